@@ -1,0 +1,1 @@
+"""DAMIAN: delay-aware multi-UAV reinforcement learning on TorchRL."""
