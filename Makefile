@@ -1,0 +1,52 @@
+# make train | test | test-slow | bench | check        (each sets up what it needs)
+
+PYTHON ?= python3
+VENV   ?= .venv
+TORCH  ?= torch==2.13.0
+PY     := $(VENV)/bin/python
+PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
+
+.PHONY: train test test-slow bench check format clean
+
+train: $(VENV)/base
+	$(PY) recipes/train.py $(ARGS)
+
+test: $(VENV)/test
+	$(PY) -m pytest -n 2 $(ARGS)
+
+test-slow: $(VENV)/test
+	$(PY) -m pytest -m slow $(ARGS)
+
+bench: $(VENV)/bench
+	$(PY) recipes/bench.py $(ARGS)
+
+check: $(VENV)/dev
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/pyright
+
+format: $(VENV)/dev
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix .
+
+# Torch first and by itself: an unpinned one would bring gigabytes of CUDA along.
+$(VENV)/base: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) "$(TORCH)"
+	$(PIP) -e . "$(TORCH)"
+	touch $@
+
+$(VENV)/test: $(VENV)/base
+	$(PIP) -e ".[test]" "$(TORCH)"
+	touch $@
+
+$(VENV)/dev: $(VENV)/test
+	$(PIP) -e ".[dev]" "$(TORCH)"
+	touch $@
+
+$(VENV)/bench: $(VENV)/base
+	$(PIP) -e ".[bench]" "$(TORCH)"
+	touch $@
+
+clean:
+	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,202 @@
+"""What a UAV chooses: a distance and a heading, turned into a landing point that no other UAV has."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from damian import checks
+from damian.world.airspace import Airspace, inside, nearest_points
+
+
+@dataclass
+class ActionConfig:
+    """The (distance, heading) pairs of SPEC 2."""
+
+    kind: str = "discrete"
+    """``discrete`` (every listed distance with every listed heading) or ``continuous``."""
+    distances: list[float] = field(default_factory=lambda: [0.0, 50.0, 100.0, 150.0, 200.0])
+    """[m]; 0 holds the position. Continuous actions reach up to the largest."""
+    headings: list[float] = field(
+        default_factory=lambda: [-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0]
+    )
+    """Clockwise from north [deg]; discrete actions only."""
+    mask: bool = True
+    """Mask out discrete actions that would only hold (target outside, battery too low, in flight)."""
+
+    def __post_init__(self) -> None:
+        checks.one_of("actions.kind", self.kind, ["discrete", "continuous"])
+        checks.require(len(self.distances) > 0, "actions.distances", self.distances, "is empty")
+        checks.require(len(self.headings) > 0, "actions.headings", self.headings, "is empty")
+        for distance in self.distances:
+            checks.in_range("actions.distances", distance, 0.0, unit="m")
+        for heading in self.headings:
+            checks.in_range("actions.headings", heading, -360.0, 360.0, unit="deg")
+        checks.above("actions.distances (largest)", max(self.distances), 0.0, "m")
+
+    @property
+    def n_actions(self) -> int:
+        """Number of discrete actions."""
+        return len(self.distances) * len(self.headings)
+
+    def table(self) -> Tensor:
+        """Discrete actions as (distance [m], heading [rad]), distance-major, [A, 2]."""
+        headings = [math.radians(heading) for heading in self.headings]
+        return torch.tensor([[d, h] for d in self.distances for h in headings])
+
+
+def displacement(distance: Tensor, heading: Tensor) -> Tensor:
+    """Metres east and north of a flight, [*, 2]."""
+    return distance.unsqueeze(-1) * torch.stack([heading.sin(), heading.cos()], -1)
+
+
+class Candidates:
+    """Landing points that an action may lead to, nearest its target first.
+
+    UAVs choose only while they stand on a landing point, so for discrete actions the candidates of every
+    (landing point, action) are computed once. ``2N - 1`` candidates always contain a free one: the
+    others stand on ``N - 1`` points at most and have booked as many.
+    """
+
+    def __init__(self, airspace: Airspace, config: ActionConfig, n_agents: int) -> None:
+        self.airspace = airspace
+        self.config = config
+        self.n_candidates = min(2 * n_agents - 1, airspace.max_points)
+        self.max_distance = max(config.distances)
+        if config.kind == "discrete":
+            self._rank_all()
+
+    def of(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Candidate point ids [M, K], and each UAV's row among them [B, N].
+
+        Args:
+            flat: flat id of the landing point each UAV stands on, [B, N].
+            region: [B].
+            action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
+        """
+        if self.config.kind == "discrete":
+            return self.ranked, flat * self.config.n_actions + action
+        distance = action[..., 0].clamp(0, 1) * self.max_distance
+        heading = action[..., 1].clamp(0, 1) * 2 * math.pi
+        ranked, _ = self._rank(
+            self.airspace.points[region].unsqueeze(1),
+            self.airspace.edges[region].unsqueeze(1),
+            self.airspace.points.flatten(0, 1)[flat],
+            flat % self.airspace.max_points,
+            displacement(distance, heading),
+        )
+        return ranked.flatten(0, 1), torch.arange(flat.numel(), device=flat.device).view_as(flat)
+
+    def _rank(
+        self, points: Tensor, edges: Tensor, standing: Tensor, own: Tensor, move: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Candidates [*, K] and whether the target lies inside, [*]. Outside the UAV holds (SPEC 2)."""
+        target = standing + move
+        valid = inside(edges, target)
+        ranked = nearest_points(points, target, self.n_candidates)
+        return torch.where(valid.unsqueeze(-1), ranked, own.unsqueeze(-1)), valid
+
+    def _rank_all(self) -> None:
+        """Every (landing point, action): its candidates, is it valid, how far is its nearest point.
+
+        ``ranked`` [R*L*A, K], ``valid`` [R*L, A], ``distance`` [R*L, A]; ``hold`` [A] marks one action
+        that holds (the first, if no listed distance is 0).
+        """
+        table = self.config.table()
+        move = displacement(table[:, 0], table[:, 1])
+        ranked, valid, distance = [], [], []
+        for points, edges in zip(self.airspace.points, self.airspace.edges, strict=True):
+            for own in torch.arange(len(points)).split(64):  # bounds the memory of the search
+                standing = torch.nan_to_num(points[own], posinf=0.0).unsqueeze(1)
+                own_point = own.unsqueeze(-1).expand(-1, len(table))
+                rows = self._rank(points, edges, standing, own_point, move)
+                reached = points[rows[0][..., 0]]
+                ranked.append(rows[0].flatten(0, 1).to(torch.int32))
+                valid.append(rows[1] | (table[:, 0] == 0))
+                distance.append(torch.linalg.vector_norm(reached - standing, dim=-1))
+        self.ranked, self.valid = torch.cat(ranked), torch.cat(valid)
+        self.distance = torch.cat(distance)
+        self.can_hold = bool((table[:, 0] == 0).any())
+        first_hold = int((table[:, 0] == 0).int().argmax())
+        self.hold = torch.arange(len(table)) == first_hold
+
+    def to(self, device: torch.device) -> "Candidates":
+        """Move the tables in place."""
+        self.airspace = self.airspace.to(device)
+        if self.config.kind == "discrete":
+            for name in ("ranked", "valid", "distance", "hold"):
+                setattr(self, name, getattr(self, name).to(device))
+        return self
+
+
+@torch.library.custom_op("damian::book", mutates_args=())
+def book(ranked: Tensor, row: Tensor, standing: Tensor, ready: Tensor, n_points: int) -> Tensor:
+    """Give every UAV its best free candidate, in index order, so that no two book one point.
+
+    A point is free if no other UAV stands on it or is bound for it (SPEC 2); a UAV's own always is. Most
+    UAVs get their first candidate at once; only the worlds in which one does not are looked at again. An
+    operator of its own, because how many these are depends on the data, which a compiler cannot trace.
+
+    Args:
+        ranked: candidate point ids by preference, [M, K].
+        row: each UAV's row of candidates, [B, N].
+        standing: point that each UAV stands on or is bound for, [B, N].
+        ready: may the UAV choose; else it keeps its point, [B, N].
+        n_points: landing points of a region; ids are below it.
+
+    Returns:
+        Booked point of each UAV, [B, N].
+    """
+    first = ranked[:, 0].index_select(0, row.flatten()).view_as(row).long()
+    choice = torch.where(ready, first, standing)
+    moves = choice != standing
+    occupied = standing.new_zeros(len(standing), n_points, dtype=torch.bool)
+    occupied.scatter_(1, standing, True)
+    taken = occupied.gather(1, choice) & moves
+    same = (choice.unsqueeze(-1) == choice.unsqueeze(-2)).sum(-1)
+    open_worlds = (taken | (moves & (same > 1))).any(-1).nonzero().squeeze(-1)
+    if len(open_worlds):
+        row, standing, ready, occupied = (t[open_worlds] for t in (row, standing, ready, occupied))
+        candidates = torch.where(ready.unsqueeze(-1), ranked[row].long(), standing.unsqueeze(-1))
+        choice[open_worlds] = _book_in_order(candidates, standing, occupied)
+    return choice
+
+
+@book.register_fake
+def _(ranked: Tensor, row: Tensor, standing: Tensor, ready: Tensor, n_points: int) -> Tensor:
+    return torch.empty_like(standing)
+
+
+def _book_in_order(candidates: Tensor, standing: Tensor, occupied: Tensor) -> Tensor:
+    """Serial choice as the fixed point of "take the best candidate that no earlier UAV has taken".
+
+    After r rounds the first r + 1 UAVs are settled, so that N - 1 rounds suffice; mostly one or two do.
+
+    Args:
+        candidates: [B, N, K].
+        standing: [B, N].
+        occupied: does some UAV stand on the point or fly to it, [B, L].
+    """
+    n_agents = standing.shape[1]
+    index = torch.arange(n_agents, device=standing.device)
+    flat = candidates.flatten(1)
+    own = candidates == standing.unsqueeze(-1)
+    free = ~occupied.gather(1, flat).view_as(candidates) | own
+    choice = _first(candidates, free, standing)
+    for _ in range(n_agents - 1):
+        owner = torch.full_like(occupied, n_agents, dtype=torch.long)
+        owner.scatter_reduce_(1, choice, index.expand_as(choice), "amin")
+        untaken = owner.gather(1, flat).view_as(candidates) >= index.unsqueeze(-1)
+        settled = _first(candidates, free & (untaken | own), standing)
+        if torch.equal(settled, choice):
+            break
+        choice = settled
+    return choice
+
+
+def _first(candidates: Tensor, allowed: Tensor, standing: Tensor) -> Tensor:
+    """The first allowed candidate, else the own point, [B, N]."""
+    first = allowed.to(torch.uint8).argmax(-1, keepdim=True)
+    choice = candidates.gather(-1, first).squeeze(-1)
+    return torch.where(allowed.any(-1), choice, standing)

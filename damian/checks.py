@@ -1,0 +1,54 @@
+"""Checks of written values; each failure is one line that names the key, the value and its unit."""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from damian.errors import InputError
+
+_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+def require(condition: bool, key: str, value: Any, should: str) -> None:
+    """Raise ``InputError("<key>: <value> <should>")`` unless the condition holds."""
+    if not condition:
+        raise InputError(f"{key}: {value} {should}")
+
+
+def in_range(key: str, value: float, low: float, high: float = math.inf, unit: str = "") -> None:
+    """Require a finite number ``low <= value <= high``."""
+    unit = f" {unit}" if unit else ""
+    bounds = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
+    good = isinstance(value, int | float) and math.isfinite(value) and low <= value <= high
+    require(good, key, f"{value}{unit}", f"is not {bounds}{unit}")
+
+
+def above(key: str, value: float, low: float, unit: str = "") -> None:
+    """Require a finite number above ``low``."""
+    unit = f" {unit}" if unit else ""
+    good = isinstance(value, int | float) and math.isfinite(value) and value > low
+    require(good, key, f"{value}{unit}", f"is not above {low:g}{unit}")
+
+
+def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:
+    """Require membership."""
+    choices = list(choices)
+    require(value in choices, key, value, f"is not one of {', '.join(map(str, choices))}")
+
+
+def place(key: str, value: Sequence[float]) -> None:
+    """Require one ``[x, y]`` in metres."""
+    good = len(value) == 2 and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
+    require(good, key, list(value), "is not [x, y] in metres")
+
+
+def seconds(key: str, value: str | float) -> float:
+    """Read a time: ``"2s"``, ``"0.5m"``, ``"1h"``, or a bare number of seconds."""
+    text = str(value).strip()
+    number, unit = (text[:-1], text[-1]) if text[-1:] in _SECONDS else (text, "s")
+    try:
+        time = float(number) * _SECONDS[unit]
+    except ValueError:
+        raise InputError(f"{key}: {value} is not a time such as 2s, 0.5m or 1h") from None
+    above(key, time, 0.0, "s")
+    return time

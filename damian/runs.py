@@ -1,0 +1,118 @@
+"""A run folder that explains itself: metrics, learning curve, table of results."""
+
+import csv
+import math
+from pathlib import Path
+
+import matplotlib
+from torch.utils.tensorboard import SummaryWriter
+
+from damian.errors import InputError
+from damian.metrics import Evaluation
+
+matplotlib.use("Agg")
+
+METRICS = "metrics.csv"
+FIGURE = "learning_curve.png"
+CHECKPOINT = "checkpoint"
+CONFIG = "config.yaml"
+
+
+class MetricsLog:
+    """Rows of named numbers, to ``metrics.csv`` and TensorBoard; a resumed run goes on below its rows.
+
+    Args:
+        folder: the run folder.
+        tensorboard: write TensorBoard events too.
+        to_csv: write ``metrics.csv``.
+        frames: rows from here on are dropped first (they lie after the checkpoint).
+    """
+
+    def __init__(self, folder: Path, tensorboard: bool, to_csv: bool, frames: int = 0) -> None:
+        self._path = folder / METRICS if to_csv else None
+        self._writer = SummaryWriter(str(folder)) if tensorboard else None
+        self.rows = [row for row in read_metrics(folder) if row["frames"] <= frames]
+        if self._path:
+            self._path.unlink(missing_ok=True)
+            for row in self.rows:
+                self._append(row)
+
+    def add(self, frames: int, numbers: dict[str, float]) -> None:
+        """Log numbers at a count of frames."""
+        row = {"frames": float(frames), **numbers}
+        self.rows.append(row)
+        self._append(row)
+        if self._writer:
+            for name, number in numbers.items():
+                self._writer.add_scalar(name, number, frames)
+
+    def close(self) -> None:
+        """Write out what TensorBoard still holds."""
+        if self._writer:
+            self._writer.close()
+
+    def _append(self, row: dict[str, float]) -> None:
+        if not self._path:
+            return
+        new = not self._path.exists()
+        with self._path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, list(row))
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+
+
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """The rows of a run's ``metrics.csv``; none if it has none.
+
+    Raises:
+        InputError: the file is not what a run has written.
+    """
+    path = folder / METRICS
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file)
+        try:
+            return [{name: float(number) for name, number in row.items()} for row in reader]
+        except (TypeError, ValueError) as error:
+            line = f"{path}, line {reader.line_num}"
+            raise InputError(f"{line}: not a row of numbers ({error})") from None
+
+
+def plot_learning_curve(
+    rows: list[dict[str, float]], random: Evaluation, path: Path, title: str
+) -> None:
+    """Draw return and success rate over frames, with the random policy as a dashed line."""
+    from matplotlib import pyplot as plt  # noqa: PLC0415 (slow to import, needed once)
+
+    panels = [("episode_return", "return", random.episode_return)]
+    if any(row["success_rate"] > 0 for row in rows):
+        panels.append(("success_rate", "success rate", random.success_rate))
+    figure, axes = plt.subplots(1, len(panels), figsize=(5 * len(panels), 3.4), squeeze=False)
+    for axis, (name, label, level) in zip(axes[0], panels, strict=True):
+        points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
+        axis.plot(*zip(*points, strict=True), color="tab:blue", label="MAPPO while training")
+        axis.axhline(level, color="tab:gray", linestyle="--", label="random policy")
+        axis.set_xlabel("steps of all worlds")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    axes[0][0].legend(loc="best", fontsize="small")
+    figure.suptitle(title, fontsize="medium")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def results_table(rows: dict[str, Evaluation]) -> str:
+    """Evaluations beside each other, as a Markdown table."""
+    lines = [
+        "| policy | success rate | steps | return | episodes |",
+        "|:--|--:|--:|--:|--:|",
+    ]
+    for name, row in rows.items():
+        lines.append(
+            f"| {name} | {row.success_rate:.2f} | {row.steps:.2f} "
+            f"| {row.episode_return:.3f} | {row.episodes} |"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,124 @@
+"""Operative regions as padded tensors: polygons, landing points, nearest points, inside tests."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import shapely
+import torch
+from torch import Tensor
+
+from damian.errors import InputError
+from damian.world.polygon import landing_lattice, largest_vertex_distance
+from damian.world.regions import Region
+
+
+@dataclass(frozen=True)
+class Airspace:
+    """``R`` operative regions with at most ``L`` landing points and ``E`` polygon edges each.
+
+    A landing point's *flat id* is ``region * L + point``; padded points lie infinitely far away.
+
+    Attributes:
+        points: landing points, [R, L, 2] metres.
+        n_points: number of real landing points, [R].
+        edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres.
+        scale: largest distance between two vertices, [R] metres; what distances are divided by.
+        regions: where the polygons came from.
+    """
+
+    points: Tensor
+    n_points: Tensor
+    edges: Tensor
+    scale: Tensor
+    regions: tuple[Region, ...]
+
+    @property
+    def max_points(self) -> int:
+        return self.points.shape[1]
+
+    def to(self, device: torch.device) -> "Airspace":
+        moved = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "regions"}
+        return replace(self, **{name: tensor.to(device) for name, tensor in moved.items()})
+
+
+def build_airspace(
+    regions: list[Region], step_m: float, degrees: float, n_points: int | None, n_agents: int
+) -> Airspace:
+    """Lay the landing lattice over each region.
+
+    Raises:
+        InputError: fewer landing points than UAVs in some region.
+    """
+    lattices = [landing_lattice(r.polygon, step_m, degrees, n_points) for r in regions]
+    for region, lattice in zip(regions, lattices, strict=True):
+        if len(lattice) < n_agents:
+            raise InputError(
+                f"agents: {n_agents} UAVs need as many landing points, but {region.name} has "
+                f"{len(lattice)}; lower agents or region.lattice_step ({step_m:g} m)"
+            )
+    edges = [_edges(region.polygon) for region in regions]
+    return Airspace(
+        points=_padded(lattices, torch.inf),
+        n_points=torch.tensor([len(lattice) for lattice in lattices]),
+        # A padded edge has no height, so no ray crosses it.
+        edges=_padded(edges, 0.0),
+        scale=torch.tensor(
+            [largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32
+        ),
+        regions=tuple(regions),
+    )
+
+
+def inside(edges: Tensor, target: Tensor) -> Tensor:
+    """Even-odd test: does each target lie inside its polygon? Concave polygons and holes included.
+
+    Args:
+        edges: [*, E, 4] metres.
+        target: [*, 2] metres.
+
+    Returns:
+        Bool, [*].
+    """
+    x1, y1, x2, y2 = edges.unbind(-1)
+    x, y = target[..., :1], target[..., 1:]
+    straddles = (y1 > y) != (y2 > y)
+    # Where a horizontal edge divides by zero it does not straddle either.
+    crossing = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
+    return ((straddles & (x < crossing)).sum(-1) % 2).bool()
+
+
+def nearest_points(points: Tensor, target: Tensor, n: int) -> Tensor:
+    """The ``n`` landing points nearest each target, nearest first, equal distances by lowest id.
+
+    Args:
+        points: [*, L, 2] metres; padded ones infinitely far.
+        target: [*, 2] metres.
+
+    Returns:
+        Point ids, [*, n].
+    """
+    offset = (points - target.unsqueeze(-2)).double()
+    # Far below any real difference of squared distances, so it only orders ties.
+    order = 1e-9 * torch.arange(points.shape[-2], device=points.device, dtype=torch.float64)
+    return (offset.square().sum(-1) + order).topk(n, dim=-1, largest=False).indices
+
+
+def rows(table: Tensor, index: Tensor) -> Tensor:
+    """``table[index]`` for a table [M, ...] and any shape of index; several times as fast on a CPU."""
+    return table.index_select(0, index.flatten()).view(*index.shape, *table.shape[1:])
+
+
+def _edges(polygon: shapely.Geometry) -> np.ndarray:
+    """Every edge of every ring, [E, 4] metres."""
+    rings = shapely.get_rings(shapely.get_parts(polygon))
+    corners = [shapely.get_coordinates(ring) for ring in rings]
+    return np.concatenate([np.hstack([ring[:-1], ring[1:]]) for ring in corners])
+
+
+def _padded(arrays: list[np.ndarray], value: float) -> Tensor:
+    """Stack arrays of different lengths as float32, [R, longest, ...]."""
+    longest = max(len(a) for a in arrays)
+    stacked = np.full((len(arrays), longest, *arrays[0].shape[1:]), value)
+    for row, array in zip(stacked, arrays, strict=True):
+        row[: len(array)] = array
+    return torch.as_tensor(stacked, dtype=torch.float32)

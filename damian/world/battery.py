@@ -1,0 +1,116 @@
+"""Battery: what flying drains and standing charges, in percent of the capacity (SPEC 1, Battery).
+
+The cruise drain's rate is proportional to the speed, so the drain of any piece of a cruise is
+proportional to its length: exact whatever the time step and the speed profile.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from damian import checks
+
+_VERTICAL_FACTOR = 0.9
+"""Takeoff and landing: the base that the engine's power is divided by shrinks by 10 %."""
+
+
+@dataclass
+class BatteryConfig:
+    """The UAVs' batteries and where they charge."""
+
+    enabled: bool = False
+    """Do flights drain the battery? If not, it stays full."""
+    engine_power_kw: float = 10.0
+    """Engine power at the reference speed, and in takeoff and landing [kW]."""
+    reference_speed: float = 20.0
+    """Cruise speed at which the engine takes its full power [m/s]."""
+    capacity_kwh: float = 9.0
+    """Energy of a full battery [kWh]."""
+    efficiency: float = 12.0
+    """Efficiency factor of the consumption (``eff`` in SPEC 1)."""
+    charging_power_kw: float = 4.0
+    """Power with which a landed UAV charges [kW]."""
+    resolution: float = 5.0
+    """Step in which a battery level is observed [%]."""
+    charging_points: list | None = None
+    """Places [x, y] in metres where UAVs charge; anywhere if not given."""
+
+    def __post_init__(self) -> None:
+        checks.above("battery.engine_power_kw", self.engine_power_kw, 0.0, "kW")
+        checks.above("battery.reference_speed", self.reference_speed, 0.0, "m/s")
+        checks.above("battery.capacity_kwh", self.capacity_kwh, 0.0, "kWh")
+        checks.above("battery.efficiency", self.efficiency, 0.0)
+        checks.above("battery.charging_power_kw", self.charging_power_kw, 0.0, "kW")
+        checks.above("battery.resolution", self.resolution, 0.0, "%")
+        checks.in_range("battery.resolution", self.resolution, 0.0, 100.0, "%")
+        checks.require(
+            self.charging_points != [],
+            "battery.charging_points",
+            "[]",
+            "is not a list of places; leave it out to charge anywhere",
+        )
+        for point in self.charging_points or []:
+            checks.place("battery.charging_points", point if isinstance(point, list) else [point])
+
+
+def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:
+    """Drain of cruising a distance: [*] metres to [*] percent."""
+    percent_per_hour = _full_power_drain(battery)
+    return distance * (percent_per_hour / (3600 * battery.reference_speed))
+
+
+def vertical_drain(seconds: Tensor, battery: BatteryConfig) -> Tensor:
+    """Drain of taking off or landing for a time: [*] seconds to [*] percent."""
+    return seconds * (_full_power_drain(battery) / (3600 * _VERTICAL_FACTOR))
+
+
+def flight_drain(vertical: Tensor, distance: Tensor, battery: BatteryConfig) -> Tensor:
+    """Drain of a whole flight: takeoff, cruise and landing.
+
+    Args:
+        vertical: duration of the takeoff, the same as of the landing, [*] seconds.
+        distance: length of the cruise, [*] metres.
+        battery: its figures.
+
+    Returns:
+        Percent, [*].
+    """
+    return vertical_drain(2 * vertical, battery) + cruise_drain(distance, battery)
+
+
+def used_so_far(
+    elapsed: Tensor, vertical: Tensor, cruise: Tensor, cruised: Tensor, battery: BatteryConfig
+) -> Tensor:
+    """Drain of a flight up to a time.
+
+    Args:
+        elapsed: time since takeoff, [*] seconds.
+        vertical: duration of the takeoff, the same as of the landing, [*] seconds.
+        cruise: duration of the cruise, [*] seconds.
+        cruised: distance cruised so far, [*] metres.
+        battery: its figures.
+
+    Returns:
+        Percent, [*]; ``flight_drain`` from the end of the flight on.
+    """
+    took_off = torch.minimum(elapsed, vertical)
+    landing = torch.minimum((elapsed - vertical - cruise).clamp(min=0), vertical)
+    return vertical_drain(took_off + landing, battery) + cruise_drain(cruised, battery)
+
+
+def charge_gain(seconds: Tensor, battery: BatteryConfig) -> Tensor:
+    """What charging for a time adds: [*] seconds to [*] percent; not clipped at a full battery."""
+    full = 3600 * battery.capacity_kwh / battery.charging_power_kw
+    return seconds * (100 / full)
+
+
+def observed(level: Tensor, battery: BatteryConfig) -> Tensor:
+    """The level as it is observed: [*] percent, rounded down to the resolution."""
+    # The slack keeps a level that float error left just below a step on that step.
+    return torch.floor(level / battery.resolution + 1e-4) * battery.resolution
+
+
+def _full_power_drain(battery: BatteryConfig) -> float:
+    """Percent per hour at full engine power."""
+    return 100 * battery.engine_power_kw / (battery.capacity_kwh * battery.efficiency)

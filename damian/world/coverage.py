@@ -1,0 +1,182 @@
+"""Area covered: the share of a footprint that is new, in the polygon and nobody else's.
+
+A footprint is a disc of radius R. It is sampled at ``64 * words`` points, always the same ones:
+then "which part of the disc at p" is a bit mask, and set algebra on discs and polygons is bitwise
+algebra on a few int64 words. Two kinds of masks are tabulated once: what lies outside the polygon,
+for each landing point, and what lies in a second disc, for each offset of two discs (to 4R/320).
+Nothing is left for the hot path but to look masks up, OR them and count the bits that stay 0.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from damian.errors import InputError
+
+# Offsets from -2R to 2R along each axis; odd, so that "the same place" (offset 0) is exact.
+_GRID = 321
+# Words looked up at once: bounds the memory of large fleets in many worlds. 8 MiB stay in the cache
+# of a CPU; 128 MiB on a GPU and in compiled graphs, which grow with the number of chunks.
+_CHUNK_WORDS, _CHUNK_WORDS_LARGE = 2**20, 2**24
+
+
+class FootprintTables(NamedTuple):
+    """Bit masks of a sampled footprint; a 1 is a sample that does not count.
+
+    ``masks`` is ``[G * G + P, words]`` int64. Row ``x * G + y``: samples of a disc that lie in a
+    second one, whose centre is ``(x - G // 2, y - G // 2)`` cells further (east, north); the border
+    is 0. Row ``G * G + p``: samples of the disc at landing point p that lie outside its polygon.
+    ``cells_per_metre`` is ``(G - 1) / 4R``.
+    """
+
+    masks: Tensor
+    cells_per_metre: float
+
+    def to(self, device: torch.device | str) -> "FootprintTables":
+        """The same tables on another device."""
+        return self._replace(masks=self.masks.to(device))
+
+
+def build_tables(
+    polygons: Sequence[shapely.Polygon | shapely.MultiPolygon],
+    points: np.ndarray,
+    radius: float,
+    words: int = 16,
+) -> FootprintTables:
+    """Tables for the landing points ``points[r, l]`` [m] of ``polygons[r]``, shape ``[R, L, 2]``.
+
+    A landing point's flat id is ``r * L + l``. Rows of NaN pad; nothing counts as covered there.
+    ``radius`` is the footprint's [m]. Polygons may be concave, in several parts and have holes.
+
+    Accuracy of one footprint's area with 16 words, over random polygons and up to 5 other discs:
+    rms 0.2 %, worst 0.8 % of pi R^2. More words cost time, fewer cost accuracy.
+
+    Raises:
+        InputError: the radius is not a positive length, or there are no words.
+    """
+    if not (math.isfinite(radius) and radius > 0):
+        raise InputError(f"footprint radius: {radius} m: must be finite and above 0 m")
+    if words < 1:
+        raise InputError(f"words: {words} words of 64 samples: must be 1 or more")
+    offsets = radius * _unit_disc_samples(64 * words)
+    outside = [_outside(*pair, offsets) for pair in zip(polygons, points, strict=True)]
+    masks = torch.cat([_overlap(words), *map(_packed, outside)])
+    return FootprintTables(masks, (_GRID - 1) / (4 * radius))
+
+
+def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
+    """Coverage c_a in [0, 1], ``[*, N]``: mean share of each UAV's last n footprints that counts.
+
+    What counts of the footprint at ``positions[..., i, k, :]`` (index 0 newest, n - 1 oldest) lies
+    inside the polygon, in the footprint of no other UAV at the same index k, and in none of UAV i's
+    older ones (index > k). The share is of pi R^2.
+
+    Args:
+        tables: from :func:`build_tables`, on the same device as the positions.
+        point_ids: ``[*, N, n]`` int64, flat ids of the landing points where the UAVs stood.
+        positions: ``[*, N, n, 2]`` [m], the same places; finite (not checked).
+    """
+    lead, (n_uavs, n_last) = point_ids.shape[:-2], point_ids.shape[-2:]
+    ids, xy = point_ids.reshape(-1, n_uavs, n_last), positions.reshape(-1, n_uavs, n_last, 2)
+    worlds = _worlds_at_once(tables, ids)
+    chunks = zip(ids.split(worlds), xy.split(worlds), strict=True)
+    return torch.cat([_covered_share(tables, *chunk) for chunk in chunks]).reshape(*lead, n_uavs)
+
+
+def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:
+    """How many worlds of ``point_ids [b, N, n]`` to look up together; from shapes alone."""
+    _, n_uavs, n_last = point_ids.shape
+    words_per_world = n_uavs * n_last * (n_uavs + n_last - 1) * tables.masks.shape[-1]
+    small = point_ids.device.type == "cpu" and not torch.compiler.is_compiling()
+    return max(1, (_CHUNK_WORDS if small else _CHUNK_WORDS_LARGE) // words_per_world)
+
+
+def _covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
+    """:func:`covered_share` of a chunk of worlds: ``[b, N, n]``, ``[b, N, n, 2]`` -> ``[b, N]``."""
+    overlaps = _overlap_rows(positions * tables.cells_per_metre).movedim(-1, 0)
+    rows = torch.cat([(point_ids + _GRID**2).unsqueeze(0), overlaps])
+    masks = tables.masks.index_select(0, rows.reshape(-1))
+    lost = _or_first(masks.view(len(rows), *point_ids.shape, -1))
+    counts = _bit_count(lost).flatten(-2)
+    # Summed as floats (exact: small integers), which compiles to a much faster loop than int64.
+    return 1 - counts.sum(-1, dtype=positions.dtype) / (64 * counts.shape[-1])
+
+
+def _overlap_rows(cells: Tensor) -> Tensor:
+    """Table rows of all that may cover a footprint, ``[b, N, n, 2]`` -> ``[b, N, n, N + n - 2]``.
+
+    First the other UAVs i + 1, i + 2, ... (around the fleet) at the same index, then the UAV itself
+    at the indices k + 1, k + 2, ...; beyond the window it is infinitely far away. Windows sliding
+    over the fleet and over the past leave out the pairs that do not count, without index tensors.
+    """
+    n_uavs, n_last = cells.shape[-3:-1]
+    fleet = torch.cat([cells, cells[..., :-1, :, :]], -3).unfold(-3, n_uavs, 1)
+    past = F.pad(cells, (0, 0, 0, n_last - 1), value=math.inf).unfold(-2, n_last, 1)
+    other = torch.cat([fleet[..., 1:], past[..., 1:]], -1)
+    # Adding half a cell before truncation rounds to the nearest one.
+    cell = (other - (cells - (_GRID / 2)).unsqueeze(-1)).clamp(0, _GRID - 1).long()
+    return cell[..., 0, :] * _GRID + cell[..., 1, :]
+
+
+def _or_first(masks: Tensor) -> Tensor:
+    """Bitwise OR over the first dimension, in log2 steps: ``[M, *]`` -> ``[*]``."""
+    while len(masks) > 1:
+        half = (len(masks) + 1) // 2
+        masks = masks[:half] | masks[-half:]  # an odd one in the middle is taken twice: no harm
+    return masks[0]
+
+
+def _bit_count(words: Tensor) -> Tensor:
+    """Number of 1 bits of each int64, same shape and dtype.
+
+    Counts side by side in fields of 2, 4 and 8 bits, then adds the bytes up with a product (H. S.
+    Warren, Hacker's Delight, 2nd ed., 5-1). ``>>`` repeats the sign bit, hence a mask after each;
+    the last needs none, as its top byte is at most 64. In place on what is new: fewer allocations.
+    """
+    twos = words - (words >> 1).bitwise_and_(0x5555555555555555)
+    fours = (twos >> 2).bitwise_and_(0x3333333333333333).add_(twos & 0x3333333333333333)
+    eights = (fours >> 4).add_(fours).bitwise_and_(0x0F0F0F0F0F0F0F0F)
+    return eights.mul_(0x0101010101010101) >> 56
+
+
+def _unit_disc_samples(count: int) -> np.ndarray:
+    """Well-spread points of equal weight in the unit disc, ``[count, 2]`` (H. Vogel, 1979).
+
+    The sunflower's seeds: r = sqrt((k + 1/2) / count), each a golden angle on from the last.
+    """
+    k = np.arange(count)
+    r, angle = np.sqrt((k + 0.5) / count), k * np.pi * (3 - math.sqrt(5))
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
+
+
+def _outside(polygon: shapely.Geometry, points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Which samples around each point are outside, ``[L, 2]``, ``[S, 2]`` -> bool ``[L, S]``."""
+    shapely.prepare(polygon)
+    real = np.isfinite(points).all(-1)
+    outside = np.ones((len(points), len(offsets)), bool)
+    samples = points[real, None] + offsets
+    outside[real] = ~shapely.contains_xy(polygon, samples[..., 0], samples[..., 1])
+    return outside
+
+
+@functools.lru_cache(maxsize=2)
+def _overlap(words: int) -> Tensor:
+    """Overlap masks for every offset, ``[G * G, words]``; they do not depend on R or the region."""
+    samples = _unit_disc_samples(64 * words).astype(np.float32)
+    axis = np.linspace(-2, 2, _GRID, dtype=np.float32)
+    dx2, dy2 = np.square(samples.T[:, None] - axis[:, None])  # [G, S] each
+    table = torch.stack([_packed(row + dy2 < 1) for row in dx2])
+    table[[0, -1]] = table[:, [0, -1]] = 0
+    return table.view(-1, words)
+
+
+def _packed(bits: np.ndarray) -> Tensor:
+    """Booleans packed 64 to an int64: ``[*, 64 * W]`` -> ``[*, W]``."""
+    return torch.from_numpy(np.packbits(bits, axis=-1, bitorder="little").view(np.int64))

@@ -1,0 +1,69 @@
+"""Latitude and longitude to local metres and back, on a sphere.
+
+Local metres are an azimuthal equidistant map about an origin: x east, y north, distance and bearing
+from the origin exact. Formulas: R. W. Sinnott, "Virtues of the Haversine" (1984), and the direct
+problem on a sphere. The sphere differs from the WGS 84 ellipsoid by up to 0.6 % of a distance.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+EARTH_RADIUS_M = 6_371_008.8
+"""Mean radius of the Earth (IUGG R1)."""
+
+
+def to_local(
+    lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]
+) -> tuple[Floats, Floats]:
+    """Local metres of places, by haversine distance d and initial bearing b from the origin.
+
+    Args:
+        lat_deg: latitudes, [*] degrees in [-90, 90].
+        lon_deg: longitudes, [*] degrees; any turn.
+        origin: (latitude, longitude) in degrees.
+
+    Returns:
+        ``x = d sin b`` (east) and ``y = d cos b`` (north), each [*] metres. The bearing of the
+        origin's antipode is arbitrary.
+    """
+    lat, lat_0 = np.radians(np.asarray(lat_deg, float)), np.radians(origin[0])
+    d_lon = np.radians(np.asarray(lon_deg, float) - origin[1])
+    haversine = (
+        np.sin((lat - lat_0) / 2) ** 2 + np.cos(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
+    )
+    distance = 2 * EARTH_RADIUS_M * np.arcsin(np.sqrt(np.clip(haversine, 0, 1)))
+    east = np.cos(lat) * np.sin(d_lon)
+    # cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(d_lon), without its cancellation nearby.
+    north = np.sin(lat - lat_0) + 2 * np.sin(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
+    bearing = np.arctan2(east, north)
+    return distance * np.sin(bearing), distance * np.cos(bearing)
+
+
+def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Places of local metres, where the great circle from the origin ends; inverts `to_local`.
+
+    Args:
+        x_m: metres east, [*].
+        y_m: metres north, [*].
+        origin: (latitude, longitude) in degrees.
+
+    Returns:
+        Latitudes in [-90, 90] and longitudes in [-180, 180), each [*] degrees.
+    """
+    x, y, lat_0 = np.asarray(x_m, float), np.asarray(y_m, float), np.radians(origin[0])
+    arc, bearing = np.hypot(x, y) / EARTH_RADIUS_M, np.arctan2(x, y)
+    east, north = np.sin(arc) * np.sin(bearing), np.sin(arc) * np.cos(bearing)
+    # Cartesian on the unit sphere, with the origin's meridian as the x-z plane. The arctangent of
+    # the latitude keeps its digits at the poles, where an arcsine loses half of them.
+    out = np.cos(arc) * np.cos(lat_0) - north * np.sin(lat_0)
+    up = np.cos(arc) * np.sin(lat_0) + north * np.cos(lat_0)
+    lat = np.degrees(np.arctan2(up, np.hypot(out, east)))
+    return lat, wrap_longitude(np.degrees(np.arctan2(east, out)) + origin[1])
+
+
+def wrap_longitude(lon_deg: ArrayLike) -> Floats:
+    """Longitudes [*] in degrees, brought into [-180, 180)."""
+    lon = np.asarray(lon_deg, float)
+    return lon - 360 * np.floor((lon + 180) / 360)

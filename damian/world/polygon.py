@@ -1,0 +1,248 @@
+"""Operative polygons and the landing points in them, in local metres (SPEC section 1).
+
+Everything here runs once, when a world is built. Polygons may be concave, have holes or come in
+several parts.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import cast
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+from shapely.geometry import MultiPoint, MultiPolygon, Polygon
+
+from damian import checks
+from damian.errors import InputError
+
+Floats = NDArray[np.float64]
+
+MAX_COORDINATE_M = 2.0e7
+"""Half way round the Earth: what lies further is no local coordinate."""
+MAX_CANDIDATES = 5_000_000
+"""Lattice points looked at before those outside the polygon are dropped."""
+_MAX_POINTS = 1000
+_MAX_ROUNDS = 100
+
+
+def polygon_from_vertices(vertices: ArrayLike, source: str) -> Polygon:
+    """Polygon of given corners, concave or not, in the order in which they are given.
+
+    Args:
+        vertices: [V, 2] metres; the first may be repeated at the end.
+        source: what begins an error's line: a file, a line, a key.
+
+    Raises:
+        InputError: not [V, 2] finite metres, fewer than three distinct points, crossing edges, or
+            no area.
+    """
+    corners = _corners(vertices, source)
+    far = np.flatnonzero(np.abs(corners).max(axis=1) > MAX_COORDINATE_M)
+    if len(far):
+        raise InputError(
+            f"{source}: vertex {far[0]} {corners[far[0]].tolist()} m is more than "
+            f"{MAX_COORDINATE_M:g} m from the origin; give local metres"
+        )
+    return polygon_from_rings([corners], source, "m")
+
+
+def polygon_from_rings(rings: Sequence[ArrayLike], source: str, unit: str) -> Polygon:
+    """Polygon of a shell and its holes; only shapes without doubt are taken.
+
+    Args:
+        rings: the shell, then the holes; each [V, 2] in ``unit``.
+        source: what begins an error's line.
+        unit: what the coordinates are, for that line.
+
+    Raises:
+        InputError: a ring that is none, crossing edges, or a hole that is not inside the shell.
+    """
+    shell, *holes = [_closed_shape(_corners(ring, source), source) for ring in rings]
+    polygon = Polygon(shell, holes)
+    if not polygon.is_valid:
+        reason, _, place = shapely.is_valid_reason(polygon).rstrip("]").partition("[")
+        reason = "edges cross" if "self-intersection" in reason.lower() else reason.lower()
+        raise InputError(
+            f"{source}: {reason} at [{', '.join(place.split())}] {unit}; list the corners in "
+            "order around the polygon, and holes inside its shell"
+        )
+    return polygon
+
+
+def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: float) -> Polygon:
+    """Random convex polygon: the hull of points uniform in the disc of area ``max_area_m2``.
+
+    The hull grows a point at a time until its area reaches ``min_area_m2``. It cannot pass
+    ``max_area_m2``, since it lies in that disc. Where the two areas are so close that a thousand
+    points do not get there, the hull is scaled up to an area between them.
+
+    Raises:
+        InputError: unless 0 < min_area_m2 <= max_area_m2.
+    """
+    checks.above("min_area", min_area_m2, 0.0, "m^2")
+    checks.in_range("max_area", max_area_m2, min_area_m2, unit="m^2")
+    points = _disc(rng, max_area_m2, _MAX_POINTS)
+    hull = _hull(points[:3])
+    for point in points[3:]:
+        if hull.area >= min_area_m2:
+            return hull
+        hull = _hull(np.vstack([shapely.get_coordinates(hull), point]))
+    if hull.area >= min_area_m2:
+        return hull
+    grow = np.sqrt((min_area_m2 + max_area_m2) / 2 / hull.area)
+    return _hull(grow * shapely.get_coordinates(hull))
+
+
+def largest_vertex_distance(polygon: Polygon | MultiPolygon) -> float:
+    """Largest distance between two vertices [m]; what distances are divided by."""
+    corners = shapely.get_coordinates(shapely.convex_hull(polygon))
+    # A row at a time: a hull of many corners would not fit in memory as one square.
+    return max(float(np.hypot(*(corners - corner).T).max()) for corner in corners)
+
+
+def landing_lattice(
+    polygon: Polygon | MultiPolygon, step_m: float, degrees: float, n_points: int | None = None
+) -> Floats:
+    """Landing points: a serpentine lattice laid over the polygon, of which the inside is kept.
+
+    Points are ``step_m`` apart in a row and rows ``step_m sin(degrees)`` apart, so no two points
+    coincide. A landing point's id is its place in the result: counter-clockwise about the centroid
+    from due west, due west itself last; where two lie in one direction, the nearer first.
+
+    Args:
+        polygon: local metres; its boundary is outside.
+        step_m: distance of neighbours in a row.
+        degrees: slant of the lattice, in (0, 90].
+        n_points: keep only that many, the nearest to the centroid; all if not given.
+
+    Returns:
+        [L, 2] metres.
+
+    Raises:
+        InputError: a wrong step, slant or number; no point, or fewer than ``n_points``, inside.
+    """
+    checks.above("lattice step", step_m, 0.0, "m")
+    checks.in_range("lattice step", step_m, 0.0, MAX_COORDINATE_M, "m")
+    checks.above("lattice angle", degrees, 0.0, "deg")
+    checks.in_range("lattice angle", degrees, 0.0, 90.0, "deg")
+    lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
+    shapely.prepare(polygon)
+    inside = lattice[shapely.contains_xy(polygon, lattice)]
+    wanted = 1 if n_points is None else n_points
+    checks.in_range("landing points", wanted, 1)
+    checks.require(
+        len(inside) >= wanted,
+        "landing points",
+        len(inside),
+        f"lie inside the polygon of {polygon.area:g} m^2, fewer than the {wanted} wanted; take a "
+        f"lattice step below {step_m:g} m",
+    )
+    return _by_direction(inside, shapely.get_coordinates(polygon.centroid)[0], n_points)
+
+
+def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Generator) -> Floats:
+    """Points uniform in the polygon, strictly inside.
+
+    A triangle of its constrained Delaunay triangulation is drawn by area, then a point in it (Osada
+    et al., "Shape Distributions", 2002, eq. 1). So a sliver takes no longer than a square, and only
+    points that rounding has put on the boundary are drawn again.
+
+    Returns:
+        [n, 2] metres.
+
+    Raises:
+        InputError: the polygon is thinner than rounding, or empty.
+    """
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+    share = shapely.area(triangles)
+    shapely.prepare(polygon)
+    points = np.empty((0, 2))
+    for _ in range(_MAX_ROUNDS if share.sum() > 0 else 0):
+        triangle = rng.choice(len(share), n - len(points), p=share / share.sum())
+        a, b, c = corners[triangle].swapaxes(0, 1)
+        root, along = np.sqrt(rng.random((len(a), 1))), rng.random((len(a), 1))
+        drawn = (1 - root) * a + root * (1 - along) * b + root * along * c
+        points = np.vstack([points, drawn[shapely.contains_xy(polygon, drawn)]])
+        if len(points) == n:
+            return points
+    raise InputError(f"polygon: {polygon.area:g} m^2 has no inside to draw {n} points from")
+
+
+def _corners(vertices: ArrayLike, source: str) -> Floats:
+    """Corners as finite [V, 2]."""
+    try:
+        corners = np.asarray(vertices, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{source}: vertices are not a list of [x, y] numbers") from None
+    if corners.ndim != 2 or corners.shape[1] != 2:
+        raise InputError(
+            f"{source}: vertices of shape {list(corners.shape)} are not a list of [x, y]"
+        )
+    bad = np.flatnonzero(~np.isfinite(corners).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{source}: vertex {bad[0]} {corners[bad[0]].tolist()} is not two finite numbers"
+        )
+    return corners
+
+
+def _closed_shape(corners: Floats, source: str) -> Floats:
+    """Corners that span an area."""
+    n_distinct = len(np.unique(corners, axis=0))
+    if n_distinct < 3:
+        raise InputError(f"{source}: {n_distinct} distinct points; a polygon needs at least 3")
+    # The hull, not the shape itself: a bow tie of two equal halves has zero area and another fault.
+    if _hull(corners).area <= 1e-12 * np.ptp(corners, axis=0).max() ** 2:
+        raise InputError(f"{source}: no area: all {len(corners)} points lie on one line")
+    return corners
+
+
+def _hull(corners: Floats) -> Polygon:
+    """Convex hull of points, [V, 2]; of no area where they lie on one line."""
+    return cast(Polygon, MultiPoint(corners).convex_hull)
+
+
+def _disc(rng: np.random.Generator, area_m2: float, n: int) -> Floats:
+    """Points uniform in the disc of that area about (0, 0), [n, 2]."""
+    radius = np.sqrt(area_m2 / np.pi * rng.random(n))
+    angle = 2 * np.pi * rng.random(n)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+def _lattice(bounds: tuple[float, float, float, float], step: float, slant: float) -> Floats:
+    """Every lattice point of the bounding box and a margin, row by row, [P, 2].
+
+    Rows run right and left in turn, from where they start to the first point at or past the
+    opposite bound; each starts ``2 step cos(slant)`` past the last point of the one before.
+    """
+    min_x, min_y, max_x, max_y = bounds
+    width, height, rise = max_x - min_x, max_y - min_y, step * np.sin(slant)
+    # Multiplied out, since a tiny step must not overflow a quotient.
+    if (width + 4 * step) * (height + rise) > MAX_CANDIDATES * step * rise:
+        raise InputError(
+            f"lattice step: {step:g} m is too fine for a polygon of {width:g} m x {height:g} m: "
+            f"more than {MAX_CANDIDATES} points; take a longer one"
+        )
+    rows, start, ends = [], min_x, itertools.cycle([(max_x, 1), (min_x, -1)])
+    for y, (end, way) in zip(min_y + rise * np.arange(int(height / rise) + 1), ends, strict=False):
+        # A bound met but for rounding is met.
+        n_steps = int(np.ceil(way * (end - start) / step - 1e-9))
+        x = start + way * step * np.arange(n_steps + 1)
+        rows.append(np.column_stack([x, np.full_like(x, y)]))
+        start = x[-1] + 2 * way * step * np.cos(slant)
+    return np.concatenate(rows)
+
+
+def _by_direction(points: Floats, centre: Floats, n: int | None) -> Floats:
+    """The ``n`` points nearest the centre (all if not given), by direction, [n, 2].
+
+    Counter-clockwise about it from due west. Rounded before ordering, so that ties are ties on
+    every machine (a negative zero included, which would turn due west by a full circle).
+    """
+    x, y = (np.round(points - centre, 9) + 0.0).T
+    distance, angle = np.round(np.hypot(x, y), 6), np.round(np.arctan2(y, x), 12)
+    order = np.lexsort([distance, angle])
+    nearest = np.argsort(distance[order], kind="stable")[:n]
+    return points[order[np.sort(nearest)]]

@@ -1,0 +1,320 @@
+"""The signal source: how far it is heard, and the walk that it takes.
+
+A dynamic source visits hotspots in a random order and, around each, a few inner points; it waits
+at every stop and goes straight to the next one with a trapezoidal speed profile. Walks are drawn
+once and held as padded tensors; where a source is at a time is then closed form. In a concave
+polygon the way between two stops may lie outside it.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+import torch
+from torch import Tensor
+
+from damian import checks
+from damian.world.polygon import sample_interior
+
+_Polygon = shapely.Polygon | shapely.MultiPolygon
+
+_TINY = 1e-9
+_FULL_DISC_ROUNDS, _ROUNDS = 256, 320
+
+
+@dataclass
+class SourceConfig:
+    """What the UAVs look for."""
+
+    level_db: float = 140.0
+    """Sound level at 1 m [dB re 1e-12 W/m^2]."""
+    microphone_db: float = 105.0
+    """Faintest level that a UAV's microphone hears [dB re 1e-12 W/m^2]."""
+    motion: str = "static"
+    """``static``, or ``dynamic``: a walk over hotspots."""
+    emission: str = "constant"
+    """``constant``; ``per_stop`` or ``per_step``: on or off, drawn anew for each stop or step."""
+    emission_probability: float = 0.5
+    """How often an intermittent source is on."""
+    position: list | None = None
+    """Where it is, or where its walk begins, [x, y] in metres; drawn each episode if not given."""
+    n_hotspots: int = 10
+    """Hotspots of a walk."""
+    min_stops: int = 3
+    """Fewest inner points around a hotspot."""
+    max_stops: int = 7
+    """Most inner points around a hotspot."""
+    local_distance: float = 50.0
+    """Largest distance of an inner point from its hotspot [m]."""
+    speed: float = 20.0
+    """Largest speed on the way to another hotspot [m/s]."""
+    acceleration: float = 2.5
+    """Acceleration on the way to another hotspot [m/s^2]."""
+    local_speed: float = 1.7
+    """Largest speed between stops around one hotspot [m/s]."""
+    local_acceleration: float = 1.1
+    """Acceleration between stops around one hotspot [m/s^2]."""
+    min_wait: float = 60.0
+    """Shortest wait at a stop [s]."""
+    max_wait: float = 360.0
+    """Longest wait at a stop [s]."""
+
+    def __post_init__(self) -> None:
+        checks.in_range("source.microphone_db", self.microphone_db, 0.0, unit="dB")
+        checks.require(
+            self.microphone_db < self.level_db < math.inf,
+            "source.level_db",
+            f"{self.level_db} dB",
+            f"is not above microphone_db={self.microphone_db:g} dB: not heard even at 1 m",
+        )
+        checks.one_of("source.motion", self.motion, ["static", "dynamic"])
+        checks.one_of("source.emission", self.emission, ["constant", "per_stop", "per_step"])
+        checks.require(
+            self.motion == "dynamic" or self.emission != "per_stop",
+            "source.emission",
+            "per_stop",
+            "needs source.motion=dynamic: a static source has one stop; take constant or per_step",
+        )
+        checks.in_range("source.emission_probability", self.emission_probability, 0.0, 1.0)
+        if self.position is not None:
+            checks.place("source.position", self.position)
+        checks.in_range("source.n_hotspots", self.n_hotspots, 1)
+        checks.in_range("source.min_stops", self.min_stops, 0)
+        checks.in_range("source.max_stops", self.max_stops, self.min_stops)
+        for name in ("speed", "local_speed"):
+            checks.above(f"source.{name}", getattr(self, name), 0.0, "m/s")
+        for name in ("acceleration", "local_acceleration"):
+            checks.above(f"source.{name}", getattr(self, name), 0.0, "m/s^2")
+        checks.above("source.local_distance", self.local_distance, 0.0, "m")
+        checks.in_range("source.min_wait", self.min_wait, 0.0, unit="s")
+        checks.in_range("source.max_wait", self.max_wait, self.min_wait, unit="s")
+
+
+class Walk(NamedTuple):
+    """Walks of ``W`` sources over at most ``K`` stops; a static source has one and never leaves.
+
+    Padded stops repeat the last real one: same place and departure, arrival at infinity.
+
+    Attributes:
+        stop: places, [W, K, 2] metres.
+        arrive: arrival times, [W, K] seconds, increasing; the first is 0.
+        depart: departure times, [W, K] seconds; infinite for a static source.
+        speed: largest speed of the leg that leaves the stop, [W, K] m/s.
+        acceleration: of the leg that leaves the stop, [W, K] m/s^2.
+        emits: whether the source emits from its arrival until it arrives at the next stop, [W, K]
+            bool (always true unless emission is ``per_stop``).
+    """
+
+    stop: Tensor
+    arrive: Tensor
+    depart: Tensor
+    speed: Tensor
+    acceleration: Tensor
+    emits: Tensor
+
+
+class Located(NamedTuple):
+    """Where sources are: position [B, 2] m, latest stop [B] long, is the walk over [B] bool."""
+
+    position: Tensor
+    stop: Tensor
+    finished: Tensor
+
+
+class _Stops(NamedTuple):
+    """Stops without times: [W, K, 2] m, how many are real [W], which are hotspots [W, K]."""
+
+    place: np.ndarray
+    n: np.ndarray
+    hotspot: np.ndarray
+
+
+def footprint_radius(config: SourceConfig) -> float:
+    """Distance at which the source is just heard [m]: inverse-square law (paper, eq. 2 and 3)."""
+    # P = 4 pi I0 10^(level/10) over 4 pi I0 10^(microphone/10): all but the levels cancels.
+    return 10 ** ((config.level_db - config.microphone_db) / 20)
+
+
+def draw_walks(
+    polygon: _Polygon,
+    config: SourceConfig,
+    n_walks: int,
+    rng: np.random.Generator,
+) -> Walk:
+    """Draw the walks of ``W = n_walks`` sources, float32 on the CPU.
+
+    Hotspots are uniform in the polygon (hence in random order), inner points uniform in the part of
+    the disc around their hotspot that lies in the polygon. Where that part is a sliver
+    (under about 1 % of the disc), inner points lie nearer their hotspot than uniform ones would.
+
+    Raises:
+        InputError: the given position is not inside the polygon.
+    """
+    shapely.prepare(polygon)
+    if config.position is not None:
+        _check_inside(polygon, config.position)
+    if config.motion == "static":
+        return _static_walk(_hotspots(polygon, config, n_walks, 1, rng))
+    stops = _draw_stops(polygon, config, n_walks, rng)
+    return _timed_walk(stops, config, rng)
+
+
+def leg_duration(length: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
+    """Time of a rest-to-rest leg: trapezoidal speed, triangular if too short to reach ``speed``.
+
+    Args:
+        length: [*] metres.
+        speed: largest speed, [*] m/s.
+        acceleration: speeding up and slowing down, [*] m/s^2.
+
+    Returns:
+        Seconds, [*]; 0 for length 0.
+    """
+    return _profile(length, speed, acceleration)[1]
+
+
+def locate(walk: Walk, time: Tensor) -> Located:
+    """Where the sources are at a time; at its last stop once the walk is over.
+
+    Args:
+        walk: one walk per world, leading dimension ``B``.
+        time: since the walk's beginning, not negative, [B] seconds.
+    """
+    finished = time >= walk.depart[..., -1]
+    last = walk.stop.shape[-2] - 1
+    if last == 0:
+        return Located(walk.stop[..., 0, :], torch.zeros_like(time, dtype=torch.long), finished)
+    stop = (walk.arrive[..., 1:] <= time.unsqueeze(-1)).sum(-1)
+    here = stop.unsqueeze(-1)
+    ends = torch.cat([here, (here + 1).clamp_max(last)], dim=-1)
+    places = walk.stop.gather(-2, ends.unsqueeze(-1).expand(*ends.shape, 2))
+    origin, target = places.unbind(-2)
+    depart, speed, acceleration = (
+        x.gather(-1, here).squeeze(-1) for x in (walk.depart, walk.speed, walk.acceleration)
+    )
+    length = torch.linalg.vector_norm(target - origin, dim=-1)
+    share = _covered(length, speed, acceleration, time - depart) / length.clamp_min(_TINY)
+    return Located(torch.lerp(origin, target, share.unsqueeze(-1)), stop, finished)
+
+
+def _profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+    """Time of speeding up and of the whole leg [s], [*]."""
+    peak = torch.minimum(speed, (length * acceleration).sqrt())
+    ramp = peak / acceleration
+    return ramp, length / peak.clamp_min(_TINY) + ramp
+
+
+def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tensor) -> Tensor:
+    """Distance covered of a leg, [*] metres; 0 before it begins, ``length`` once it is over."""
+    ramp, duration = _profile(length, speed, acceleration)
+    # The profile is symmetric: measure from the nearer end, where speed has only risen so far.
+    from_end = torch.minimum(elapsed, duration - elapsed).clamp_min(0.0)
+    rising = torch.minimum(from_end, ramp)
+    near = acceleration * rising * (from_end - rising / 2)
+    return torch.where(2 * elapsed > duration, length - near, near)
+
+
+def _check_inside(polygon: _Polygon, position: list) -> None:
+    west, south, east, north = shapely.bounds(polygon)
+    checks.require(
+        bool(shapely.contains_xy(polygon, *position)),
+        "source.position",
+        f"{list(position)} m",
+        f"is not inside the polygon (x {west:g} to {east:g} m, y {south:g} to {north:g} m)",
+    )
+
+
+def _hotspots(
+    polygon: _Polygon,
+    config: SourceConfig,
+    n_walks: int,
+    n_hotspots: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Hotspots in the order of their visit, the first where the config says, [W, H, 2] metres."""
+    hotspots = sample_interior(polygon, n_walks * n_hotspots, rng).reshape(n_walks, n_hotspots, 2)
+    if config.position is not None:
+        hotspots[:, 0] = config.position
+    return hotspots
+
+
+def _static_walk(hotspots: np.ndarray) -> Walk:
+    stop = torch.as_tensor(hotspots, dtype=torch.float32)
+    zeros = torch.zeros(stop.shape[:2])
+    ones = torch.ones_like(zeros)
+    return Walk(stop, zeros, zeros + math.inf, ones, ones, ones.bool())
+
+
+def _draw_stops(
+    polygon: _Polygon, config: SourceConfig, n_walks: int, rng: np.random.Generator
+) -> _Stops:
+    """Each hotspot followed by its inner points, packed to the left and padded."""
+    hotspots = _hotspots(polygon, config, n_walks, config.n_hotspots, rng)
+    inner = _inner_points(polygon, hotspots, config, rng)
+    grid = np.concatenate([hotspots[:, :, None], inner], axis=2)  # [W, H, 1 + max_stops, 2]
+    n_inner = rng.integers(config.min_stops, config.max_stops, hotspots.shape[:2], endpoint=True)
+    column = np.broadcast_to(np.arange(grid.shape[2]), grid.shape[:3]).reshape(n_walks, -1)
+    real = column <= n_inner.repeat(grid.shape[2], axis=1)
+    n = real.sum(1)
+    order = np.argsort(~real, axis=1, kind="stable")[:, : n.max()]
+    place = np.take_along_axis(grid.reshape(n_walks, -1, 2), order[..., None], axis=1)
+    return _Stops(place, n, np.take_along_axis(column, order, axis=1) == 0)
+
+
+def _inner_points(
+    polygon: _Polygon,
+    hotspots: np.ndarray,
+    config: SourceConfig,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2] metres.
+
+    Rejection from the disc. What is still outside after the first rounds is drawn from ever smaller
+    discs, at last at the hotspot itself, so this ends however thin the polygon is.
+    """
+    radii = config.local_distance / 2.0 ** np.maximum(np.arange(_ROUNDS) - _FULL_DISC_ROUNDS, 0)
+    points = np.repeat(hotspots[:, :, None], config.max_stops, axis=2)
+    flat, centre = points.reshape(-1, 2), points.reshape(-1, 2).copy()
+    missing = np.arange(len(flat))
+    for radius in radii:
+        drawn = centre[missing] + _in_disc(len(missing), radius, rng)
+        good = shapely.contains_xy(polygon, drawn)
+        flat[missing[good]] = drawn[good]
+        missing = missing[~good]
+        if not len(missing):
+            break
+    return flat.reshape(points.shape)
+
+
+def _in_disc(n: int, radius: float, rng: np.random.Generator) -> np.ndarray:
+    """Points uniform in the disc about the origin, [n, 2]."""
+    distance = radius * np.sqrt(rng.random(n))
+    angle = 2 * math.pi * rng.random(n)
+    return distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
+
+
+def _timed_walk(stops: _Stops, config: SourceConfig, rng: np.random.Generator) -> Walk:
+    """Add waits, legs and emission to the stops."""
+    shape = stops.hotspot.shape
+    padded = np.arange(shape[1]) >= stops.n[:, None]
+    last = (stops.n - 1)[:, None]
+    place = np.where(
+        padded[..., None], np.take_along_axis(stops.place, last[..., None], axis=1), stops.place
+    )
+    to_hotspot = np.roll(stops.hotspot, -1, axis=1)
+    speed = np.where(to_hotspot, config.speed, config.local_speed)
+    acceleration = np.where(to_hotspot, config.acceleration, config.local_acceleration)
+    length = np.linalg.norm(np.diff(place, axis=1), axis=2)
+    leg = leg_duration(*(torch.as_tensor(x) for x in (length, speed[:, :-1], acceleration[:, :-1])))
+    wait = rng.uniform(config.min_wait, config.max_wait, shape)
+    arrive = np.zeros(shape)
+    arrive[:, 1:] = np.cumsum(wait[:, :-1] + leg.numpy(), axis=1)
+    depart = arrive + wait
+    depart = np.where(padded, np.take_along_axis(depart, last, axis=1), depart)
+    arrive = np.where(padded, math.inf, arrive)
+    per_stop = config.emission == "per_stop"
+    emits = rng.random(shape) < (config.emission_probability if per_stop else 1.0)
+    walk = Walk(*map(torch.as_tensor, (place, arrive, depart, speed, acceleration, emits)))
+    return Walk(*(x if x.dtype == torch.bool else x.float() for x in walk))

@@ -1,0 +1,150 @@
+"""Train UAVs with MAPPO, and show what they have learnt beside a random policy.
+
+    python recipes/train.py agents=3 scenario=spotting motion=polynomial seed=1
+    python recipes/train.py +usecase=2
+    python recipes/train.py -m seed=0,1,2 agents=3,5
+    python recipes/train.py resume=runs/2026-01-31_12-00-00
+
+The run folder explains itself: config.yaml, metrics.csv, TensorBoard events, checkpoint,
+learning_curve.png, result.md.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydra
+import torch
+from launch import TrainConfig, launch, prepare, save_config
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.checkpoint import Checkpoint, GlobalRNGState
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+from torchrl.objectives.multiagent import MAPPOLoss
+from tqdm import tqdm
+
+from damian.env import UavEnv
+from damian.losses import MappoConfig, add_advantages, mappo_loss
+from damian.metrics import EpisodeLog, Evaluation, evaluate
+from damian.models import make_actor, make_critic, random_policy
+from damian.runs import CHECKPOINT, FIGURE, MetricsLog, plot_learning_curve, results_table
+
+
+@dataclass
+class Progress:
+    """How far a run has come; part of its checkpoint."""
+
+    frames: int = 0
+    updates: int = 0
+
+    def state_dict(self) -> dict[str, int]:
+        return {"frames": self.frames, "updates": self.updates}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self.frames, self.updates = int(state["frames"]), int(state["updates"])
+
+
+def make_env(config: TrainConfig, worlds: int, seed: int) -> TransformedEnv:
+    """The environment that policies are trained and evaluated in."""
+    env = UavEnv(
+        config, worlds, seed, config.device, extras=(), compile=config.compile
+    )
+    episode_reward = RewardSum([("agents", "reward")], [("agents", "episode_reward")])
+    return TransformedEnv(env, Compose(episode_reward, StepCounter()))
+
+
+def update(
+    batch: TensorDictBase,
+    loss: MAPPOLoss,
+    optimizer: torch.optim.Optimizer,
+    buffer: TensorDictReplayBuffer,
+    algo: MappoConfig,
+) -> dict[str, float]:
+    """One MAPPO update on a batch [B, T]; returns the mean losses."""
+    add_advantages(batch, loss, algo)
+    buffer.empty()
+    buffer.extend(batch.reshape(-1))
+    sums: dict[str, float] = {}
+    for _ in range(algo.epochs):
+        for part in buffer:
+            losses = loss(part)
+            terms = ("loss_objective", "loss_critic", "loss_entropy")
+            optimizer.zero_grad()
+            sum(losses[term] for term in terms).backward()
+            torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
+            optimizer.step()
+            for term in terms:
+                sums[term] = sums.get(term, 0.0) + losses[term].item()
+    return {term: total / (algo.epochs * algo.minibatches) for term, total in sums.items()}
+
+
+def train(config: TrainConfig, folder: Path) -> None:
+    """Learn, then evaluate and fill the run folder."""
+    env = make_env(config, config.worlds, config.seed)
+    save_config(config, folder)
+    actor, critic = make_actor(env, config.model), make_critic(env, config.model)
+    loss = mappo_loss(actor, critic, config.algo)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=config.algo.lr)
+    frames = config.worlds * config.algo.steps
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(frames, device=config.device),
+        sampler=SamplerWithoutReplacement(),
+        batch_size=frames // config.algo.minibatches,
+    )
+    progress, episodes = Progress(), EpisodeLog()
+    checkpoint = Checkpoint(
+        actor=actor, critic=critic, optimizer=optimizer, progress=progress, rng=GlobalRNGState()
+    )
+    if config.resume:
+        checkpoint.load(folder / CHECKPOINT)
+    log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
+    collector = Collector(env, actor, frames_per_batch=frames, total_frames=-1)
+    bar = tqdm(total=config.frames, initial=progress.frames, unit="frame", unit_scale=True)
+    try:
+        for batch in collector:
+            episodes.add(batch)
+            losses = update(batch, loss, optimizer, buffer, config.algo)
+            progress.frames += batch.numel()
+            progress.updates += 1
+            log.add(progress.frames, {**episodes.means(), **losses})
+            bar.set_postfix({name: f"{mean:.2f}" for name, mean in episodes.means().items()})
+            bar.update(batch.numel())
+            done = progress.frames >= config.frames
+            done = done or episodes.finished >= (config.episodes or torch.inf)
+            if done or progress.updates % config.checkpoint_every == 0:
+                checkpoint.save(folder / CHECKPOINT, overwrite=True)
+            if done:
+                break
+    finally:
+        bar.close()
+        log.close()
+        collector.shutdown()
+    report(config, folder, actor, log)
+
+
+def report(config: TrainConfig, folder: Path, actor: torch.nn.Module, log: MetricsLog) -> None:
+    """Evaluate on situations that were not trained on, and write figure and table."""
+
+    def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
+        unseen = make_env(config, config.eval_episodes, config.seed + 10_000)
+        return evaluate(unseen, policy, config.horizon, sample)
+
+    random = fly(random_policy(make_env(config, 1, config.seed)))
+    rows = {"trained, sampled": fly(actor), "trained, mode": fly(actor, False), "random": random}
+    table = results_table(rows)
+    (folder / "result.md").write_text(table + "\n")
+    plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, MAPPO")
+    print(f"\n{table}\n\nlearning curve: {folder / FIGURE}")
+
+
+@hydra.main(version_base=None, config_path="../conf", config_name="train")
+def main(written: DictConfig) -> None:
+    config, folder = prepare(written)
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    train(config, folder)
+
+
+if __name__ == "__main__":
+    launch(main)

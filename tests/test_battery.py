@@ -1,0 +1,187 @@
+"""Battery: golden figures of the original, and the odd run of it that is not SPEC 1."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from damian.errors import InputError
+from damian.world.battery import (
+    BatteryConfig,
+    charge_gain,
+    cruise_drain,
+    flight_drain,
+    observed,
+    used_so_far,
+    vertical_drain,
+)
+from damian.world.motion import MotionConfig, fly, phase_times
+
+DATA = Path(__file__).parent / "data"
+ENERGY = json.loads((DATA / "motion_energy_coverage.json").read_text())["energy"]
+ODD_RUN = ENERGY["instantaneous_env_run_usecase1"]
+START = json.loads((DATA / "usecase1.json").read_text())["scenario"]["uav_start_positions"][0]
+BATTERY = BatteryConfig()
+
+
+def tensor(value):
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def test_the_defaults_are_the_golden_parameters():
+    golden = ENERGY["params"]
+    assert (BATTERY.engine_power_kw, BATTERY.reference_speed) == (golden["p_eng"], golden["v_ref"])
+    assert (BATTERY.capacity_kwh, BATTERY.efficiency) == (golden["p_bat"], golden["b_efficiency"])
+    assert (BATTERY.charging_power_kw, BATTERY.resolution) == (
+        golden["p_bat_charging"],
+        golden["b_res"],
+    )
+    full = charge_gain(tensor(golden["T_empty_to_full_s"]), BATTERY)
+    assert full.item() == pytest.approx(100.0)
+
+
+def test_golden_flights_drain_the_same():
+    rows = [row for row in ENERGY["consumption"] if row["mode"] == "estimate"]
+    assert len(rows) == 5
+    for row in rows:
+        vertical, distance = row["T_takeoff_or_landing"], row["speed"] * row["T_flight"]
+        drain = flight_drain(tensor(vertical), tensor(distance), BATTERY)
+        assert drain.item() == pytest.approx(row["battery_percent"], rel=1e-4)
+
+
+def test_golden_steps_of_a_flight_drain_the_same():
+    rows = [row for row in ENERGY["consumption"] if row["mode"] == "real time"]
+    assert len(rows) == 12
+    for row in rows:
+        if row["phase"] == "flight":
+            drain = cruise_drain(tensor(row["speed"] * row["dt"]), BATTERY)
+        else:
+            drain = vertical_drain(tensor(row["dt"]), BATTERY)
+        assert drain.item() == pytest.approx(row["battery_percent"], rel=1e-4)
+
+
+def test_golden_charging_adds_the_same():
+    assert len(ENERGY["charged"]) == 4
+    for row in ENERGY["charged"]:
+        gain = charge_gain(tensor(row["dt"]), BATTERY)
+        assert gain.item() == pytest.approx(row["battery_percent"], rel=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_golden_levels_are_observed_the_same(dtype):
+    levels, expected = zip(*ENERGY["observable_level"], strict=True)
+    assert observed(torch.tensor(levels, dtype=dtype), BATTERY).tolist() == list(expected)
+
+
+@given(multiple=st.integers(0, 20), error=st.floats(-4e-4, 4e-4))
+def test_a_level_that_float_error_left_below_a_step_is_observed_on_it(multiple, error):
+    level = torch.tensor(5.0 * multiple + error)
+    assert observed(level, BATTERY).item() == 5.0 * multiple
+
+
+def test_every_transition_of_the_odd_golden_run_is_left_out_for_a_known_reason():
+    # In this run of the original a flight's drain is: takeoff and landing (as in SPEC 1); a cruise
+    # whose speed is the length over 10 000 s (the placeholder for the time of an instant motion);
+    # and what the whole flight would have *charged*, taken off instead of left out. Then one step
+    # of charging is added. So no transition follows SPEC 1; this test pins that reading, and with
+    # it what the original does agree on.
+    left_out, level, place = 0, 100.0, START
+    for _, _, x, y, after, seen, vertical, cruise in ODD_RUN["rows"]:
+        length = math.dist(place, (x, y))
+        ours = flight_drain(tensor(vertical), tensor(length), BATTERY).item()
+        theirs = (
+            flight_drain(tensor(vertical), tensor(length / 10_000 * cruise), BATTERY)
+            + charge_gain(tensor(2 * vertical + cruise), BATTERY)
+            - charge_gain(tensor(1.0), BATTERY)
+        ).item()
+        assert level - after == pytest.approx(theirs, abs=2e-7)
+        assert observed(tensor(after), BATTERY).item() == seen
+        left_out += level - after > 2 * ours
+        level, place = after, (x, y)
+    assert left_out == len(ODD_RUN["rows"]) == 40
+
+
+@pytest.mark.parametrize("degree", [3, 5, 7])
+@pytest.mark.parametrize("n_steps", [3, 17, 400])
+def test_the_drain_of_a_flight_is_the_same_whatever_the_step(degree, n_steps):
+    # The twin integrates the rate 100 (p_eng v / v_ref) / (p_bat eff) per hour over the speed.
+    origin, target, level = tensor([[0.0, 0.0]]), tensor([[30.0, 40.0]]), tensor([2.0])
+    times = phase_times(origin, target, level, MotionConfig(degree=degree))
+
+    def cruised(n):
+        elapsed = torch.linspace(0, 1, n + 1, dtype=torch.float64) * (
+            2 * times.vertical + times.cruise
+        )
+        return elapsed, fly(origin, target, level, elapsed, *times, degree).cruised
+
+    elapsed, fine = cruised(20_000)
+    speed = fine.diff() / elapsed.diff()
+    rate = 100 * (10 * speed / 20) / (9 * 12) / 3600
+    steps = cruise_drain(cruised(n_steps)[1].diff(), BATTERY).sum()
+    assert steps.item() == pytest.approx((rate * elapsed.diff()).sum().item(), rel=1e-9)
+
+
+@given(
+    share=st.floats(0, 1.5),
+    vertical=st.floats(0.1, 20),
+    cruise=st.floats(0, 100),
+    part=st.floats(0, 1),
+)
+def test_what_a_flight_used_so_far_is_its_phases_one_by_one(share, vertical, cruise, part):
+    elapsed = share * (2 * vertical + cruise)
+    cruised = part * 150.0
+    if elapsed <= vertical:
+        flown = elapsed
+    elif elapsed <= vertical + cruise:
+        flown = vertical
+    else:
+        flown = min(elapsed - cruise, 2 * vertical)
+    expected = flown * 100 * 10 / (9 * 12 * 0.9) / 3600 + cruised / 20 * 100 * 10 / (9 * 12) / 3600
+    values = (tensor(x) for x in (elapsed, vertical, cruise, cruised))
+    assert used_so_far(*values, BATTERY).item() == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_a_flight_that_is_over_used_its_whole_drain():
+    vertical, cruise, length = tensor(3.0), tensor(20.0), tensor(90.0)
+    used = used_so_far(tensor(30.0), vertical, cruise, length, BATTERY)
+    assert used.item() == pytest.approx(flight_drain(vertical, length, BATTERY).item())
+
+
+def test_float32_levels_stay_float32():
+    level = torch.tensor([50.1])
+    for function in (cruise_drain, vertical_drain, charge_gain, observed):
+        assert function(level, BATTERY).dtype == torch.float32
+    assert flight_drain(level, level, BATTERY).dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("engine_power_kw", 0.0, "battery.engine_power_kw: 0.0 kW is not above 0 kW"),
+        ("reference_speed", -1.0, "battery.reference_speed: -1.0 m/s is not above 0 m/s"),
+        ("capacity_kwh", math.inf, "battery.capacity_kwh: inf kWh is not above 0 kWh"),
+        ("efficiency", 0.0, "battery.efficiency: 0.0 is not above 0"),
+        ("charging_power_kw", 0.0, "battery.charging_power_kw: 0.0 kW is not above 0 kW"),
+        ("resolution", 0.0, "battery.resolution: 0.0 % is not above 0 %"),
+        ("resolution", 101.0, "battery.resolution: 101.0 % is not between 0 and 100 %"),
+        (
+            "charging_points",
+            [[1.0, 2.0], [3.0]],
+            "battery.charging_points: [3.0] is not [x, y] in metres",
+        ),
+        ("charging_points", [1.0, 2.0], "battery.charging_points: [1.0] is not [x, y] in metres"),
+        (
+            "charging_points",
+            [],
+            "battery.charging_points: [] is not a list of places; leave it out to charge anywhere",
+        ),
+    ],
+)
+def test_a_wrong_battery_setting_is_named_with_its_value_and_unit(field, value, message):
+    with pytest.raises(InputError) as error:
+        BatteryConfig(**{field: value})
+    assert str(error.value) == message

@@ -1,0 +1,265 @@
+"""Coverage by bit masks against shapely's exact geometry, the authors' figures and symmetries."""
+
+import itertools
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.affinity import translate
+from shapely.geometry import MultiPolygon, Point, Polygon
+
+from damian.errors import InputError
+from damian.world import coverage
+from damian.world.coverage import build_tables, covered_share
+
+DATA = Path(__file__).parent / "data"
+R = 56.2341
+
+
+def exact_share(polygon, positions, radius=R):
+    """The slow twin, one world: positions ``[N, n, 2]`` -> ``[N]``, set algebra UAV by UAV."""
+    discs = [[Point(p).buffer(radius, quad_segs=128) for p in uav] for uav in positions]
+    shares = []
+    for i, own in enumerate(discs):
+        areas = []
+        for k, disc in enumerate(own):
+            lost = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
+            areas.append(disc.intersection(polygon).difference(shapely.union_all(lost)).area)
+        shares.append(np.mean(areas) / (math.pi * radius**2))
+    return np.array(shares)
+
+
+def star(rng, low, high):
+    """A polygon around 0 whose vertices lie at distances ``low .. high`` [m]."""
+    n = rng.integers(5, 12)
+    angle = 2 * np.pi * (np.arange(n) + rng.uniform(0, 0.8, n)) / n
+    r = rng.uniform(low, high, n)
+    return Polygon(np.stack([r * np.cos(angle), r * np.sin(angle)], -1))
+
+
+def random_polygon(rng, kind):
+    """A random polygon a few footprints wide."""
+    if kind == "convex":
+        return star(rng, 150, 250).convex_hull
+    concave = star(rng, 80, 250)
+    if kind == "concave":
+        return concave
+    if kind == "hole":
+        return concave.difference(Point(rng.uniform(-50, 50, 2)).buffer(rng.uniform(15, 60)))
+    east = translate(concave, 520)
+    return MultiPolygon([concave, east])
+
+
+def random_points(rng, polygon, count, spread):
+    """Points strictly inside the polygon, all over it or within ``spread`` [m] of one another."""
+    inside = np.empty((0, 2))
+    centre = rng.uniform(-60, 60, 2)
+    while len(inside) < count:
+        low, high = np.split(np.array(polygon.bounds), 2)
+        points = rng.uniform(low, high, (500, 2))
+        points = points if spread is None else centre + rng.uniform(-spread, spread, (500, 2))
+        inside = np.concatenate([inside, points[shapely.contains_xy(polygon, *points.T)]])
+        centre = rng.uniform(low, high)
+    return inside[:count]
+
+
+def share_at(polygon, positions, radius=R):
+    """Coverage with tables built for these very positions ``[*, N, n, 2]``: ``[*, N]``."""
+    positions = np.asarray(positions, float)
+    tables = build_tables([polygon], positions.reshape(1, -1, 2), radius)
+    ids = torch.arange(positions[..., 0].size).view(positions.shape[:-1])
+    return covered_share(tables, ids, torch.tensor(positions, dtype=torch.float32)).numpy()
+
+
+@pytest.fixture(scope="module")
+def square():
+    """Tables, polygon and landing points of a 400 m square with 36 points."""
+    axis = np.linspace(-190, 190, 6)
+    points = np.array(list(itertools.product(axis, axis)))
+    polygon = shapely.box(-200, -200, 200, 200)
+    return build_tables([polygon], points[None], R), polygon, points
+
+
+def at_random(points, shape, seed=0):
+    """Random flat ids of ``shape`` and where they are."""
+    ids = torch.randint(len(points), shape, generator=torch.Generator().manual_seed(seed))
+    return ids, torch.tensor(points, dtype=torch.float32)[ids]
+
+
+@pytest.mark.parametrize("kind", ["convex", "concave", "hole", "parts"])
+@pytest.mark.parametrize("spread", [None, 70.0, 25.0])
+def test_coverage_is_within_one_percent_of_the_exact_area(kind, spread):
+    rng = np.random.default_rng([len(kind), int(spread or 0)])
+    for n_uavs, n_last in itertools.product(range(1, 7), range(1, 4)):
+        polygon = random_polygon(rng, kind)
+        positions = random_points(rng, polygon, n_uavs * n_last, spread)
+        positions = positions.reshape(n_uavs, n_last, 2)
+        got, exact = share_at(polygon, positions), exact_share(polygon, positions)
+        np.testing.assert_allclose(got, exact, rtol=0, atol=0.01)
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(["convex", "concave", "hole", "parts"]),
+    size=st.tuples(st.integers(1, 6), st.integers(1, 3)),
+    spread=st.none() | st.floats(5, 150),
+    radius=st.floats(5, 150),
+)
+def test_coverage_is_exact_to_one_percent_for_any_radius(seed, kind, size, spread, radius):
+    rng = np.random.default_rng(seed)
+    polygon = random_polygon(rng, kind)
+    positions = random_points(rng, polygon, math.prod(size), spread).reshape(*size, 2)
+    got, exact = share_at(polygon, positions, radius), exact_share(polygon, positions, radius)
+    np.testing.assert_allclose(got, exact, rtol=0, atol=0.01)
+
+
+def test_the_authors_clean_areas_come_out_within_one_percent_of_the_disc():
+    golden = json.loads((DATA / "motion_energy_coverage.json").read_text())["coverage"]
+    scenario = json.loads((DATA / "usecase1.json").read_text())["scenario"]
+    polygon, radius = Polygon(scenario["polygon_vertices_ring"]), golden["footprint_radius"]
+    assert len(golden["cases"]) == 6
+    for case in golden["cases"]:
+        newest = [[old_new[-1]] for old_new in case["stored_positions_old_new"]]
+        expected = np.array(case["clean_current_disc_minus_polygon_and_others_m2"])
+        got = share_at(polygon, newest, radius) * math.pi * radius**2
+        np.testing.assert_allclose(got, expected, rtol=0, atol=0.01 * golden["disc_area"])
+
+
+def test_a_lone_uav_covers_its_disc_inside_the_polygon():
+    polygon = shapely.box(0, -500, 500, 500)
+    places = [[[0.001, 0.0]], [[R, 300.0]], [[R / 2, -300.0]]]
+    half_in = 2 / 3 + math.sqrt(3) / (4 * math.pi)  # all but the segment beyond a chord at R / 2
+    np.testing.assert_allclose(share_at(polygon, places), [0.5, 1, half_in], atol=0.005)
+
+
+def test_a_hole_and_a_gap_between_parts_are_not_covered():
+    ring = Point(0, 0).buffer(400).difference(Point(0, 0).buffer(R, quad_segs=128))
+    assert share_at(ring, [[[0.0, 0.0]]]) == pytest.approx(0, abs=0.005)
+    parts = MultiPolygon([shapely.box(-300, -300, -R / 2, 300), shapely.box(R / 2, -300, 300, 300)])
+    places = [[[-R / 2 - 0.01, 0.0]]]
+    np.testing.assert_allclose(share_at(parts, places), exact_share(parts, places), atol=0.01)
+
+
+@given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=1, max_size=40))
+def test_bits_are_counted_as_python_counts_them(words):
+    expected = [bin(w % 2**64).count("1") for w in words]
+    assert coverage._bit_count(torch.tensor(words)).tolist() == expected
+
+
+@pytest.mark.parametrize("word", [0, -1, -(2**63), 2**63 - 1, 1, 0x5555555555555555])
+def test_bits_of_extreme_words_are_counted(word):
+    assert coverage._bit_count(torch.tensor(word)).item() == bin(word % 2**64).count("1")
+
+
+@pytest.mark.parametrize("count", range(1, 10))
+def test_or_over_the_first_dimension_is_pythons(count):
+    masks = np.random.default_rng(count).integers(-(2**63), 2**63 - 1, (count, 5, 2))
+    got = coverage._or_first(torch.tensor(masks))
+    assert got.tolist() == np.bitwise_or.reduce(masks, 0).tolist()
+
+
+@pytest.mark.parametrize(("n_uavs", "n_last"), [(1, 1), (1, 3), (2, 2), (3, 2), (5, 1)])
+def test_a_batch_equals_a_loop_over_its_worlds(square, n_uavs, n_last):
+    tables, _, points = square
+    ids, positions = at_random(points, (4, 3, n_uavs, n_last))
+    batch = covered_share(tables, ids, positions)
+    assert batch.shape == (4, 3, n_uavs)
+    for b in itertools.product(range(4), range(3)):
+        assert torch.equal(batch[b], covered_share(tables, ids[b], positions[b]))
+
+
+def test_splitting_the_worlds_into_chunks_changes_nothing(square, monkeypatch):
+    tables, _, points = square
+    ids, positions = at_random(points, (11, 3, 2))
+    whole = covered_share(tables, ids, positions)
+    for words in (1, 16 * 3 * 2 * 4 * 3):  # one world, and three worlds, at a time
+        monkeypatch.setattr(coverage, "_CHUNK_WORDS", words)
+        assert torch.equal(covered_share(tables, ids, positions), whole)
+
+
+def test_permuting_the_uavs_permutes_their_shares(square):
+    tables, _, points = square
+    ids, positions = at_random(points, (8, 4, 2))
+    share = covered_share(tables, ids, positions)
+    for order in itertools.permutations(range(4)):
+        permuted = covered_share(tables, ids[:, order], positions[:, order])
+        assert torch.equal(permuted, share[:, order])
+
+
+def test_uavs_more_than_two_radii_apart_do_not_interact():
+    open_sea = shapely.box(-1e5, -1e5, 1e5, 1e5)
+    apart = [[[0.0, 0.0]], [[2.01 * R, 0.0]], [[0.0, -2.01 * R]], [[-9e4, 9e4]]]
+    assert share_at(open_sea, apart).tolist() == [1, 1, 1, 1]
+
+
+def test_uavs_closer_than_two_radii_share_the_lens_between_them():
+    open_sea = shapely.box(-1e5, -1e5, 1e5, 1e5)
+    lens = 2 / 3 - math.sqrt(3) / (2 * math.pi)  # two unit discs, centres 1 apart, over pi
+    share = share_at(open_sea, [[[0.0, 0.0]], [[R * 0.6, R * 0.8]]])
+    np.testing.assert_allclose(share, [1 - lens] * 2, atol=0.01)
+
+
+@pytest.mark.parametrize("n_last", [1, 2, 3, 5])
+def test_holding_counts_the_footprint_once(n_last):
+    open_sea = shapely.box(-1e5, -1e5, 1e5, 1e5)
+    assert share_at(open_sea, np.full((1, n_last, 2), 17.3)) == pytest.approx(1 / n_last)
+
+
+def test_only_older_positions_of_the_uav_itself_are_taken_away():
+    left = shapely.box(-1e5, -1e5, 0, 1e5)  # the newest footprint half outside, the older inside
+    newest, oldest = [-0.001, 0.0], [-R / 2, 0.0]
+    forth, back = [[newest, oldest]], [[oldest, newest]]
+    forth_share, back_share = share_at(left, forth), share_at(left, back)
+    np.testing.assert_allclose(forth_share, exact_share(left, forth), atol=0.01)
+    np.testing.assert_allclose(back_share, exact_share(left, back), atol=0.01)
+
+
+def test_others_count_at_the_same_step_only(square):
+    _, polygon, _ = square
+    here, there = [0.0, 0.0], [140.0, 0.0]
+    assert share_at(polygon, [[here, there], [there, here]]) == pytest.approx([1, 1])
+    assert share_at(polygon, [[here, there], [here, there]]) == pytest.approx([0, 0])
+
+
+def test_flat_ids_run_over_regions_and_padding_covers_nothing():
+    regions = [shapely.box(-500, -500, 500, 500), shapely.box(-500, -500, 0, 500)]
+    points = np.array([[[100.0, 0], [200.0, 0]], [[0.0, 0], [np.nan, np.nan]]])
+    tables = build_tables(regions, points, R)
+    ids, positions = torch.arange(4).view(4, 1, 1), torch.zeros(4, 1, 1, 2)
+    share = covered_share(tables, ids, positions).squeeze(-1)
+    np.testing.assert_allclose(share, [1, 1, 0.5, 0], atol=0.005)
+
+
+def test_the_result_has_the_positions_dtype_and_tables_move(square):
+    tables, _, points = square
+    ids, positions = at_random(points, (2, 3, 2))
+    share = covered_share(tables.to("cpu"), ids, positions.double())
+    assert share.dtype == torch.float64
+    np.testing.assert_allclose(share, covered_share(tables, ids, positions), atol=1e-6)
+
+
+def test_it_compiles_to_one_graph(square):
+    tables, _, points = square
+    ids, positions = at_random(points, (7, 3, 2))
+    compiled = torch.compile(covered_share, fullgraph=True, backend="eager")
+    assert torch.equal(compiled(tables, ids, positions), covered_share(tables, ids, positions))
+
+
+@pytest.mark.parametrize("radius", [0, -3.0, math.nan, math.inf])
+def test_a_radius_that_is_no_length_is_refused(radius):
+    with pytest.raises(
+        InputError, match=r"^footprint radius: \S+ m: must be finite and above 0 m$"
+    ):
+        build_tables([shapely.box(0, 0, 1, 1)], np.zeros((1, 1, 2)), radius)
+
+
+def test_tables_without_words_are_refused():
+    with pytest.raises(InputError, match=r"^words: 0 words of 64 samples: must be 1 or more$"):
+        build_tables([shapely.box(0, 0, 1, 1)], np.zeros((1, 1, 2)), R, words=0)

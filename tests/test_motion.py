@@ -1,0 +1,252 @@
+"""Flights: golden trajectories of the original, its flight run, limits, and an obvious twin."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from damian.errors import InputError
+from damian.world.motion import (
+    MotionConfig,
+    flight_levels,
+    fly,
+    minimum_time,
+    phase_times,
+    time_law,
+)
+
+GOLDEN = json.loads((Path(__file__).parent / "data" / "motion_energy_coverage.json").read_text())
+CASES = GOLDEN["uav_trajectories"]["cases"]
+FLIGHT_RUN = GOLDEN["action_delay_env_run_usecase1_FL2"]
+DEGREES = [3, 5, 7]
+
+sizes = st.floats(0.1, 1000.0)
+limits = st.floats(0.1, 50.0)
+
+
+def slow_law(tau, degree):
+    """The time laws as SPEC 1 prints them."""
+    tau = min(max(tau, 0.0), 1.0)
+    return {
+        3: 3 * tau**2 - 2 * tau**3,
+        5: 10 * tau**3 - 15 * tau**4 + 6 * tau**5,
+        7: 35 * tau**4 - 84 * tau**5 + 70 * tau**6 - 20 * tau**7,
+    }[degree]
+
+
+def slow_pose(origin, target, level, elapsed, *, vertical, cruise, degree):
+    """One UAV, one branch per phase."""
+    length = math.dist(origin, target)
+    if elapsed < vertical:
+        return [*origin, level * slow_law(elapsed / vertical, degree)], 0.0
+    if elapsed < vertical + cruise:
+        s = slow_law((elapsed - vertical) / cruise, degree)
+        x, y = (a + s * (b - a) for a, b in zip(origin, target, strict=True))
+        return [x, y, level], s * length
+    s = slow_law((elapsed - vertical - cruise) / vertical, degree)
+    return [*target, level * (1 - s)], length
+
+
+def derivatives(length, time, degree, n=2001):
+    """Speed and acceleration along a phase, sampled densely, by autograd (float64)."""
+    t = torch.linspace(0, 1, n, dtype=torch.float64) * time
+    t.requires_grad_(True)
+    (v,) = torch.autograd.grad((length * time_law(t / time, degree)).sum(), t, create_graph=True)
+    (a,) = torch.autograd.grad(v.sum(), t)
+    return v.detach(), a
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_a_time_law_equals_its_printed_polynomial_and_is_clamped(degree):
+    tau = torch.linspace(-0.5, 1.5, 401, dtype=torch.float64)
+    expected = [slow_law(t, degree) for t in tau.tolist()]
+    torch.testing.assert_close(time_law(tau, degree), torch.tensor(expected, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_a_time_law_ends_exactly_in_float32(degree):
+    assert time_law(torch.tensor([0.0, 1.0]), degree).tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c['degree']}-{c['flight_level']}")
+def test_golden_flights_take_the_same_time(case):
+    motion = MotionConfig(
+        degree=case["degree"], max_speed=case["max_speed"], max_acceleration=case["max_acc"]
+    )
+    times = phase_times(
+        torch.tensor(case["A"]),
+        torch.tensor(case["B"]),
+        torch.tensor(case["flight_level"]),
+        motion,
+    )
+    assert times.vertical.item() == pytest.approx(case["T_takeoff"], abs=1e-4)
+    assert times.vertical.item() == pytest.approx(case["T_landing"], abs=1e-4)
+    assert times.cruise.item() == pytest.approx(case["T_flight"], abs=1e-4)
+    assert times.vertical.dtype == times.cruise.dtype == torch.float32
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c['degree']}-{c['flight_level']}")
+def test_golden_flights_have_the_same_positions_velocities_and_accelerations(case):
+    start = {"takeoff": 0.0, "flight": case["T_takeoff"]}
+    start["landing"] = case["T_takeoff"] + case["T_flight"]
+    rows = case["continuous_samples_phase_t_pos_vel_acc"]
+    assert len(rows) == 15
+    expected = torch.tensor([row[2:] for row in rows], dtype=torch.float64)
+    elapsed = torch.tensor([start[r[0]] + r[1] for r in rows], dtype=torch.float64)
+    elapsed.requires_grad_(True)
+    n = len(rows)
+    pose = fly(
+        torch.tensor(case["A"], dtype=torch.float64).expand(n, 2),
+        torch.tensor(case["B"], dtype=torch.float64).expand(n, 2),
+        torch.full((n,), case["flight_level"], dtype=torch.float64),
+        elapsed,
+        torch.full((n,), case["T_takeoff"], dtype=torch.float64),
+        torch.full((n,), case["T_flight"], dtype=torch.float64),
+        case["degree"],
+    )
+    velocity, acceleration = [], []
+    for axis in pose.position.unbind(-1):
+        (v,) = torch.autograd.grad(axis.sum(), elapsed, create_graph=True)
+        velocity.append(v)
+        acceleration.append(torch.autograd.grad(v.sum(), elapsed, retain_graph=True)[0])
+    torch.testing.assert_close(pose.position.detach(), expected[:, :3], atol=1e-4, rtol=0)
+    # Where two phases meet their derivatives differ, so those are compared strictly inside.
+    inside = [i for i in range(n) if i % 5 in (1, 2, 3)]
+    torch.testing.assert_close(
+        torch.stack(velocity, -1)[inside], expected[inside, 3:6], atol=1e-4, rtol=0
+    )
+    torch.testing.assert_close(
+        torch.stack(acceleration, -1)[inside], expected[inside, 6:], atol=1e-4, rtol=0
+    )
+
+
+def test_the_golden_flight_run_has_the_same_times_and_positions():
+    motion = MotionConfig(kind="polynomial", degree=5, max_speed=5.0, max_acceleration=2.0)
+    compared = landed = 0
+    for row in FLIGHT_RUN:
+        if row["start"] == row["target"]:
+            landed += 1  # The original has already moved the start on.
+            continue
+        origin, target = (torch.tensor(row[k], dtype=torch.float64) for k in ("start", "target"))
+        level = torch.tensor(2.0, dtype=torch.float64)
+        times = phase_times(origin, target, level, motion)
+        assert [*times, times.vertical] == pytest.approx(row["T"][:2] + row["T"][2:], abs=1e-4)
+        # It samples a phase at its counter, before it adds dt = 1 s.
+        phase = max(i for i, counter in enumerate(row["counters"]) if counter > 0)
+        into_phase = row["counters"][phase] - 1.0
+        began = [0.0, row["T"][0], row["T"][0] + row["T"][1]][phase]
+        pose = fly(origin, target, level, torch.tensor(began + into_phase), *times, 5)
+        assert pose.position.tolist() == pytest.approx(row["pos"], abs=1e-4)
+        compared += 1
+    assert compared + landed == len(FLIGHT_RUN)
+    assert compared > 60
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@given(length=sizes, speed=limits, acceleration=limits)
+def test_minimum_times_reach_a_limit_and_exceed_none(degree, length, speed, acceleration):
+    time = minimum_time(torch.tensor(length, dtype=torch.float64), degree, speed, acceleration)
+    v, a = derivatives(length, time, degree)
+    fastest, hardest = (x.abs().max().item() for x in (v, a))
+    assert fastest <= speed * (1 + 1e-9)
+    assert hardest <= acceleration * (1 + 1e-9)
+    assert max(fastest / speed, hardest / acceleration) >= 1 - 1e-4
+
+
+def test_a_phase_of_no_length_takes_no_time():
+    assert minimum_time(torch.zeros(3), 5, 5.0, 2.0).tolist() == [0.0] * 3
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_flying_equals_its_twin_at_dense_times(degree):
+    motion = MotionConfig(degree=degree)
+    generator = torch.Generator().manual_seed(degree)
+    origin, target = 100 * torch.randn(2, 4, 3, 1, 2, generator=generator, dtype=torch.float64)
+    target[0, 0] = origin[0, 0]  # A UAV that only goes up and down.
+    level = torch.tensor([1.0, 1.5, 8.0], dtype=torch.float64)[:, None].expand(4, 3, 1)
+    times = phase_times(origin, target, level, motion)
+    share = torch.linspace(-0.02, 1.1, 200, dtype=torch.float64)
+    elapsed = (2 * times.vertical + times.cruise) * share.clamp_min(0)
+    pose = fly(origin, target, level, elapsed, *times, degree)
+    assert pose.position.shape == (4, 3, 200, 3)
+    assert pose.cruised.shape == (4, 3, 200)
+    for b in range(4):
+        for n in range(3):
+            for k in range(200):
+                position, cruised = slow_pose(
+                    origin[b, n, 0].tolist(),
+                    target[b, n, 0].tolist(),
+                    level[b, n, 0].item(),
+                    elapsed[b, n, k].item(),
+                    vertical=times.vertical[b, n, 0].item(),
+                    cruise=times.cruise[b, n, 0].item(),
+                    degree=degree,
+                )
+                assert pose.position[b, n, k].tolist() == pytest.approx(position, abs=1e-9)
+                assert pose.cruised[b, n, k].item() == pytest.approx(cruised, abs=1e-9)
+
+
+def test_a_flight_that_is_over_stands_exactly_at_its_target():
+    origin, target = torch.tensor([[3.7, -8.1]]), torch.tensor([[-91.3, 77.7]])
+    level = torch.tensor([3.5])
+    times = phase_times(origin, target, level, MotionConfig())
+    for late in (0.0, 0.5, 1000.0):
+        elapsed = 2 * times.vertical + times.cruise + late
+        pose = fly(origin, target, level, elapsed, *times, 5)
+        assert pose.position[0, :2].tolist() == target[0].tolist()
+        assert pose.position[0, 2].item() == pytest.approx(0.0, abs=1e-6)
+        assert pose.position.dtype == torch.float32
+        assert pose.cruised.item() == pytest.approx(math.dist(origin[0], target[0]), rel=1e-6)
+
+
+def test_a_hop_on_the_spot_goes_up_and_down_and_nowhere_else():
+    here, level = torch.tensor([3.0, 4.0]), torch.tensor(2.0)
+    times = phase_times(here, here, level, MotionConfig())
+    for share, height in ((0.0, 0.0), (0.5, 1.0), (1.0, 2.0), (1.5, 1.0), (2.0, 0.0)):
+        pose = fly(here, here, level, share * times.vertical, *times, 5)
+        assert pose.position.tolist() == pytest.approx([3.0, 4.0, height], abs=1e-6)
+        assert pose.cruised.item() == 0.0
+
+
+def test_flying_compiles_to_one_graph():
+    motion = MotionConfig()
+
+    def flight(origin, target, level, elapsed):
+        return fly(origin, target, level, elapsed, *phase_times(origin, target, level, motion), 5)
+
+    inputs = (torch.randn(2, 3, 2), torch.randn(2, 3, 2), torch.ones(2, 3), torch.rand(2, 3))
+    compiled = torch.compile(flight, fullgraph=True, backend="eager")
+    for one, other in zip(compiled(*inputs), flight(*inputs), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_flight_levels_are_separated_and_lie_within_bounds():
+    config = MotionConfig(min_level=1.0, max_level=2.2, level_separation=0.4)
+    assert flight_levels(config, 4) == pytest.approx([1.0, 1.4, 1.8, 2.2])
+    assert len(flight_levels(MotionConfig(max_level=1.7, level_separation=0.1), 8)) == 8
+    with pytest.raises(InputError, match=r"^motion\.max_level: 2\.2 m leaves room for 4 .* 5 UAVs"):
+        flight_levels(config, 5)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("kind", "teleport", "motion.kind: teleport is not one of instant, polynomial"),
+        ("degree", 4, "motion.degree: 4 is not one of 3, 5, 7"),
+        ("max_speed", 0.0, "motion.max_speed: 0.0 m/s is not above 0 m/s"),
+        ("max_acceleration", -2.0, "motion.max_acceleration: -2.0 m/s^2 is not above 0 m/s^2"),
+        ("max_speed", math.nan, "motion.max_speed: nan m/s is not above 0 m/s"),
+        ("sensing_time", -1.0, "motion.sensing_time: -1.0 s is not at least 0 s"),
+        ("min_level", 0.0, "motion.min_level: 0.0 m is not above 0 m"),
+        ("max_level", 0.5, "motion.max_level: 0.5 m is not at least 1 m"),
+        ("level_separation", 0.0, "motion.level_separation: 0.0 m is not above 0 m"),
+    ],
+)
+def test_a_wrong_motion_setting_is_named_with_its_value_and_unit(field, value, message):
+    with pytest.raises(InputError) as error:
+        MotionConfig(**{field: value})
+    assert str(error.value) == message

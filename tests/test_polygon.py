@@ -1,0 +1,279 @@
+"""Operative polygons and landing points, against the original's and against slow loops."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.geometry import MultiPolygon, Point, Polygon
+
+from damian.errors import InputError
+from damian.world.polygon import (
+    landing_lattice,
+    largest_vertex_distance,
+    polygon_from_vertices,
+    random_polygon,
+    sample_interior,
+)
+
+DATA = Path(__file__).parent / "data"
+GOLDEN = json.loads((DATA / "motion_energy_coverage.json").read_text())
+EXAMPLES = GOLDEN["discretisation_examples"]
+reproducible = settings(max_examples=40, derandomize=True, deadline=None)
+SQUARE = Polygon([(0, 0), (100, 0), (100, 100), (0, 100)])
+ELL = Polygon([(0, 0), (300, 0), (300, 100), (100, 100), (100, 300), (0, 300)])
+LAKE = Polygon(SQUARE.buffer(100).exterior, [SQUARE.exterior])
+ISLANDS = MultiPolygon([SQUARE, shapely.affinity.translate(SQUARE, 250, 40)])
+SHAPES = {"square": SQUARE, "ell": ELL, "lake": LAKE, "islands": ISLANDS}
+
+
+# --- landing points -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", [1, 2])
+def test_the_lattice_gives_the_use_cases_92_points_in_their_order(case):
+    scenario = json.loads((DATA / f"usecase{case}.json").read_text())["scenario"]
+    polygon = polygon_from_vertices(scenario["polygon_vertices_ring"], "usecase")
+    points = landing_lattice(polygon, scenario["step_m"], scenario["deg"])
+    assert points.shape == (92, 2)
+    np.testing.assert_allclose(points, scenario["landing_points"], atol=1e-6)
+    distance = largest_vertex_distance(polygon)
+    assert distance == pytest.approx(scenario["max_distance_normaliser_m"], abs=1e-6)
+
+
+def test_there_are_golden_lattices_to_compare():
+    assert len(EXAMPLES) == 9
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_the_lattice_gives_the_original_points_of_other_polygons(example):
+    n = None if example["n_landing_points"] == "all" else example["n_landing_points"]
+    polygon = polygon_from_vertices(example["polygon"], "example")
+    points = landing_lattice(polygon, example["step"], example["deg"], n)
+    np.testing.assert_allclose(points, example["landing_points_in_id_order"], atol=1e-6)
+
+
+def _slow_lattice(polygon, step, degrees):
+    """The rule of the original in words, a point at a time."""
+    min_x, min_y, max_x, max_y = polygon.bounds
+    slant, points, x, y, signed = math.radians(degrees), [], min_x, min_y, step
+    while y <= max_y + 1e-9:
+        while True:
+            if polygon.contains(Point(x, y)):
+                points.append((x, y))
+            if (x >= max_x - 1e-7) if signed > 0 else (x <= min_x + 1e-7):
+                break
+            x += signed
+        x += 2 * signed * math.cos(slant)
+        y, signed = y + step * math.sin(slant), -signed
+    centre = polygon.centroid
+
+    def direction(point):
+        x, y = point[0] - centre.x, point[1] - centre.y
+        return round(math.atan2(y, x), 9), math.hypot(x, y)
+
+    return sorted(points, key=direction)
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+@pytest.mark.parametrize(("step", "degrees"), [(17.3, 45), (29.7, 30), (11.1, 80)])
+def test_the_lattice_is_that_of_a_slow_loop_on_concave_holed_and_split_polygons(
+    shape, step, degrees
+):
+    polygon = shapely.affinity.translate(shapely.affinity.rotate(shape, 7.7), 31.7, -11.3)
+    points = landing_lattice(polygon, step, degrees)
+    assert len(points) > 10
+    np.testing.assert_allclose(points, _slow_lattice(polygon, step, degrees), atol=1e-6)
+
+
+@reproducible
+@given(st.integers(0, 2**32 - 1), st.floats(10, 60), st.floats(5, 90))
+def test_landing_points_are_strictly_inside_distinct_and_ordered_by_direction(seed, step, degrees):
+    polygon = random_polygon(np.random.default_rng(seed), 30_000, 60_000)
+    points = landing_lattice(polygon, step, degrees)
+    assert all(polygon.contains(Point(p)) for p in points)
+    assert len(np.unique(points, axis=0)) == len(points)
+    centre = np.array(polygon.centroid.coords[0])
+    angles = np.arctan2(*(points - centre).T[::-1])
+    assert (np.diff(angles) > -1e-9).all()
+
+
+def test_points_on_the_boundary_are_not_landing_points():
+    points = landing_lattice(SQUARE, 25, 90)
+    assert len(points) == 9
+    assert {tuple(p) for p in points.round(9)} == {
+        (x, y) for x in (25, 50, 75) for y in (25, 50, 75)
+    }
+
+
+def test_the_points_kept_are_the_nearest_to_the_centroid_in_unchanged_order():
+    every = landing_lattice(ELL, 20, 45)
+    some = landing_lattice(ELL, 20, 45, 10)
+    away = np.linalg.norm(every - np.array(ELL.centroid.coords[0]), axis=1)
+    nearest = sorted(np.argsort(away)[:10])
+    np.testing.assert_array_equal(some, every[nearest])
+    np.testing.assert_array_equal(landing_lattice(ELL, 20, 45, len(every)), every)
+
+
+def test_shifting_a_symmetric_polygon_keeps_the_order_of_its_points():
+    here = landing_lattice(SQUARE, 10, 90)
+    for shift in [(0.1, 0.7), (1e5 / 3, -2e4 / 7)]:
+        there = landing_lattice(shapely.affinity.translate(SQUARE, *shift), 10, 90)
+        np.testing.assert_allclose(there - shift, here, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("step", "degrees", "n", "says"),
+    [
+        (500, 45, None, "0 lie inside the polygon of 10000 m^2"),
+        (30, 45, 50, "the 50 wanted"),
+        (30, 45, 0, "landing points: 0"),
+        (0, 45, None, "lattice step: 0 m"),
+        (-3, 45, None, "lattice step: -3 m"),
+        (math.nan, 45, None, "lattice step: nan m"),
+        (1e300, 45, None, "lattice step: 1e+300 m"),
+        (1e-320, 45, None, "too fine"),
+        (0.01, 45, None, "lattice step: 0.01 m is too fine for a polygon of 100 m x 100 m"),
+        (30, 0, None, "lattice angle: 0 deg"),
+        (30, 91, None, "lattice angle: 91 deg"),
+        (30, 1e-300, None, "too fine"),
+    ],
+)
+def test_a_lattice_that_cannot_be_laid_is_one_line(step, degrees, n, says):
+    with pytest.raises(InputError) as error:
+        landing_lattice(SQUARE, step, degrees, n)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+# --- random polygons ----------------------------------------------------------------------------
+
+
+def test_random_polygons_have_the_original_statistics():
+    stats, rng = GOLDEN["random_polygon_stats"], np.random.default_rng(0)
+    polygons = [random_polygon(rng, stats["min_area"], stats["max_area"]) for _ in range(1000)]
+    areas = np.array([p.area for p in polygons])
+    n_vertices = np.array([len(p.exterior.coords) - 1 for p in polygons])
+    lattices = np.array([len(landing_lattice(p, 30, 45)) for p in polygons])
+    diameters = np.array([largest_vertex_distance(p) for p in polygons])
+    golden = {
+        "area": areas,
+        "n_vertices": n_vertices,
+        "n_grid_points_inside": lattices,
+        "diameter": diameters,
+    }
+    for name, ours in golden.items():
+        # Both means are of a thousand: four standard errors of their difference.
+        error = 4 * ours.std() * math.sqrt(2 / 1000)
+        assert ours.mean() == pytest.approx(stats[name]["mean"], abs=error), name
+    assert areas.std() == pytest.approx(stats["area"]["std"], rel=0.25)
+
+
+@reproducible
+@given(st.integers(0, 2**32 - 1), st.floats(1, 1e10), st.floats(0, 1))
+def test_a_random_polygon_is_convex_and_between_its_areas(seed, max_area, share):
+    min_area = max(max_area * share, max_area * 1e-6)
+    polygon = random_polygon(np.random.default_rng(seed), min_area, max_area)
+    assert min_area * (1 - 1e-9) <= polygon.area <= max_area * (1 + 1e-9)
+    assert polygon.area == pytest.approx(polygon.convex_hull.area)
+
+
+def test_one_seed_gives_one_polygon():
+    drawn = [random_polygon(np.random.default_rng(seed), 1e5, 2e5) for seed in (3, 3, 4)]
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "says"),
+    [
+        (0, 1, "min_area: 0 m^2"),
+        (-1, 1, "min_area: -1 m^2"),
+        (2, 1, "max_area: 1 m^2"),
+        (1, math.inf, "max_area: inf m^2"),
+        (math.nan, 1, "min_area: nan m^2"),
+    ],
+)
+def test_areas_that_cannot_be_are_refused(low, high, says):
+    with pytest.raises(InputError) as error:
+        random_polygon(np.random.default_rng(0), low, high)
+    assert str(error.value).startswith(says)
+
+
+# --- polygons by hand ---------------------------------------------------------------------------
+
+
+def test_a_concave_polygon_by_hand_stays_concave_open_or_closed():
+    corners = list(ELL.exterior.coords)
+    for given_corners in (corners, corners[:-1], corners[:1] + corners, corners[::-1]):
+        assert polygon_from_vertices(given_corners, "here").equals(ELL)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "says"),
+    [
+        ([], "not a list of [x, y]"),
+        ([[0, 0], [1, 1]], "2 distinct points"),
+        ([[0, 0], [1, 1], [0, 0], [1, 1]], "2 distinct points"),
+        ([[0, 0], [1, 1], [2, 2], [3, 3]], "no area"),
+        ([[0, 0], [0.1, 0.3], [0.7, 2.1]], "no area"),
+        ([[0, 0], [1, 1], [1, 0], [0, 1]], "edges cross at [0.5, 0.5] m"),
+        ([[0, 0], [9, 9], [9, 0], [0, 5]], "edges cross"),
+        ([[0, 0], [1, math.nan], [1, 0]], "vertex 1 [1.0, nan]"),
+        ([[0, 0], [1, 1], [math.inf, 0]], "vertex 2 [inf, 0.0]"),
+        ([[0, 0], [1, 1], [1e300, 0]], "vertex 2 [1e+300, 0.0] m"),
+        ([[0, 0], [1, 1], [2]], "not a list of [x, y] numbers"),
+        ([[0, 0], [1, 1], [2, "north"]], "not a list of [x, y] numbers"),
+        ([[0, 0, 0], [1, 1, 0], [2, 0, 0]], "shape [3, 3]"),
+        ([0, 1, 2], "shape [3]"),
+    ],
+)
+def test_vertices_that_make_no_polygon_are_one_line(vertices, says):
+    with pytest.raises(InputError) as error:
+        polygon_from_vertices(vertices, "region.vertices")
+    assert str(error.value).startswith("region.vertices: ")
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_the_largest_vertex_distance_is_that_of_a_slow_loop(shape):
+    corners = shapely.get_coordinates(shape)
+    slow = max(math.dist(a, b) for a in corners for b in corners)
+    assert largest_vertex_distance(shape) == pytest.approx(slow)
+
+
+# --- points inside ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_sampled_points_are_strictly_inside_and_uniform(shape):
+    points = sample_interior(shape, 4000, np.random.default_rng(0))
+    assert points.shape == (4000, 2)
+    assert all(shape.contains(Point(p)) for p in points)
+    xs, ys = np.linspace(shape.bounds[:2], shape.bounds[2:], 5).T
+    counts = np.histogram2d(*points.T, bins=[xs, ys])[0]
+    for i in range(4):
+        for j in range(4):
+            cell = shapely.box(xs[i], ys[j], xs[i + 1], ys[j + 1])
+            share = shape.intersection(cell).area / shape.area
+            spread = math.sqrt(4000 * share * (1 - share))
+            assert counts[i, j] == pytest.approx(4000 * share, abs=4.5 * spread + 1e-6)
+
+
+def test_a_sliver_is_sampled_as_fast_as_a_square():
+    sliver = Polygon([(0, 0), (1e5, 1e5), (1e5, 1e5 + 1e-3)])
+    points = sample_interior(sliver, 500, np.random.default_rng(0))
+    assert shapely.contains_xy(sliver, points).all()
+    assert len(np.unique(points, axis=0)) == 500
+
+
+def test_a_polygon_without_inside_gives_an_error_rather_than_no_end():
+    # The smallest triangle that numbers can hold: no number lies between its corners.
+    dust = Polygon([(1, 1), (1, np.nextafter(1, 2)), (np.nextafter(1, 2), 1)])
+    for nothing in (Polygon(), MultiPolygon(), dust):
+        with pytest.raises(InputError, match="no inside"):
+            sample_interior(nothing, 5, np.random.default_rng(0))

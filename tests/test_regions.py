@@ -1,0 +1,351 @@
+"""FIR tables and GeoJSON: what is read from good files, and the line that each bad one gives."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
+
+import damian
+from damian.errors import InputError
+from damian.world.geodesy import EARTH_RADIUS_M, to_latlon
+from damian.world.polygon import landing_lattice
+from damian.world.regions import MAX_BYTES, Region, read_fir, read_geojson
+
+DATA = Path(__file__).parent / "data" / "regions"
+FIR, ZONES = DATA / "fir.csv", DATA / "zones.geojson"
+SHIPPED = Path(damian.__file__).parent / "data" / "fir.csv"
+DEGREE_M = EARTH_RADIUS_M * np.pi / 180
+
+
+def _places(region: Region) -> np.ndarray:
+    """Corners as they were in the file, [V, 2] (latitude, longitude)."""
+    assert region.origin is not None
+    return np.column_stack(to_latlon(*shapely.get_coordinates(region.polygon).T, region.origin))
+
+
+# --- good files ---------------------------------------------------------------------------------
+
+
+def test_the_shipped_table_holds_the_llanbedr_polygon():
+    region = read_fir(SHIPPED, "LlanbedrTest")
+    assert (region.name, region.levels) == ("LlanbedrTest", (0, 60))
+    assert region.origin == pytest.approx((52.813, -4.129), abs=1e-3)
+    assert _places(region)[[0, 9]] == pytest.approx(
+        np.array([[52.814992, -4.132176], [52.814502, -4.132138]]), abs=1e-9
+    )
+    assert len(region.polygon.exterior.coords) == 11
+    # The same by the shoelace formula on a flat map at the region's latitude.
+    flat = Polygon(_places(region)[:, ::-1]).area * DEGREE_M**2 * np.cos(np.radians(52.813))
+    assert region.polygon.area == pytest.approx(flat, rel=1e-4)
+    assert len(landing_lattice(region.polygon, 30, 45)) > 100
+
+
+def test_rows_of_a_table_are_taken_in_their_sequence():
+    region = read_fir(FIR, "North Bay")
+    assert region.levels == (10, 45.5)
+    corners = [[52.8, -4.13], [52.8, -4.12], [52.81, -4.12], [52.81, -4.13], [52.8, -4.13]]
+    np.testing.assert_allclose(_places(region), corners, atol=1e-9)
+    width = 0.01 * DEGREE_M * np.cos(np.radians(52.805))
+    assert region.polygon.area == pytest.approx(width * 0.01 * DEGREE_M, rel=1e-4)
+
+
+def test_local_metres_are_about_the_centroid():
+    for region in (read_fir(FIR, "North Bay"), read_geojson(ZONES, where="name=ell")):
+        assert region.polygon.centroid.coords[0] == pytest.approx((0, 0), abs=1.0)
+
+
+def test_a_region_over_the_antimeridian_is_one_small_polygon():
+    region = read_fir(FIR, "Strait")
+    assert abs(region.origin[1]) == pytest.approx(180)
+    width = 0.2 * DEGREE_M * np.cos(np.radians(16.45))
+    assert region.polygon.area == pytest.approx(width * 0.1 * DEGREE_M, rel=1e-4)
+
+
+def test_a_concave_polygon_stays_concave():
+    region = read_geojson(ZONES, index=0)
+    assert region.name == "ell"
+    assert region.levels is None
+    assert region.polygon.area == pytest.approx(0.75 * region.polygon.envelope.area, rel=1e-3)
+
+
+def test_a_hole_stays_a_hole_and_heights_are_ignored():
+    region = read_geojson(ZONES, where="name=lake")
+    assert len(region.polygon.interiors) == 1
+    whole = Polygon(region.polygon.exterior).area
+    assert region.polygon.area == pytest.approx(whole * 8 / 9, rel=1e-3)
+    assert not region.polygon.contains(region.polygon.centroid)
+
+
+def test_a_multipolygon_keeps_its_parts():
+    region = read_geojson(ZONES, index=2)
+    assert isinstance(region.polygon, MultiPolygon)
+    assert len(region.polygon.geoms) == 2
+    assert region.name == "zones features[2]"
+
+
+@pytest.mark.parametrize(("where", "name"), [("zone=1", "ell"), ("zone=2", "lake")])
+def test_a_feature_is_chosen_by_a_number_among_its_properties(where, name):
+    assert read_geojson(ZONES, where=where).name == name
+
+
+SQUARE = [[[8.0, 45.0], [8.01, 45.0], [8.01, 45.01], [8.0, 45.01], [8.0, 45.0]]]
+POINT = {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [8, 45]}}
+
+
+def _polygon(*rings):
+    return {"type": "Polygon", "coordinates": list(rings)}
+
+
+def _feature(geometry, **properties):
+    return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+
+def _collection(*features):
+    return {"type": "FeatureCollection", "features": list(features)}
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        _polygon(*SQUARE),
+        {"type": "MultiPolygon", "coordinates": [SQUARE]},
+        _feature(_polygon(*SQUARE)),
+        _collection(_feature(_polygon(*SQUARE))),
+        _collection(POINT, _feature(_polygon(*SQUARE))),
+    ],
+    ids=["Polygon", "MultiPolygon", "Feature", "FeatureCollection", "beside a point"],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_each_kind_of_geojson_gives_its_only_area_with_and_without_bom(
+    tmp_path, document, encoding
+):
+    file = tmp_path / "square.geojson"
+    file.write_text(json.dumps(document), encoding=encoding)
+    region = read_geojson(file)
+    corners = [[45, 8], [45, 8.01], [45.01, 8.01], [45.01, 8], [45, 8]]
+    area = (0.01 * DEGREE_M) ** 2 * np.cos(np.radians(45.005))
+    assert region.polygon.area == pytest.approx(area, rel=1e-4)
+    assert sorted(_places(region).round(9).tolist()) == sorted(corners)
+
+
+def test_a_name_can_be_printed_on_one_line_whatever_the_file_holds(tmp_path):
+    file = tmp_path / "odd.geojson"
+    file.write_text(json.dumps(_feature(_polygon(*SQUARE), name="north\n\ud800")))
+    assert read_geojson(file).name == r"north \ud800"
+
+
+def test_a_string_may_name_the_file():
+    assert read_fir(str(FIR), "Strait") == read_fir(FIR, "Strait")
+    assert read_geojson(str(ZONES), 0) == read_geojson(ZONES, 0)
+
+
+def test_a_table_may_have_a_bom_and_windows_line_ends(tmp_path):
+    file = tmp_path / "fir.csv"
+    file.write_bytes(b"\xef\xbb\xbf" + FIR.read_bytes().replace(b"\n", b"\r\n"))
+    assert read_fir(file, "North Bay") == read_fir(FIR, "North Bay")
+
+
+def test_parts_cut_at_the_antimeridian_become_one(tmp_path):
+    west = [[179.9, 1], [180, 1], [180, 1.1], [179.9, 1.1], [179.9, 1]]
+    east = [[-180, 1], [-179.9, 1], [-179.9, 1.1], [-180, 1.1], [-180, 1]]
+    file = tmp_path / "cut.geojson"
+    file.write_text(json.dumps({"type": "MultiPolygon", "coordinates": [[west], [east]]}))
+    region = read_geojson(file)
+    assert isinstance(region.polygon, Polygon)
+    assert region.polygon.area == pytest.approx(0.2 * 0.1 * DEGREE_M**2, rel=1e-3)
+
+
+# --- bad files ----------------------------------------------------------------------------------
+
+HEADER = "Airspace ID,Min Flight Level,Max Flight Level,Sequence Number,Latitude,Longitude\n"
+ROWS = ("A,0,60,0,52.80,-4.13", "A,0,60,1,52.80,-4.12", "A,0,60,2,52.81,-4.12")
+
+
+def _table(*changed: str, header: str = HEADER) -> str:
+    """A good table with the last rows changed."""
+    return header + "\n".join([*ROWS[: len(ROWS) - len(changed)], *changed]) + "\n"
+
+
+BAD_TABLES = {
+    "empty": ("", "is empty"),
+    "only blank": (" \n\n", "is empty"),
+    "not UTF-8": (b"Airspace ID\xff", "byte 11 is not UTF-8"),
+    "no columns": ("a;b\n1;2\n", "column Airspace ID, Min Flight Level, Max Flight Level, Seq"),
+    "one column missing": (_table(header=HEADER.replace("Latitude", "Lat")), "column Latitude"),
+    "column twice": (_table(header=HEADER.strip() + ",Latitude\n"), "column Latitude missing or"),
+    "header only": (HEADER, "no Airspace ID 'A'; the file has none"),
+    "wrong id": (_table().replace("A,0", "a1,0"), "no Airspace ID 'A'; did you mean 'a1'?"),
+    "other ids": (_table().replace("A,0", "Mona,0"), "no Airspace ID 'A'; the file has 'Mona'"),
+    "too few values": (_table("A,0,60,2,52.81"), "line 4: 5 values for 6 columns"),
+    "decimal commas": (_table("A,0,60,2,52,81,-4,12"), "line 4: 8 values for 6 columns"),
+    "open quote": (_table('A,0,60,2,"52.81,-4.12'), "line 4: unexpected end of data"),
+    "NUL": (_table("A,0,60,2,52\0.81,-4.12"), "line 4"),
+    "text": (_table("A,0,60,2,north,-4.12"), "line 4: Latitude 'north' is not a number"),
+    "two lines in a cell": (_table('A,0,60,2,"no\nrth",-4.12'), r"line 5: Latitude 'no\nrth' is"),
+    "blank cell": (_table("A,0,60,2,52.81,"), "line 4: Longitude '' is not a number"),
+    "underscore": (_table("A,0,60,2,5_2.81,-4.12"), "line 4: Latitude '5_2.81' is not a number"),
+    "NaN": (_table("A,0,60,2,nan,-4.12"), "line 4: Latitude nan deg is not between -90 and 90"),
+    "infinite": (_table("A,0,60,2,52.81,inf"), "line 4: Longitude inf deg is not between"),
+    "latitude 95": (_table("A,0,60,2,95,-4.12"), "line 4: Latitude 95 deg is not between -90"),
+    "longitude 200": (_table("A,0,60,2,52.81,200"), "line 4: Longitude 200 deg is not between"),
+    "level below ground": (_table("A,-1,60,2,52.81,-4.12"), "Min Flight Level -1 FL is not"),
+    "levels swapped": (_table().replace("0,60", "60,0"), "line 2: Min Flight Level 60 FL is above"),
+    "levels differ": (_table("A,0,70,2,52.81,-4.12"), "line 4: Max Flight Level 70 FL is not the"),
+    "sequence twice": (_table("A,0,60,1,52.81,-4.12"), "line 4: Sequence Number 1 is on line 3"),
+    "sequence gap": (_table("A,0,60,3,52.81,-4.12"), "line 4: Sequence Number 3 where 2 is next"),
+    "sequence from 1": (
+        _table("A,0,60,2,52.8,-4.12", "A,0,60,3,52.81,-4.12", "A,0,60,1,52.8,-4.13"),
+        "line 4: Sequence Number 1 where 0 is next",
+    ),
+    "half sequence": (_table("A,0,60,1.5,52.81,-4.12"), "Sequence Number 1.5 where 2 is next"),
+    "sequence negative": (_table("A,0,60,-1,52.81,-4.12"), "Sequence Number -1 is not between"),
+    "sequence text": (_table("A,0,60,two,52.81,-4.12"), "Sequence Number 'two' is not a number"),
+    "two points": (_table("A,0,60,2,52.80,-4.12"), "A: 2 distinct points"),
+    "on a line": (_table("A,0,60,2,52.80,-4.11"), "A: no area"),
+    "crossing edges": (
+        _table() + "A,0,60,3,52.79,-4.125\n",
+        "A: edges cross at [-4.1225, 52.8] deg",
+    ),
+    "round the Earth": (
+        _table("A,0,60,0,10,-120", "A,0,60,1,10,0", "A,0,60,2,20,120"),
+        "A: more than 180 deg",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "says"), BAD_TABLES.values(), ids=BAD_TABLES)
+def test_a_bad_table_is_one_line_that_names_the_file_and_the_fault(tmp_path, text, says):
+    file = tmp_path / "bad.csv"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    _assert_one_line(file, says, lambda: read_fir(file, "A"))
+
+
+LON_200 = [[8, 45], [200, 45], [8, 46], [8, 45]]
+LAT_95 = [[8, 45], [9, 95], [8, 46], [8, 45]]
+FAR_HOLE = [[18, 45], [18.01, 45], [18.01, 45.01], [18, 45]]
+RING = SQUARE[0]
+TWO = _collection(_feature(_polygon(RING), zone="a"), _feature(_polygon(RING), zone="b"))
+
+BAD_GEOJSON = {
+    "empty": ("", {}, "is empty"),
+    "not UTF-8": (b'{"type": "\xff"}', {}, "byte 10 is not UTF-8"),
+    "not JSON": ('{"type":\n oops}', {}, "line 2: not JSON"),
+    "cut short": ('{"type": "Polygon"', {}, "line 1: not JSON"),
+    "deeply nested": ("[" * 200_000, {}, "nested too deeply"),
+    "endless integer": ("1" * 10_000, {}, "not JSON"),
+    "a list": ([], {}, "type None is not one of Polygon"),
+    "wrong type": (POINT["geometry"], {}, "type 'Point' is not one of Polygon, MultiPolygon, Feat"),
+    "type not text": ({"type": {"a": [1]}}, {}, "type {'a': [1]} is not one of"),
+    "point feature": (POINT, {}, "geometry: type 'Point' is not one of"),
+    "no geometry": (_feature(None), {}, "geometry: type None is not one of"),
+    "no features": (_collection(), {}, "features [] is not a list of at least one"),
+    "features a dict": ({"type": "FeatureCollection", "features": {}}, {}, "features {} is not"),
+    "not a feature": (_collection(3), {}, "features[0]: 3 is not a Feature"),
+    "only points": (_collection(POINT, POINT), {}, "none of 2 features is a Polygon"),
+    "no choice": (TWO, {}, "choose one of 2 features by index or property=value: features[0] {'zo"),
+    "both choices": (TWO, {"index": 0, "where": "zone=a"}, "index 0 and where 'zone=a' both"),
+    "index 2 of 2": (TWO, {"index": 2}, "index 2 is not between 0 and 1"),
+    "index -1": (TWO, {"index": -1}, "index -1 is not between 0 and 1"),
+    "index of a point": (_collection(POINT), {"index": 0}, "features[0].geometry: type 'Point'"),
+    "where without =": (TWO, {"where": "zone"}, "where 'zone' is not property=value"),
+    "where unknown": (TWO, {"where": "zome=a"}, "no feature has a property 'zome'; did you mean"),
+    "where no value": (TWO, {"where": "zone=c"}, "no feature has zone='c'; the file has 'a', 'b'"),
+    "where twice": (
+        _collection(*TWO["features"][:1] * 2),
+        {"where": "zone=a"},
+        "fits 2 features: features[0], features[1]",
+    ),
+    "no coordinates": ({"type": "Polygon"}, {}, "geometry.coordinates: None is not a list"),
+    "empty coordinates": (_polygon(), {}, "geometry.coordinates: [] is not a list with"),
+    "empty ring": (_polygon([]), {}, "geometry.coordinates[0]: [] is not a list with"),
+    "no parts": ({"type": "MultiPolygon", "coordinates": []}, {}, "geometry.coordinates: []"),
+    "open ring": (_polygon(RING[:-1]), {}, "geometry.coordinates[0]: not closed"),
+    "two points": (_polygon([RING[0], RING[1], RING[0]]), {}, "geometry: 2 distinct points"),
+    "on a line": (_polygon([[8, 45], [8, 46], [8, 47], [8, 45]]), {}, "geometry: no area"),
+    "crossing edges": (
+        _collection(_feature(_polygon([RING[0], RING[2], RING[1], RING[3], RING[0]]))),
+        {},
+        "features[0]: edges cross at [8.005, 45.005] deg",
+    ),
+    "hole outside": (_polygon(RING, FAR_HOLE), {}, "hole lies outside shell at [18, 45] deg"),
+    "part crossing": (
+        {"type": "MultiPolygon", "coordinates": [[RING], [FAR_HOLE, RING]]},
+        {},
+        "hole lies outside shell",
+    ),
+    "longitude 200": (_polygon(LON_200), {}, "coordinates[0][1]: longitude 200 is not a number"),
+    "latitude 95": (_polygon(LAT_95), {}, "coordinates[0][1]: latitude 95 is not a number"),
+    "NaN": (_polygon([[8, float("nan")]]), {}, "coordinates[0][0]: latitude nan is not a number"),
+    "infinite": (_polygon([[float("inf"), 45]]), {}, "[0][0]: longitude inf is not a number"),
+    "huge integer": (_polygon([[10**400, 45]]), {}, "[0][0]: longitude 1000"),
+    "text": (_polygon([["8", 45]]), {}, "coordinates[0][0]: longitude '8' is not a number"),
+    "boolean": (_polygon([[True, 45]]), {}, "coordinates[0][0]: longitude True is not a number"),
+    "one number": (_polygon([[8]]), {}, "coordinates[0][0]: [8] is not [longitude, latitude]"),
+    "a ring too flat": (_polygon([8, 45]), {}, "coordinates[0][0]: 8 is not [longitude, latitude]"),
+    "half a character": (_feature({"type": "\ud800"}), {}, r"type '\ud800' is not one of"),
+}
+
+
+@pytest.mark.parametrize(("content", "choice", "says"), BAD_GEOJSON.values(), ids=BAD_GEOJSON)
+def test_a_bad_geojson_is_one_line_that_names_the_file_and_the_fault(
+    tmp_path, content, choice, says
+):
+    file = tmp_path / "bad.geojson"
+    if not isinstance(content, bytes):
+        content = (content if isinstance(content, str) else json.dumps(content)).encode()
+    file.write_bytes(content)
+    _assert_one_line(file, says, lambda: read_geojson(file, **choice))
+
+
+def _missing(folder: Path) -> Path:
+    return folder / "nowhere.csv"
+
+
+def _directory(folder: Path) -> Path:
+    return folder
+
+
+def _oversized(folder: Path) -> Path:
+    file = folder / "huge.csv"
+    file.touch()
+    os.truncate(file, 200_000_000)  # sparse: it takes no room
+    return file
+
+
+def _pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "pipe")
+    return folder / "pipe"
+
+
+def _long_name(folder: Path) -> Path:
+    return folder / ("x" * 5000)
+
+
+@pytest.mark.parametrize("read", [lambda f: read_fir(f, "A"), read_geojson], ids=["fir", "geojson"])
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (_missing, "no such file"),
+        (_directory, "is not a file"),
+        (_pipe, "is not a file"),
+        (_oversized, f"200000000 bytes are more than the {MAX_BYTES}"),
+        (_long_name, "cannot be read"),
+    ],
+)
+def test_what_is_no_readable_file_is_one_line_that_names_it(tmp_path, make, says, read):
+    file = make(tmp_path)
+    _assert_one_line(file, says, lambda: read(file))
+
+
+def _assert_one_line(file: Path, says: str, read) -> None:
+    with pytest.raises(InputError) as error:
+        read()
+    message = str(error.value)
+    assert message.startswith(f"{file}: ")
+    assert says in message
+    assert len(message.splitlines()) == 1
+    message.encode()

@@ -1,0 +1,410 @@
+"""The source: sound, walks over many polygons, and where it is (integrated speed profiles)."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from damian.errors import InputError
+from damian.world.source import (
+    SourceConfig,
+    Walk,
+    draw_walks,
+    footprint_radius,
+    leg_duration,
+    locate,
+)
+
+DATA = Path(__file__).parent / "data"
+SCENARIO = json.loads((DATA / "usecase1.json").read_text())["scenario"]
+GOLDEN = json.loads((DATA / "motion_energy_coverage.json").read_text())
+
+USE_CASE = shapely.Polygon(SCENARIO["polygon_vertices_ring"])
+HOLE = shapely.Polygon(
+    [(-100, -100), (100, -100), (100, 100), (-100, 100)],
+    [[(-60, -60), (60, -60), (60, 60), (-60, 60)]],
+)
+CONCAVE = shapely.Polygon([(0, 0), (200, 0), (200, 20), (20, 20), (20, 200), (0, 200)])
+SLIVER = shapely.Polygon([(0, 0), (1000, 0), (1000, 1e-3)])
+TURNED_SLIVER = shapely.affinity.rotate(SLIVER, 31.7)
+TWO_PARTS = shapely.MultiPolygon([shapely.box(0, 0, 50, 50), shapely.box(300, 0, 350, 50)])
+POLYGONS = {
+    "use case": USE_CASE,
+    "hole": HOLE,
+    "concave": CONCAVE,
+    "sliver": SLIVER,
+    "turned sliver": TURNED_SLIVER,
+    "two parts": TWO_PARTS,
+}
+DYNAMIC = SourceConfig(motion="dynamic")
+
+
+def drawn(polygon=USE_CASE, n=8, seed=0, **settings_):
+    config = SourceConfig(motion="dynamic", **settings_)
+    return draw_walks(polygon, config, n, np.random.default_rng(seed))
+
+
+def in_double(walk):
+    return Walk(*(x if x.dtype == torch.bool else x.double() for x in walk))
+
+
+def n_stops(walk):
+    return walk.arrive.isfinite().sum(1)
+
+
+def leg_lengths(walk):
+    """Lengths of all real legs."""
+    return walk.stop.diff(dim=1).norm(dim=-1)[walk.arrive[:, 1:].isfinite()]
+
+
+def twin_duration(length, speed, acceleration):
+    """Longhand: two ramps and a coast, or two ramps that meet."""
+    if length == 0:
+        return 0.0
+    ramp = speed**2 / (2 * acceleration)
+    if 2 * ramp >= length:
+        return 2 * math.sqrt(length / acceleration)
+    return 2 * speed / acceleration + (length - 2 * ramp) / speed
+
+
+def twin_covered(length, speed, acceleration, elapsed, n=4000):
+    """Integrate the speed: rise, hold, fall, whichever allows least (midpoint rule)."""
+    duration = twin_duration(length, speed, acceleration)
+    end = min(max(elapsed, 0.0), duration)
+    t = (np.arange(n) + 0.5) * end / n
+    profile = np.minimum(np.minimum(acceleration * t, acceleration * (duration - t)), speed)
+    return profile.sum() * end / n
+
+
+def twin_position(walk, w, time):
+    """One walk, searched from its first stop on."""
+    stop, arrive, depart, speed, acceleration = (x[w].tolist() for x in walk[:5])
+    n = sum(math.isfinite(a) for a in arrive)
+    k = max(i for i in range(n) if arrive[i] <= time)
+    if k == n - 1 or time <= depart[k]:
+        return stop[k], k
+    length = math.dist(stop[k], stop[k + 1])
+    share = twin_covered(length, speed[k], acceleration[k], time - depart[k]) / length
+    return [a + share * (b - a) for a, b in zip(stop[k], stop[k + 1], strict=True)], k
+
+
+def test_the_footprint_radius_is_the_golden_one():
+    assert footprint_radius(SourceConfig()) == pytest.approx(SCENARIO["footprint_radius_m"])
+    assert footprint_radius(SourceConfig()) == pytest.approx(56.23413252, abs=1e-8)
+
+
+def test_the_footprint_radius_follows_from_power_and_intensity():
+    config = SourceConfig(level_db=123.0, microphone_db=71.5)
+    power = 4 * math.pi * 1e-12 * 10 ** (123.0 / 10)
+    faintest = 1e-12 * 10 ** (71.5 / 10)
+    assert footprint_radius(config) == pytest.approx(math.sqrt(power / (4 * math.pi * faintest)))
+
+
+@given(length=st.floats(0, 2000), speed=st.floats(0.1, 50), acceleration=st.floats(0.05, 20))
+def test_a_leg_takes_as_long_as_its_ramps_and_its_coast(length, speed, acceleration):
+    values = (torch.tensor(x, dtype=torch.float64) for x in (length, speed, acceleration))
+    expected = twin_duration(length, speed, acceleration)
+    assert leg_duration(*values).item() == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+@given(length=st.floats(0.01, 2000), speed=st.floats(0.1, 50), acceleration=st.floats(0.05, 20))
+def test_a_leg_covers_its_length_in_its_time_and_not_sooner(length, speed, acceleration):
+    values = [torch.tensor(x, dtype=torch.float64) for x in (length, speed, acceleration)]
+    duration = leg_duration(*values).item()
+    assert twin_covered(length, speed, acceleration, duration) == pytest.approx(length, rel=1e-3)
+    assert twin_covered(length, speed, acceleration, 0.9 * duration) < length * 0.99
+
+
+def golden_legs():
+    """(first leg of all, length, the original's time) of each leg that it recorded."""
+    for run in GOLDEN["source_motion_action_delay"]:
+        places = [place[:2] for place in run["hotspot_walk"]]
+        moving = [dict(zip(run["columns"], row, strict=True)) for row in run["rows"]]
+        moving = [row for row in moving if row["cur_moving_time"] > 0]
+        times = {places.index([row["target_x"], row["target_y"]]): row["bcb_T"] for row in moving}
+        for k, time in times.items():
+            yield k == 1, math.dist(places[k - 1], places[k]), time
+
+
+def test_golden_legs_take_the_same_time():
+    # Left out: triangular legs, which the original times as if they reached their largest speed,
+    # and legs whose time it forgot to renew. Lengths are between planned stops.
+    compared, triangular, stale, before = 0, 0, 0, math.nan
+    for first, length, theirs in golden_legs():
+        local = (DYNAMIC.local_speed, DYNAMIC.local_acceleration)
+        speed, acceleration = (DYNAMIC.speed, DYNAMIC.acceleration) if first else local
+        values = (torch.tensor(x, dtype=torch.float64) for x in (length, speed, acceleration))
+        if length < speed**2 / acceleration:
+            assert theirs == pytest.approx(length / speed + speed / acceleration, abs=1e-6)
+            triangular += 1
+        elif theirs == before:
+            stale += 1
+        else:
+            assert leg_duration(*values).item() == pytest.approx(theirs, abs=1e-6)
+            compared += 1
+        before = theirs
+    assert (compared, triangular, stale) == (8, 2, 3)
+
+
+def test_a_static_source_stays_where_it_is_put_for_ever():
+    config = SourceConfig(position=SCENARIO["source_position"])
+    walk = draw_walks(USE_CASE, config, 3, np.random.default_rng(0))
+    assert walk.stop.shape == (3, 1, 2)
+    for time in (0.0, 1.0, 1e6):
+        located = locate(walk, torch.full((3,), time))
+        torch.testing.assert_close(
+            located.position, torch.tensor([SCENARIO["source_position"]]).expand(3, 2)
+        )
+        assert located.stop.tolist() == [0] * 3
+        assert located.stop.dtype == torch.long
+        assert not located.finished.any()
+
+
+@pytest.mark.parametrize("name", POLYGONS)
+def test_static_sources_are_drawn_inside_the_polygon(name):
+    walk = draw_walks(POLYGONS[name], SourceConfig(), 200, np.random.default_rng(1))
+    inside = shapely.dwithin(POLYGONS[name], shapely.points(walk.stop[:, 0].numpy()), 1e-3)
+    assert inside.all()
+    assert len(walk.stop.unique(dim=0)) > 150
+
+
+@pytest.mark.parametrize("name", POLYGONS)
+def test_every_stop_is_inside_the_polygon_and_near_its_hotspot(name):
+    walk = drawn(POLYGONS[name], n=20, local_distance=40.0)
+    # A millimetre for the rounding to float32.
+    places = shapely.points(walk.stop.double().numpy())
+    assert shapely.dwithin(POLYGONS[name], places, 1e-3).all()
+    hotspots = 0
+    for w, n in enumerate(n_stops(walk).tolist()):
+        stops, speeds = walk.stop[w, :n].tolist(), walk.speed[w, :n].tolist()
+        begins = [0] + [k + 1 for k in range(n - 1) if speeds[k] == DYNAMIC.speed]
+        hotspots += len(begins)
+        for begin, end in zip(begins, [*begins[1:], n], strict=True):
+            assert 3 <= end - begin - 1 <= 7
+            assert all(math.dist(stops[begin], stops[k]) <= 40.001 for k in range(begin, end))
+    assert hotspots == 20 * 10
+
+
+def test_inner_points_fill_the_part_of_the_disc_inside_the_polygon():
+    box = shapely.box(0, 0, 60, 60)
+    walk = drawn(box, n=400, n_hotspots=1, min_stops=7, position=[30.0, 0.5], local_distance=20.0)
+    inner = walk.stop[:, 1:].reshape(-1, 2)
+    distance = (inner - torch.tensor([30.0, 0.5])).norm(dim=1)
+    # Uniform in (almost) a half disc: half of the points lie beyond 20 / sqrt(2) m.
+    assert (distance > 20 / math.sqrt(2)).float().mean().item() == pytest.approx(0.5, abs=0.05)
+    assert (inner[:, 0] > 30).float().mean().item() == pytest.approx(0.5, abs=0.05)
+
+
+def test_even_in_a_sliver_a_source_moves_around_its_hotspot():
+    walk = in_double(drawn(SLIVER))
+    assert leg_lengths(walk).median() > 1e-4
+
+
+def test_a_walk_begins_at_the_given_place():
+    walk = drawn(position=[51.5, 32.5])
+    assert walk.stop[:, 0].tolist() == [[51.5, 32.5]] * 8
+    assert (walk.stop[0, 1] != walk.stop[1, 1]).any()
+
+
+def test_a_given_place_outside_the_polygon_is_refused():
+    with pytest.raises(InputError) as error:
+        drawn(HOLE, position=[0.0, 10.0])
+    assert str(error.value) == (
+        "source.position: [0.0, 10.0] m is not inside the polygon "
+        "(x -100 to 100 m, y -100 to 100 m)"
+    )
+
+
+def test_waits_and_legs_follow_each_other():
+    walk = in_double(drawn(n=20))
+    for w, n in enumerate(n_stops(walk).tolist()):
+        arrive, depart = walk.arrive[w, :n].tolist(), walk.depart[w, :n].tolist()
+        assert arrive[0] == 0.0
+        for k in range(n):
+            assert 60 - 1e-2 <= depart[k] - arrive[k] <= 360 + 1e-2
+        for k in range(n - 1):
+            leg = twin_duration(
+                math.dist(walk.stop[w, k].tolist(), walk.stop[w, k + 1].tolist()),
+                walk.speed[w, k].item(),
+                walk.acceleration[w, k].item(),
+            )
+            assert arrive[k + 1] - depart[k] == pytest.approx(leg, abs=1e-2)
+
+
+def test_padded_stops_repeat_the_last_one_and_are_never_reached():
+    walk = drawn(n=20)
+    assert len(n_stops(walk).unique()) > 1
+    assert n_stops(walk).max() == walk.arrive.shape[1]
+    for w, n in enumerate(n_stops(walk).tolist()):
+        assert walk.arrive[w, n:].isinf().all()
+        assert (walk.depart[w, n:] == walk.depart[w, n - 1]).all()
+        assert (walk.stop[w, n:] == walk.stop[w, n - 1]).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    speed=st.floats(0.5, 40),
+    acceleration=st.floats(0.05, 5),
+    max_stops=st.integers(0, 3),
+    n_hotspots=st.integers(1, 3),
+    share=st.floats(0, 1.1),
+)
+def test_a_position_equals_the_integrated_speed_profile(
+    *, seed, speed, acceleration, max_stops, n_hotspots, share
+):
+    walk = in_double(
+        drawn(
+            n=3,
+            seed=seed,
+            speed=speed,
+            acceleration=acceleration,
+            n_hotspots=n_hotspots,
+            min_stops=0,
+            max_stops=max_stops,
+            min_wait=0.0,
+            max_wait=5.0,
+        )
+    )
+    time = share * walk.depart[:, -1]
+    located = locate(walk, time)
+    for w in range(3):
+        position, stop = twin_position(walk, w, time[w].item())
+        assert located.position[w].tolist() == pytest.approx(position, abs=2e-2)
+        assert located.stop[w].item() == stop
+
+
+def test_a_triangular_leg_is_half_done_at_half_time_and_never_reaches_its_speed():
+    stop = torch.tensor([[[0.0, 0.0], [0.0, 8.0]]])
+    speed, acceleration = torch.full((1, 2), 20.0), torch.full((1, 2), 2.0)
+    arrive, depart = torch.tensor([[0.0, 14.0]]), torch.tensor([[10.0, 20.0]])
+    walk = Walk(stop, arrive, depart, speed, acceleration, torch.ones(1, 2, dtype=torch.bool))
+    expected = {9.0: 0.0, 10.0: 0.0, 11.0: 1.0, 12.0: 4.0, 13.0: 7.0, 14.0: 8.0, 30.0: 8.0}
+    for time, y in expected.items():
+        assert locate(walk, torch.tensor([time])).position.tolist() == [[0.0, pytest.approx(y)]]
+
+
+def traced(walk, n):
+    """Positions along whole walks at n equal steps, [n, W, 2], and the steps, [W] seconds."""
+    step = walk.depart[:, -1] * 1.05 / (n - 1)
+    repeated = Walk(*(x.repeat(n, *[1] * (x.ndim - 1)) for x in walk))
+    times = torch.arange(n, dtype=torch.float64)[:, None] * step
+    located = locate(repeated, times.reshape(-1))
+    return located.position.reshape(n, -1, 2), located, times, step
+
+
+def test_positions_are_continuous_and_never_faster_than_their_speed():
+    walk = in_double(drawn(n=4, n_hotspots=3, min_wait=1.0, max_wait=10.0))
+    positions, located, times, step = traced(walk, 20_000)
+    moved = positions.diff(dim=0).norm(dim=-1)
+    stop = located.stop.reshape(times.shape)
+    allowed = walk.speed.gather(1, stop.T).T
+    # Legs end a rounding of the arrival's float32 early or late.
+    slack = 5e-3
+    either = torch.maximum(allowed[1:], allowed[:-1])
+    assert (moved <= either * step + slack).all()
+    assert moved.max() > 0.9 * DYNAMIC.local_speed * step.min()
+
+
+def test_a_source_stays_exactly_at_a_stop_while_it_waits():
+    walk = in_double(drawn(n=6))
+    for k in (0, 1, 5, 20):
+        for share in (0.0, 0.5, 1.0):
+            time = walk.arrive[:, k] + share * (walk.depart[:, k] - walk.arrive[:, k])
+            located = locate(walk, time)
+            assert located.position.tolist() == walk.stop[:, k].tolist()
+            assert located.stop.tolist() == [k] * 6
+            assert not located.finished.any()
+
+
+def test_a_walk_is_over_after_its_last_wait_and_the_source_stays_there():
+    walk = drawn(n=20)
+    end = walk.depart[:, -1]
+    assert end.isfinite().all()
+    assert not locate(walk, 0.999 * end).finished.any()
+    for late in (end, end + 1, end + 1e6):
+        located = locate(walk, late)
+        assert located.finished.all()
+        assert (located.position == walk.stop[:, -1]).all()
+        assert (located.stop == n_stops(walk) - 1).all()
+
+
+def test_a_walk_of_one_stop_ends_too():
+    walk = drawn(n_hotspots=1, min_stops=0, max_stops=0)
+    assert walk.stop.shape == (8, 1, 2)
+    assert not locate(walk, torch.zeros(8)).finished.any()
+    assert locate(walk, torch.full((8,), 361.0)).finished.all()
+
+
+def test_emission_is_drawn_per_stop_only_if_asked_for():
+    assert drawn().emits.all()
+    assert drawn(emission="per_step", emission_probability=0.0).emits.all()
+    walk = drawn(n=100, emission="per_stop", emission_probability=0.3)
+    assert walk.emits.float().mean().item() == pytest.approx(0.3, abs=0.03)
+    assert (walk.emits[:, 1:] != walk.emits[:, :-1]).any()
+
+
+def test_the_same_seed_draws_the_same_walks_in_float32():
+    for one, other in zip(drawn(seed=7), drawn(seed=7), strict=True):
+        assert torch.equal(one, other)
+        assert one.dtype in (torch.float32, torch.bool)
+    assert not torch.equal(drawn(seed=7).stop[:, :30], drawn(seed=8).stop[:, :30])
+
+
+@pytest.mark.parametrize("n_hotspots", [1, 4])
+def test_locating_compiles_to_one_graph(n_hotspots):
+    walk = drawn(n_hotspots=n_hotspots, min_stops=0, max_stops=n_hotspots - 1)
+    compiled = torch.compile(locate, fullgraph=True, backend="eager")
+    time = torch.linspace(0, 2000, 8)
+    for one, other in zip(compiled(walk, time), locate(walk, time), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize(
+    ("settings_", "message"),
+    [
+        (
+            {"level_db": 100.0},
+            "source.level_db: 100.0 dB is not above microphone_db=105 dB: not heard even at 1 m",
+        ),
+        ({"microphone_db": -1.0}, "source.microphone_db: -1.0 dB is not at least 0 dB"),
+        ({"motion": "walk"}, "source.motion: walk is not one of static, dynamic"),
+        (
+            {"emission": "blinking"},
+            "source.emission: blinking is not one of constant, per_stop, per_step",
+        ),
+        (
+            {"emission": "per_stop"},
+            "source.emission: per_stop needs source.motion=dynamic: "
+            "a static source has one stop; take constant or per_step",
+        ),
+        (
+            {"emission_probability": 1.5},
+            "source.emission_probability: 1.5 is not between 0 and 1",
+        ),
+        ({"position": [1.0, math.nan]}, "source.position: [1.0, nan] is not [x, y] in metres"),
+        ({"n_hotspots": 0}, "source.n_hotspots: 0 is not at least 1"),
+        ({"min_stops": -1}, "source.min_stops: -1 is not at least 0"),
+        ({"max_stops": 2}, "source.max_stops: 2 is not at least 3"),
+        ({"local_distance": 0.0}, "source.local_distance: 0.0 m is not above 0 m"),
+        ({"speed": 0.0}, "source.speed: 0.0 m/s is not above 0 m/s"),
+        ({"local_speed": -1.7}, "source.local_speed: -1.7 m/s is not above 0 m/s"),
+        ({"acceleration": 0.0}, "source.acceleration: 0.0 m/s^2 is not above 0 m/s^2"),
+        (
+            {"local_acceleration": math.inf},
+            "source.local_acceleration: inf m/s^2 is not above 0 m/s^2",
+        ),
+        ({"min_wait": -1.0}, "source.min_wait: -1.0 s is not at least 0 s"),
+        ({"max_wait": 59.0}, "source.max_wait: 59.0 s is not at least 60 s"),
+    ],
+)
+def test_a_wrong_source_setting_is_named_with_its_value_and_unit(settings_, message):
+    with pytest.raises(InputError) as error:
+        SourceConfig(**settings_)
+    assert str(error.value) == message
