@@ -154,8 +154,12 @@ def book(ranked: Tensor, row: Tensor, standing: Tensor, ready: Tensor, n_points:
     occupied = standing.new_zeros(len(standing), n_points, dtype=torch.bool)
     occupied.scatter_(1, standing, True)
     taken = occupied.gather(1, choice) & moves
-    same = (choice.unsqueeze(-1) == choice.unsqueeze(-2)).sum(-1)
-    open_worlds = (taken | (moves & (same > 1))).any(-1).nonzero().squeeze(-1)
+    # Of those who write their name on one point all but one read another's: nobody else reads a cell
+    # that is not written first.
+    name = torch.arange(choice.shape[1], device=choice.device).expand_as(choice)
+    names = choice.new_empty(len(choice), n_points).scatter_(1, choice, name)
+    shared = names.gather(1, choice) != name
+    open_worlds = (taken | shared).any(-1).nonzero().squeeze(-1)
     if len(open_worlds):
         row, standing, ready, occupied = (t[open_worlds] for t in (row, standing, ready, occupied))
         candidates = torch.where(ready.unsqueeze(-1), ranked[row].long(), standing.unsqueeze(-1))

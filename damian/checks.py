@@ -36,10 +36,11 @@ def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:
     require(value in choices, key, value, f"is not one of {', '.join(map(str, choices))}")
 
 
-def place(key: str, value: Sequence[float]) -> None:
+def place(key: str, value: Any) -> None:
     """Require one ``[x, y]`` in metres."""
-    good = len(value) == 2 and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
-    require(good, key, list(value), "is not [x, y] in metres")
+    good = isinstance(value, Sequence) and len(value) == 2
+    good = good and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
+    require(good, key, value, "is not [x, y] in metres")
 
 
 def seconds(key: str, value: str | float) -> float:

@@ -15,7 +15,8 @@ from torchrl.envs import EnvBase
 from damian.features import Server, observe, stack
 from damian.rewards import Counters, final_reward, reward, status
 from damian.scenario import ScenarioConfig
-from damian.simulation import Simulation, State, tree_map
+from damian.simulation import Simulation
+from damian.state import SITUATION, Rows, State, tree_map
 from damian.world import draws
 from damian.world.airspace import rows
 from damian.world.coverage import FootprintTables, build_tables
@@ -95,17 +96,17 @@ class UavEnv(EnvBase):
     @property
     def state(self) -> State:
         """Everything that changes; assign it to put the worlds into a situation of your own."""
-        return self._state
+        return self.simulation.layout.unpack(self._worlds)
 
     @state.setter
     def state(self, state: State) -> None:
-        self._state = state
+        self._worlds = self.simulation.layout.pack(state)
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own stream, [B] integers; the next reset is its first episode."""
         row = torch.zeros_like(seeds)
         first = tree_map(lambda table: table.index_select(0, row), self.simulation.initial)
-        self._state = first._replace(seed=seeds)
+        self.state = first._replace(seed=seeds)
 
     def _set_seed(self, seed: int | None) -> None:
         self.seed_worlds(draws.world_seeds(seed or 0, self.batch_size[0], self.device))
@@ -114,26 +115,26 @@ class UavEnv(EnvBase):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._state, shown = self._advance(self._state, tensordict["agents", "action"])
+        self._worlds, shown = self._advance(self._worlds, tensordict["agents", "action"])
         return self._tensordict(shown)
 
     @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         if tensordict is None or "_reset" not in tensordict.keys():
-            mask = torch.ones_like(self._state.source_over)
+            mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         else:
             mask = tensordict["_reset"].view(-1)
-        self._state = self.simulation.reset(self._state, mask)
-        situation = self._state.situation
+        self._worlds = self.simulation.reset(self._worlds, mask)
+        situation = self._worlds.integers[:, SITUATION]
         shown = _map(lambda table: table.index_select(0, situation), self._first)
         return self._tensordict(shown)  # TorchRL keeps what the other worlds showed
 
     # Pure functions of the state; ``_play`` compiles.
 
-    def _play(self, state: State, action: Tensor) -> tuple[State, Shown]:
+    def _play(self, worlds: Rows, action: Tensor) -> tuple[Rows, Shown]:
         """One step: physics, then what the server makes of the messages."""
-        scenario = self.scenario
-        state = self.simulation.step(state, action)
+        scenario, layout = self.scenario, self.simulation.layout
+        state = self.simulation.step(layout.unpack(worlds), action)
         ended = status(
             state.sent,
             state.steps,
@@ -150,7 +151,7 @@ class UavEnv(EnvBase):
         shown["agents"]["reward"] = total.unsqueeze(-1)
         if "reward_terms" in self.extras:
             shown["agents"]["reward_terms"] = terms
-        return state, shown | {
+        return layout.pack(state), shown | {
             "success": ended.success.unsqueeze(-1),
             "done": (ended.terminated | ended.truncated).unsqueeze(-1),
             "terminated": ended.terminated.unsqueeze(-1),

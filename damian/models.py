@@ -95,4 +95,3 @@ def _has_mask(env: EnvBase) -> bool:
 def _module(network: Callable[..., torch.Tensor], seen: str, *shown: str) -> TensorDictModule:
     keys = [("agents", name) for name in shown]
     return TensorDictModule(network, in_keys=[("agents", seen)], out_keys=keys)
-

@@ -34,7 +34,7 @@ class RegionConfig:
     """Largest random region [m^2]."""
     pool: int = 1
     """Random regions drawn once per seed; every episode of every world takes one of them."""
-    vertices: list[list[float]] = field(default_factory=list)
+    vertices: list = field(default_factory=list)
     """Corners [x, y] in metres, for ``vertices``."""
     path: str = ""
     """File, for ``fir`` and ``geojson``."""
@@ -52,7 +52,7 @@ class RegionConfig:
     """Keep only the nearest to the centroid; all of them if not given."""
     situations: int = 1024
     """Beginnings (starts, source walk) drawn per seed and shared out among the regions."""
-    start_positions: list[list[float]] | None = None
+    start_positions: list | None = None
     """Where each UAV starts, [x, y] in metres (its nearest landing point); drawn if not given."""
     start_together: bool = False
     """Let all UAVs start on one drawn landing point."""
@@ -82,7 +82,7 @@ class RegionConfig:
         if self.kind == "geojson":
             return [read_geojson(self.path, self.index, self.where)]
         if self.kind == "vertices":
-            polygons = [polygon_from_vertices(np.array(self.vertices), "region.vertices")]
+            polygons = [polygon_from_vertices(self.vertices, "region.vertices")]
         else:
             polygons = [random_polygon(rng, self.min_area, self.max_area) for _ in range(self.pool)]
         return [Region(p, f"{self.kind} region {i}", None, None) for i, p in enumerate(polygons)]

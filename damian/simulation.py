@@ -5,8 +5,6 @@ can begin with (start points, the source's walk) is drawn once, as *situations*;
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -16,77 +14,15 @@ from damian.actions import Candidates, book
 from damian.errors import InputError
 from damian.features import Snapshot
 from damian.scenario import ScenarioConfig
+from damian.state import EPISODE, SEED, Layout, Rows, State, tree_map, where
 from damian.world import draws
 from damian.world.airspace import Airspace, inside, nearest_points, rows
-from damian.world.battery import charge_gain, flight_drain, used_so_far
+from damian.world.battery import charge_gain, cruise_drain, used_so_far, vertical_drain
 from damian.world.motion import flight_levels, fly, minimum_time
 from damian.world.source import Walk, draw_walks, footprint_radius, locate
 
 _TIME_EPS = 1e-4
 """Seconds; far below any step, far above float32 error within an episode."""
-
-Tree = TypeVar("Tree", bound=NamedTuple)
-
-
-class State(NamedTuple):
-    """Everything that changes; B worlds, N UAVs."""
-
-    seed: Tensor
-    """The world's random stream, [B]."""
-    episode: Tensor
-    """Episodes begun, [B]."""
-    situation: Tensor
-    """What the episode began with, [B]."""
-    region: Tensor
-    """[B]."""
-    steps: Tensor
-    """Elapsed in this episode, [B]."""
-    origin: Tensor
-    """Flat id of the landing point of departure, [B, N]."""
-    goal: Tensor
-    """Flat id of the landing point that the UAV stands on or is bound for, [B, N]."""
-    elapsed: Tensor
-    """Since the latest decision [s], [B, N]."""
-    vertical: Tensor
-    """Duration of takeoff, and of landing [s]; 0 if it holds, [B, N]."""
-    cruise: Tensor
-    """Duration of the level flight [s], [B, N]."""
-    used: Tensor
-    """Battery used so far on this flight [%], [B, N]."""
-    position: Tensor
-    """East, north, up [m], [B, N, 3]."""
-    track: Tensor
-    """Heading of the latest flight, clockwise from north [rad], [B, N]."""
-    battery: Tensor
-    """[%], [B, N]."""
-    motions: Tensor
-    """Motions since the UAV last spotted the source, holding included, [B, N]."""
-    source: Tensor
-    """East, north [m], [B, 2]."""
-    source_over: Tensor
-    """Has the source finished its walk, [B]."""
-    talks: Tensor
-    """Did the UAV send a message in this step, [B, N]."""
-    sent: Snapshot
-    """The latest message of each UAV, [B, N]."""
-
-
-def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
-    """Apply a function to the tensors of nested named tuples."""
-    values: list[Any] = [
-        tree_map(function, *leaf) if hasattr(leaf[0], "_fields") else function(*leaf)
-        for leaf in zip(tree, *others, strict=True)
-    ]
-    return type(tree)(*values)
-
-
-def where(mask: Tensor, new: Tree, old: Tree) -> Tree:
-    """Take whole rows of ``new`` where the mask [B] (or [B, N]) says so."""
-
-    def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(mask.view(*mask.shape, *[1] * (a.dim() - mask.dim())), a, b)
-
-    return tree_map(pick, new, old)
 
 
 class Simulation:
@@ -110,23 +46,30 @@ class Simulation:
         self.points = self.airspace.points.flatten(0, 1)
         self.levels = torch.tensor(flight_levels(config.motion, config.agents), device=device)
         self.vertical = self._shortest(self.levels)
+        self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
+        if config.battery.enabled and config.actions.kind == "discrete":
+            self.action_drain = self._action_drain()
         self.charge = float(charge_gain(torch.tensor(self.dt), config.battery))
         self.chargers = _chargers(config, self.airspace).to(device)
         self.walk = tree_map(lambda t: t.to(device), walk)
         self.initial = self._begin(region.to(device), start.to(device), seed)
+        self.layout = Layout(self.initial)
+        self.beginnings = self.layout.pack(self.initial)
 
     @property
     def n_situations(self) -> int:
         return len(self.initial.situation)
 
-    def reset(self, state: State, mask: Tensor) -> State:
+    def reset(self, worlds: Rows, mask: Tensor) -> Rows:
         """Begin a new episode in the worlds of the mask [B]; the others stay as they are."""
-        worlds = mask.nonzero().squeeze(-1)  # mostly few, so not a ``where`` over all
-        seed, episode = state.seed[worlds], state.episode[worlds] + 1
+        chosen = mask.nonzero().squeeze(-1)  # mostly few
+        seed = worlds.integers[chosen, SEED]
+        episode = worlds.integers[chosen, EPISODE] + 1
         situation = draws.bits(seed, episode) % self.n_situations
-        fresh = tree_map(lambda table: table.index_select(0, situation), self.initial)
-        fresh = fresh._replace(seed=seed, episode=episode)
-        return tree_map(lambda old, new: old.index_copy(0, worlds, new), state, fresh)
+        fresh = tree_map(lambda table: table.index_select(0, situation), self.beginnings)
+        fresh.integers[:, SEED] = seed
+        fresh.integers[:, EPISODE] = episode
+        return tree_map(lambda old, new: old.index_copy(0, chosen, new), worlds, fresh)
 
     def step(self, state: State, action: Tensor) -> State:
         """One simulation step of ``dt``; actions of UAVs that are not ready change nothing."""
@@ -149,15 +92,24 @@ class Simulation:
 
         A single legal action has log-probability 0 and no gradient: in flight a policy learns nothing.
         """
-        valid = rows(self.candidates.valid, state.goal)
         if self.config.battery.enabled:
-            needed = self._drain(rows(self.candidates.distance, state.goal), self.vertical.unsqueeze(-1))
-            valid = valid & (needed <= state.battery.unsqueeze(-1))
+            left = (state.battery - self.vertical_drain).unsqueeze(-1)
+            valid = rows(self.action_drain, state.goal) <= left
+        else:
+            valid = rows(self.candidates.valid, state.goal)
         if not self.candidates.can_hold:
             valid = valid | ~valid.any(-1, keepdim=True)
         if not self.flies:
             return valid
         return torch.where(self.ready(state).unsqueeze(-1), valid, self.candidates.hold)
+
+    def _action_drain(self) -> Tensor:
+        """Cruise drain of the flight to each action's nearest point [%], [R*L, A]: -inf if it holds,
+        inf if it is not valid."""
+        distance = self.candidates.distance
+        drain = cruise_drain(distance, self.config.battery)
+        drain = drain.where(distance > 0, -torch.inf)
+        return drain.where(self.candidates.valid, torch.inf)
 
     # One step, in order.
 
@@ -169,7 +121,7 @@ class Simulation:
         ready = self.ready(state)
         goal = book(ranked, row, standing, ready, self.airspace.max_points) + base
         if self.config.battery.enabled:
-            reachable = self._drain(self._length(state.goal, goal), self.vertical) <= state.battery
+            reachable = self._drain(self._length(state.goal, goal)) <= state.battery
             goal = torch.where(reachable, goal, state.goal)
         departs = goal != state.goal
         east, north = (rows(self.points, goal) - rows(self.points, state.goal)).unbind(-1)
@@ -198,7 +150,7 @@ class Simulation:
         if not self.config.battery.enabled:
             return state
         length = self._length(state.origin, state.goal)
-        return self._drain_or_charge(state, self._drain(length, self.vertical), length == 0)
+        return self._drain_or_charge(state, self._drain(length), length == 0)
 
     def _fly(self, state: State) -> State:
         """Polynomial motion: ``dt`` of takeoff, cruise and landing."""
@@ -281,9 +233,9 @@ class Simulation:
         motion = self.config.motion
         return minimum_time(length, motion.degree, motion.max_speed, motion.max_acceleration)
 
-    def _drain(self, length: Tensor, vertical: Tensor) -> Tensor:
+    def _drain(self, length: Tensor) -> Tensor:
         """Battery that a flight of this length takes with takeoff and landing [%]; 0 for holding."""
-        return flight_drain(vertical, length, self.config.battery) * (length > 0)
+        return (self.vertical_drain + cruise_drain(length, self.config.battery)) * (length > 0)
 
     def _drain_or_charge(self, state: State, drain: Tensor, rests: Tensor) -> State:
         gain = self.charge * (rests & rows(self.chargers, state.goal))

@@ -47,9 +47,7 @@ class Progress:
 
 def make_env(config: TrainConfig, worlds: int, seed: int) -> TransformedEnv:
     """The environment that policies are trained and evaluated in."""
-    env = UavEnv(
-        config, worlds, seed, config.device, extras=(), compile=config.compile
-    )
+    env = UavEnv(config, worlds, seed, config.device, extras=(), compile=config.compile)
     episode_reward = RewardSum([("agents", "reward")], [("agents", "episode_reward")])
     return TransformedEnv(env, Compose(episode_reward, StepCounter()))
 
@@ -99,7 +97,9 @@ def train(config: TrainConfig, folder: Path) -> None:
     if config.resume:
         checkpoint.load(folder / CHECKPOINT)
     log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
-    collector = Collector(env, actor, frames_per_batch=frames, total_frames=-1)
+    collector = Collector(
+        env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
+    )
     bar = tqdm(total=config.frames, initial=progress.frames, unit="frame", unit_scale=True)
     try:
         for batch in collector:
@@ -113,7 +113,7 @@ def train(config: TrainConfig, folder: Path) -> None:
             done = progress.frames >= config.frames
             done = done or episodes.finished >= (config.episodes or torch.inf)
             if done or progress.updates % config.checkpoint_every == 0:
-                checkpoint.save(folder / CHECKPOINT, overwrite=True)
+                checkpoint.save(folder / CHECKPOINT)
             if done:
                 break
     finally:

@@ -51,7 +51,7 @@ class BatteryConfig:
             "is not a list of places; leave it out to charge anywhere",
         )
         for point in self.charging_points or []:
-            checks.place("battery.charging_points", point if isinstance(point, list) else [point])
+            checks.place("battery.charging_points", point)
 
 
 def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:
