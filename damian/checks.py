@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import torch
+
 from damian.errors import InputError
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -53,3 +55,11 @@ def seconds(key: str, value: str | float) -> float:
         raise InputError(f"{key}: {value} is not a time such as 2s, 0.5m or 1h") from None
     above(key, time, 0.0, "s")
     return time
+
+
+def device(key: str, value: str) -> None:
+    """Require a device that torch knows and that this machine has."""
+    try:
+        torch.empty(0, device=value)
+    except (RuntimeError, AssertionError):
+        raise InputError(f"{key}: {value} is not to be had here; try cpu or cuda") from None

@@ -3,10 +3,11 @@
 import math
 from collections import deque
 from dataclasses import asdict, dataclass
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -61,16 +62,23 @@ class EpisodeLog:
     def add(self, batch: TensorDictBase) -> None:
         """Take the episodes that end in a batch [B, T] with ``RewardSum`` and ``StepCounter``."""
         done = batch["next", "done"].squeeze(-1)
-        ended = batch["next"][done]
-        returns = ended["agents", "episode_reward"].mean((-2, -1))
-        rows = zip(
-            returns.tolist(),
-            ended["success"].float().flatten().tolist(),
-            ended["step_count"].float().flatten().tolist(),
-            strict=True,
-        )
-        self._recent.extend(rows)
-        self.finished += len(returns)
+
+        def ended(*key: str) -> Tensor:
+            return cast(Tensor, batch["next", *key])[done].float().flatten(1).mean(1)
+
+        keys = (("agents", "episode_reward"), ("success",), ("step_count",))
+        rows = torch.stack([ended(*key) for key in keys], -1).tolist()
+        self._recent.extend(map(tuple, rows))
+        self.finished += len(rows)
+
+    def state_dict(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"finished": self.finished, "recent": [list(row) for row in self._recent]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """From a checkpoint."""
+        self.finished = int(state["finished"])
+        self._recent.extend(tuple(row) for row in state["recent"])
 
     def means(self) -> dict[str, float]:
         """Episode return, success rate and steps; nan before the first end."""

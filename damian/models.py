@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Categorical
@@ -50,7 +51,7 @@ def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
         keys = {"logits": ("agents", "logits")}
         return ProbabilisticActor(
             _module(network, "observation", "logits"),
-            in_keys=keys | {"mask": ("agents", "action_mask")} if masked else keys,
+            in_keys=keys | {"mask": ("agents", "action_mask")} if masked else keys,  # type: ignore[arg-type]
             out_keys=[("agents", "action")],
             distribution_class=MaskedCategorical if masked else torch.distributions.Categorical,
             distribution_kwargs={"neg_inf": -1e8} if masked else {},
@@ -93,5 +94,5 @@ def _has_mask(env: EnvBase) -> bool:
 
 
 def _module(network: Callable[..., torch.Tensor], seen: str, *shown: str) -> TensorDictModule:
-    keys = [("agents", name) for name in shown]
+    keys: list[NestedKey] = [("agents", name) for name in shown]
     return TensorDictModule(network, in_keys=[("agents", seen)], out_keys=keys)

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import signal
 from pathlib import Path
 
 import matplotlib
@@ -62,6 +63,22 @@ class MetricsLog:
             writer.writerow(row)
 
 
+class Interrupt:
+    """While entered, the first Ctrl-C only asks to stop at the next good moment; a second one stops."""
+
+    def __enter__(self) -> "Interrupt":
+        self.asked = False
+        self._before = signal.signal(signal.SIGINT, self._ask)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _ask(self, *_: object) -> None:
+        self.asked = True
+        signal.signal(signal.SIGINT, self._before)
+
+
 def read_metrics(folder: Path) -> list[dict[str, float]]:
     """The rows of a run's ``metrics.csv``; none if it has none.
 
@@ -85,6 +102,7 @@ def plot_learning_curve(
 ) -> None:
     """Draw return and success rate over frames, with the random policy as a dashed line."""
     from matplotlib import pyplot as plt  # noqa: PLC0415 (slow to import, needed once)
+    from matplotlib.ticker import EngFormatter  # noqa: PLC0415
 
     panels = [("episode_return", "return", random.episode_return)]
     if any(row["success_rate"] > 0 for row in rows):
@@ -94,7 +112,8 @@ def plot_learning_curve(
         points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
         axis.plot(*zip(*points, strict=True), color="tab:blue", label="MAPPO while training")
         axis.axhline(level, color="tab:gray", linestyle="--", label="random policy")
-        axis.set_xlabel("steps of all worlds")
+        axis.set_xlabel("environment steps, all worlds")
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     axes[0][0].legend(loc="best", fontsize="small")
@@ -104,15 +123,14 @@ def plot_learning_curve(
     plt.close(figure)
 
 
-def results_table(rows: dict[str, Evaluation]) -> str:
-    """Evaluations beside each other, as a Markdown table."""
+def results_table(rows: dict[str, Evaluation], can_succeed: bool) -> str:
+    """Evaluations beside each other, as a Markdown table; a task without success shows none."""
     lines = [
         "| policy | success rate | steps | return | episodes |",
         "|:--|--:|--:|--:|--:|",
     ]
     for name, row in rows.items():
-        lines.append(
-            f"| {name} | {row.success_rate:.2f} | {row.steps:.2f} "
-            f"| {row.episode_return:.3f} | {row.episodes} |"
-        )
+        success = f"{row.success_rate:.2f}" if can_succeed else "-"
+        numbers = f"{row.steps:.2f} | {row.episode_return:.3f} | {row.episodes}"
+        lines.append(f"| {name} | {success} | {numbers} |")
     return "\n".join(lines)

@@ -68,6 +68,10 @@ class RegionConfig:
         checks.in_range("region.lattice_angle", self.lattice_angle, 0.0, 90.0, "deg")
         if self.n_landing_points is not None:
             checks.in_range("region.n_landing_points", self.n_landing_points, 1)
+        needs = {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}
+        for key in needs.get(self.kind, []):
+            should = f"is missing: region.kind={self.kind} needs it"
+            checks.require(bool(getattr(self, key)), f"region.{key}", "it", should)
         for start in self.start_positions or []:
             checks.place("region.start_positions", start)
 

@@ -3,15 +3,17 @@
 The configuration is a scenario (``damian.scenario``) plus how to learn in it.
 """
 
+import difflib
+import functools
 import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises; ``launch`` prints
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
@@ -28,6 +30,9 @@ from damian.losses import MappoConfig
 from damian.models import ModelConfig
 from damian.runs import CHECKPOINT, CONFIG
 from damian.scenario import ScenarioConfig, leftovers
+
+CONF = str(Path(__file__).parents[1] / "conf")
+"""Absolute, so that a recipe can be imported as well as run."""
 
 
 @dataclass
@@ -51,7 +56,7 @@ class TrainConfig(ScenarioConfig):
     """Of everything that is drawn."""
     worlds: int = 64
     """Worlds that are stepped together."""
-    frames: int = 400_000
+    frames: int = 300_000
     """Steps to learn from, over all worlds."""
     episodes: int | None = None
     """Stop after so many episodes, if that comes first."""
@@ -75,6 +80,7 @@ class TrainConfig(ScenarioConfig):
             checks.in_range(name, getattr(self, name), 1)
         if self.episodes is not None:
             checks.in_range("episodes", self.episodes, 1)
+        checks.device("device", self.device)
         batch = self.worlds * self.algo.steps
         checks.require(
             batch % self.algo.minibatches == 0,
@@ -91,6 +97,7 @@ class TrainConfig(ScenarioConfig):
 
 
 ConfigStore.instance().store(name="schema", node=TrainConfig)
+OmegaConf.register_new_resolver("plain", lambda name: re.sub(r"[^\w.=,-]", "", name))
 OmegaConf.register_new_resolver("shipped", lambda name: str(files("damian") / "data" / name))
 
 
@@ -110,7 +117,7 @@ def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:
     config = OmegaConf.to_object(written)
     unknown = leftovers(written, config)
     if unknown:
-        raise InputError(f"{unknown[0]}: no such key")
+        raise InputError(_no_such_key(unknown[0]))
     return cast(TrainConfig, config), folder
 
 
@@ -137,17 +144,33 @@ def _resumed(folder: Path, overrides: Sequence[str]) -> DictConfig:
     return cast(DictConfig, OmegaConf.merge(saved, OmegaConf.from_dotlist(list(overrides))))
 
 
-def launch(recipe: Callable[[], Any]) -> None:
-    """Run a Hydra application; what a person got wrong becomes one line on stderr and exit code 2."""
+def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """Turn what a person got wrong into one line on stderr and exit code 2, and leave no folder."""
+
+    @functools.wraps(main)
+    def checked(written: DictConfig) -> None:
+        try:
+            main(written)
+        except (InputError, OmegaConfBaseException) as error:
+            _drop_empty(Path(HydraConfig.get().runtime.output_dir))
+            _give_up(error)
+
+    return checked
+
+
+def launch(main: Callable[[], Any]) -> None:
+    """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
     # Hydra reads a bare number as an integer, which no config group may be called.
     sys.argv = [re.sub(r"^(\+?usecase=)([\d,]+)$", _quoted, word) for word in sys.argv]
     try:
-        recipe()
-    except (InputError, HydraException, OmegaConfBaseException) as error:
-        if HydraConfig.initialized():
-            _drop_empty(Path(HydraConfig.get().runtime.output_dir))
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        main()
+    except (HydraException, OmegaConfBaseException) as error:
+        _give_up(error)
+
+
+def _give_up(error: Exception) -> NoReturn:
+    print(f"error: {_one_line(error)}", file=sys.stderr)
+    sys.exit(2)
 
 
 def _quoted(match: re.Match[str]) -> str:
@@ -160,13 +183,31 @@ def _drop_empty(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def _one_line(error: Exception) -> str:
-    """The message without Hydra's tail of types and hints."""
-    cause = error.__cause__ if isinstance(error.__cause__, InputError) else error
-    lines = [line.strip() for line in str(cause).splitlines()]
-    keep = [
-        line for line in lines if line and not line.startswith(("reference_type", "object_type"))
-    ]
-    keys = [line.removeprefix("full_key: ") for line in keep if line.startswith("full_key: ")]
-    text = "; ".join(line for line in keep if not line.startswith(("full_key", "Set the env")))
-    return f"{keys[0]}: {text}" if keys and keys[0] not in text else text
+def _one_line(error: BaseException) -> str:
+    """What is wrong, from the deepest cause, without Hydra's tails of types, paths and hints."""
+    while isinstance(error.__cause__, OmegaConfBaseException):
+        error = error.__cause__
+    text, _, _ = str(error).partition("Config search path")
+    key = re.search(r"full_key: (\S+)", text)
+    if key and re.search(r"Key '.*' (is )?not in ", text):
+        return _no_such_key(key[1])
+    tails = ("full_key", "reference_type", "object_type", "Set the env")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    told, *more = [line for line in lines if not line.startswith(tails)]
+    told = " ".join([told, ", ".join(more).replace(":,", ":")]).strip()
+    return f"{key[1]}: {told}" if key else told
+
+
+def _no_such_key(key: str) -> str:
+    """The message for an unknown key, with the nearest known one."""
+    known = [str(name) for name in _keys(OmegaConf.structured(TrainConfig))]
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.75)
+    return f"{key}: no such key" + (f"; did you mean {near[0]}?" if near else "")
+
+
+def _keys(config: DictConfig, path: str = "") -> Iterator[str]:
+    """Every dotted key of a configuration."""
+    for name in config:
+        yield f"{path}{name}"
+        if isinstance(config._get_node(name), DictConfig):
+            yield from _keys(config[name], f"{path}{name}.")

@@ -9,12 +9,14 @@ The run folder explains itself: config.yaml, metrics.csv, TensorBoard events, ch
 learning_curve.png, result.md.
 """
 
+import sys
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import hydra
 import torch
-from launch import TrainConfig, launch, prepare, save_config
+from launch import CONF, TrainConfig, launch, prepare, reported, save_config
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
@@ -28,7 +30,14 @@ from damian.env import UavEnv
 from damian.losses import MappoConfig, add_advantages, mappo_loss
 from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.models import make_actor, make_critic, random_policy
-from damian.runs import CHECKPOINT, FIGURE, MetricsLog, plot_learning_curve, results_table
+from damian.runs import (
+    CHECKPOINT,
+    FIGURE,
+    Interrupt,
+    MetricsLog,
+    plot_learning_curve,
+    results_table,
+)
 
 
 @dataclass
@@ -47,9 +56,13 @@ class Progress:
 
 def make_env(config: TrainConfig, worlds: int, seed: int) -> TransformedEnv:
     """The environment that policies are trained and evaluated in."""
-    env = UavEnv(config, worlds, seed, config.device, extras=(), compile=config.compile)
-    episode_reward = RewardSum([("agents", "reward")], [("agents", "episode_reward")])
-    return TransformedEnv(env, Compose(episode_reward, StepCounter()))
+    env = UavEnv(config, worlds, seed, config.device, extras=())
+    if config.compile:
+        env.compile()
+    episode_reward = RewardSum(
+        in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")]
+    )
+    return TransformedEnv(env, Compose(episode_reward, StepCounter()))  # type: ignore[call-arg]
 
 
 def update(
@@ -69,7 +82,7 @@ def update(
             losses = loss(part)
             terms = ("loss_objective", "loss_critic", "loss_entropy")
             optimizer.zero_grad()
-            sum(losses[term] for term in terms).backward()
+            torch.stack([losses[term] for term in terms]).sum().backward()
             torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
             optimizer.step()
             for term in terms:
@@ -92,16 +105,22 @@ def train(config: TrainConfig, folder: Path) -> None:
     )
     progress, episodes = Progress(), EpisodeLog()
     checkpoint = Checkpoint(
-        actor=actor, critic=critic, optimizer=optimizer, progress=progress, rng=GlobalRNGState()
+        actor=actor,
+        critic=critic,
+        optimizer=optimizer,
+        progress=progress,
+        episodes=episodes,
+        rng=GlobalRNGState(),
     )
     if config.resume:
         checkpoint.load(folder / CHECKPOINT)
+        env.set_seed(config.seed + progress.updates)  # not the first episodes once more
     log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
     collector = Collector(
         env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
     )
-    bar = tqdm(total=config.frames, initial=progress.frames, unit="frame", unit_scale=True)
-    try:
+    bar = tqdm(total=config.frames, initial=progress.frames, unit=" steps", unit_scale=True)
+    with closing(log), closing(bar), Interrupt() as interrupt:
         for batch in collector:
             episodes.add(batch)
             losses = update(batch, loss, optimizer, buffer, config.algo)
@@ -110,16 +129,15 @@ def train(config: TrainConfig, folder: Path) -> None:
             log.add(progress.frames, {**episodes.means(), **losses})
             bar.set_postfix({name: f"{mean:.2f}" for name, mean in episodes.means().items()})
             bar.update(batch.numel())
-            done = progress.frames >= config.frames
-            done = done or episodes.finished >= (config.episodes or torch.inf)
-            if done or progress.updates % config.checkpoint_every == 0:
+            over = progress.frames >= config.frames
+            over = over or episodes.finished >= (config.episodes or torch.inf)
+            if over or interrupt.asked or progress.updates % config.checkpoint_every == 0:
                 checkpoint.save(folder / CHECKPOINT)
-            if done:
+            if over or interrupt.asked:
                 break
-    finally:
-        bar.close()
-        log.close()
-        collector.shutdown()
+    collector.shutdown()
+    if interrupt.asked:
+        sys.exit(f"interrupted; go on with resume={folder}")
     report(config, folder, actor, log)
 
 
@@ -132,13 +150,14 @@ def report(config: TrainConfig, folder: Path, actor: torch.nn.Module, log: Metri
 
     random = fly(random_policy(make_env(config, 1, config.seed)))
     rows = {"trained, sampled": fly(actor), "trained, mode": fly(actor, False), "random": random}
-    table = results_table(rows)
+    table = results_table(rows, config.episode.success_share is not None)
     (folder / "result.md").write_text(table + "\n")
     plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, MAPPO")
     print(f"\n{table}\n\nlearning curve: {folder / FIGURE}")
 
 
-@hydra.main(version_base=None, config_path="../conf", config_name="train")
+@hydra.main(version_base=None, config_path=CONF, config_name="train")
+@reported
 def main(written: DictConfig) -> None:
     config, folder = prepare(written)
     torch.set_num_threads(config.threads)

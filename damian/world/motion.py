@@ -135,7 +135,7 @@ def phase_times(origin: Tensor, target: Tensor, level: Tensor, motion: MotionCon
     return PhaseTimes(minimum_time(level, *limits), minimum_time(cruise, *limits))
 
 
-def fly(  # noqa: PLR0917
+def fly(
     origin: Tensor,
     target: Tensor,
     level: Tensor,

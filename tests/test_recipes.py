@@ -1,0 +1,185 @@
+"""The recipes as a person runs them: what they write, what they refuse, how they go on."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from launch import TrainConfig, launch
+from omegaconf import OmegaConf
+from train import main
+
+TINY = ["frames=256", "worlds=8", "algo.steps=16", "eval_episodes=4", "model.hidden=[16]"]
+GOLDEN = Path(__file__).parent / "data"
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Run the recipe with overrides in an empty folder; returns its run folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_recipe(*overrides: str, folder: str = "run") -> Path:
+        monkeypatch.setattr(sys, "argv", ["train.py", *overrides, f"hydra.run.dir={folder}"])
+        launch(main)
+        return tmp_path / folder
+
+    return run_recipe
+
+
+def metrics(folder: Path) -> list[dict[str, float]]:
+    with (folder / "metrics.csv").open(newline="") as file:
+        return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["scenario=tracking", "motion=polynomial", "agents=2"],
+        ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
+        ["scenario=energy", "motion=polynomial", "observation.ctde=true"],
+        ["scenario=mixed", "logger=csv", "agents=1"],
+        ["scenario=spotting", "task=tracking", "region=usecase", "actions=continuous"],
+    ],
+)
+def test_a_run_folder_explains_itself(run, capsys, overrides):
+    folder = run(*TINY, *overrides)
+    told = capsys.readouterr().out
+    written = {path.name for path in folder.iterdir()}
+    assert {"config.yaml", "metrics.csv", "checkpoint", "learning_curve.png"} <= written
+    assert (folder / "result.md").read_text().strip() in told
+    assert "| random |" in told
+    assert str(Path(folder.name) / "learning_curve.png") in told
+    assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0]
+    config = OmegaConf.load(folder / "config.yaml")
+    assert config.agents == (2 if "agents=2" in overrides else 1 if "agents=1" in overrides else 3)
+    assert "${" not in (folder / "config.yaml").read_text()
+    events = [name for name in written if name.startswith("events.out")]
+    assert bool(events) == ("logger=csv" not in overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["agent=3"], "agent: no such key; did you mean agents?"),
+        (["algo.lrr=1"], "algo.lrr: no such key; did you mean algo.lr?"),
+        (["+motion.foo=1"], "motion.foo: no such key"),
+        (["+delay.obs=3"], "delay: no such key"),
+        (["agents=two"], "agents: Value 'two'"),
+        (["agents=0"], "agents: 0 is not at least 1"),
+        (["task=foo"], "'task/foo'"),
+        (["+usecase=3"], "'usecase/3'"),
+        (["motion.degree=4"], "motion.degree: 4 is not one of 3, 5, 7"),
+        (["clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
+        (["clock.server=soon"], "clock.server: soon is not a time"),
+        (["clock.agents=2s"], "which this version does not have yet"),
+        (["agents=600", "motion.max_level=900"], "agents: 600 UAVs need as many landing points"),
+        (["agents=60"], "leaves room for 39 flight levels"),
+        (["motion.min_level=1900", "motion.max_level=2000"], "is not between 0 and 1828.8 m"),
+        (["region.id=Nope"], "Nope"),
+        (["region=fir"], "region.path: it is missing"),
+        (["region=geojson", "region.path=nowhere.json"], "nowhere.json"),
+        (["region=vertices", "region.vertices=[[0,0],[1,1]]"], "region.vertices"),
+        (["source.position=[1,2,3]"], "source.position: [1, 2, 3] is not [x, y] in metres"),
+        (["region.start_positions=[[0,0]]"], "region.start_positions: 1 places"),
+        (["source.emission=per_stop"], "needs source.motion=dynamic"),
+        (["worlds=7", "algo.steps=3"], "does not divide a batch of worlds x algo.steps = 21"),
+        (["device=abacus"], "device: abacus"),
+        (["resume=nowhere"], "nowhere holds no config.yaml"),
+        (["resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
+    ],
+)
+def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(
+    run, capsys, tmp_path, overrides, told
+):
+    with pytest.raises(SystemExit) as stopped:
+        run(*overrides)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert told in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_same_seed_gives_the_same_curve_and_another_one_another(run):
+    one, same = run(*TINY, folder="one"), run(*TINY, folder="same")
+    other = run(*TINY, "seed=1", folder="other")
+    assert (one / "metrics.csv").read_text() == (same / "metrics.csv").read_text()
+    assert (one / "metrics.csv").read_text() != (other / "metrics.csv").read_text()
+
+
+def test_a_resumed_run_goes_on_below_its_own_rows(run):
+    folder = run(*TINY, folder="first")
+    before = (folder / "metrics.csv").read_text()
+    run(f"resume={folder}", "frames=512", folder="second")
+    assert (folder / "metrics.csv").read_text().startswith(before)
+    assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0, 384.0, 512.0]
+    assert not (folder.parent / "second").exists()
+
+
+def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):
+    folder = run(*TINY, "algo.steps=16", folder="first")
+    with (folder / "metrics.csv").open("a") as file:
+        file.write(",".join(["99999"] + ["0"] * (len(metrics(folder)[0]) - 1)) + "\n")
+    run(f"resume={folder}", "frames=384", folder="second")
+    assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0, 384.0]
+
+
+def test_a_sweep_fills_one_folder_per_run(run, tmp_path):
+    run("-m", *TINY, "agents=1,2", "hydra.sweep.dir=sweep")
+    tables = list((tmp_path / "sweep").glob("*/result.md"))
+    assert len(tables) == 2
+    agents = {OmegaConf.load(path.parent / "config.yaml").agents for path in tables}
+    assert agents == {1, 2}
+
+
+@pytest.mark.parametrize("case", [1, 2])
+def test_use_case_presets_are_the_golden_scenarios(run, case):
+    folder = run(*TINY, f"+usecase={case}", "algo.minibatches=1")
+    config = OmegaConf.load(folder / "config.yaml")
+    golden = json.loads((GOLDEN / f"usecase{case}.json").read_text())
+    scenario = golden["scenario"]
+    assert config.agents == len(scenario["uav_ids"])
+    assert config.region.vertices == scenario["polygon_vertices_ring"][:-1]
+    assert config.region.start_positions == scenario["uav_start_positions"]
+    assert config.source.position == scenario["source_position"]
+    assert config.source.level_db == scenario["source_db"]
+    assert config.source.microphone_db == scenario["min_db_level"]
+    assert config.region.lattice_step == scenario["step_m"]
+    assert config.region.lattice_angle == scenario["deg"]
+    assert config.episode.max_steps == scenario["max_episode_len"]
+    assert config.episode.success_share == scenario["perc_needed"]
+    distances = sorted({row["distance_m"] for row in golden["action_table"]})
+    headings = {row["heading_deg_input"] % 360 for row in golden["action_table"]}
+    assert config.actions.distances == distances
+    assert {heading % 360 for heading in config.actions.headings} == headings
+
+
+def test_every_default_of_the_schema_survives_a_round_trip(tmp_path):
+    OmegaConf.save(OmegaConf.structured(TrainConfig), tmp_path / "config.yaml")
+    loaded = OmegaConf.merge(
+        OmegaConf.structured(TrainConfig), OmegaConf.load(tmp_path / "config.yaml")
+    )
+    assert OmegaConf.to_object(loaded) == TrainConfig()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("case", "most_steps"), [(1, 1.2), (2, 1.3)])
+def test_the_use_cases_are_learnt_in_500_episodes(run, case, most_steps, seed):
+    folder = run(f"+usecase={case}", f"seed={seed}")
+    row = (folder / "result.md").read_text().splitlines()[2].split("|")
+    success, steps = float(row[2]), float(row[3])
+    assert success >= 0.97
+    assert steps <= most_steps
+
+
+@pytest.mark.slow
+def test_training_on_the_real_region_clearly_beats_random(run):
+    folder = run()
+    rows = [line.split("|") for line in (folder / "result.md").read_text().splitlines()[2:]]
+    trained, random = float(rows[0][2]), float(rows[2][2])
+    assert trained >= 0.8
+    assert random <= 0.1

@@ -1,0 +1,68 @@
+"""Settings: what fits together, and what does not."""
+
+import numpy as np
+import pytest
+
+from damian.errors import InputError
+from damian.scenario import ClockConfig, RegionConfig, ScenarioConfig, leftovers
+from damian.world.motion import MotionConfig
+
+
+def test_the_library_needs_no_hydra_and_no_yaml():
+    config = ScenarioConfig(agents=5)
+    airspace = config.airspace(np.random.default_rng(0))
+    assert airspace.n_points.min() >= 5
+
+
+@pytest.mark.parametrize(
+    ("clock", "seconds"), [("1s", 1.0), ("0.5m", 30.0), ("1h", 3600.0), ("0.2", 0.2)]
+)
+def test_times_are_read_with_their_unit(clock, seconds):
+    assert ClockConfig(simulation=clock).dt == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(
+    ("clock", "told"),
+    [
+        ({"simulation": "1s", "agents": "1.5s"}, "clock.agents: 1.5s is not a multiple"),
+        ({"simulation": "2s", "server": "1s"}, "clock.server: 1s is not a multiple"),
+        ({"agents": "2s", "server": "3s"}, "clock.server: 3s is not a multiple of clock.agents=2s"),
+        ({"simulation": "0s"}, "clock.simulation: 0.0 s is not above 0 s"),
+        ({"simulation": "fast"}, "clock.simulation: fast is not a time such as 2s"),
+        ({"simulation": "nan"}, "clock.simulation: nan s is not above 0 s"),
+        ({"system": "4s"}, "slower clocks come with the delays"),
+    ],
+)
+def test_clocks_that_do_not_fit_are_refused(clock, told):
+    with pytest.raises(InputError, match="clock") as refused:
+        ClockConfig(**clock)
+    assert told in str(refused.value)
+
+
+def test_more_uavs_than_landing_points_are_refused():
+    region = RegionConfig(kind="vertices", vertices=[[0, 0], [100, 0], [100, 100], [0, 100]])
+    config = ScenarioConfig(agents=30, region=region)
+    with pytest.raises(InputError, match="agents: 30 UAVs need as many landing points"):
+        config.airspace(np.random.default_rng(0))
+
+
+def test_flight_levels_must_fit_the_scenario_and_the_airspace():
+    with pytest.raises(InputError, match="leaves room for 2 flight levels"):
+        ScenarioConfig(motion=MotionConfig(min_level=1, max_level=2, level_separation=1))
+    fir = RegionConfig(kind="fir", path="damian/data/fir.csv", id="LlanbedrTest")
+    high = MotionConfig(min_level=1828, max_level=2000)
+    with pytest.raises(InputError, match=r"1829.0 m is not between 0 and 1828.8 m"):
+        ScenarioConfig(agents=3, region=fir, motion=high).airspace(np.random.default_rng(0))
+
+
+def test_a_pool_draws_that_many_different_regions_and_the_same_seed_the_same():
+    config = ScenarioConfig(region=RegionConfig(pool=5))
+    one, two = (config.airspace(np.random.default_rng(3)) for _ in range(2))
+    assert len(one.regions) == 5
+    assert len({region.polygon.wkt for region in one.regions}) == 5
+    assert [r.polygon.wkt for r in one.regions] == [r.polygon.wkt for r in two.regions]
+
+
+def test_keys_that_no_field_takes_are_found_at_any_depth():
+    written = {"agents": 3, "motion": {"kind": "instant", "wings": 2}, "delay": {"obs": 3}}
+    assert sorted(leftovers(written, ScenarioConfig())) == ["delay", "motion.wings"]
