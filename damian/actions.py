@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from damian import checks
-from damian.world.airspace import Airspace, inside, nearest_points
+from damian.world.airspace import Airspace, inside, nearest_points, rows
 
 
 @dataclass
@@ -110,10 +110,10 @@ class Candidates:
             for own in torch.arange(len(points)).split(64):  # bounds the memory of the search
                 standing = torch.nan_to_num(points[own], posinf=0.0).unsqueeze(1)
                 own_point = own.unsqueeze(-1).expand(-1, len(table))
-                rows = self._rank(points, edges, standing, own_point, move)
-                reached = points[rows[0][..., 0]]
-                ranked.append(rows[0].flatten(0, 1).to(torch.int32))
-                valid.append(rows[1] | (table[:, 0] == 0))
+                nearest, within = self._rank(points, edges, standing, own_point, move)
+                reached = points[nearest[..., 0]]
+                ranked.append(nearest.flatten(0, 1).to(torch.int32))
+                valid.append(within | (table[:, 0] == 0))
                 distance.append(torch.linalg.vector_norm(reached - standing, dim=-1))
         self.ranked, self.valid = torch.cat(ranked), torch.cat(valid)
         self.distance = torch.cat(distance)
@@ -130,13 +130,11 @@ class Candidates:
         return self
 
 
-@torch.library.custom_op("damian::book", mutates_args=())
 def book(ranked: Tensor, row: Tensor, standing: Tensor, ready: Tensor, n_points: int) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point.
 
     A point is free if no other UAV stands on it or is bound for it (SPEC 2); a UAV's own always is. Most
-    UAVs get their first candidate at once; only the worlds in which one does not are looked at again. An
-    operator of its own, because how many these are depends on the data, which a compiler cannot trace.
+    UAVs get their first candidate at once; only the worlds in which one does not are looked at again.
 
     Args:
         ranked: candidate point ids by preference, [M, K].
@@ -148,31 +146,53 @@ def book(ranked: Tensor, row: Tensor, standing: Tensor, ready: Tensor, n_points:
     Returns:
         Booked point of each UAV, [B, N].
     """
-    first = ranked[:, 0].index_select(0, row.flatten()).view_as(row).long()
-    choice = torch.where(ready, first, standing)
+    choice = torch.where(ready, rows(ranked[:, 0], row).long(), standing)
     moves = choice != standing
-    occupied = standing.new_zeros(len(standing), n_points, dtype=torch.bool)
-    occupied.scatter_(1, standing, True)
-    taken = occupied.gather(1, choice) & moves
-    # Of those who write their name on one point all but one read another's: nobody else reads a cell
-    # that is not written first.
-    name = torch.arange(choice.shape[1], device=choice.device).expand_as(choice)
-    names = choice.new_empty(len(choice), n_points).scatter_(1, choice, name)
-    shared = names.gather(1, choice) != name
-    open_worlds = (taken | shared).any(-1).nonzero().squeeze(-1)
-    if len(open_worlds):
-        row, standing, ready, occupied = (t[open_worlds] for t in (row, standing, ready, occupied))
-        candidates = torch.where(ready.unsqueeze(-1), ranked[row].long(), standing.unsqueeze(-1))
-        choice[open_worlds] = _book_in_order(candidates, standing, occupied)
-    return choice
+    # How many stand on each point or want to move there: who finds more than itself may have to yield.
+    claims = standing.new_zeros(len(standing), n_points, dtype=torch.int16)
+    claim = torch.cat([torch.ones_like(moves), moves], -1).to(claims.dtype)
+    claims = claims.scatter_add(1, torch.cat([standing, choice], -1), claim)
+    contested = (moves & (claims.gather(1, choice) > 1)).any(-1)
+    return _settle(ranked, row, standing, ready, choice, contested, n_points)
 
 
-@book.register_fake
-def _(ranked: Tensor, row: Tensor, standing: Tensor, ready: Tensor, n_points: int) -> Tensor:
-    return torch.empty_like(standing)
+@torch.library.custom_op("damian::settle", mutates_args=())
+def _settle(
+    ranked: Tensor,
+    row: Tensor,
+    standing: Tensor,
+    ready: Tensor,
+    choice: Tensor,
+    contested: Tensor,
+    n_points: int,
+) -> Tensor:
+    """The choices, made anew in index order in the contested worlds [B].
+
+    An operator of its own, because how many these are depends on the data, which a compiler cannot trace.
+    """
+    settled = choice.clone()
+    worlds = contested.nonzero().squeeze(-1)
+    if len(worlds):
+        row, standing, ready = (t.index_select(0, worlds) for t in (row, standing, ready))
+        candidates = torch.where(ready.unsqueeze(-1), rows(ranked, row), standing.unsqueeze(-1))
+        settled.index_copy_(0, worlds, _book_in_order(candidates, standing, n_points))
+    return settled
 
 
-def _book_in_order(candidates: Tensor, standing: Tensor, occupied: Tensor) -> Tensor:
+@_settle.register_fake
+def _(
+    ranked: Tensor,
+    row: Tensor,
+    standing: Tensor,
+    ready: Tensor,
+    choice: Tensor,
+    contested: Tensor,
+    n_points: int,
+) -> Tensor:
+    return torch.empty_like(choice)
+
+
+def _book_in_order(candidates: Tensor, standing: Tensor, n_points: int) -> Tensor:
     """Serial choice as the fixed point of "take the best candidate that no earlier UAV has taken".
 
     After r rounds the first r + 1 UAVs are settled, so that N - 1 rounds suffice; mostly one or two do.
@@ -180,27 +200,25 @@ def _book_in_order(candidates: Tensor, standing: Tensor, occupied: Tensor) -> Te
     Args:
         candidates: [B, N, K].
         standing: [B, N].
-        occupied: does some UAV stand on the point or fly to it, [B, L].
+        n_points: ids are below it.
     """
     n_agents = standing.shape[1]
-    index = torch.arange(n_agents, device=standing.device)
+    index = torch.arange(n_agents, device=standing.device).expand_as(standing)
     flat = candidates.flatten(1)
     own = candidates == standing.unsqueeze(-1)
-    free = ~occupied.gather(1, flat).view_as(candidates) | own
-    choice = _first(candidates, free, standing)
+    owner = index.new_full((len(index), n_points), n_agents).scatter_(1, standing, -1)
+
+    def choose(owner: Tensor) -> Tensor:
+        """Best candidate that belongs to no earlier UAV; there always is one."""
+        owners = owner.gather(1, flat).view_as(candidates)
+        allowed = own | (owners >= index.unsqueeze(-1))
+        best = allowed.view(torch.uint8).argmax(-1, keepdim=True)
+        return candidates.gather(-1, best).squeeze(-1)
+
+    choice = choose(owner)
     for _ in range(n_agents - 1):
-        owner = torch.full_like(occupied, n_agents, dtype=torch.long)
-        owner.scatter_reduce_(1, choice, index.expand_as(choice), "amin")
-        untaken = owner.gather(1, flat).view_as(candidates) >= index.unsqueeze(-1)
-        settled = _first(candidates, free & (untaken | own), standing)
+        settled = choose(owner.scatter_reduce(1, choice, index, "amin"))
         if torch.equal(settled, choice):
             break
         choice = settled
     return choice
-
-
-def _first(candidates: Tensor, allowed: Tensor, standing: Tensor) -> Tensor:
-    """The first allowed candidate, else the own point, [B, N]."""
-    first = allowed.to(torch.uint8).argmax(-1, keepdim=True)
-    choice = candidates.gather(-1, first).squeeze(-1)
-    return torch.where(allowed.any(-1), choice, standing)

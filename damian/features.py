@@ -184,7 +184,9 @@ def _raw_source_distance(v: _View) -> Tensor:
 def _bearing(v: _View) -> Tensor:
     """Bearing of the source, clockwise from north, [*, N] in (-pi, pi]."""
     east, north = v(_to_source).unbind(-1)
-    return torch.atan2(east, north)
+    # Within a millimetre of the source there is no bearing, only rounding errors: north it is.
+    away = east.abs() + north.abs() > 1e-3
+    return torch.atan2(east, north) * away
 
 
 def _pairwise(v: _View) -> Tensor:

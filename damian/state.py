@@ -60,7 +60,7 @@ def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree
         tree_map(function, *leaf) if hasattr(leaf[0], "_fields") else function(*leaf)
         for leaf in zip(tree, *others, strict=True)
     ]
-    return type(tree)(*values)
+    return tree._make(values)
 
 
 def where(mask: Tensor, new: Tree, old: Tree) -> Tree:
@@ -113,7 +113,7 @@ class Layout:
             for dtype, shape in self._fields
         ]
         n = len(State._fields) - 1  # the message comes last
-        return State(*leaves[:n], Snapshot(*leaves[n:]))
+        return State._make([*leaves[:n], Snapshot._make(leaves[n:])])
 
 
 _TYPES = (torch.float32, torch.int64, torch.bool)

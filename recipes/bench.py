@@ -1,0 +1,220 @@
+"""How fast the environment is beside VMAS, how it grows, and what memory it takes.
+
+    python recipes/bench.py            (a few minutes)
+    python recipes/bench.py --quick    (seconds: does it run?)
+
+One thread, random actions through TorchRL's ``rollout``. Rivals take turns, so that a busy machine slows
+all of them, and medians are reported. The tables are also written to runs/bench.md.
+"""
+
+import argparse
+import importlib.util
+import statistics
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from hydra import compose, initialize_config_dir
+from launch import CONF, TrainConfig
+from omegaconf import OmegaConf
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.libs.vmas import VmasEnv
+from tqdm import tqdm
+
+from damian.env import EXTRAS, UavEnv
+from damian.features import GLOBAL, LOCAL, ObservationConfig
+from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
+from damian.scenario import BatteryConfig, MotionConfig, ScenarioConfig
+
+RIVAL = "VMAS discovery"
+Scenarios = dict[str, ScenarioConfig]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured."""
+
+    worlds: int = 1024
+    """Worlds of the comparison and of the growth with UAVs."""
+    steps: int = 50
+    """Length of a rollout."""
+    repeats: int = 5
+    """Rollouts of each environment."""
+    many_worlds: tuple[int, ...] = (1, 8, 64, 512, 1024, 2048, 4096, 8192)
+    many_uavs: tuple[int, ...] = (1, 2, 3, 5, 10, 20, 50)
+    growth_steps: int = 15
+    """Length of a rollout where only the growth is of interest."""
+    modes: tuple[str, ...] = ("eager", "compiled")
+
+
+QUICK = Sizes(16, 4, 2, many_worlds=(1, 8), many_uavs=(1, 3), growth_steps=4, modes=("eager",))
+
+
+def scenarios() -> Scenarios:
+    """The paper's second use case, as ``+usecase=2`` trains it, and the same place with everything on."""
+    with initialize_config_dir(CONF, version_base=None):
+        written = compose("train", overrides=["+usecase='2'"])
+    paper = cast(TrainConfig, OmegaConf.to_object(written))
+    full = replace(
+        paper,
+        region=replace(paper.region, start_positions=None),
+        motion=MotionConfig(kind="polynomial"),
+        battery=BatteryConfig(enabled=True),
+        actions=replace(paper.actions, mask=True),
+        observation=ObservationConfig(list(LOCAL), list(GLOBAL), ctde=True),
+        task=RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 1.0)),
+        episode=EpisodeConfig(max_steps=100),
+    )
+    return {"use case 2": paper, "everything": full}
+
+
+def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:
+    """The scenario with another number of UAVs, which start anywhere."""
+    return replace(
+        scenario,
+        agents=agents,
+        region=replace(scenario.region, start_positions=None),
+        motion=replace(scenario.motion, max_level=30.0),  # room for 50 flight levels
+    )
+
+
+def step_times(envs: Mapping[str, EnvBase], steps: int, repeats: int) -> dict[str, float]:
+    """Median milliseconds per step of each environment, all of them timed in turn."""
+    times: dict[str, list[float]] = {name: [] for name in envs}
+    for env in tqdm(envs.values(), "warming up", leave=False):  # and compiling
+        env.rollout(steps, break_when_any_done=False)
+    for _ in tqdm(range(repeats), "measuring", leave=False):
+        for name, env in envs.items():
+            begin = time.perf_counter()
+            env.rollout(steps, break_when_any_done=False)
+            times[name].append(1e3 * (time.perf_counter() - begin) / steps)
+    return {name: statistics.median(measured) for name, measured in times.items()}
+
+
+def comparison(presets: Scenarios, sizes: Sizes) -> str:
+    """Steps of worlds per second beside VMAS, if that is installed."""
+    envs: dict[str, EnvBase] = {}
+    if importlib.util.find_spec("vmas"):
+        envs[RIVAL] = VmasEnv(
+            "discovery", num_envs=sizes.worlds, n_agents=3, device="cpu", continuous_actions=True
+        )
+    else:
+        print("VMAS is not installed, so there are no ratios: pip install -e '.[bench]'")
+    for name, scenario in presets.items():
+        for shown, extras in (("as trained", ()), ("all extras", EXTRAS)):
+            for mode in sizes.modes:
+                env = UavEnv(scenario, sizes.worlds, extras=extras)
+                envs[f"{name}, {shown}, {mode}"] = env.compile() if mode == "compiled" else env
+    times = step_times(envs, sizes.steps, sizes.repeats)
+    rows = [
+        (name, f"{ms:.2f}", f"{sizes.worlds / ms * 1e3:,.0f}", f"{times.get(RIVAL, 0) / ms:.1f}")
+        for name, ms in times.items()
+    ]
+    return table(
+        f"{sizes.worlds} worlds, 3 UAVs; median of {sizes.repeats} rollouts of {sizes.steps} steps",
+        ("environment", "ms/step", "steps of worlds/s", "times VMAS"),
+        rows if RIVAL in envs else [(*row[:-1], "-") for row in rows],
+    )
+
+
+def growth_with_worlds(presets: Scenarios, sizes: Sizes) -> str:
+    """Time of a step by the number of worlds, 3 UAVs, eager."""
+    rows = []
+    for worlds in tqdm(sizes.many_worlds, "worlds"):
+        envs = {name: UavEnv(scenario, worlds, extras=()) for name, scenario in presets.items()}
+        rows.append((worlds, *_costs(envs, worlds, sizes)))
+    return table("Growth with worlds: 3 UAVs, eager", _cost_header("worlds", presets), rows)
+
+
+def growth_with_uavs(presets: Scenarios, sizes: Sizes) -> str:
+    """Time of a step by the number of UAVs, eager."""
+    rows = []
+    for agents in tqdm(sizes.many_uavs, "UAVs"):
+        fleets = {name: fleet(scenario, agents) for name, scenario in presets.items()}
+        envs = {name: UavEnv(s, sizes.worlds, extras=()) for name, s in fleets.items()}
+        rows.append((agents, *_costs(envs, sizes.worlds, sizes)))
+    title = f"Growth with UAVs: {sizes.worlds} worlds, eager, starting anywhere"
+    return table(title, _cost_header("UAVs", presets), rows)
+
+
+def memory(presets: Scenarios) -> str:
+    """Bytes of each world and of what all worlds share, counted from the tensors."""
+    rows = []
+    for name, scenario in presets.items():
+        env = UavEnv(scenario, 2, extras=EXTRAS)
+        bare = UavEnv(scenario, 2, extras=())
+        state = sum(x.nbytes for x in tensors(env.state)) // 2
+        shown = [
+            sum(x.nbytes for x in tensors(e.rand_step(e.reset()).select("next").to_dict())) // 2
+            for e in (bare, env)
+        ]
+        shared = {
+            x.data_ptr(): x.nbytes for x in tensors([vars(bare.simulation), bare.__dict__["_footprints"]])
+        }
+        rows.append((name, state, *shown, f"{sum(shared.values()) / 2**20:.1f} MiB"))
+    return table(
+        "Memory: bytes of a world with 3 UAVs",
+        ("scenario", "state", "shown, as trained", "shown, all extras", "shared tables"),
+        rows,
+    )
+
+
+def tensors(tree: Any) -> Iterator[Tensor]:
+    """Every tensor in nested containers and objects."""
+    if isinstance(tree, Tensor):
+        yield tree
+        return
+    if isinstance(tree, dict):
+        branches = tree.values()
+    elif isinstance(tree, list | tuple):
+        branches = tree
+    else:
+        branches = getattr(tree, "__dict__", {}).values()
+    for branch in branches:
+        yield from tensors(branch)
+
+
+def table(title: str, header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+    """A Markdown table."""
+    lines = [header, ("---", *["---:"] * (len(header) - 1)), *rows]
+    return "\n".join([f"## {title}\n", *("| " + " | ".join(map(str, x)) + " |" for x in lines), ""])
+
+
+def _costs(envs: Mapping[str, EnvBase], worlds: int, sizes: Sizes) -> list[str]:
+    times = step_times(envs, sizes.growth_steps, sizes.repeats)
+    return [text for ms in times.values() for text in (f"{ms:.2f}", f"{worlds / ms * 1e3:,.0f}")]
+
+
+def _cost_header(what: str, presets: Scenarios) -> tuple[str, ...]:
+    costs = [f"{name}: {cost}" for name in presets for cost in ("ms/step", "steps of worlds/s")]
+    return (what, *costs)
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description="How fast is the environment?")
+    parser.add_argument("--quick", action="store_true", help="only see whether it runs")
+    sizes = QUICK if parser.parse_args().quick else Sizes()
+    torch.set_num_threads(1)
+    presets = scenarios()
+    report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]
+    for part in (
+        comparison(presets, sizes),
+        growth_with_worlds(presets, sizes),
+        growth_with_uavs(presets, sizes),
+        memory(presets),
+    ):
+        print(part)
+        report.append(part)
+    target = Path("runs/bench.md")
+    target.parent.mkdir(exist_ok=True)
+    target.write_text("\n".join(report))
+    print(f"written to {target}")
+
+
+if __name__ == "__main__":
+    main()
