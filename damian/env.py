@@ -64,10 +64,10 @@ class UavEnv(EnvBase):
         device: torch.device | str = "cpu",
         extras: Collection[str] = EXTRAS,
     ) -> None:
-        super().__init__(device=torch.device(device), batch_size=torch.Size([num_worlds]))
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
         self.scenario = scenario or ScenarioConfig()
         self.extras = frozenset(extras)
-        self.simulation = Simulation(self.scenario, seed, torch.device(device))
+        self.simulation = Simulation(self.scenario, seed)
         observation, task = self.scenario.observation, self.scenario.task
         self._wanted = sorted({*observation.actor, *observation.critic, *task.terms})
         self._footprints = self._build_footprints() if "coverage" in self._wanted else None
@@ -76,6 +76,7 @@ class UavEnv(EnvBase):
         self._make_specs()
         self.set_seed(seed)
         self._advance = self._play
+        self.to(torch.device(device))
 
     def compile(self, **options: Any) -> "UavEnv":
         """Compile what a step computes, as one graph, in place of TorchRL's bookkeeping around it.
@@ -88,6 +89,19 @@ class UavEnv(EnvBase):
         self._advance = torch.compile(  # type: ignore[call-overload]
             self._play, fullgraph=True, isolate_recompiles=True, **options
         )
+        return self
+
+    def to(self, device: torch.device | str) -> "UavEnv":
+        """Move the worlds and all tables, in place."""
+        device = torch.device(device)
+        if device == self.device:
+            return self
+        super().to(device)
+        self.simulation.to(device)
+        self._first = _map(lambda table: table.to(device), self._first)
+        self._worlds = tree_map(lambda t: t.to(device), self._worlds)
+        if self._footprints is not None:
+            self._footprints = self._footprints.to(device)
         return self
 
     @property
@@ -226,8 +240,8 @@ class UavEnv(EnvBase):
     def _build_footprints(self) -> FootprintTables:
         airspace = self.simulation.airspace
         polygons = [region.polygon for region in airspace.regions]
-        places = airspace.points.cpu().double().numpy()
-        return build_tables(polygons, places, self.simulation.radius).to(self.device)
+        places = airspace.points.double().numpy()
+        return build_tables(polygons, places, self.simulation.radius)
 
 
 _DONE = ("done", "terminated", "truncated")

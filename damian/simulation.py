@@ -17,7 +17,13 @@ from damian.scenario import ScenarioConfig
 from damian.state import EPISODE, SEED, Layout, Rows, State, tree_map, where
 from damian.world import draws
 from damian.world.airspace import Airspace, inside, nearest_points, rows
-from damian.world.battery import charge_gain, cruise_drain, used_so_far, vertical_drain
+from damian.world.battery import (
+    charge_gain,
+    cruise_drain,
+    flight_drain,
+    used_so_far,
+    vertical_drain,
+)
 from damian.world.motion import flight_levels, fly, minimum_time
 from damian.world.source import Walk, draw_walks, footprint_radius, locate
 
@@ -28,8 +34,8 @@ _TIME_EPS = 1e-4
 class Simulation:
     """Worlds of one scenario; holds what never changes."""
 
-    def __init__(self, config: ScenarioConfig, seed: int, device: torch.device) -> None:
-        """Draw regions and situations.
+    def __init__(self, config: ScenarioConfig, seed: int) -> None:
+        """Draw regions and situations, on the CPU.
 
         Raises:
             InputError: the scenario asks for something impossible.
@@ -40,21 +46,30 @@ class Simulation:
         self.flies = config.motion.kind == "polynomial"
         self.radius = footprint_radius(config.source)
         self.airspace = config.airspace(rng)
-        self.candidates = Candidates(self.airspace, config.actions, config.agents).to(device)
-        region, start, walk = _draw_situations(config, self.airspace, rng)
-        self.airspace = self.airspace.to(device)
+        self.candidates = Candidates(self.airspace, config.actions, config.agents)
+        region, start, self.walk = _draw_situations(config, self.airspace, rng)
         self.points = self.airspace.points.flatten(0, 1)
-        self.levels = torch.tensor(flight_levels(config.motion, config.agents), device=device)
+        self.levels = torch.tensor(flight_levels(config.motion, config.agents))
         self.vertical = self._shortest(self.levels)
         self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
         if config.battery.enabled and config.actions.kind == "discrete":
             self.action_drain = self._action_drain()
         self.charge = float(charge_gain(torch.tensor(self.dt), config.battery))
-        self.chargers = _chargers(config, self.airspace).to(device)
-        self.walk = tree_map(lambda t: t.to(device), walk)
-        self.initial = self._begin(region.to(device), start.to(device), seed)
+        self.chargers = _chargers(config, self.airspace)
+        self.initial = self._begin(region, start, seed)
         self.layout = Layout(self.initial)
         self.beginnings = self.layout.pack(self.initial)
+
+    def to(self, device: torch.device) -> "Simulation":
+        """Move everything, in place."""
+        self.airspace = self.airspace.to(device)
+        self.candidates.to(device)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(self, name, value.to(device))
+            elif isinstance(value, (Walk, State, Rows)):
+                setattr(self, name, tree_map(lambda t: t.to(device), value))
+        return self
 
     @property
     def n_situations(self) -> int:
@@ -235,7 +250,7 @@ class Simulation:
 
     def _drain(self, length: Tensor) -> Tensor:
         """Battery that a flight of this length takes with takeoff and landing [%]; 0 for holding."""
-        return (self.vertical_drain + cruise_drain(length, self.config.battery)) * (length > 0)
+        return flight_drain(self.vertical, length, self.config.battery) * (length > 0)
 
     def _drain_or_charge(self, state: State, drain: Tensor, rests: Tensor) -> State:
         gain = self.charge * (rests & rows(self.chargers, state.goal))
@@ -243,10 +258,10 @@ class Simulation:
 
     def _begin(self, region: Tensor, start: Tensor, seed: int) -> State:
         """The state at time 0 of every situation, [Q, ...]: what resets copy from."""
-        n, device = len(region), region.device
+        n = len(region)
         goal = start + region.unsqueeze(-1) * self.airspace.max_points
-        number = torch.arange(n, device=device)
-        count, zeros = torch.zeros_like(goal), torch.zeros(goal.shape, device=device)
+        number = torch.arange(n)
+        count, zeros = torch.zeros_like(goal), torch.zeros(goal.shape)
         place = rows(self.points, goal)
         sent = Snapshot(
             time=zeros,
@@ -261,7 +276,7 @@ class Simulation:
             trail=goal.unsqueeze(-1).repeat(1, 1, self.config.observation.window),
         )
         state = State(
-            seed=draws.world_seeds(seed, n, device),
+            seed=draws.world_seeds(seed, n),
             episode=torch.zeros_like(number),
             situation=number,
             region=region,
@@ -333,12 +348,9 @@ def _draw_starts(
 def _chargers(config: ScenarioConfig, airspace: Airspace) -> Tensor:
     """At which landing points UAVs charge, [R*L] bool."""
     places = config.battery.charging_points
-    flat = airspace.points.flatten(0, 1)
+    n_regions, n_points = airspace.points.shape[:2]
     if places is None:
-        return torch.ones(len(flat), dtype=torch.bool, device=flat.device)
-    nearest = nearest_points(
-        airspace.points.unsqueeze(1), torch.tensor(places, device=flat.device), 1
-    ).squeeze(-1)
-    base = torch.arange(len(nearest), device=flat.device).unsqueeze(-1) * airspace.max_points
-    charges = torch.zeros(len(flat), dtype=torch.bool, device=flat.device)
-    return charges.index_fill(0, (nearest + base).flatten(), True)
+        return torch.ones(n_regions * n_points, dtype=torch.bool)
+    nearest = nearest_points(airspace.points.unsqueeze(1), torch.tensor(places), 1).squeeze(-1)
+    flat = nearest + n_points * torch.arange(n_regions).unsqueeze(-1)
+    return torch.zeros(n_regions * n_points, dtype=torch.bool).index_fill(0, flat.flatten(), True)

@@ -1,0 +1,245 @@
+"""Shared builders: the use cases without Hydra, small worlds of every kind, and playing them."""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from twin import Uav
+
+from damian.actions import ActionConfig
+from damian.env import UavEnv
+from damian.features import GLOBAL, LOCAL, ObservationConfig, Server, Snapshot
+from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
+from damian.scenario import ClockConfig, RegionConfig, ScenarioConfig
+from damian.world.battery import BatteryConfig
+from damian.world.motion import MotionConfig
+from damian.world.source import SourceConfig
+
+DATA = Path(__file__).parent / "data"
+
+GOLDEN = {case: json.loads((DATA / f"usecase{case}.json").read_text()) for case in (1, 2)}
+
+SCALE, TIME_SCALE = 250.0, 60.0
+"""Of random worlds: what distances [m] and times [s] are divided by."""
+
+SQUARE = [[0.0, 0.0], [200.0, 0.0], [200.0, 200.0], [0.0, 200.0]]
+"""Corners of a region of 200 m by 200 m [m]."""
+
+
+def usecase(case: int, **changed: Any) -> ScenarioConfig:
+    """The paper's use case 1 or 2; ``changed`` replaces whole sections."""
+    golden = GOLDEN[case]["scenario"]
+    table = GOLDEN[case]["action_table"]
+    distances = sorted({row["distance_m"] for row in table})
+    headings = [row["heading_deg_input"] for row in table[: len(table) // len(distances)]]
+    region = RegionConfig(
+        kind="vertices",
+        vertices=golden["polygon_vertices_ring"][:-1],
+        lattice_step=golden["step_m"],
+        lattice_angle=golden["deg"],
+        situations=1,
+        start_positions=golden["uav_start_positions"],
+    )
+    observation = ObservationConfig(
+        local_features=["spotted"],
+        global_features=[] if case == 1 else ["source_distance"],
+        ctde=case == 2,
+        time_scale=golden["time_max_normaliser"],
+    )
+    task = RewardConfig(spotted=1.0, bonus=0.5)
+    if case == 2:
+        task = RewardConfig(spotted=0.05, source_distance=0.04, bonus=2.0, bonus_over_steps=True)
+    sections = {
+        "agents": len(golden["uav_start_positions"]),
+        "region": region,
+        "source": SourceConfig(
+            level_db=golden["source_db"],
+            microphone_db=golden["min_db_level"],
+            position=golden["source_position"],
+        ),
+        "actions": ActionConfig(distances=distances, headings=headings, mask=False),
+        "observation": observation,
+        "task": task,
+        "episode": EpisodeConfig(max_steps=golden["max_episode_len"], success_share=golden["perc_needed"]),
+    }
+    return ScenarioConfig(**(sections | changed))
+
+
+def square(**changed: Any) -> ScenarioConfig:
+    """Three UAVs start side by side in a small square, the source in its middle."""
+    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, situations=8)
+    sections = {
+        "region": region,
+        "source": SourceConfig(level_db=135.0, position=[100.0, 100.0]),
+        "episode": EpisodeConfig(max_steps=6),
+    }
+    return ScenarioConfig(**(sections | changed))
+
+
+def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) -> ScenarioConfig:
+    """Every feature, every reward term, a walking source that is heard now and then, batteries."""
+    sections = {
+        "region": RegionConfig(min_area=20_000, max_area=60_000, pool=3, situations=12),
+        "motion": MotionConfig(kind=motion, max_speed=20.0, max_acceleration=10.0),
+        "source": walking(emission="per_step", emission_probability=0.7),
+        "battery": BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=20.0),
+        "actions": ActionConfig(kind=kind),
+        "observation": ObservationConfig(local_features=list(LOCAL), global_features=list(GLOBAL)),
+        "task": RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5), bonus=1.0, penalty=0.25),
+        "episode": EpisodeConfig(max_steps=8, success_share=1.0, discharged_share=1.0),
+    }
+    return ScenarioConfig(**(sections | changed))
+
+
+def walking(**changed: Any) -> SourceConfig:
+    """A source that leaves its first stop soon enough for a short test."""
+    sections = {"level_db": 140.0, "motion": "dynamic", "min_wait": 1.0, "max_wait": 3.0}
+    return SourceConfig(**(sections | {"local_distance": 15.0} | changed))
+
+
+def tracking(emission: str) -> dict[str, Any]:
+    """Sections of a tracking task."""
+    return {
+        "source": walking(emission=emission),
+        "task": RewardConfig(spotted=0.0, spotting_agents=0.5, source_drift=0.5, source_time=0.5),
+        "observation": ObservationConfig(global_features=["source_drift", "source_bearing"]),
+    }
+
+
+KINDS: dict[str, dict[str, Any]] = {
+    "spotting": {"episode": EpisodeConfig(max_steps=5, success_share=0.5)},
+    "tracking, emission per stop": tracking("per_stop"),
+    "tracking, emission per step": tracking("per_step"),
+    "coverage": {
+        "task": RewardConfig(spotted=0.0, coverage=1.0),
+        "observation": ObservationConfig(global_features=["coverage", "agent_distances"]),
+    },
+    "energy": {
+        "battery": BatteryConfig(enabled=True, capacity_kwh=0.2, charging_power_kw=40.0),
+        "task": RewardConfig(battery=0.5),
+        "observation": ObservationConfig(local_features=["battery", "spotted"], ctde=True),
+        "episode": EpisodeConfig(max_steps=5, discharged_share=0.5),
+    },
+    "mixed": {
+        name: getattr(everything(), name) for name in ("source", "battery", "observation", "task", "episode")
+    },
+}
+"""Sections of each kind of scenario."""
+
+REGIONS = {
+    "fixed": RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, situations=4),
+    "pool": RegionConfig(min_area=20_000, max_area=60_000, pool=2, situations=8),
+}
+
+
+def random_actions(env: UavEnv, generator: torch.Generator) -> Tensor:
+    """Uniform actions from a generator of the test's own, as the environment takes them."""
+    shape = (*env.batch_size, env.n_agents)
+    if env.scenario.actions.kind == "continuous":
+        return torch.rand(*shape, 2, generator=generator)
+    return torch.randint(env.scenario.actions.n_actions, shape, generator=generator)
+
+
+def act(env: UavEnv, action: Tensor) -> TensorDictBase:
+    """One step without resets: what stands under ``next``."""
+    td = TensorDict({"agents": {"action": action}}, env.batch_size)
+    return env.step(td)["next"]
+
+
+def play(
+    env: UavEnv, choose: Sequence[Tensor] | Callable[[int], Tensor], n_steps: int | None = None
+) -> list[TensorDictBase]:
+    """Step through episodes, resetting what is done: what every step and every reset showed."""
+    td = env.reset()
+    shown = [td.clone()]
+    for t in range(len(choose) if n_steps is None else n_steps):
+        action = choose(t) if callable(choose) else choose[t]
+        td = td.set(("agents", "action"), action)
+        after, td = env.step_and_maybe_reset(td)
+        shown += [after["next"].clone(), td.exclude(("agents", "action"))]
+    return shown
+
+
+def same(one: TensorDictBase, other: TensorDictBase) -> bool:
+    """Equal keys, and equal bit for bit."""
+    keys = set(one.keys(True, True))
+    return keys == set(other.keys(True, True)) and all(one[k].equal(other[k]) for k in keys)
+
+
+def all_same(some: Sequence[TensorDictBase], others: Sequence[TensorDictBase]) -> bool:
+    """Equal step by step."""
+    return len(some) == len(others) and all(map(same, some, others))
+
+
+def heading(degrees: float) -> float:
+    """A continuous action's heading for a bearing clockwise from north."""
+    return (degrees % 360) / 360
+
+
+def clock(period: str) -> ClockConfig:
+    """A clock whose simulation step is ``period``."""
+    return ClockConfig(simulation=period)
+
+
+def nearest(points: Sequence[Sequence[float]], place: Sequence[float]) -> int:
+    """Index of the point nearest a place, the lowest of several."""
+    return min(range(len(points)), key=lambda i: math.dist(points[i], place))
+
+
+def random_worlds(
+    seed: int, n_agents: int, heard: float, spots: float, n_worlds: int = 4
+) -> list[tuple[float, list[Uav]]]:
+    """Times and UAVs as the twin holds them; who never heard the source cannot spot it."""
+    rng = np.random.default_rng(seed)
+    worlds = []
+    for _ in range(n_worlds):
+        now = float(rng.uniform(0, 100))  # Sometimes past the time scale.
+        uavs = []
+        for _ in range(n_agents):
+            place = tuple(rng.uniform(-150, 150, 2).astype(np.float32).tolist())
+            uav = Uav(place, track=float(rng.uniform(0, 2 * math.pi)))
+            uav.battery = float(rng.choice([0.0, 35.0, 100.0, rng.uniform(0, 100)]))
+            if rng.random() < heard:
+                uav.heard_at = float(rng.uniform(0, now))
+                uav.heard_from = tuple(rng.uniform(-150, 150, 2).tolist())
+            if uav.heard_at is not None and rng.random() < spots:
+                uav.spots, uav.heard_at, uav.heard_from = True, now, place
+            uavs.append(uav)
+        worlds.append((now, uavs))
+    return worlds
+
+
+def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Snapshot, Server]:
+    """The same worlds in the package's own form, [B, N]."""
+
+    def column(read: Callable[[Uav], Any], dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.tensor([[read(uav) for uav in uavs] for _, uavs in worlds], dtype=dtype)
+
+    place = column(lambda uav: uav.place)
+    snapshot = Snapshot(
+        time=torch.zeros(place.shape[:-1]),
+        position=place,
+        target=place,
+        track=column(lambda uav: uav.track),
+        battery=column(lambda uav: uav.battery),
+        spotted=column(lambda uav: uav.spots, torch.bool),
+        motions=column(lambda uav: uav.motions, torch.long),
+        detected_time=column(lambda uav: -1.0 if uav.heard_at is None else uav.heard_at),
+        detected_position=column(lambda uav: uav.heard_from),
+        trail=torch.zeros(*place.shape[:-1], 2, dtype=torch.long),
+    )
+    server = Server(
+        now=torch.tensor([now for now, _ in worlds]),
+        scale=torch.full((len(worlds),), SCALE),
+        time_scale=TIME_SCALE,
+        battery=BatteryConfig(resolution=5.0),
+        footprints=None,
+        points=torch.zeros(1, 2),
+    )
+    return snapshot, server

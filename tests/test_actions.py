@@ -1,0 +1,236 @@
+"""Actions against plain loops: booking in index order, nearest points, inside tests, the table."""
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+import torch
+import twin
+from helpers import heading
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely.affinity import translate
+from shapely.geometry import MultiPolygon, Polygon
+
+from damian.actions import ActionConfig, Candidates, book, displacement
+from damian.errors import InputError
+from damian.world.airspace import build_airspace, inside, nearest_points
+from damian.world.regions import Region
+
+
+def fleets(seed, n_worlds, n_agents, n_points, together):
+    """Random preferences, standing points (``together``: of few) and who may choose."""
+    rng = np.random.default_rng(seed)
+    n_candidates = min(2 * n_agents - 1, n_points)
+    ranked = np.stack([rng.permutation(n_points)[:n_candidates] for _ in range(40)])
+    # Alike preferences make contention: many UAVs share a row.
+    row = rng.integers(0, rng.integers(1, 40, endpoint=True), (n_worlds, n_agents))
+    if together:
+        standing = rng.integers(0, min(n_points, 3), (n_worlds, n_agents))
+    else:
+        standing = np.stack([rng.permutation(n_points)[:n_agents] for _ in range(n_worlds)])
+    ready = rng.random((n_worlds, n_agents)) < rng.choice([0.3, 0.8, 1.0])
+    return ranked, row, standing, ready
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_agents=st.integers(1, 12),
+    spare=st.integers(0, 20),
+    together=st.booleans(),
+)
+def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
+    n_points = n_agents + spare
+    case = fleets(seed, 6, n_agents, n_points, together)
+    ranked, row, standing, ready = map(torch.as_tensor, case)
+    ours = book(ranked.int(), row, standing, ready, n_points)
+    expected = [twin.book(ranked[row[b]].tolist(), standing[b].tolist(), ready[b].tolist()) for b in range(6)]
+    assert ours.tolist() == expected
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(2, 12), spare=st.integers(0, 6))
+def test_uavs_on_different_points_never_book_the_same(seed, n_agents, spare):
+    case = fleets(seed, 20, n_agents, n_agents + spare, False)
+    ranked, row, standing, ready = map(torch.as_tensor, case)
+    ours = book(ranked.int(), row, standing, ready, n_agents + spare)
+    assert all(len(set(world)) == n_agents for world in ours.tolist())
+    assert ours[~ready].equal(standing[~ready])
+
+
+def test_of_two_that_want_one_point_the_first_gets_it_and_the_other_its_next():
+    ranked = torch.tensor([[5, 7, 1], [5, 0, 2]], dtype=torch.int32)
+    row, standing = torch.tensor([[0, 1], [1, 0]]), torch.tensor([[1, 2], [1, 2]])
+    ready = torch.ones(2, 2, dtype=torch.bool)
+    assert book(ranked, row, standing, ready, 8).tolist() == [[5, 0], [5, 7]]
+
+
+def test_a_point_that_is_left_in_this_step_is_not_free_yet():
+    ranked = torch.tensor([[5, 7, 1], [1, 6, 2]], dtype=torch.int32)
+    row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
+    ready = torch.ones(1, 2, dtype=torch.bool)
+    assert book(ranked, row, standing, ready, 8).tolist() == [[5, 6]]
+
+
+def test_from_a_common_start_one_may_stay_and_the_others_leave():
+    ranked = torch.tensor([[3, 0, 1, 2, 4], [4, 0, 1, 2, 3]], dtype=torch.int32)
+    row, standing = torch.tensor([[0, 0, 1]]), torch.tensor([[3, 3, 3]])
+    ready = torch.ones(1, 3, dtype=torch.bool)
+    assert book(ranked, row, standing, ready, 5).tolist() == [[3, 3, 4]]
+
+
+@given(seed=st.integers(0, 2**32 - 1), n_points=st.integers(1, 40), integer_grid=st.booleans())
+@settings(max_examples=100, deadline=None)
+def test_nearest_points_are_numpys_and_ties_go_to_the_lowest_id(seed, n_points, integer_grid):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-200, 200, (n_points, 2)).astype(np.float32)
+    targets = rng.uniform(-200, 200, (7, 2)).astype(np.float32)
+    if integer_grid:  # Whole metres: many equal distances.
+        points, targets = (np.round(x / 50).astype(np.float32) for x in (points, targets))
+    squared = ((points.astype(float) - targets[:, None].astype(float)) ** 2).sum(-1)
+    expected = np.argsort(squared, axis=1, kind="stable")
+    n = int(rng.integers(1, n_points, endpoint=True))
+    ours = nearest_points(torch.as_tensor(points), torch.as_tensor(targets), n)
+    assert ours.tolist() == expected[:, :n].tolist()
+
+
+def test_padded_points_are_nobodys_nearest():
+    points = torch.tensor([[9e3, 9e3], [torch.inf, torch.inf], [-9e3, 0.0]])
+    assert nearest_points(points, torch.zeros(1, 2), 2).tolist() == [[2, 0]]
+
+
+HORSESHOE = Polygon([(0, 0), (10, 0), (10, 8), (7, 8), (7, 3), (3, 3), (3, 8), (0, 8)])
+HOLED = Polygon([(-4, -3), (9, -5), (12, 4), (3, 9), (-6, 5)], [[(0, 0), (4, 0), (4, 4), (0, 4)]])
+POLYGONS = {
+    "concave": HORSESHOE,
+    "with a hole": HOLED,
+    "in two parts": MultiPolygon([HORSESHOE, translate(HOLED, 20, 3)]),
+}
+
+
+def star(rng):
+    """A jagged polygon with a hole near its middle."""
+    angle = np.sort(rng.uniform(0, 2 * np.pi, 14))
+    radius = rng.uniform(4, 12, 14)
+    shell = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
+    hole = np.stack([np.cos(angle), np.sin(angle)], -1) * 1.5
+    return Polygon(shell).buffer(0).difference(Polygon(hole))
+
+
+def check_inside(polygon, rng):
+    airspace = build_airspace([Region(polygon, "test", None, None)], 1.0, 45.0, None, 1)
+    west, south, east, north = polygon.bounds
+    target = rng.uniform([west - 1, south - 1], [east + 1, north + 1], (2000, 2))
+    # A quarter of the targets on the level of some corner, where rays meet edges' ends.
+    corners = shapely.get_coordinates(polygon)
+    target[:500, 1] = corners[rng.integers(len(corners), size=500), 1]
+    target = target.astype(np.float32).astype(float)
+    clear = shapely.distance(polygon.boundary, shapely.points(target)) > 1e-3
+    assert clear.sum() > 1500
+    ours = inside(airspace.edges[0], torch.as_tensor(target[clear], dtype=torch.float32))
+    expected = shapely.contains_xy(polygon, target[clear])
+    assert 0 < expected.sum() < len(expected)
+    assert ours.numpy().tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize("name", POLYGONS)
+def test_inside_is_shapelys_contains(name):
+    check_inside(POLYGONS[name], np.random.default_rng(3))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_inside_is_shapelys_contains_for_jagged_polygons(seed):
+    rng = np.random.default_rng(seed)
+    check_inside(star(rng), rng)
+
+
+def candidates(kind):
+    """A region with a notch, and one kind of actions."""
+    notch = Polygon([(0, 0), (210, 0), (210, 190), (120, 190), (100, 60), (80, 190), (0, 190)])
+    regions = [Region(notch, "notch", None, None), Region(HORSESHOE.buffer(40), "oval", None, None)]
+    airspace = build_airspace(regions, 30.0, 45.0, None, 3)
+    config = ActionConfig(
+        kind=kind, distances=[0.0, 41.7, 97.3, 153.9], headings=[-130.0, -31.0, 5.0, 77.0, 180.0]
+    )
+    return Candidates(airspace, config, 3), config
+
+
+def test_the_discrete_table_equals_the_continuous_path():
+    discrete, config = candidates("discrete")
+    continuous, _ = candidates("continuous")
+    airspace, table = discrete.airspace, config.table()
+    compared = 0
+    for region, count in enumerate(airspace.n_points.tolist()):
+        points = torch.arange(count) + region * airspace.max_points
+        flat = points[:, None].expand(-1, len(table))
+        number = torch.arange(len(table)).expand_as(flat)
+        share = [[d / 153.9, heading(math.degrees(h))] for d, h in table.tolist()]
+        action = torch.tensor(share).expand(count, -1, -1)
+        regions = torch.full((count,), region)
+        ranked, row = discrete.of(flat, regions, number)
+        loose, loose_row = continuous.of(flat, regions, action)
+        assert loose_row.shape == row.shape == flat.shape
+        assert ranked[row][..., :1].long().equal(loose[loose_row][..., :1])
+        compared += row.numel()
+    assert compared == 20 * int(airspace.n_points.sum())
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_candidates_are_the_points_nearest_the_target_or_the_own_one(kind):
+    ways, config = candidates(kind)
+    polygon = ways.airspace.regions[0].polygon
+    points = ways.airspace.points[0].tolist()
+    flat = torch.arange(int(ways.airspace.n_points[0]))[:, None]
+    rng = np.random.default_rng(0)
+    number = torch.as_tensor(rng.integers(config.n_actions, size=flat.shape))
+    share = torch.as_tensor(rng.random((*flat.shape, 2)), dtype=torch.float32)
+    moves = config.table()[number[:, 0]]
+    if kind == "continuous":
+        moves = share[:, 0] * torch.tensor([153.9, 2 * math.pi])
+    action = number if kind == "discrete" else share
+    ranked, row = ways.of(flat, torch.zeros(len(flat), dtype=torch.long), action)
+    outside = 0
+    for own, (distance, bearing) in enumerate(moves.tolist()):
+        x, y = points[own]
+        target = (x + distance * math.sin(bearing), y + distance * math.cos(bearing))
+        found = ranked[row[own, 0]].tolist()
+        assert len(found) == 2 * 3 - 1
+        if shapely.contains_xy(polygon, *target):
+            far = sorted(math.dist(p, target) for p in points)
+            assert [math.dist(points[p], target) for p in found] == pytest.approx(far[:5], abs=1e-3)
+        else:
+            assert found == [own] * 5
+            outside += 1
+    assert 10 < outside < len(moves) - 10
+
+
+def test_headings_turn_clockwise_from_north():
+    moved = displacement(torch.tensor([10.0] * 4), torch.tensor([0.0, 90, 180, 270]).deg2rad())
+    expected = [[0.0, 10.0], [10.0, 0.0], [0.0, -10.0], [-10.0, 0.0]]
+    assert moved.tolist() == [pytest.approx(pair, abs=1e-5) for pair in expected]
+
+
+def test_the_table_holds_every_distance_with_every_heading_distance_by_distance():
+    config = ActionConfig(distances=[0.0, 10.0], headings=[0.0, 90.0, -90.0])
+    expected = [[d, math.radians(h)] for d in (0.0, 10.0) for h in (0.0, 90.0, -90.0)]
+    assert config.n_actions == 6
+    assert config.table().tolist() == [pytest.approx(row) for row in expected]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"kind": "both"}, "actions.kind: both is not one of discrete, continuous"),
+        ({"distances": []}, "actions.distances: [] is empty"),
+        ({"headings": []}, "actions.headings: [] is empty"),
+        ({"distances": [-1.0]}, "actions.distances: -1.0 m is not at least 0 m"),
+        ({"distances": [0.0]}, "actions.distances (largest): 0.0 m is not above 0 m"),
+        ({"headings": [400.0]}, "actions.headings: 400.0 deg is not between -360 and 360 deg"),
+    ],
+)
+def test_wrong_actions_are_named_with_their_value_and_unit(changed, message):
+    with pytest.raises(InputError) as error:
+        ActionConfig(**changed)
+    assert str(error.value) == message

@@ -1,0 +1,218 @@
+"""The slow, obvious twin: one world, one UAV at a time, in plain Python."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import shapely
+
+from damian.rewards import INDIVIDUAL, EpisodeConfig, RewardConfig
+
+
+@dataclass
+class Uav:
+    """What the server holds of one UAV: metres, seconds, radians clockwise from north."""
+
+    place: tuple[float, float]
+    point: int = 0
+    track: float = 0.0
+    battery: float = 100.0
+    spots: bool = False
+    motions: int = 0
+    """Since it last spotted, before this message."""
+    moved: int = 0
+    """Since it last spotted, after this message."""
+    heard_at: float | None = None
+    heard_from: tuple[float, float] = (0.0, 0.0)
+
+
+def features(
+    uavs: Sequence[Uav], now: float, scale: float, time_scale: float, resolution: float = 5.0
+) -> dict[str, list]:
+    """Table 2 but for the coverage, a value for each UAV."""
+    heard = [uav for uav in uavs if uav.heard_at is not None]
+    source = None
+    if heard:
+        source = tuple(sum(uav.heard_from[axis] for uav in heard) / len(heard) for axis in (0, 1))
+    found: dict[str, list] = {}
+    for uav in uavs:
+        others = [other for other in uavs if other is not uav]
+        row = {
+            "battery": math.floor(uav.battery / resolution + 1e-4) * resolution / 100,
+            "spotted": float(uav.spots),
+            "source_distance": 1.0,
+            "source_bearing": 1.0,
+            "source_drift": 1.0,
+            "source_time": 1.0,
+            "agent_distances": [near(uav.place, other.place, scale) for other in others],
+            "spotting_agents": sum(other.spots for other in uavs) / len(uavs),
+        }
+        if source is not None:
+            bearing = 0.0  # As of a UAV that stands there.
+            if math.dist(source, uav.place) > 1e-3:
+                bearing = math.atan2(source[0] - uav.place[0], source[1] - uav.place[1])
+            row["source_distance"] = near(uav.place, source, scale)
+            row["source_bearing"] = bearing % (2 * math.pi) / (2 * math.pi)
+            row["source_drift"] = (bearing - uav.track + math.pi) % (2 * math.pi) / (2 * math.pi)
+            row["source_time"] = min((now - max(u.heard_at for u in heard)) / time_scale, 1.0)
+        row["mean_distance"] = mean([math.dist(uav.place, u.place) / scale for u in others])
+        silent = [u for u in others if not u.spots and not uav.spots]
+        row["mean_distance_not_spotting"] = mean([math.dist(uav.place, u.place) / scale for u in silent])
+        row["mean_distance_spotting"] = mean([math.dist(u.place, source) / scale for u in uavs if u.spots])
+        for name, value in row.items():
+            found.setdefault(name, []).append(value)
+    return found
+
+
+def near(one: tuple[float, float], other: tuple[float, float], scale: float) -> float:
+    return min(math.dist(one, other) / scale, 1.0)
+
+
+def mean(values: list[float]) -> float:
+    """At most 1; 0 of nothing."""
+    return min(sum(values) / len(values), 1.0) if values else 0.0
+
+
+def terms(values: dict[str, float], motions: int, task: RewardConfig) -> dict[str, float]:
+    """Eq. 6 and 7 for one UAV: every term with its weight of eq. 8."""
+    found = {}
+    for name, value in values.items():
+        weight = getattr(task, name) * (task.individual if name in INDIVIDUAL else task.system)
+        if weight != 0:
+            found[name] = weight * term(name, value, max(motions, 1), task)
+    return found
+
+
+def term(name: str, value: float, motions: int, task: RewardConfig) -> float:
+    """One term before its weight."""
+    desired = {
+        "spotting_agents": task.desired_spotting,
+        "mean_distance": task.desired_distance,
+        "mean_distance_not_spotting": task.desired_distance_not_spotting,
+        "mean_distance_spotting": task.desired_distance_spotting,
+    }
+    if name in ("coverage", "battery"):
+        return value
+    if name == "spotted":
+        return value / motions
+    if name == "source_distance":
+        return (1 - value) / motions
+    if name in desired:
+        return 1 - abs(desired[name] - value)
+    if name == "source_drift" and task.drift == "smooth":
+        return 1 - abs(2 * value - 1)
+    if name == "source_drift":
+        return 2 * value if value <= 0.5 else 1 - value
+    return 1 - value
+
+
+def end(
+    uavs: Sequence[Uav], steps: int, now: float, dt: float, episode: EpisodeConfig
+) -> tuple[bool, bool, bool]:
+    """Success, terminated, truncated."""
+
+    def enough(share: float, flags: list[bool]) -> bool:
+        return sum(flags) >= max(share * len(flags), 1) - 1e-9
+
+    success = failure = late = False
+    if episode.success_share is not None:
+        success = enough(episode.success_share, [u.spots for u in uavs])
+    if episode.discharged_share is not None:
+        failure = enough(episode.discharged_share, [u.battery <= 0 for u in uavs])
+    if episode.max_steps is not None:
+        waited = steps
+        if episode.since_detection:
+            waited = (now - max([0.0, *[u.heard_at for u in uavs if u.heard_at is not None]])) / dt
+        late = waited > episode.max_steps - 1e-3
+    ended = success or failure
+    return success, ended, late and not ended
+
+
+def final(ended: tuple[bool, bool, bool], steps: int, task: RewardConfig) -> float:
+    """Bonus or penalty."""
+    success, terminated, truncated = ended
+    if success:
+        return task.bonus / steps if task.bonus_over_steps else task.bonus
+    return -task.penalty if terminated or truncated else 0.0
+
+
+def book(preferences: Sequence[Sequence[int]], standing: Sequence[int], ready: Sequence[bool]) -> list[int]:
+    """Points by preference, in index order; what others stand on or have booked is not free."""
+    booked: list[int] = []
+    for i, wanted in enumerate(preferences):
+        busy = {*booked, *standing[:i], *standing[i + 1 :]}
+        own = standing[i]
+        booked.append(next((p for p in wanted if p == own or p not in busy), own))
+        if not ready[i]:
+            booked[i] = own
+    return booked
+
+
+@dataclass
+class World:
+    """A world of instant motion, with a static source and without batteries."""
+
+    polygon: shapely.Geometry
+    points: list
+    source: tuple[float, float]
+    radius: float
+    scale: float
+    time_scale: float
+    dt: float
+    task: RewardConfig
+    episode: EpisodeConfig
+    uavs: list[Uav]
+    steps: int = 0
+    ended: tuple[bool, bool, bool] = field(default=(False, False, False))
+
+    def begin(self) -> None:
+        """Listen at time 0."""
+        for uav in self.uavs:
+            self._listen(uav)
+
+    def step(self, moves: Sequence[tuple[float, float]]) -> list[float]:
+        """Fly (distance [m], heading [rad]) and return each UAV's reward."""
+        wanted = [self._preferences(*pair) for pair in zip(self.uavs, moves, strict=True)]
+        standing = [uav.point for uav in self.uavs]
+        self.steps += 1
+        for uav, point in zip(self.uavs, book(wanted, standing, [True] * len(standing)), strict=True):
+            self._move(uav, point)
+            self._listen(uav)
+        now = self.steps * self.dt
+        self.ended = end(self.uavs, self.steps, now, self.dt, self.episode)
+        seen = self.observe()
+        extra = final(self.ended, self.steps, self.task)
+        rewards = []
+        for i, uav in enumerate(self.uavs):
+            own = {name: values[i] for name, values in seen.items() if name != "agent_distances"}
+            rewards.append(sum(terms(own, uav.motions, self.task).values()) + extra)
+        return rewards
+
+    def observe(self) -> dict[str, list]:
+        return features(self.uavs, self.steps * self.dt, self.scale, self.time_scale)
+
+    def _preferences(self, uav: Uav, move: tuple[float, float]) -> list[int]:
+        """Landing points, nearest the target first; only the own one if the target is outside."""
+        distance, heading = move
+        target = (
+            uav.place[0] + distance * math.sin(heading),
+            uav.place[1] + distance * math.cos(heading),
+        )
+        if not shapely.contains_xy(self.polygon, *target):
+            return [uav.point]
+        return sorted(range(len(self.points)), key=lambda p: math.dist(self.points[p], target))
+
+    def _move(self, uav: Uav, point: int) -> None:
+        place = tuple(self.points[point])
+        if point != uav.point:
+            east, north = (b - a for a, b in zip(uav.place, place, strict=True))
+            uav.track = math.atan2(east, north) % (2 * math.pi)
+        uav.point, uav.place = point, place
+        uav.moved += 1
+
+    def _listen(self, uav: Uav) -> None:
+        uav.motions = uav.moved
+        uav.spots = math.dist(uav.place, self.source) <= self.radius
+        if uav.spots:
+            uav.heard_at, uav.heard_from = self.steps * self.dt, uav.place
+            uav.moved = 0
