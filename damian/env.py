@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
 from damian.features import Server, observe, stack
@@ -91,7 +92,7 @@ class UavEnv(EnvBase):
         )
         return self
 
-    def to(self, device: torch.device | str) -> "UavEnv":
+    def to(self, device: DEVICE_TYPING) -> "UavEnv":
         """Move the worlds and all tables, in place."""
         device = torch.device(device)
         if device == self.device:
@@ -159,8 +160,9 @@ class UavEnv(EnvBase):
             scenario.episode,
         )
         features = self._features(state)
-        terms = reward(features, Counters(state.steps, state.sent.motions), scenario.task)
-        total = final_reward(ended, state.steps, scenario.task)
+        counters = Counters(state.steps, state.sent.motions)
+        terms = reward(features, counters, scenario.task)
+        total = final_reward(ended, counters, scenario.task)
         total = sum(terms.values(), start=total.unsqueeze(-1).expand_as(state.track))
         shown = self._show(state, features)
         shown["agents"]["reward"] = total.unsqueeze(-1)

@@ -266,6 +266,4 @@ def _spotted(v: _View) -> Tensor:
     return v.snapshot.spotted.to(v.scale.dtype)
 
 
-_FEATURES: dict[str, Callable[[_View], Tensor]] = {
-    name: globals()[f"_{name}"] for name in (*GLOBAL, *LOCAL)
-}
+_FEATURES: dict[str, Callable[[_View], Tensor]] = {name: globals()[f"_{name}"] for name in (*GLOBAL, *LOCAL)}

@@ -53,9 +53,7 @@ class MappoConfig:
             checks.in_range(f"algo.{name}", getattr(self, name), 1)
 
 
-def mappo_loss(
-    actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig
-) -> MAPPOLoss:
+def mappo_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig) -> MAPPOLoss:
     """Clipped PPO objective with a centralised critic, on the keys of ``UavEnv``."""
     loss = MAPPOLoss(
         actor,

@@ -136,9 +136,7 @@ class Status(NamedTuple):
     truncated: Tensor
 
 
-def reward(
-    features: dict[str, Tensor], counters: Counters, config: RewardConfig
-) -> dict[str, Tensor]:
+def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig) -> dict[str, Tensor]:
     """Weighted reward terms by name (eq. 6 and 7); their sum is the reward (eq. 8).
 
     Args:
@@ -150,8 +148,7 @@ def reward(
         Each term with a weight, [*, N].
     """
     return {
-        name: config.weight(name) * _TERMS[name](features[name], counters, config)
-        for name in config.terms
+        name: config.weight(name) * _TERMS[name](features[name], counters, config) for name in config.terms
     }
 
 
@@ -192,9 +189,9 @@ def status(
     return Status(success, success | over, late & ~(success | over))
 
 
-def final_reward(ended: Status, steps: Tensor, config: RewardConfig) -> Tensor:
+def final_reward(ended: Status, counters: Counters, config: RewardConfig) -> Tensor:
     """Bonus on success, penalty on failure, the same for every UAV, [*]."""
-    bonus = config.bonus / steps.clamp(min=1) if config.bonus_over_steps else config.bonus
+    bonus = config.bonus / counters.steps.clamp(min=1) if config.bonus_over_steps else config.bonus
     failure = (ended.terminated | ended.truncated) & ~ended.success
     return ended.success * bonus - failure * config.penalty
 

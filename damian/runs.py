@@ -97,9 +97,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
             raise InputError(f"{line}: not a row of numbers ({error})") from None
 
 
-def plot_learning_curve(
-    rows: list[dict[str, float]], random: Evaluation, path: Path, title: str
-) -> None:
+def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: Path, title: str) -> None:
     """Draw return and success rate over frames, with the random policy as a dashed line."""
     from matplotlib import pyplot as plt  # noqa: PLC0415 (slow to import, needed once)
     from matplotlib.ticker import EngFormatter  # noqa: PLC0415

@@ -205,9 +205,7 @@ class Simulation:
             spotted=spotted,
             motions=state.motions,
             detected_time=torch.where(spotted, times, state.sent.detected_time),
-            detected_position=torch.where(
-                spotted.unsqueeze(-1), position, state.sent.detected_position
-            ),
+            detected_position=torch.where(spotted.unsqueeze(-1), position, state.sent.detected_position),
             trail=torch.cat([state.goal.unsqueeze(-1), state.sent.trail[..., :-1]], -1),
         )
         return state._replace(

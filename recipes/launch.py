@@ -137,9 +137,7 @@ def _resumed(folder: Path, overrides: Sequence[str]) -> DictConfig:
         )
     for needed in (CONFIG, CHECKPOINT):
         if not (folder / needed).exists():
-            raise InputError(
-                f"resume: {folder} holds no {needed}, so there is nothing to go on with"
-            )
+            raise InputError(f"resume: {folder} holds no {needed}, so there is nothing to go on with")
     saved = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(folder / CONFIG))
     return cast(DictConfig, OmegaConf.merge(saved, OmegaConf.from_dotlist(list(overrides))))
 

@@ -59,9 +59,7 @@ def make_env(config: TrainConfig, worlds: int, seed: int) -> TransformedEnv:
     env = UavEnv(config, worlds, seed, config.device, extras=())
     if config.compile:
         env.compile()
-    episode_reward = RewardSum(
-        in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")]
-    )
+    episode_reward = RewardSum(in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")])
     return TransformedEnv(env, Compose(episode_reward, StepCounter()))  # type: ignore[call-arg]
 
 

@@ -19,7 +19,7 @@ from damian.world.battery import (
     used_so_far,
     vertical_drain,
 )
-from damian.world.motion import MotionConfig, fly, phase_times
+from damian.world.motion import fly, minimum_time
 
 DATA = Path(__file__).parent / "data"
 ENERGY = json.loads((DATA / "motion_energy_coverage.json").read_text())["energy"]
@@ -110,13 +110,11 @@ def test_every_transition_of_the_odd_golden_run_is_left_out_for_a_known_reason()
 def test_the_drain_of_a_flight_is_the_same_whatever_the_step(degree, n_steps):
     # The twin integrates the rate 100 (p_eng v / v_ref) / (p_bat eff) per hour over the speed.
     origin, target, level = tensor([[0.0, 0.0]]), tensor([[30.0, 40.0]]), tensor([2.0])
-    times = phase_times(origin, target, level, MotionConfig(degree=degree))
+    vertical, cruise = minimum_time(tensor([2.0, 50.0]), degree, max_speed=5.0, max_acceleration=2.0)
 
     def cruised(n):
-        elapsed = torch.linspace(0, 1, n + 1, dtype=torch.float64) * (
-            2 * times.vertical + times.cruise
-        )
-        return elapsed, fly(origin, target, level, elapsed, *times, degree).cruised
+        elapsed = torch.linspace(0, 1, n + 1, dtype=torch.float64) * (2 * vertical + cruise)
+        return elapsed, fly(origin, target, level, elapsed, vertical, cruise, degree).cruised
 
     elapsed, fine = cruised(20_000)
     speed = fine.diff() / elapsed.diff()

@@ -254,9 +254,7 @@ def test_it_compiles_to_one_graph(square):
 
 @pytest.mark.parametrize("radius", [0, -3.0, math.nan, math.inf])
 def test_a_radius_that_is_no_length_is_refused(radius):
-    with pytest.raises(
-        InputError, match=r"^footprint radius: \S+ m: must be finite and above 0 m$"
-    ):
+    with pytest.raises(InputError, match=r"^footprint radius: \S+ m: must be finite and above 0 m$"):
         build_tables([shapely.box(0, 0, 1, 1)], np.zeros((1, 1, 2)), radius)
 
 

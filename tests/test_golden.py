@@ -368,7 +368,7 @@ def test_recorded_episodes_have_the_recorded_totals_and_ends(case, ends):
     ended = status(snapshot, counters.steps, server.now, never, 1.0, config.episode)
     terms = reward(observe(snapshot, server, config.task.terms), counters, config.task)
     total = torch.stack([*terms.values()]).sum(0)
-    total += final_reward(ended, counters.steps, config.task)[:, None]
+    total += final_reward(ended, counters, config.task)[:, None]
     torch.testing.assert_close(total, column(records, "reward"), atol=TOLERANCE, rtol=0)
     assert total.numel() == {1: 48, 2: 204}[case]
     outcome = [INFO.get(move.after["info"]) for move in records]

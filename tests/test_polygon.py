@@ -81,9 +81,7 @@ def _slow_lattice(polygon, step, degrees):
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 @pytest.mark.parametrize(("step", "degrees"), [(17.3, 45), (29.7, 30), (11.1, 80)])
-def test_the_lattice_is_that_of_a_slow_loop_on_concave_holed_and_split_polygons(
-    shape, step, degrees
-):
+def test_the_lattice_is_that_of_a_slow_loop_on_concave_holed_and_split_polygons(shape, step, degrees):
     polygon = shapely.affinity.translate(shapely.affinity.rotate(shape, 7.7), 31.7, -11.3)
     points = landing_lattice(polygon, step, degrees)
     assert len(points) > 10
@@ -105,9 +103,7 @@ def test_landing_points_are_strictly_inside_distinct_and_ordered_by_direction(se
 def test_points_on_the_boundary_are_not_landing_points():
     points = landing_lattice(SQUARE, 25, 90)
     assert len(points) == 9
-    assert {tuple(p) for p in points.round(9)} == {
-        (x, y) for x in (25, 50, 75) for y in (25, 50, 75)
-    }
+    assert {tuple(p) for p in points.round(9)} == {(x, y) for x in (25, 50, 75) for y in (25, 50, 75)}
 
 
 def test_the_points_kept_are_the_nearest_to_the_centroid_in_unchanged_order():

@@ -90,9 +90,7 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
         (["resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
     ],
 )
-def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(
-    run, capsys, tmp_path, overrides, told
-):
+def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(run, capsys, tmp_path, overrides, told):
     with pytest.raises(SystemExit) as stopped:
         run(*overrides)
     error = capsys.readouterr().err
@@ -159,9 +157,7 @@ def test_use_case_presets_are_the_golden_scenarios(run, case):
 
 def test_every_default_of_the_schema_survives_a_round_trip(tmp_path):
     OmegaConf.save(OmegaConf.structured(TrainConfig), tmp_path / "config.yaml")
-    loaded = OmegaConf.merge(
-        OmegaConf.structured(TrainConfig), OmegaConf.load(tmp_path / "config.yaml")
-    )
+    loaded = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(tmp_path / "config.yaml"))
     assert OmegaConf.to_object(loaded) == TrainConfig()
 
 

@@ -120,9 +120,7 @@ def _collection(*features):
     ids=["Polygon", "MultiPolygon", "Feature", "FeatureCollection", "beside a point"],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
-def test_each_kind_of_geojson_gives_its_only_area_with_and_without_bom(
-    tmp_path, document, encoding
-):
+def test_each_kind_of_geojson_gives_its_only_area_with_and_without_bom(tmp_path, document, encoding):
     file = tmp_path / "square.geojson"
     file.write_text(json.dumps(document), encoding=encoding)
     region = read_geojson(file)
@@ -291,9 +289,7 @@ BAD_GEOJSON = {
 
 
 @pytest.mark.parametrize(("content", "choice", "says"), BAD_GEOJSON.values(), ids=BAD_GEOJSON)
-def test_a_bad_geojson_is_one_line_that_names_the_file_and_the_fault(
-    tmp_path, content, choice, says
-):
+def test_a_bad_geojson_is_one_line_that_names_the_file_and_the_fault(tmp_path, content, choice, says):
     file = tmp_path / "bad.geojson"
     if not isinstance(content, bytes):
         content = (content if isinstance(content, str) else json.dumps(content)).encode()

@@ -180,7 +180,7 @@ def test_a_share_of_a_fleet_is_rounded_up_but_for_float_error(share, n_agents, l
 
 def paid(success, terminated, truncated, **task):
     flags = Status(*(torch.tensor([flag]) for flag in (success, terminated, truncated)))
-    return final_reward(flags, torch.tensor([4]), RewardConfig(**task)).item()
+    return final_reward(flags, Counters(torch.tensor([4]), torch.zeros(1, 1)), RewardConfig(**task)).item()
 
 
 def test_the_bonus_is_constant_or_over_the_steps_and_only_for_success():

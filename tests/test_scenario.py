@@ -14,9 +14,7 @@ def test_the_library_needs_no_hydra_and_no_yaml():
     assert airspace.n_points.min() >= 5
 
 
-@pytest.mark.parametrize(
-    ("clock", "seconds"), [("1s", 1.0), ("0.5m", 30.0), ("1h", 3600.0), ("0.2", 0.2)]
-)
+@pytest.mark.parametrize(("clock", "seconds"), [("1s", 1.0), ("0.5m", 30.0), ("1h", 3600.0), ("0.2", 0.2)])
 def test_times_are_read_with_their_unit(clock, seconds):
     assert ClockConfig(simulation=clock).dt == pytest.approx(seconds)
 

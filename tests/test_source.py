@@ -158,9 +158,7 @@ def test_a_static_source_stays_where_it_is_put_for_ever():
     assert walk.stop.shape == (3, 1, 2)
     for time in (0.0, 1.0, 1e6):
         located = locate(walk, torch.full((3,), time))
-        torch.testing.assert_close(
-            located.position, torch.tensor([SCENARIO["source_position"]]).expand(3, 2)
-        )
+        torch.testing.assert_close(located.position, torch.tensor([SCENARIO["source_position"]]).expand(3, 2))
         assert located.stop.tolist() == [0] * 3
         assert located.stop.dtype == torch.long
         assert not located.finished.any()
@@ -216,8 +214,7 @@ def test_a_given_place_outside_the_polygon_is_refused():
     with pytest.raises(InputError) as error:
         drawn(HOLE, position=[0.0, 10.0])
     assert str(error.value) == (
-        "source.position: [0.0, 10.0] m is not inside the polygon "
-        "(x -100 to 100 m, y -100 to 100 m)"
+        "source.position: [0.0, 10.0] m is not inside the polygon (x -100 to 100 m, y -100 to 100 m)"
     )
 
 

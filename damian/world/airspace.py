@@ -62,9 +62,7 @@ def build_airspace(
         n_points=torch.tensor([len(lattice) for lattice in lattices]),
         # A padded edge has no height, so no ray crosses it.
         edges=_padded(edges, 0.0),
-        scale=torch.tensor(
-            [largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32
-        ),
+        scale=torch.tensor([largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32),
         regions=tuple(regions),
     )
 

@@ -14,9 +14,7 @@ EARTH_RADIUS_M = 6_371_008.8
 """Mean radius of the Earth (IUGG R1)."""
 
 
-def to_local(
-    lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]
-) -> tuple[Floats, Floats]:
+def to_local(lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
     """Local metres of places, by haversine distance d and initial bearing b from the origin.
 
     Args:
@@ -30,9 +28,7 @@ def to_local(
     """
     lat, lat_0 = np.radians(np.asarray(lat_deg, float)), np.radians(origin[0])
     d_lon = np.radians(np.asarray(lon_deg, float) - origin[1])
-    haversine = (
-        np.sin((lat - lat_0) / 2) ** 2 + np.cos(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
-    )
+    haversine = np.sin((lat - lat_0) / 2) ** 2 + np.cos(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
     distance = 2 * EARTH_RADIUS_M * np.arcsin(np.sqrt(np.clip(haversine, 0, 1)))
     east = np.cos(lat) * np.sin(d_lon)
     # cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(d_lon), without its cancellation nearby.

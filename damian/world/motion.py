@@ -52,13 +52,6 @@ class MotionConfig:
         checks.above("motion.level_separation", self.level_separation, 0.0, "m")
 
 
-class PhaseTimes(NamedTuple):
-    """Durations of the phases of a flight [s]; landing takes as long as takeoff."""
-
-    vertical: Tensor
-    cruise: Tensor
-
-
 class Pose(NamedTuple):
     """Where a UAV is in its flight: position [*, 3] m, and the distance cruised so far [*] m."""
 
@@ -119,20 +112,6 @@ def minimum_time(length: Tensor, degree: int, max_speed: float, max_acceleration
     for_speed = length * (_PEAK_SPEED[degree] / max_speed)
     for_acceleration = (length * (_PEAK_ACCELERATION[degree] / max_acceleration)).sqrt()
     return torch.maximum(for_speed, for_acceleration)
-
-
-def phase_times(origin: Tensor, target: Tensor, level: Tensor, motion: MotionConfig) -> PhaseTimes:
-    """Shortest phases of the flights from ``origin`` to ``target``.
-
-    Args:
-        origin: takeoff points, [*, 2] metres.
-        target: landing points, [*, 2] metres.
-        level: flight levels, [*] metres.
-        motion: degree and limits.
-    """
-    limits = (motion.degree, motion.max_speed, motion.max_acceleration)
-    cruise = torch.linalg.vector_norm(target - origin, dim=-1)
-    return PhaseTimes(minimum_time(level, *limits), minimum_time(cruise, *limits))
 
 
 def fly(

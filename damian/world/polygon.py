@@ -177,14 +177,10 @@ def _corners(vertices: ArrayLike, source: str) -> Floats:
     except (TypeError, ValueError):
         raise InputError(f"{source}: vertices are not a list of [x, y] numbers") from None
     if corners.ndim != 2 or corners.shape[1] != 2:
-        raise InputError(
-            f"{source}: vertices of shape {list(corners.shape)} are not a list of [x, y]"
-        )
+        raise InputError(f"{source}: vertices of shape {list(corners.shape)} are not a list of [x, y]")
     bad = np.flatnonzero(~np.isfinite(corners).all(axis=1))
     if len(bad):
-        raise InputError(
-            f"{source}: vertex {bad[0]} {corners[bad[0]].tolist()} is not two finite numbers"
-        )
+        raise InputError(f"{source}: vertex {bad[0]} {corners[bad[0]].tolist()} is not two finite numbers")
     return corners
 
 

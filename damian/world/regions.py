@@ -95,9 +95,7 @@ def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
         return _region([[np.array(corners)]], airspace_id, levels, airspace_id)
 
 
-def read_geojson(
-    path: str | os.PathLike[str], index: int | None = None, where: str | None = None
-) -> Region:
+def read_geojson(path: str | os.PathLike[str], index: int | None = None, where: str | None = None) -> Region:
     """Read one Polygon or MultiPolygon of a GeoJSON file, bare or within features.
 
     Positions are longitude, latitude; a height is ignored. Rings must be closed, as RFC 7946 asks
@@ -188,9 +186,7 @@ def _number(row: _Row, column: str) -> float:
         raise InputError(f"line {row.line}: {column} {_show(text)} is not a number") from None
     if not low <= value <= high:
         written = f"{text[:40]} {unit}".strip()
-        raise InputError(
-            f"line {row.line}: {column} {written} is not between {low:g} and {high:g} {unit}"
-        )
+        raise InputError(f"line {row.line}: {column} {written} is not between {low:g} and {high:g} {unit}")
     return value
 
 
@@ -314,8 +310,7 @@ def _position(place: str, position: Any) -> list[float]:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and low <= value <= high):
             raise InputError(
-                f"{place}: {name.lower()} {_show(value)} is not a number between {low:g} and "
-                f"{high:g} {unit}"
+                f"{place}: {name.lower()} {_show(value)} is not a number between {low:g} and {high:g} {unit}"
             )
     return position[:2]
 

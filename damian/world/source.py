@@ -247,9 +247,7 @@ def _static_walk(hotspots: np.ndarray) -> Walk:
     return Walk(stop, zeros, zeros + math.inf, ones, ones, ones.bool())
 
 
-def _draw_stops(
-    polygon: _Polygon, config: SourceConfig, n_walks: int, rng: np.random.Generator
-) -> _Stops:
+def _draw_stops(polygon: _Polygon, config: SourceConfig, n_walks: int, rng: np.random.Generator) -> _Stops:
     """Each hotspot followed by its inner points, packed to the left and padded."""
     hotspots = _hotspots(polygon, config, n_walks, config.n_hotspots, rng)
     inner = _inner_points(polygon, hotspots, config, rng)
@@ -300,9 +298,7 @@ def _timed_walk(stops: _Stops, config: SourceConfig, rng: np.random.Generator) -
     shape = stops.hotspot.shape
     padded = np.arange(shape[1]) >= stops.n[:, None]
     last = (stops.n - 1)[:, None]
-    place = np.where(
-        padded[..., None], np.take_along_axis(stops.place, last[..., None], axis=1), stops.place
-    )
+    place = np.where(padded[..., None], np.take_along_axis(stops.place, last[..., None], axis=1), stops.place)
     to_hotspot = np.roll(stops.hotspot, -1, axis=1)
     speed = np.where(to_hotspot, config.speed, config.local_speed)
     acceleration = np.where(to_hotspot, config.acceleration, config.local_acceleration)
