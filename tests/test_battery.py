@@ -171,7 +171,7 @@ def test_float32_levels_stay_float32():
             [[1.0, 2.0], [3.0]],
             "battery.charging_points: [3.0] is not [x, y] in metres",
         ),
-        ("charging_points", [1.0, 2.0], "battery.charging_points: [1.0] is not [x, y] in metres"),
+        ("charging_points", [1.0, 2.0], "battery.charging_points: 1.0 is not [x, y] in metres"),
         (
             "charging_points",
             [],
