@@ -61,7 +61,7 @@ def scenarios() -> Scenarios:
     paper = cast(TrainConfig, OmegaConf.to_object(written))
     full = replace(
         paper,
-        region=replace(paper.region, start_positions=None),
+        region=replace(paper.region, start_positions=None, situations=1024),
         motion=MotionConfig(kind="polynomial"),
         battery=BatteryConfig(enabled=True),
         actions=replace(paper.actions, mask=True),
@@ -77,7 +77,7 @@ def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:
     return replace(
         scenario,
         agents=agents,
-        region=replace(scenario.region, start_positions=None),
+        region=replace(scenario.region, start_positions=None, situations=1024),
         motion=replace(scenario.motion, max_level=30.0),  # room for 50 flight levels
     )
 
