@@ -13,9 +13,11 @@ from damian.features import ObservationConfig
 from damian.rewards import EpisodeConfig, RewardConfig
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import BatteryConfig
+from damian.world.fir import read_fir
+from damian.world.geojson import read_geojson
 from damian.world.motion import MotionConfig, flight_levels
 from damian.world.polygon import polygon_from_vertices, random_polygon
-from damian.world.regions import Region, read_fir, read_geojson
+from damian.world.regions import Region
 from damian.world.source import SourceConfig
 
 FLIGHT_LEVEL_M = 30.48

@@ -1,0 +1,177 @@
+"""GeoJSON (RFC 7946): one area of a file. Everything wrong in one is one `InputError` that says where."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from damian.errors import InputError
+from damian.world.geodesy import Floats
+from damian.world.reading import listed, named, near, read_text, show
+from damian.world.regions import Region, local_region
+
+_SHAPES = ("Polygon", "MultiPolygon")
+_BOUNDS = (("longitude", -180.0, 180.0), ("latitude", -90.0, 90.0))
+"""Of the numbers of a position, in their order [deg]."""
+
+
+class _Candidate(NamedTuple):
+    """One feature of a GeoJSON file; ``place`` is where it stands in there."""
+
+    place: str
+    properties: dict[str, Any]
+    geometry: Any
+
+
+def read_geojson(path: str | os.PathLike[str], index: int | None = None, where: str | None = None) -> Region:
+    """Read one Polygon or MultiPolygon of a GeoJSON file, bare or within features.
+
+    Positions are longitude, latitude; a height is ignored. Rings must be closed, as RFC 7946 asks
+    (an open one may be a file cut short). Parts of a MultiPolygon that touch or overlap are united.
+
+    Args:
+        path: the file.
+        index: which feature, counted from 0 over all features of the file.
+        where: which feature, as ``property=value``; needless, like ``index``, where only one
+            feature is an area.
+
+    Raises:
+        InputError: the file or the chosen shape is wrong, or the choice is not of one feature.
+    """
+    with named(path):
+        features = _candidates(_parse_json(read_text(Path(path))))
+        chosen = _choose(features, index, where)
+        name = chosen.properties.get("name")
+        name = name if isinstance(name, str) else f"{Path(path).stem} {chosen.place}".strip()
+        return local_region(_parts(chosen), name, None, chosen.place or "geometry")
+
+
+def _parse_json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"line {error.lineno}: not JSON: {error.msg}") from None
+    except RecursionError:
+        raise InputError("JSON nested too deeply for a GeoJSON file") from None
+    except ValueError as error:
+        raise InputError(f"not JSON: {error}") from None
+
+
+def _candidates(document: Any) -> list[_Candidate]:
+    """Every feature of a document; a bare geometry is one without properties."""
+    kind = document.get("type") if isinstance(document, dict) else None
+    if kind in _SHAPES:
+        return [_Candidate("", {}, document)]
+    if kind == "Feature":
+        return [_feature("", document)]
+    if kind != "FeatureCollection":
+        raise InputError(f"type {show(kind)} is not one of Polygon, MultiPolygon, Feature, FeatureCollection")
+    features = document.get("features")
+    if not isinstance(features, list) or not features:
+        raise InputError(f"features {show(features)} is not a list of at least one feature")
+    return [_feature(f"features[{i}]", feature) for i, feature in enumerate(features)]
+
+
+def _feature(place: str, feature: Any) -> _Candidate:
+    if not isinstance(feature, dict) or feature.get("type") != "Feature":
+        raise InputError(f"{place}: {show(feature)} is not a Feature")
+    properties = feature.get("properties")
+    properties = properties if isinstance(properties, dict) else {}
+    return _Candidate(place, properties, feature.get("geometry"))
+
+
+def _choose(candidates: list[_Candidate], index: int | None, where: str | None) -> _Candidate:
+    """The one feature that is meant."""
+    if index is not None and where is not None:
+        raise InputError(f"index {index} and where {show(where)} both choose; give one of them")
+    if index is not None:
+        if not 0 <= index < len(candidates):
+            raise InputError(f"index {index} is not between 0 and {len(candidates) - 1}")
+        return candidates[index]
+    if where is not None:
+        return _where(candidates, where)
+    areas = [c for c in candidates if _kind(c.geometry) in _SHAPES]
+    if len(areas) == 1 or len(candidates) == 1:
+        return (areas or candidates)[0]
+    if not areas:
+        raise InputError(f"none of {len(candidates)} features is a Polygon or MultiPolygon")
+    choice = listed(f"{c.place} {show(c.properties)}" for c in areas)
+    raise InputError(f"choose one of {len(areas)} features by index or property=value: {choice}")
+
+
+def _where(candidates: list[_Candidate], where: str) -> _Candidate:
+    """The one feature whose property has that value, as written in Python or in JSON."""
+    key, equals, value = where.partition("=")
+    if not equals:
+        raise InputError(f"where {show(where)} is not property=value")
+    having = [c for c in candidates if key in c.properties]
+    if not having:
+        known = {name for c in candidates for name in c.properties}
+        raise InputError(f"no feature has a property {show(key)}; {near(key, known)}")
+    found = [c for c in having if value in _spellings(c.properties[key])]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        places = listed(c.place for c in found)
+        raise InputError(f"where {show(where)} fits {len(found)} features: {places}")
+    known = {text for c in having for text in _spellings(c.properties[key])[:1]}
+    raise InputError(f"no feature has {key}={show(value)}; {near(value, known)}")
+
+
+def _spellings(value: Any) -> tuple[str, ...]:
+    """How a property may be written: ``north``, ``3``, ``true``; a nested one not at all."""
+    if isinstance(value, str):
+        return (value,)
+    return () if isinstance(value, dict | list) else (json.dumps(value), str(value))
+
+
+def _parts(chosen: _Candidate) -> list[list[Floats]]:
+    """Rings of every part, each [V, 2] degrees (longitude, latitude), closed."""
+    kind = _kind(chosen.geometry)
+    place = f"{chosen.place}.geometry".lstrip(".")
+    if kind not in _SHAPES:
+        raise InputError(f"{place}: type {show(kind)} is not one of Polygon, MultiPolygon")
+    place += ".coordinates"
+    coordinates = chosen.geometry.get("coordinates")
+    if kind == "Polygon":
+        return [_rings(place, coordinates)]
+    parts = _filled(place, coordinates)
+    return [_rings(f"{place}[{i}]", part) for i, part in enumerate(parts)]
+
+
+def _rings(place: str, rings: Any) -> list[Floats]:
+    rings = _filled(place, rings)
+    return [_ring(f"{place}[{i}]", ring) for i, ring in enumerate(rings)]
+
+
+def _ring(place: str, ring: Any) -> Floats:
+    positions = _filled(place, ring)
+    corners = [_position(f"{place}[{i}]", p) for i, p in enumerate(positions)]
+    if corners[0] != corners[-1]:
+        raise InputError(f"{place}: not closed: its last position is not its first {corners[0]}")
+    return np.array(corners, dtype=np.float64)
+
+
+def _position(place: str, position: Any) -> list[float]:
+    """Longitude and latitude of a position."""
+    if not isinstance(position, list) or len(position) < 2:
+        raise InputError(f"{place}: {show(position)} is not [longitude, latitude]")
+    for (name, low, high), value in zip(_BOUNDS, position, strict=False):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and low <= value <= high):
+            raise InputError(
+                f"{place}: {name} {show(value)} is not a number between {low:g} and {high:g} deg"
+            )
+    return position[:2]
+
+
+def _filled(place: str, value: Any) -> list[Any]:
+    if not isinstance(value, list) or not value:
+        raise InputError(f"{place}: {show(value)} is not a list with something in it")
+    return value
+
+
+def _kind(geometry: Any) -> Any:
+    return geometry.get("type") if isinstance(geometry, dict) else None
