@@ -45,7 +45,7 @@ class RegionConfig:
     index: int | None = None
     """Which feature of a GeoJSON file."""
     where: str | None = None
-    """Which feature of a GeoJSON file, as ``property=value``."""
+    """Which feature of a GeoJSON file, as ``property:value``."""
     lattice_step: float = 30.0
     """Distance between landing points in a row [m]."""
     lattice_angle: float = 45.0

@@ -57,7 +57,7 @@ def test_rows_of_a_table_are_taken_in_their_sequence():
 
 
 def test_local_metres_are_about_the_centroid():
-    for region in (read_fir(FIR, "North Bay"), read_geojson(ZONES, where="name=ell")):
+    for region in (read_fir(FIR, "North Bay"), read_geojson(ZONES, where="name:ell")):
         assert region.polygon.centroid.coords[0] == pytest.approx((0, 0), abs=1.0)
 
 

@@ -34,7 +34,8 @@ def read_geojson(path: str | os.PathLike[str], index: int | None = None, where: 
     Args:
         path: the file.
         index: which feature, counted from 0 over all features of the file.
-        where: which feature, as ``property=value``; needless, like ``index``, where only one
+        where: which feature, as ``property=value`` or, where = means something else already,
+            ``property:value``; needless, like ``index``, where only one
             feature is an area.
 
     Raises:
@@ -103,8 +104,8 @@ def _choose(candidates: list[_Candidate], index: int | None, where: str | None) 
 
 def _where(candidates: list[_Candidate], where: str) -> _Candidate:
     """The one feature whose property has that value, as written in Python or in JSON."""
-    key, equals, value = where.partition("=")
-    if not equals:
+    key, separator, value = where.partition("=" if "=" in where else ":")
+    if not separator:
         raise InputError(f"where {show(where)} is not property=value")
     having = [c for c in candidates if key in c.properties]
     if not having:
