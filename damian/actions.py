@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,6 +52,15 @@ def displacement(distance: Tensor, heading: Tensor) -> Tensor:
     return distance.unsqueeze(-1) * torch.stack([heading.sin(), heading.cos()], -1)
 
 
+class Ranking(NamedTuple):
+    """M lists of K landing points, the most preferred first."""
+
+    point: Tensor
+    """Ids within the region, [M, K]."""
+    distance: Tensor
+    """From where the UAV stands [m], [M, K]."""
+
+
 class Candidates:
     """Landing points that an action may lead to, nearest its target first.
 
@@ -67,8 +77,8 @@ class Candidates:
         if config.kind == "discrete":
             self._rank_all()
 
-    def of(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Candidate point ids [M, K], and each UAV's row among them [B, N].
+    def of(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Ranking, Tensor]:
+        """Candidates, and each UAV's row among them [B, N].
 
         Args:
             flat: flat id of the landing point each UAV stands on, [B, N].
@@ -76,92 +86,100 @@ class Candidates:
             action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
         """
         if self.config.kind == "discrete":
-            return self.ranked, flat * self.config.n_actions + action
+            return self.ranking, flat * self.config.n_actions + action
         distance = action[..., 0].clamp(0, 1) * self.max_distance
         heading = action[..., 1].clamp(0, 1) * 2 * math.pi
-        ranked, _ = self._rank(
+        ranking, _ = self._rank(
             self.airspace.points[region].unsqueeze(1),
             self.airspace.edges[region].unsqueeze(1),
             self.airspace.points.flatten(0, 1)[flat],
             flat % self.airspace.max_points,
             displacement(distance, heading),
         )
-        return ranked.flatten(0, 1), torch.arange(flat.numel(), device=flat.device).view_as(flat)
+        row = torch.arange(flat.numel(), device=flat.device).view_as(flat)
+        return Ranking(*(x.flatten(0, 1) for x in ranking)), row
 
     def _rank(
         self, points: Tensor, edges: Tensor, standing: Tensor, own: Tensor, move: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Ranking, Tensor]:
         """Candidates [*, K] and whether the target lies inside, [*]. Outside the UAV holds (SPEC 2)."""
         target = standing + move
         valid = inside(edges, target)
-        ranked = nearest_points(points, target, self.n_candidates)
-        return torch.where(valid.unsqueeze(-1), ranked, own.unsqueeze(-1)), valid
+        nearest = nearest_points(points, target, self.n_candidates)
+        nearest = torch.where(valid.unsqueeze(-1), nearest, own.unsqueeze(-1))
+        places = points.expand(*nearest.shape[:-1], *points.shape[-2:])
+        places = places.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, 2))
+        distance = torch.linalg.vector_norm(places - standing.unsqueeze(-2), dim=-1)
+        return Ranking(nearest, distance), valid
 
     def _rank_all(self) -> None:
-        """Every (landing point, action): its candidates, is it valid, how far is its nearest point.
+        """Everything about every (landing point, action).
 
-        ``ranked`` [R*L*A, K], ``valid`` [R*L, A], ``distance`` [R*L, A]; ``hold`` [A] marks one action
-        that holds (the first, if no listed distance is 0).
+        ``ranking`` of R*L*A lists; ``distance`` [R*L, A] to the nearest candidate, 0 if the action holds,
+        infinite if its target lies outside; ``hold`` [A] marks one action that holds (the first, if no
+        listed distance is 0).
         """
         table = self.config.table()
         move = displacement(table[:, 0], table[:, 1])
-        ranked, valid, distance = [], [], []
+        holds = table[:, 0] == 0
+        ranked, far, distance = [], [], []
         for points, edges in zip(self.airspace.points, self.airspace.edges, strict=True):
             for own in torch.arange(len(points)).split(64):  # bounds the memory of the search
                 standing = torch.nan_to_num(points[own], posinf=0.0).unsqueeze(1)
                 own_point = own.unsqueeze(-1).expand(-1, len(table))
-                nearest, within = self._rank(points, edges, standing, own_point, move)
-                reached = points[nearest[..., 0]]
-                ranked.append(nearest.flatten(0, 1).to(torch.int32))
-                valid.append(within | (table[:, 0] == 0))
-                distance.append(torch.linalg.vector_norm(reached - standing, dim=-1))
-        self.ranked, self.valid = torch.cat(ranked), torch.cat(valid)
+                ranking, within = self._rank(points, edges, standing, own_point, move)
+                ranked.append(ranking.point.flatten(0, 1).to(torch.int32))
+                far.append(ranking.distance.flatten(0, 1))
+                distance.append(ranking.distance[..., 0].where(within | holds, torch.inf))
+        self.ranking = Ranking(torch.cat(ranked), torch.cat(far))
         self.distance = torch.cat(distance)
-        self.can_hold = bool((table[:, 0] == 0).any())
-        first_hold = int((table[:, 0] == 0).int().argmax())
-        self.hold = torch.arange(len(table)) == first_hold
+        self.can_hold = bool(holds.any())
+        self.hold = torch.arange(len(table)) == int(holds.int().argmax())
 
     def to(self, device: torch.device) -> "Candidates":
         """Move the tables in place."""
         self.airspace = self.airspace.to(device)
         if self.config.kind == "discrete":
-            for name in ("ranked", "valid", "distance", "hold"):
-                setattr(self, name, getattr(self, name).to(device))
+            self.ranking = Ranking(*(table.to(device) for table in self.ranking))
+            self.distance, self.hold = self.distance.to(device), self.hold.to(device)
         return self
 
 
-def book(ranked: Tensor, row: Tensor, standing: Tensor, ready: Tensor, n_points: int) -> Tensor:
+def book(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_points: int) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point.
 
     A point is free if no other UAV stands on it or is bound for it (SPEC 2); a UAV's own always is. Most
     UAVs get their first candidate at once; only the worlds in which one does not are looked at again.
 
     Args:
-        ranked: candidate point ids by preference, [M, K].
-        row: each UAV's row of candidates, [B, N].
+        ranking: candidates.
+        row: each UAV's list among them, [B, N].
         standing: point that each UAV stands on or is bound for, [B, N].
-        ready: may the UAV choose; else it keeps its point, [B, N].
+        reach: how far the UAV may fly now [m], negative if it may not choose; a candidate beyond it is
+            none, so that it keeps nobody else from that point, [B, N].
         n_points: landing points of a region; ids are below it.
 
     Returns:
         Booked point of each UAV, [B, N].
     """
-    choice = torch.where(ready, rows(ranked[:, 0], row).long(), standing)
+    reached = rows(ranking.distance[:, 0], row) <= reach
+    choice = torch.where(reached, rows(ranking.point[:, 0], row).long(), standing)
     moves = choice != standing
     # How many stand on each point or want to move there: who finds more than itself may have to yield.
     claims = standing.new_zeros(len(standing), n_points, dtype=torch.int16)
     claim = torch.cat([torch.ones_like(moves), moves], -1).to(claims.dtype)
     claims = claims.scatter_add(1, torch.cat([standing, choice], -1), claim)
     contested = (moves & (claims.gather(1, choice) > 1)).any(-1)
-    return _settle(ranked, row, standing, ready, choice, contested, n_points)
+    return _settle(*ranking, row, standing, reach, choice, contested, n_points)
 
 
 @torch.library.custom_op("damian::settle", mutates_args=())
 def _settle(
-    ranked: Tensor,
+    point: Tensor,
+    distance: Tensor,
     row: Tensor,
     standing: Tensor,
-    ready: Tensor,
+    reach: Tensor,
     choice: Tensor,
     contested: Tensor,
     n_points: int,
@@ -173,18 +191,20 @@ def _settle(
     settled = choice.clone()
     worlds = contested.nonzero().squeeze(-1)
     if len(worlds):
-        row, standing, ready = (t.index_select(0, worlds) for t in (row, standing, ready))
-        candidates = torch.where(ready.unsqueeze(-1), rows(ranked, row), standing.unsqueeze(-1))
+        row, standing, reach = (t.index_select(0, worlds) for t in (row, standing, reach))
+        reached = rows(distance, row) <= reach.unsqueeze(-1)
+        candidates = torch.where(reached, rows(point, row), standing.unsqueeze(-1))
         settled.index_copy_(0, worlds, _book_in_order(candidates, standing, n_points))
     return settled
 
 
 @_settle.register_fake
 def _(
-    ranked: Tensor,
+    point: Tensor,
+    distance: Tensor,
     row: Tensor,
     standing: Tensor,
-    ready: Tensor,
+    reach: Tensor,
     choice: Tensor,
     contested: Tensor,
     n_points: int,

@@ -21,14 +21,14 @@ def in_range(key: str, value: float, low: float, high: float = math.inf, unit: s
     """Require a finite number ``low <= value <= high``."""
     unit = f" {unit}" if unit else ""
     bounds = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
-    good = isinstance(value, int | float) and math.isfinite(value) and low <= value <= high
+    good = isinstance(value, int | float) and low <= value <= high and value < math.inf
     require(good, key, f"{value}{unit}", f"is not {bounds}{unit}")
 
 
 def above(key: str, value: float, low: float, unit: str = "") -> None:
     """Require a finite number above ``low``."""
     unit = f" {unit}" if unit else ""
-    good = isinstance(value, int | float) and math.isfinite(value) and value > low
+    good = isinstance(value, int | float) and low < value < math.inf
     require(good, key, f"{value}{unit}", f"is not above {low:g}{unit}")
 
 
@@ -58,8 +58,7 @@ def seconds(key: str, value: str | float) -> float:
 
 
 def device(key: str, value: str) -> None:
-    """Require a device that torch knows and that this machine has."""
-    try:
-        torch.empty(0, device=value)
-    except (RuntimeError, AssertionError):
-        raise InputError(f"{key}: {value} is not to be had here; try cpu or cuda") from None
+    """Require the CPU or a CUDA device that this machine has."""
+    known = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    known += ["cuda"] * (len(known) > 1)
+    require(value in known, key, value, f"is not one of the devices here: {', '.join(known)}")

@@ -45,7 +45,7 @@ class ObservationConfig:
     ctde: bool = False
     """Centralised training, decentralised execution: the actor sees the local features only."""
     time_scale: float | None = None
-    """Times are divided by this [s]; the episode's time limit if not given."""
+    """Times are divided by this [s]; by the episode's time limit, or an hour, if not given."""
     window: int = 2
     """Positions over which the coverage area is counted."""
 

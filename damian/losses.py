@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.utils import ValueEstimators
@@ -62,6 +63,7 @@ def mappo_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: Mapp
         entropy_coeff=config.entropy,
         critic_coeff=config.value,
         normalize_advantage=False,  # done in ``add_advantages``, over decisions only
+        reduction="none",  # likewise, in ``losses_of``
     )
     loss.set_keys(
         reward=("agents", "reward"),
@@ -86,6 +88,24 @@ def add_advantages(batch: TensorDictBase, loss: MAPPOLoss, config: MappoConfig) 
     advantage = batch["agents", "advantage"]
     ready = batch["agents", "ready"].unsqueeze(-1)
     if config.normalize_advantage:
-        chosen = advantage[ready]
-        advantage = (advantage - chosen.mean()) / chosen.std().clamp(min=1e-6)
-    batch["agents", "advantage"] = advantage * ready
+        chosen = advantage[ready] if ready.any() else torch.zeros(1, device=advantage.device)
+        advantage = (advantage - chosen.mean()) / chosen.std(correction=0).clamp(min=1e-6)
+    batch["agents", "advantage"] = torch.where(ready, advantage, 0.0)
+
+
+def losses_of(batch: TensorDictBase, loss: MAPPOLoss) -> dict[str, Tensor]:
+    """The parts of the loss on a batch [M]; actor and entropy over decisions only, the critic over all.
+
+    In flight a policy "chooses" too, but nothing follows from it (SPEC 1).
+    """
+    parts = loss(batch)
+    ready = batch["agents", "ready"].float()
+
+    def over_decisions(part: Tensor) -> Tensor:
+        return (part.view_as(ready) * ready).sum() / ready.sum().clamp(min=1)
+
+    return {
+        "loss_objective": over_decisions(parts["loss_objective"]),
+        "loss_entropy": over_decisions(parts["loss_entropy"]),
+        "loss_critic": parts["loss_critic"].mean(),
+    }

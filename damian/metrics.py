@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -14,17 +14,13 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Means over episodes; a failed episode counts its time limit as its steps."""
+    """Means over episodes; one that nothing ends counts the horizon as its steps."""
 
     episodes: int
     success_rate: float
     steps: float
     episode_return: float
     """Sum of rewards of an episode, mean over the UAVs."""
-
-    def row(self) -> dict[str, float]:
-        """By name, for logs and tables."""
-        return asdict(self)
 
 
 @torch.no_grad()

@@ -29,7 +29,7 @@ class ModelConfig:
     def __post_init__(self) -> None:
         checks.one_of("model.activation", self.activation, _ACTIVATIONS)
         for width in self.hidden:
-            checks.in_range("model.hidden", width, 1)
+            checks.in_range("model.hidden", width, 1, 16384)
 
     def network(self, n_in: int, n_out: int, device: torch.device | None) -> MLP:
         """Features [*, n_in] to outputs [*, n_out]."""

@@ -73,7 +73,7 @@ class RewardConfig:
     bonus_over_steps: bool = False
     """Divide the bonus by the steps that the success took (use case 2: 2 / steps)."""
     penalty: float = 0.0
-    """Subtracted on failure (time or battery)."""
+    """Subtracted when an episode ends without success."""
 
     def __post_init__(self) -> None:
         for name in (*INDIVIDUAL, *SYSTEM, "individual", "system", "bonus", "penalty"):
@@ -190,7 +190,7 @@ def status(
 
 
 def final_reward(ended: Status, counters: Counters, config: RewardConfig) -> Tensor:
-    """Bonus on success, penalty on failure, the same for every UAV, [*]."""
+    """Bonus on success, penalty at any other end, the same for every UAV, [*]."""
     bonus = config.bonus / counters.steps.clamp(min=1) if config.bonus_over_steps else config.bonus
     failure = (ended.terminated | ended.truncated) & ~ended.success
     return ended.success * bonus - failure * config.penalty

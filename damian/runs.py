@@ -31,7 +31,8 @@ class MetricsLog:
 
     def __init__(self, folder: Path, tensorboard: bool, to_csv: bool, frames: int = 0) -> None:
         self._path = folder / METRICS if to_csv else None
-        self._writer = SummaryWriter(str(folder)) if tensorboard else None
+        purge = frames + 1 if frames else None
+        self._writer = SummaryWriter(str(folder), purge_step=purge) if tensorboard else None
         self.rows = [row for row in read_metrics(folder) if row["frames"] <= frames]
         if self._path:
             self._path.unlink(missing_ok=True)
@@ -90,6 +91,8 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         return []
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
+        if "frames" not in (reader.fieldnames or []):
+            raise InputError(f"{path}, line 1: no column frames")
         try:
             return [{name: float(number) for name, number in row.items()} for row in reader]
         except (TypeError, ValueError) as error:

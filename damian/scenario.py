@@ -64,7 +64,13 @@ class RegionConfig:
         checks.above("region.min_area", self.min_area, 0.0, "m^2")
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
         checks.in_range("region.pool", self.pool, 1)
-        checks.in_range("region.situations", self.situations, self.pool)
+        checks.in_range("region.situations", self.situations, self.pool, 1e6)
+        checks.require(
+            self.pool == 1 or self.kind == "random",
+            "region.pool",
+            self.pool,
+            f"means nothing with region.kind={self.kind}: only random regions are drawn",
+        )
         checks.above("region.lattice_step", self.lattice_step, 0.0, "m")
         checks.above("region.lattice_angle", self.lattice_angle, 0.0, "deg")
         checks.in_range("region.lattice_angle", self.lattice_angle, 0.0, 90.0, "deg")
@@ -153,12 +159,30 @@ class ScenarioConfig:
     def __post_init__(self) -> None:
         checks.in_range("agents", self.agents, 1)
         flight_levels(self.motion, self.agents)
+        self._check_ends()
+        alone = self.agents == 1 and self.observation.actor == ["agent_distances"]
+        checks.require(not alone, "observation", "agent_distances", "is all that a single UAV sees")
         starts = self.region.start_positions
         checks.require(
             starts is None or len(starts) == self.agents,
             "region.start_positions",
             f"{len(starts or [])} places",
             f"are not one for each of the {self.agents} UAVs (agents)",
+        )
+
+    def _check_ends(self) -> None:
+        """An end that can never come is a mistake."""
+        checks.require(
+            self.episode.discharged_share is None or self.battery.enabled,
+            "episode.discharged_share",
+            self.episode.discharged_share,
+            "needs battery.enabled=true: the batteries stay full",
+        )
+        checks.require(
+            not self.episode.end_with_source or self.source.motion == "dynamic",
+            "episode.end_with_source",
+            True,
+            "needs source.motion=dynamic: a static source never ends its walk",
         )
 
     @property

@@ -19,12 +19,13 @@ from damian.world import draws
 from damian.world.airspace import Airspace, inside, nearest_points, rows
 from damian.world.battery import (
     charge_gain,
-    cruise_drain,
+    cruise_range,
     flight_drain,
     used_so_far,
     vertical_drain,
 )
 from damian.world.motion import flight_levels, fly, minimum_time
+from damian.world.polygon import MAX_COORDINATE_M
 from damian.world.source import Walk, draw_walks, footprint_radius, locate
 
 _TIME_EPS = 1e-4
@@ -52,8 +53,6 @@ class Simulation:
         self.levels = torch.tensor(flight_levels(config.motion, config.agents))
         self.vertical = self._shortest(self.levels)
         self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
-        if config.battery.enabled and config.actions.kind == "discrete":
-            self.action_drain = self._action_drain()
         self.charge = float(charge_gain(torch.tensor(self.dt), config.battery))
         self.chargers = _chargers(config, self.airspace)
         self.initial = self._begin(region, start, seed)
@@ -107,24 +106,21 @@ class Simulation:
 
         A single legal action has log-probability 0 and no gradient: in flight a policy learns nothing.
         """
-        if self.config.battery.enabled:
-            left = (state.battery - self.vertical_drain).unsqueeze(-1)
-            valid = rows(self.action_drain, state.goal) <= left
-        else:
-            valid = rows(self.candidates.valid, state.goal)
+        distance = rows(self.candidates.distance, state.goal)
+        valid = distance <= self.reach(state).clamp(min=0).unsqueeze(-1)
         if not self.candidates.can_hold:
             valid = valid | ~valid.any(-1, keepdim=True)
         if not self.flies:
             return valid
         return torch.where(self.ready(state).unsqueeze(-1), valid, self.candidates.hold)
 
-    def _action_drain(self) -> Tensor:
-        """Cruise drain of the flight to each action's nearest point [%], [R*L, A]: -inf if it holds,
-        inf if it is not valid."""
-        distance = self.candidates.distance
-        drain = cruise_drain(distance, self.config.battery)
-        drain = drain.where(distance > 0, -torch.inf)
-        return drain.where(self.candidates.valid, torch.inf)
+    def reach(self, state: State) -> Tensor:
+        """How far the UAV may fly now [m], [B, N]; negative if it may not leave its point."""
+        if self.config.battery.enabled:
+            left = cruise_range(state.battery - self.vertical_drain, self.config.battery)
+        else:
+            left = torch.full_like(state.battery, MAX_COORDINATE_M)
+        return torch.where(self.ready(state), left, -1.0)
 
     # One step, in order.
 
@@ -132,12 +128,9 @@ class Simulation:
         """Book landing points and start flights."""
         base = state.region.unsqueeze(-1) * self.airspace.max_points
         standing = state.goal - base
-        ranked, row = self.candidates.of(state.goal, state.region, action)
+        ranking, row = self.candidates.of(state.goal, state.region, action)
         ready = self.ready(state)
-        goal = book(ranked, row, standing, ready, self.airspace.max_points) + base
-        if self.config.battery.enabled:
-            reachable = self._drain(self._length(state.goal, goal)) <= state.battery
-            goal = torch.where(reachable, goal, state.goal)
+        goal = book(ranking, row, standing, self.reach(state), self.airspace.max_points) + base
         departs = goal != state.goal
         east, north = (rows(self.points, goal) - rows(self.points, state.goal)).unbind(-1)
         heading = torch.remainder(torch.atan2(east, north), 2 * math.pi)
@@ -206,7 +199,7 @@ class Simulation:
             motions=state.motions,
             detected_time=torch.where(spotted, times, state.sent.detected_time),
             detected_position=torch.where(spotted.unsqueeze(-1), position, state.sent.detected_position),
-            trail=torch.cat([state.goal.unsqueeze(-1), state.sent.trail[..., :-1]], -1),
+            trail=self._trail(state, talks),
         )
         return state._replace(
             source=place,
@@ -217,6 +210,14 @@ class Simulation:
         )
 
     # Parts.
+
+    def _trail(self, state: State, talks: Tensor) -> Tensor:
+        """The latest landing points, one for each decision, however long the UAV then senses there."""
+        longer = torch.cat([state.goal.unsqueeze(-1), state.sent.trail[..., :-1]], -1)
+        if not self.flies:
+            return longer
+        waited = (state.elapsed > self.dt + _TIME_EPS) & state.talks
+        return torch.where((talks & ~waited).unsqueeze(-1), longer, state.sent.trail)
 
     def _source(self, state: State, now: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Where the source is [B, 2], whether it emits [B], and whether its walk is over [B]."""

@@ -7,8 +7,8 @@ import difflib
 import functools
 import os
 import re
-import shutil
 import sys
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -21,8 +21,10 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from torchrl.checkpoint import Checkpoint
 
 from damian import checks
 from damian.errors import InputError
@@ -76,8 +78,11 @@ class TrainConfig(ScenarioConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.in_range("seed", self.seed, 0, 2**31)
-        for name in ("worlds", "frames", "eval_episodes", "checkpoint_every", "threads"):
-            checks.in_range(name, getattr(self, name), 1)
+        for name in ("worlds", "eval_episodes"):
+            checks.in_range(name, getattr(self, name), 1, 1e6)
+        for name in ("frames", "checkpoint_every"):
+            checks.in_range(name, getattr(self, name), 1, 1e12)
+        checks.in_range("threads", self.threads, 1, 1024)
         if self.episodes is not None:
             checks.in_range("episodes", self.episodes, 1)
         checks.device("device", self.device)
@@ -97,8 +102,16 @@ class TrainConfig(ScenarioConfig):
 
 
 ConfigStore.instance().store(name="schema", node=TrainConfig)
-OmegaConf.register_new_resolver("plain", lambda name: re.sub(r"[^\w.=,-]", "", name))
 OmegaConf.register_new_resolver("shipped", lambda name: str(files("damian") / "data" / name))
+
+
+def _plain(name: str) -> str:
+    """A folder's name without quotes and brackets, and not too long for a file system."""
+    plain = re.sub(r"[^\w.=,-]", "", name)
+    return plain if len(plain) <= 100 else f"{plain[:90]}_{zlib.crc32(plain.encode()):08x}"
+
+
+OmegaConf.register_new_resolver("plain", _plain)
 
 
 def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:
@@ -111,9 +124,13 @@ def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     if written.resume is not None:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise InputError("resume: one run goes on at a time; leave out -m")
         _drop_empty(folder)
         folder = Path(written.resume)
         written = _resumed(folder, HydraConfig.get().overrides.task)
+    elif (folder / CONFIG).exists():
+        raise InputError(f"hydra.run.dir: {folder} holds a run already; resume={folder} goes on with it")
     config = OmegaConf.to_object(written)
     unknown = leftovers(written, config)
     if unknown:
@@ -127,6 +144,18 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     OmegaConf.save(OmegaConf.structured(config), folder / CONFIG)
 
 
+def load(checkpoint: Checkpoint, folder: Path) -> None:
+    """Restore a checkpoint from a run folder.
+
+    Raises:
+        InputError: it is incomplete, or of another configuration.
+    """
+    try:
+        checkpoint.load(folder / CHECKPOINT)
+    except Exception as error:  # whatever a spoilt file makes of itself
+        raise InputError(f"resume: {folder / CHECKPOINT}: {_one_line(error)}") from error
+
+
 def _resumed(folder: Path, overrides: Sequence[str]) -> DictConfig:
     allowed = ("resume=", "frames=", "episodes=")
     other = [word for word in overrides if not word.startswith(allowed)]
@@ -138,8 +167,15 @@ def _resumed(folder: Path, overrides: Sequence[str]) -> DictConfig:
     for needed in (CONFIG, CHECKPOINT):
         if not (folder / needed).exists():
             raise InputError(f"resume: {folder} holds no {needed}, so there is nothing to go on with")
-    saved = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(folder / CONFIG))
+    try:
+        saved = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(folder / CONFIG))
+    except Exception as error:
+        raise InputError(f"resume: {folder / CONFIG}: {_one_line(error)}") from None
     return cast(DictConfig, OmegaConf.merge(saved, OmegaConf.from_dotlist(list(overrides))))
+
+
+_begun: list[bool] = []
+"""Filled once Hydra has composed a configuration: what fails from then on is not a wrong command line."""
 
 
 def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
@@ -147,6 +183,7 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
 
     @functools.wraps(main)
     def checked(written: DictConfig) -> None:
+        _begun.append(True)
         try:
             main(written)
         except (InputError, OmegaConfBaseException) as error:
@@ -160,9 +197,12 @@ def launch(main: Callable[[], Any]) -> None:
     """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
     # Hydra reads a bare number as an integer, which no config group may be called.
     sys.argv = [re.sub(r"^(\+?usecase=)([\d,]+)$", _quoted, word) for word in sys.argv]
+    _begun.clear()
     try:
         main()
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError) as error:
+        if _begun:
+            raise  # no wrong input but our mistake: its traceback is needed
         _give_up(error)
 
 
@@ -176,9 +216,16 @@ def _quoted(match: re.Match[str]) -> str:
 
 
 def _drop_empty(folder: Path) -> None:
-    """Remove a run folder in which nothing has been written."""
-    if folder.is_dir() and not any(path.is_file() for path in folder.rglob("*")):
-        shutil.rmtree(folder)
+    """Remove a run folder that holds nothing, and what Hydra made around it."""
+    if not folder.is_dir() or any(folder.iterdir()):
+        return
+    folder.rmdir()
+    around = folder.parent
+    if [path.name for path in around.iterdir()] == ["multirun.yaml"]:
+        (around / "multirun.yaml").unlink()
+        _drop_empty(around)
+    elif around.resolve() != Path.cwd() and not any(around.iterdir()):
+        around.rmdir()
 
 
 def _one_line(error: BaseException) -> str:

@@ -13,10 +13,11 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import hydra
 import torch
-from launch import CONF, TrainConfig, launch, prepare, reported, save_config
+from launch import CONF, TrainConfig, launch, load, prepare, reported, save_config
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
@@ -27,7 +28,7 @@ from torchrl.objectives.multiagent import MAPPOLoss
 from tqdm import tqdm
 
 from damian.env import UavEnv
-from damian.losses import MappoConfig, add_advantages, mappo_loss
+from damian.losses import MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.models import make_actor, make_critic, random_policy
 from damian.runs import (
@@ -56,7 +57,7 @@ class Progress:
 
 def make_env(config: TrainConfig, worlds: int, seed: int) -> TransformedEnv:
     """The environment that policies are trained and evaluated in."""
-    env = UavEnv(config, worlds, seed, config.device, extras=())
+    env = UavEnv(config, worlds, seed, config.device, extras=["reward_terms"])
     if config.compile:
         env.compile()
     episode_reward = RewardSum(in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")])
@@ -77,21 +78,20 @@ def update(
     sums: dict[str, float] = {}
     for _ in range(algo.epochs):
         for part in buffer:
-            losses = loss(part)
-            terms = ("loss_objective", "loss_critic", "loss_entropy")
+            losses = losses_of(part, loss)
             optimizer.zero_grad()
-            torch.stack([losses[term] for term in terms]).sum().backward()
+            torch.stack([*losses.values()]).sum().backward()
             torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
             optimizer.step()
-            for term in terms:
-                sums[term] = sums.get(term, 0.0) + losses[term].item()
+            for term, value in losses.items():
+                sums[term] = sums.get(term, 0.0) + value.item()
     return {term: total / (algo.epochs * algo.minibatches) for term, total in sums.items()}
 
 
 def train(config: TrainConfig, folder: Path) -> None:
     """Learn, then evaluate and fill the run folder."""
     env = make_env(config, config.worlds, config.seed)
-    save_config(config, folder)
+    unseen = make_env(config, config.eval_episodes, config.seed + 10_000)
     actor, critic = make_actor(env, config.model), make_critic(env, config.model)
     loss = mappo_loss(actor, critic, config.algo)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.algo.lr)
@@ -111,42 +111,55 @@ def train(config: TrainConfig, folder: Path) -> None:
         rng=GlobalRNGState(),
     )
     if config.resume:
-        checkpoint.load(folder / CHECKPOINT)
+        load(checkpoint, folder)
         env.set_seed(config.seed + progress.updates)  # not the first episodes once more
+    save_config(config, folder)
     log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
     collector = Collector(
         env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
     )
     bar = tqdm(total=config.frames, initial=progress.frames, unit=" steps", unit_scale=True)
     with closing(log), closing(bar), Interrupt() as interrupt:
-        for batch in collector:
+        for batch in collector if not enough(config, progress, episodes) else ():
             episodes.add(batch)
             losses = update(batch, loss, optimizer, buffer, config.algo)
             progress.frames += batch.numel()
             progress.updates += 1
-            log.add(progress.frames, {**episodes.means(), **losses})
+            log.add(progress.frames, {**episodes.means(), **mean_terms(batch), **losses})
             bar.set_postfix({name: f"{mean:.2f}" for name, mean in episodes.means().items()})
             bar.update(batch.numel())
-            over = progress.frames >= config.frames
-            over = over or episodes.finished >= (config.episodes or torch.inf)
-            if over or interrupt.asked or progress.updates % config.checkpoint_every == 0:
+            over = enough(config, progress, episodes) or interrupt.asked
+            if over or progress.updates % config.checkpoint_every == 0:
                 checkpoint.save(folder / CHECKPOINT)
-            if over or interrupt.asked:
+            if over:
                 break
     collector.shutdown()
     if interrupt.asked:
         sys.exit(f"interrupted; go on with resume={folder}")
-    report(config, folder, actor, log)
+    report(config, folder, unseen, actor, log)
 
 
-def report(config: TrainConfig, folder: Path, actor: torch.nn.Module, log: MetricsLog) -> None:
+def enough(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> bool:
+    """Has the run lasted as long as it should?"""
+    return progress.frames >= config.frames or episodes.finished >= (config.episodes or torch.inf)
+
+
+def mean_terms(batch: TensorDictBase) -> dict[str, float]:
+    """Mean of each weighted reward term, over steps, worlds and UAVs."""
+    terms = cast(TensorDictBase, batch["next", "agents", "reward_terms"])
+    return {f"reward/{name}": terms[name].mean().item() for name in terms.keys()}
+
+
+def report(
+    config: TrainConfig, folder: Path, unseen: TransformedEnv, actor: torch.nn.Module, log: MetricsLog
+) -> None:
     """Evaluate on situations that were not trained on, and write figure and table."""
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
-        unseen = make_env(config, config.eval_episodes, config.seed + 10_000)
+        unseen.set_seed(config.seed)  # the same episodes for every policy
         return evaluate(unseen, policy, config.horizon, sample)
 
-    random = fly(random_policy(make_env(config, 1, config.seed)))
+    random = fly(random_policy(unseen))
     rows = {"trained, sampled": fly(actor), "trained, mode": fly(actor, False), "random": random}
     table = results_table(rows, config.episode.success_share is not None)
     (folder / "result.md").write_text(table + "\n")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Polygon
 
-from damian.actions import ActionConfig, Candidates, book, displacement
+from damian.actions import ActionConfig, Candidates, Ranking, book, displacement
 from damian.errors import InputError
 from damian.world.airspace import build_airspace, inside, nearest_points
 from damian.world.regions import Region
@@ -34,6 +34,12 @@ def fleets(seed, n_worlds, n_agents, n_points, together):
     return ranked, row, standing, ready
 
 
+def booked(ranked, row, standing, ready, n_points):
+    """Points booked by UAVs that are ready or not, however far they can fly."""
+    ranking = Ranking(ranked, torch.zeros(ranked.shape))
+    return book(ranking, row, standing, torch.where(ready, 0.0, -1.0), n_points)
+
+
 @settings(max_examples=150, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -45,7 +51,7 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
     n_points = n_agents + spare
     case = fleets(seed, 6, n_agents, n_points, together)
     ranked, row, standing, ready = map(torch.as_tensor, case)
-    ours = book(ranked.int(), row, standing, ready, n_points)
+    ours = booked(ranked.int(), row, standing, ready, n_points)
     expected = [twin.book(ranked[row[b]].tolist(), standing[b].tolist(), ready[b].tolist()) for b in range(6)]
     assert ours.tolist() == expected
 
@@ -55,7 +61,7 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
 def test_uavs_on_different_points_never_book_the_same(seed, n_agents, spare):
     case = fleets(seed, 20, n_agents, n_agents + spare, False)
     ranked, row, standing, ready = map(torch.as_tensor, case)
-    ours = book(ranked.int(), row, standing, ready, n_agents + spare)
+    ours = booked(ranked.int(), row, standing, ready, n_agents + spare)
     assert all(len(set(world)) == n_agents for world in ours.tolist())
     assert ours[~ready].equal(standing[~ready])
 
@@ -64,21 +70,28 @@ def test_of_two_that_want_one_point_the_first_gets_it_and_the_other_its_next():
     ranked = torch.tensor([[5, 7, 1], [5, 0, 2]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 1], [1, 0]]), torch.tensor([[1, 2], [1, 2]])
     ready = torch.ones(2, 2, dtype=torch.bool)
-    assert book(ranked, row, standing, ready, 8).tolist() == [[5, 0], [5, 7]]
+    assert booked(ranked, row, standing, ready, 8).tolist() == [[5, 0], [5, 7]]
 
 
 def test_a_point_that_is_left_in_this_step_is_not_free_yet():
     ranked = torch.tensor([[5, 7, 1], [1, 6, 2]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
     ready = torch.ones(1, 2, dtype=torch.bool)
-    assert book(ranked, row, standing, ready, 8).tolist() == [[5, 6]]
+    assert booked(ranked, row, standing, ready, 8).tolist() == [[5, 6]]
+
+
+def test_a_point_out_of_reach_is_left_to_whoever_can_fly_there():
+    ranking = Ranking(torch.tensor([[5, 7, 1], [5, 2, 0]]), torch.tensor([[9.0, 4.0, 0.0], [9.0, 0.0, 4.0]]))
+    row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
+    assert book(ranking, row, standing, torch.tensor([[8.0, 9.0]]), 8).tolist() == [[1, 5]]
+    assert book(ranking, row, standing, torch.tensor([[9.0, 9.0]]), 8).tolist() == [[5, 2]]
 
 
 def test_from_a_common_start_one_may_stay_and_the_others_leave():
     ranked = torch.tensor([[3, 0, 1, 2, 4], [4, 0, 1, 2, 3]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 0, 1]]), torch.tensor([[3, 3, 3]])
     ready = torch.ones(1, 3, dtype=torch.bool)
-    assert book(ranked, row, standing, ready, 5).tolist() == [[3, 3, 4]]
+    assert booked(ranked, row, standing, ready, 5).tolist() == [[3, 3, 4]]
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_points=st.integers(1, 40), integer_grid=st.booleans())
@@ -169,10 +182,10 @@ def test_the_discrete_table_equals_the_continuous_path():
         share = [[d / 153.9, heading(math.degrees(h))] for d, h in table.tolist()]
         action = torch.tensor(share).expand(count, -1, -1)
         regions = torch.full((count,), region)
-        ranked, row = discrete.of(flat, regions, number)
+        ranking, row = discrete.of(flat, regions, number)
         loose, loose_row = continuous.of(flat, regions, action)
         assert loose_row.shape == row.shape == flat.shape
-        assert ranked[row][..., :1].long().equal(loose[loose_row][..., :1])
+        assert ranking.point[row][..., :1].long().equal(loose.point[loose_row][..., :1])
         compared += row.numel()
     assert compared == 20 * int(airspace.n_points.sum())
 
@@ -190,12 +203,12 @@ def test_candidates_are_the_points_nearest_the_target_or_the_own_one(kind):
     if kind == "continuous":
         moves = share[:, 0] * torch.tensor([153.9, 2 * math.pi])
     action = number if kind == "discrete" else share
-    ranked, row = ways.of(flat, torch.zeros(len(flat), dtype=torch.long), action)
+    ranking, row = ways.of(flat, torch.zeros(len(flat), dtype=torch.long), action)
     outside = 0
     for own, (distance, bearing) in enumerate(moves.tolist()):
         x, y = points[own]
         target = (x + distance * math.sin(bearing), y + distance * math.cos(bearing))
-        found = ranked[row[own, 0]].tolist()
+        found = ranking.point[row[own, 0]].tolist()
         assert len(found) == 2 * 3 - 1
         if shapely.contains_xy(polygon, *target):
             far = sorted(math.dist(p, target) for p in points)

@@ -161,7 +161,7 @@ def test_float32_levels_stay_float32():
     [
         ("engine_power_kw", 0.0, "battery.engine_power_kw: 0.0 kW is not above 0 kW"),
         ("reference_speed", -1.0, "battery.reference_speed: -1.0 m/s is not above 0 m/s"),
-        ("capacity_kwh", math.inf, "battery.capacity_kwh: inf kWh is not above 0 kWh"),
+        ("capacity_kwh", math.inf, "battery.capacity_kwh: inf kWh is not at least 1e-06 kWh"),
         ("efficiency", 0.0, "battery.efficiency: 0.0 is not above 0"),
         ("charging_power_kw", 0.0, "battery.charging_power_kw: 0.0 kW is not above 0 kW"),
         ("resolution", 0.0, "battery.resolution: 0.0 % is not above 0 %"),

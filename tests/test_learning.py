@@ -100,7 +100,7 @@ def test_advantages_are_scaled_over_decisions_only():
     add_advantages(batch, loss, MappoConfig())
     advantage = batch["agents", "advantage"][batch["agents", "ready"]]
     assert advantage.mean().item() == pytest.approx(0, abs=1e-5)
-    assert advantage.std().item() == pytest.approx(1, abs=1e-4)
+    assert advantage.std(correction=0).item() == pytest.approx(1, abs=1e-4)
 
 
 def test_advantages_are_the_generalised_estimate_of_each_uav():

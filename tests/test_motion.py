@@ -245,9 +245,9 @@ def test_flight_levels_are_separated_and_lie_within_bounds():
     [
         ("kind", "teleport", "motion.kind: teleport is not one of instant, polynomial"),
         ("degree", 4, "motion.degree: 4 is not one of 3, 5, 7"),
-        ("max_speed", 0.0, "motion.max_speed: 0.0 m/s is not above 0 m/s"),
-        ("max_acceleration", -2.0, "motion.max_acceleration: -2.0 m/s^2 is not above 0 m/s^2"),
-        ("max_speed", math.nan, "motion.max_speed: nan m/s is not above 0 m/s"),
+        ("max_speed", 0.0, "motion.max_speed: 0.0 m/s is not at least 0.001 m/s"),
+        ("max_acceleration", -2.0, "motion.max_acceleration: -2.0 m/s^2 is not at least 0.001 m/s^2"),
+        ("max_speed", math.nan, "motion.max_speed: nan m/s is not at least 0.001 m/s"),
         ("sensing_time", -1.0, "motion.sensing_time: -1.0 s is not at least 0 s"),
         ("min_level", 0.0, "motion.min_level: 0.0 m is not above 0 m"),
         ("max_level", 0.5, "motion.max_level: 0.5 m is not at least 1 m"),

@@ -39,7 +39,7 @@ class BatteryConfig:
     def __post_init__(self) -> None:
         checks.above("battery.engine_power_kw", self.engine_power_kw, 0.0, "kW")
         checks.above("battery.reference_speed", self.reference_speed, 0.0, "m/s")
-        checks.above("battery.capacity_kwh", self.capacity_kwh, 0.0, "kWh")
+        checks.in_range("battery.capacity_kwh", self.capacity_kwh, 1e-6, unit="kWh")
         checks.above("battery.efficiency", self.efficiency, 0.0)
         checks.above("battery.charging_power_kw", self.charging_power_kw, 0.0, "kW")
         checks.above("battery.resolution", self.resolution, 0.0, "%")
@@ -58,6 +58,11 @@ def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:
     """Drain of cruising a distance: [*] metres to [*] percent."""
     percent_per_hour = _full_power_drain(battery)
     return distance * (percent_per_hour / (3600 * battery.reference_speed))
+
+
+def cruise_range(level: Tensor, battery: BatteryConfig) -> Tensor:
+    """How far a level lasts, the inverse of ``cruise_drain``: [*] percent to [*] metres."""
+    return level * (3600 * battery.reference_speed / _full_power_drain(battery))
 
 
 def vertical_drain(seconds: Tensor, battery: BatteryConfig) -> Tensor:

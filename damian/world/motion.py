@@ -44,8 +44,8 @@ class MotionConfig:
     def __post_init__(self) -> None:
         checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
         checks.one_of("motion.degree", self.degree, [3, 5, 7])
-        checks.above("motion.max_speed", self.max_speed, 0.0, "m/s")
-        checks.above("motion.max_acceleration", self.max_acceleration, 0.0, "m/s^2")
+        checks.in_range("motion.max_speed", self.max_speed, 1e-3, unit="m/s")
+        checks.in_range("motion.max_acceleration", self.max_acceleration, 1e-3, unit="m/s^2")
         checks.in_range("motion.sensing_time", self.sensing_time, 0.0, unit="s")
         checks.above("motion.min_level", self.min_level, 0.0, "m")
         checks.in_range("motion.max_level", self.max_level, self.min_level, unit="m")

@@ -64,7 +64,7 @@ class SourceConfig:
     def __post_init__(self) -> None:
         checks.in_range("source.microphone_db", self.microphone_db, 0.0, unit="dB")
         checks.require(
-            self.microphone_db < self.level_db < math.inf,
+            self.microphone_db < self.level_db <= 300,
             "source.level_db",
             f"{self.level_db} dB",
             f"is not above microphone_db={self.microphone_db:g} dB: not heard even at 1 m",
@@ -80,9 +80,9 @@ class SourceConfig:
         checks.in_range("source.emission_probability", self.emission_probability, 0.0, 1.0)
         if self.position is not None:
             checks.place("source.position", self.position)
-        checks.in_range("source.n_hotspots", self.n_hotspots, 1)
+        checks.in_range("source.n_hotspots", self.n_hotspots, 1, 1000)
         checks.in_range("source.min_stops", self.min_stops, 0)
-        checks.in_range("source.max_stops", self.max_stops, self.min_stops)
+        checks.in_range("source.max_stops", self.max_stops, self.min_stops, 1000)
         for name in ("speed", "local_speed"):
             checks.above(f"source.{name}", getattr(self, name), 0.0, "m/s")
         for name in ("acceleration", "local_acceleration"):
