@@ -10,6 +10,9 @@ from torch import Tensor
 from damian import checks
 from damian.world.airspace import Airspace, inside, nearest_points, rows
 
+MAX_PAIRS = 2_000_000_000
+"""Pairs of a landing point's action and a landing point that are compared at construction: a minute."""
+
 
 @dataclass
 class ActionConfig:
@@ -120,6 +123,14 @@ class Candidates:
         listed distance is 0).
         """
         table = self.config.table()
+        n_regions, n_points = self.airspace.points.shape[:2]
+        checks.require(
+            n_regions * n_points**2 * len(table) <= MAX_PAIRS,
+            "region.lattice_step",
+            f"{n_points} landing points",
+            "are too many to rank for every action: raise region.lattice_step or set "
+            "region.n_landing_points (or lower region.pool)",
+        )
         move = displacement(table[:, 0], table[:, 1])
         holds = table[:, 0] == 0
         ranked, far, distance = [], [], []

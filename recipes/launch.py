@@ -195,8 +195,9 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
 
 def launch(main: Callable[[], Any]) -> None:
     """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
-    # Hydra reads a bare number as an integer, which no config group may be called.
-    sys.argv = [re.sub(r"^(\+?usecase=)([\d,]+)$", _quoted, word) for word in sys.argv]
+    # Hydra reads a bare number as an integer, and null as None, which no option of a group may be.
+    groups = "|".join(folder.name for folder in Path(CONF).iterdir() if folder.is_dir())
+    sys.argv = [re.sub(rf"^(\+?(?:{groups})=)([\d,]+|null)$", _quoted, word) for word in sys.argv]
     _begun.clear()
     try:
         main()

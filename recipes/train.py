@@ -147,7 +147,7 @@ def enough(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> boo
 def mean_terms(batch: TensorDictBase) -> dict[str, float]:
     """Mean of each weighted reward term, over steps, worlds and UAVs."""
     terms = cast(TensorDictBase, batch["next", "agents", "reward_terms"])
-    return {f"reward/{name}": terms[name].mean().item() for name in terms.keys()}
+    return {f"reward/{name}": term.mean().item() for name, term in terms.items()}
 
 
 def report(

@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from damian.actions import ActionConfig
 from damian.env import UavEnv
 from damian.errors import InputError
-from damian.losses import MappoConfig, add_advantages, mappo_loss
+from damian.losses import MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.models import ModelConfig, make_actor, make_critic, random_policy
 from damian.rewards import EpisodeConfig, RewardConfig
@@ -93,6 +93,31 @@ def test_nothing_is_learnt_from_actions_that_were_none(kind):
     assert 0 < ready.float().mean() < 1
     assert (batch["agents", "advantage"][~ready] == 0).all()
     assert (batch["agents", "advantage"][ready] != 0).any()
+
+
+@pytest.mark.parametrize(("kind", "mask"), [("discrete", True), ("discrete", False), ("continuous", True)])
+def test_entries_without_a_decision_move_the_critic_only(kind, mask):
+    config = scenario(actions=ActionConfig(kind=kind, mask=mask))
+    env = UavEnv(config, 4)
+    actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
+    loss = mappo_loss(actor, critic, MappoConfig())
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        batch = env.rollout(6, actor, break_when_any_done=False)
+
+    def gradients(ready: bool) -> tuple[float, float]:
+        batch["agents", "ready"] = torch.full_like(batch["agents", "ready"], ready)
+        add_advantages(batch, loss, MappoConfig())
+        loss.zero_grad()
+        sum(losses_of(batch.reshape(-1), loss).values()).backward()
+        grads = {n: p.grad.abs().sum().item() for n, p in loss.named_parameters() if p.grad is not None}
+        actors = sum(g for n, g in grads.items() if n.startswith("actor"))
+        return actors, sum(grads.values()) - actors
+
+    actor_moves, critic_moves = gradients(ready=True)
+    assert actor_moves > 0
+    assert critic_moves > 0
+    assert gradients(ready=False)[0] == 0
+    assert gradients(ready=False)[1] > 0
 
 
 def test_advantages_are_scaled_over_decisions_only():

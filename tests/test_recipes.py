@@ -86,6 +86,23 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
         (["source.emission=per_stop"], "needs source.motion=dynamic"),
         (["worlds=7", "algo.steps=3"], "does not divide a batch of worlds x algo.steps = 21"),
         (["device=abacus"], "device: abacus"),
+        (["device=meta"], "device: meta is not one of the devices here: cpu"),
+        (["source.level_db=1e4"], "source.level_db: 10000.0 dB is not between"),
+        (["frames=1" + "0" * 400], "frames: "),
+        (["worlds=1000000000000"], "worlds: 1000000000000 is not between 1 and 1e+06"),
+        (["model.hidden=[100000000000]"], "model.hidden: 100000000000 is not between"),
+        (["motion.max_speed=1e-300"], "motion.max_speed: 1e-300 m/s is not at least 0.001 m/s"),
+        (["task=3"], "'task/3'"),
+        (["algo=null"], "'algo/null'"),
+        (["region.pool=64"], "region.pool: 64 means nothing with region.kind=fir"),
+        (["episode.discharged_share=0.5"], "episode.discharged_share: 0.5 needs battery.enabled"),
+        (["episode.end_with_source=true"], "episode.end_with_source: True needs source.motion"),
+        (
+            ["region=vertices", "region.vertices=[[0,0],[5000,0],[5000,5000],[0,5000]]"],
+            "are too many to rank for every action: raise region.lattice_step",
+        ),
+        (["-m", "seed=-1,0", "hydra.sweep.dir=sweep"], "seed: -1 is not between"),
+        (["-m", "resume=nowhere", "frames=1,2", "hydra.sweep.dir=sweep"], "leave out -m"),
         (["resume=nowhere"], "nowhere holds no config.yaml"),
         (["resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
     ],
@@ -123,6 +140,62 @@ def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):
         file.write(",".join(["99999"] + ["0"] * (len(metrics(folder)[0]) - 1)) + "\n")
     run(f"resume={folder}", "frames=384", folder="second")
     assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0, 384.0]
+
+
+def test_a_finished_run_that_is_resumed_learns_nothing_more(run):
+    folder = run(*TINY, folder="first")
+    before = (folder / "metrics.csv").read_text()
+    run(f"resume={folder}", folder="second")
+    assert (folder / "metrics.csv").read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda f: (f / "config.yaml").write_text("a: [1"), "config.yaml: "),
+        (lambda f: (f / "config.yaml").write_text("- 1"), "config.yaml: "),
+        (lambda f: (f / "checkpoint" / "manifest.json").write_text("{"), "checkpoint: "),
+        (lambda f: (f / "metrics.csv").write_text("x,y\n1,2\n"), "metrics.csv, line 1: no column frames"),
+    ],
+)
+def test_a_spoilt_run_folder_is_refused_in_one_line(run, capsys, spoil, told):
+    folder = run(*TINY, folder="first")
+    spoil(folder)
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        run(f"resume={folder}", "frames=512", folder="second")
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert stopped.value.code == 2
+    assert error.startswith("error: ")
+    assert told in error
+
+
+def test_a_folder_that_holds_a_run_is_not_written_over(run, capsys):
+    folder = run(*TINY)
+    before = (folder / "metrics.csv").read_text()
+    with pytest.raises(SystemExit):
+        run(*TINY, "seed=1")
+    assert "holds a run already" in capsys.readouterr().err
+    assert (folder / "metrics.csv").read_text() == before
+
+
+def test_each_reward_term_has_its_column(run):
+    rows = metrics(run(*TINY, "task=tracking", "scenario=spotting"))
+    assert {"reward/spotting_agents", "reward/source_distance", "reward/source_time"} <= set(rows[0])
+
+
+def test_a_run_without_a_single_decision_in_a_batch_goes_on(run):
+    folder = run(
+        "agents=1",
+        "worlds=1",
+        "frames=60",
+        "algo.steps=4",
+        "algo.minibatches=1",
+        "motion=polynomial",
+        "eval_episodes=2",
+        "model.hidden=[8]",
+    )
+    assert len(metrics(folder)) == 15
 
 
 def test_a_sweep_fills_one_folder_per_run(run, tmp_path):

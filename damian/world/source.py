@@ -63,8 +63,9 @@ class SourceConfig:
 
     def __post_init__(self) -> None:
         checks.in_range("source.microphone_db", self.microphone_db, 0.0, unit="dB")
+        checks.in_range("source.level_db", self.level_db, -300.0, 300.0, "dB")
         checks.require(
-            self.microphone_db < self.level_db <= 300,
+            self.microphone_db < self.level_db,
             "source.level_db",
             f"{self.level_db} dB",
             f"is not above microphone_db={self.microphone_db:g} dB: not heard even at 1 m",
