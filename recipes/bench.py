@@ -105,7 +105,7 @@ def comparison(presets: Scenarios, sizes: Sizes) -> str:
     else:
         print("VMAS is not installed, so there are no ratios: pip install -e '.[bench]'")
     for name, scenario in presets.items():
-        for shown, extras in (("as trained", ()), ("all extras", EXTRAS)):
+        for shown, extras in (("bare", ()), ("all extras", EXTRAS)):
             for mode in sizes.modes:
                 env = UavEnv(scenario, sizes.worlds, extras=extras)
                 envs[f"{name}, {shown}, {mode}"] = env.compile() if mode == "compiled" else env
@@ -158,7 +158,7 @@ def memory(presets: Scenarios) -> str:
         rows.append((name, state, *shown, f"{sum(shared.values()) / 2**20:.1f} MiB"))
     return table(
         "Memory: bytes of a world with 3 UAVs",
-        ("scenario", "state", "shown, as trained", "shown, all extras", "shared tables"),
+        ("scenario", "state", "shown, bare", "shown, all extras", "shared tables"),
         rows,
     )
 

@@ -841,3 +841,40 @@ def test_a_compiled_environment_gives_the_same_rollout(scenario):
             # Metres in flight: differences of float32 rounding at a hundred metres.
             near = 1e-4 if key == "state" else 1e-5
             torch.testing.assert_close(one[key], other[key], atol=near, rtol=1e-5)
+
+
+@pytest.mark.parametrize("sensing_time", [0.0, 4.0])
+def test_the_trail_takes_one_place_for_each_decision_however_long_the_uav_senses(sensing_time):
+    scenario = everything("polynomial", episode=EpisodeConfig(max_steps=None))
+    scenario.motion.sensing_time = sensing_time
+    env = fresh(scenario, num_worlds=8)
+    generator = torch.Generator().manual_seed(0)
+    expected = env.state.sent.trail.tolist()
+    due = torch.zeros(8, env.n_agents, dtype=torch.bool)
+    landings = 0
+    for _ in range(60):
+        due |= env.simulation.ready(env.state)
+        shown = act(env, random_actions(env, generator))
+        for b, n in (due & shown["agents", "talks"]).nonzero().tolist():
+            expected[b][n] = [env.state.goal[b, n].item(), *expected[b][n][:-1]]
+            due[b, n] = False
+            landings += 1
+        assert env.state.sent.trail.tolist() == expected
+    assert landings > 50
+
+
+def test_a_uav_that_cannot_fly_there_keeps_nobody_else_from_a_point():
+    actions = ActionConfig(kind="continuous")
+    env = fresh(square(agents=2, battery=BatteryConfig(enabled=True), actions=actions))
+    aim, *pair = (env.simulation.points - 100.0).norm(dim=-1).argsort()[:3].tolist()
+    east, north = (env.simulation.points[aim] - env.simulation.points[pair]).unbind(-1)
+    bearing = torch.atan2(east, north) / math.tau % 1
+    action = torch.stack([torch.hypot(east, north) / max(actions.distances), bearing], -1)
+    state, goal = env.state, torch.tensor([pair])
+    for level, booked in ((100.0, [aim, None]), (0.0, [pair[0], aim])):
+        battery = torch.tensor([[level, 100.0]])
+        env.state = state._replace(goal=goal, origin=goal, battery=battery)
+        act(env, action[None])
+        first, second = env.state.goal[0].tolist()
+        assert first == booked[0]
+        assert (second == aim) == (booked[1] == aim)
