@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -17,6 +18,7 @@ from damian.env import UavEnv
 from damian.features import GLOBAL, LOCAL, ObservationConfig, Server, Snapshot
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.scenario import ClockConfig, RegionConfig, ScenarioConfig
+from damian.state import State
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 from damian.world.source import SourceConfig
@@ -243,3 +245,68 @@ def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Snapshot, Server
         points=torch.zeros(1, 2),
     )
     return snapshot, server
+
+
+MOTIONS = {
+    "instant": MotionConfig(),
+    "polynomial": MotionConfig("polynomial", max_speed=20.0, max_acceleration=10.0),
+}
+FLYING = MOTIONS["polynomial"]
+KEEPS_GOING = EpisodeConfig(max_steps=None)
+
+both_motions = pytest.mark.parametrize("motion", ["instant", "polynomial"])
+both_kinds = pytest.mark.parametrize("kind", ["discrete", "continuous"])
+
+
+def fields(state: State) -> dict[str, torch.Tensor]:
+    """Every tensor of a state by name."""
+    return state._asdict() | {f"sent.{k}": v for k, v in state.sent._asdict().items()} | {"sent": 0}
+
+
+def check_equal(one: State, other: State, rows=slice(None)):
+    """Equal bit for bit in some worlds."""
+    pairs = {name: (value, fields(other)[name]) for name, value in fields(one).items()}
+    for name, (a, b) in pairs.items():
+        if name != "sent":
+            assert a[rows].equal(b[rows]), name
+
+
+def one_uav(**changed) -> ScenarioConfig:
+    """One UAV in the square, at (100, 100) at first, the source 300 m away and not heard."""
+    region = RegionConfig(
+        kind="vertices",
+        vertices=[[0.0, 0.0], [400.0, 0.0], [400.0, 200.0], [0.0, 200.0]],
+        situations=1,
+        start_positions=[[60.0, 100.0]],
+    )
+    sections = {
+        "agents": 1,
+        "region": region,
+        "source": SourceConfig(level_db=130.0, position=[390.0, 100.0]),
+        "episode": KEEPS_GOING,
+        "actions": ActionConfig(kind="continuous", distances=[0.0, 100.0]),
+    }
+    return ScenarioConfig(**(sections | changed))
+
+
+HERE = [[0.0, 0.0]]
+EAST, WEST = [[1.0, heading(90)]], [[1.0, heading(270)]]
+"""Continuous actions of one UAV: hold, 100 m east, 100 m west."""
+
+
+def go(env: UavEnv, *actions):
+    """Step with each action in every world; what the last step showed."""
+    for action in actions:
+        after = act(env, torch.tensor(action).expand(*env.batch_size, env.n_agents, 2))
+    return after
+
+
+def fresh(scenario: ScenarioConfig, num_worlds: int = 1, **options) -> UavEnv:
+    env = UavEnv(scenario, num_worlds=num_worlds, **options)
+    env.reset()
+    return env
+
+
+def flight(env: UavEnv) -> float:
+    """Duration of the flight that has just begun [s]."""
+    return (2 * env.state.vertical + env.state.cruise).item()

@@ -1,0 +1,260 @@
+"""How episodes end and pay, what batteries do, and what the source does."""
+
+import copy
+import itertools
+import math
+
+import pytest
+import shapely
+import torch
+from helpers import (
+    EAST,
+    FLYING,
+    HERE,
+    KEEPS_GOING,
+    MOTIONS,
+    act,
+    both_motions,
+    clock,
+    everything,
+    flight,
+    fresh,
+    go,
+    one_uav,
+    random_actions,
+    square,
+    walking,
+)
+
+from damian.rewards import EpisodeConfig, RewardConfig
+from damian.world.battery import BatteryConfig, charge_gain, flight_drain
+from damian.world.motion import MotionConfig
+from damian.world.source import SourceConfig
+
+# Ends.
+
+
+@pytest.mark.parametrize(("share", "needed"), [(0.3, 1), (0.5, 2), (1.0, 3)])
+def test_success_needs_a_share_of_the_uavs_to_spot_at_once(share, needed):
+    episode = EpisodeConfig(max_steps=None, success_share=share)
+    env = fresh(square(source=SourceConfig(level_db=143.0), episode=episode), num_worlds=256)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        shown = act(env, random_actions(env, generator))
+        enough = shown["agents", "message", "spotted"].sum(-1, keepdim=True) >= needed
+        assert enough.any()
+        assert not enough.all()
+        assert shown["success"].equal(enough)
+        assert shown["terminated"].equal(enough)
+        assert not shown["truncated"].any()
+
+
+def test_the_time_limit_truncates_and_does_not_terminate():
+    env = fresh(one_uav(episode=EpisodeConfig(max_steps=3)))
+    ends = [go(env, HERE) for _ in range(3)]
+    assert [td["truncated"].item() for td in ends] == [False, False, True]
+    assert [td["done"].item() for td in ends] == [False, False, True]
+    assert not any(td["terminated"].item() or td["success"].item() for td in ends)
+
+
+def test_success_at_the_last_step_terminates_and_does_not_truncate():
+    source = SourceConfig(level_db=130.0, position=[160.0, 100.0])
+    episode = EpisodeConfig(max_steps=2, success_share=1.0)
+    env = fresh(one_uav(source=source, episode=episode))
+    shown = go(env, HERE, EAST)
+    assert (shown["success"] & shown["terminated"] & ~shown["truncated"]).item()
+
+
+def test_the_limit_can_count_from_the_latest_detection():
+    source = SourceConfig(level_db=130.0, position=[60.0, 100.0])
+    episode = EpisodeConfig(max_steps=3, since_detection=True)
+    env = fresh(one_uav(source=source, episode=episode))
+    assert not go(env, *[HERE] * 10)["done"].item()
+    assert not go(env, EAST, EAST)["done"].item()
+    assert go(env, HERE)["truncated"].item()
+    unheard = fresh(one_uav(episode=episode))
+    assert not go(unheard, HERE, HERE)["done"].item()
+    assert go(unheard, HERE)["truncated"].item()
+
+
+def test_empty_batteries_terminate_without_success():
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.02, charging_points=[[390.0, 10.0]])
+    episode = EpisodeConfig(max_steps=None, discharged_share=1.0)
+    task = RewardConfig(penalty=2.0)
+    env = fresh(one_uav(battery=battery, episode=episode, task=task))
+    env.state = env.state._replace(battery=torch.tensor([[1e-7]]))
+    assert not go(env, HERE)["done"].item()
+    env.state = env.state._replace(battery=torch.tensor([[0.0]]))
+    shown = go(env, HERE)
+    assert (shown["terminated"] & ~shown["truncated"] & ~shown["success"]).item()
+    assert shown["agents", "reward"].item() == -2.0
+
+
+def test_the_end_of_the_sources_walk_silences_it_and_terminates_if_wanted():
+    source = walking(level_db=170.0, n_hotspots=1, min_stops=0, max_stops=0, min_wait=2.0, max_wait=2.0)
+    for wanted in (True, False):
+        episode = EpisodeConfig(max_steps=None, end_with_source=wanted)
+        env = fresh(one_uav(source=source, episode=episode))
+        shown = go(env, HERE)
+        assert shown["agents", "message", "spotted"].item()
+        assert not shown["done"].item()
+        shown = go(env, HERE)
+        assert shown["terminated"].item() == wanted
+        assert not shown["agents", "message", "spotted"].item()
+
+
+def test_a_persistent_task_never_ends():
+    env = fresh(everything(episode=KEEPS_GOING), num_worlds=4)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(100):
+        assert not act(env, random_actions(env, generator))["done"].any()
+
+
+@pytest.mark.parametrize(("over_steps", "bonus"), [(False, 3.0), (True, 1.5)])
+def test_success_pays_the_bonus_and_a_time_failure_costs_the_penalty(over_steps, bonus):
+    source = SourceConfig(level_db=130.0, position=[160.0, 100.0])
+    episode = EpisodeConfig(max_steps=3, success_share=1.0)
+    task = RewardConfig(spotted=0.0, bonus=3.0, bonus_over_steps=over_steps, penalty=0.5)
+    env = fresh(one_uav(source=source, episode=episode, task=task))
+    assert go(env, HERE)["agents", "reward"].item() == 0.0
+    assert go(env, EAST)["agents", "reward"].item() == bonus
+    env.reset()
+    assert go(env, HERE, HERE, HERE)["agents", "reward"].item() == -0.5
+
+
+# Batteries.
+
+FAR = [[390.0, 10.0]]
+
+
+def test_a_flight_drains_what_it_should_whatever_the_step():
+    drained, cost = [], None
+    for period in ("1s", "0.5s", "0.25s"):
+        battery = BatteryConfig(enabled=True, capacity_kwh=0.1, charging_points=FAR)
+        env = fresh(one_uav(battery=battery, motion=MotionConfig("polynomial"), clock=clock(period)))
+        go(env, EAST)
+        origin, goal = (env.simulation.points[p.item()] for p in (env.state.origin, env.state.goal))
+        length = torch.linalg.vector_norm(goal - origin)
+        cost = flight_drain(env.state.vertical[0, 0], length, battery).item()
+        duration = flight(env)
+        levels = [env.state.battery.item()]
+        while not env.simulation.landed(env.state).all():
+            go(env, HERE)
+            levels.append(env.state.battery.item())
+        assert all(a >= b for a, b in itertools.pairwise(levels))
+        assert len(levels) == math.ceil(duration / env.simulation.dt)
+        go(env, HERE)
+        drained.append(100 - env.state.battery.item())
+    assert cost > 1
+    assert drained == pytest.approx([cost] * 3, abs=1e-3)
+
+
+def test_an_instant_flight_drains_as_much():
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.5)
+    env = fresh(one_uav(battery=battery))
+    origin = env.simulation.points[env.state.goal.item()]
+    go(env, EAST)
+    length = torch.linalg.vector_norm(env.simulation.points[env.state.goal.item()] - origin)
+    cost = flight_drain(env.simulation.vertical[0], length, battery).item()
+    assert env.state.battery.item() == pytest.approx(100 - cost, abs=1e-4)
+
+
+@both_motions
+def test_a_target_beyond_the_batterys_reach_is_not_flown_to(motion):
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.5, charging_points=FAR)
+    env = fresh(one_uav(battery=battery, motion=MOTIONS[motion]))
+    start = copy.deepcopy(env.state)
+    go(env, EAST)
+    length = torch.linalg.vector_norm(
+        env.simulation.points[env.state.goal.item()] - env.simulation.points[start.goal.item()]
+    )
+    cost = flight_drain(env.simulation.vertical[0], length, battery)
+    for factor, flies in ((0.99, False), (1.01, True)):
+        env.state = start._replace(battery=factor * cost.view(1, 1))
+        go(env, EAST)
+        assert bool((env.state.goal != start.goal).item()) == flies
+
+
+@both_motions
+def test_an_empty_uav_stays_until_it_has_charged(motion):
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=0.5)
+    env = fresh(one_uav(battery=battery, motion=MOTIONS[motion]))
+    start = env.state.goal.item()
+    env.state = env.state._replace(battery=torch.zeros(1, 1))
+    gain = charge_gain(torch.tensor(1.0), battery).item()
+    levels = []
+    while env.state.goal.item() == start:
+        levels.append(env.state.battery.item())
+        go(env, EAST)
+    assert len(levels) > 2
+    assert levels == pytest.approx([gain * n for n in range(len(levels))], abs=1e-3)
+
+
+def test_uavs_charge_only_at_charging_points():
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.5, charging_points=[[160.0, 100.0]])
+    env = fresh(one_uav(battery=battery))
+    env.state = env.state._replace(battery=torch.full((1, 1), 50.0))
+    go(env, HERE, HERE)
+    assert env.state.battery.item() == 50.0
+    go(env, EAST)
+    flown = env.state.battery.item()
+    assert flown < 50.0
+    go(env, HERE)
+    gain = charge_gain(torch.tensor(1.0), battery).item()
+    assert env.state.battery.item() == pytest.approx(flown + gain)
+
+
+def test_a_uav_charges_from_the_step_after_its_landing_on():
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.1)
+    env = fresh(one_uav(battery=battery, motion=FLYING))
+    go(env, EAST)
+    origin, goal = (env.simulation.points[p.item()] for p in (env.state.origin, env.state.goal))
+    length = torch.linalg.vector_norm(goal - origin)
+    cost = flight_drain(env.state.vertical[0, 0], length, battery).item()
+    go(env, *[HERE] * (math.ceil(flight(env)) - 1))
+    assert env.simulation.landed(env.state).all()
+    assert env.state.battery.item() == pytest.approx(100 - cost, abs=1e-3)
+    gain = charge_gain(torch.tensor(1.0), battery).item()
+    go(env, HERE)
+    assert env.state.battery.item() == pytest.approx(100 - cost + gain, abs=1e-3)
+
+
+def test_a_battery_never_leaves_its_bounds():
+    env = fresh(everything(episode=KEEPS_GOING), num_worlds=32)
+    generator = torch.Generator().manual_seed(0)
+    lowest = 100.0
+    for _ in range(40):
+        act(env, random_actions(env, generator))
+        assert ((env.state.battery >= 0) & (env.state.battery <= 100)).all()
+        lowest = min(lowest, env.state.battery.min().item())
+    assert lowest < 95
+
+
+# The source.
+
+
+def test_an_intermittent_source_is_heard_as_often_as_it_emits():
+    source = SourceConfig(
+        level_db=160.0, position=[100.0, 100.0], emission="per_step", emission_probability=0.3
+    )
+    env = fresh(square(source=source, episode=KEEPS_GOING), num_worlds=400)
+    heard = torch.stack(
+        [act(env, torch.zeros(400, 3).long())["agents", "message", "spotted"].clone() for _ in range(25)]
+    )
+    assert heard.any(-1).equal(heard.all(-1))
+    assert heard.float().mean().item() == pytest.approx(0.3, abs=0.02)
+    # Neither worlds nor steps go together.
+    assert 0 < heard[0, :, 0].float().mean() < 1
+    assert 0 < heard[:, 0, 0].float().mean() < 1
+
+
+def test_a_walking_source_moves_and_stays_inside():
+    env = fresh(everything(), num_worlds=16)
+    inside = env.simulation.airspace
+    begun = env.state.source.clone()
+    for _ in range(60):
+        act(env, torch.zeros(16, env.n_agents).long())
+        for place, region in zip(env.state.source, env.state.region, strict=True):
+            polygon = inside.regions[region].polygon
+            assert polygon.distance(shapely.Point(place.tolist())) < 1e-3
+    assert (torch.linalg.vector_norm(env.state.source - begun, dim=-1) > 1).all()

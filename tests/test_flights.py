@@ -1,0 +1,286 @@
+"""Where UAVs stand, what they may choose, when they are ready and when they talk."""
+
+import copy
+import math
+
+import pytest
+import shapely
+import torch
+from helpers import (
+    EAST,
+    FLYING,
+    HERE,
+    KEEPS_GOING,
+    MOTIONS,
+    SQUARE,
+    WEST,
+    act,
+    both_kinds,
+    both_motions,
+    check_equal,
+    everything,
+    flight,
+    fresh,
+    go,
+    one_uav,
+    random_actions,
+    same,
+    square,
+    usecase,
+)
+
+from damian.actions import ActionConfig
+from damian.env import UavEnv
+from damian.rewards import EpisodeConfig
+from damian.scenario import RegionConfig, ScenarioConfig
+from damian.state import State
+from damian.world.battery import BatteryConfig
+from damian.world.motion import MotionConfig
+from damian.world.source import SourceConfig
+
+# Where UAVs stand.
+
+
+@both_kinds
+@both_motions
+@pytest.mark.parametrize("n_agents", [2, 5, 8])
+@pytest.mark.parametrize("together", [False, True])
+def test_uavs_stand_on_landing_points_of_their_own_inside_the_region(n_agents, kind, motion, together):
+    region = RegionConfig(
+        kind="vertices",
+        vertices=[[0.0, 0.0], [90.0, 0.0], [90.0, 40.0], [40.0, 40.0], [40.0, 90.0], [0.0, 90.0]],
+        lattice_step=24.0,
+        situations=16,
+        start_together=together,
+    )
+    scenario = ScenarioConfig(
+        agents=n_agents,
+        region=region,
+        motion=MOTIONS[motion],
+        actions=ActionConfig(kind=kind, distances=[0.0, 20.0, 50.0, 90.0]),
+        episode=EpisodeConfig(max_steps=15),
+    )
+    env = fresh(scenario, num_worlds=24)
+    airspace = env.simulation.airspace
+    assert airspace.max_points < 20
+    generator = torch.Generator().manual_seed(0)
+    moved = 0
+    for _ in range(30):
+        before = env.state
+        act(env, random_actions(env, generator))
+        goal = env.state.goal
+        moved += int((goal != before.goal).sum())
+        clash = goal.unsqueeze(-1) == goal.unsqueeze(-2)
+        clash &= ~torch.eye(n_agents, dtype=torch.bool)
+        if together:  # Two may share one point only as long as neither has left the start.
+            stays = goal == before.goal
+            both = stays.unsqueeze(-1) & stays.unsqueeze(-2)
+            clash &= ~both
+        assert not clash.any()
+        assert (goal < airspace.n_points[0]).all()
+        landed = env.simulation.landed(env.state)
+        place = env.state.position[landed]
+        assert place[..., :2].equal(env.simulation.points[goal[landed]])
+        assert place[..., 2].abs().max(dim=0).values < 1e-5
+        assert shapely.contains_xy(airspace.regions[0].polygon, place[..., :2].double()).all()
+    assert moved > 24 * n_agents
+
+
+def test_starts_are_different_points_or_one_or_those_given():
+    apart = UavEnv(square(), num_worlds=64).reset()["agents", "message", "position"]
+    assert (torch.cdist(apart, apart) + 1e9 * torch.eye(3)).min() > 1
+    region = RegionConfig(kind="vertices", vertices=SQUARE, start_together=True)
+    together = UavEnv(square(region=region), num_worlds=64).reset()
+    place = together["agents", "message", "position"]
+    assert torch.cdist(place, place).max() == 0
+    assert len({tuple(p) for p in place[:, 0].tolist()}) > 10
+    given = UavEnv(usecase(2)).reset()["agents", "message", "position"]
+    expected = [pytest.approx([62.85586449, -119.2183645], abs=1e-4)] * 3
+    assert given[0].tolist() == expected
+
+
+# Choosing, flying, talking.
+
+
+def test_the_action_of_a_uav_that_is_not_ready_changes_nothing():
+    env = fresh(everything("polynomial"), num_worlds=32)
+    generator = torch.Generator().manual_seed(0)
+    waited = 0
+    for _ in range(25):
+        before = copy.deepcopy(env.state)
+        ready = env.simulation.ready(before)
+        action = random_actions(env, generator)
+        after = act(env, action)
+        state = copy.deepcopy(env.state)
+        env.state = before
+        other = torch.where(ready, action, random_actions(env, generator))
+        assert same(act(env, other), after)
+        check_equal(env.state, state)
+        waited += int((~ready & (other != action)).sum())
+        assert state.motions.le(before.motions + ready).all()
+    assert waited > 100
+
+
+@pytest.mark.parametrize("sensing", [0.0, 2.5])
+def test_a_uav_is_ready_again_once_it_has_landed_and_sensed(sensing):
+    motion = MotionConfig("polynomial", sensing_time=sensing)
+    env = fresh(one_uav(motion=motion))
+    assert env.reset()["agents", "ready"].all()
+    shown = [go(env, EAST)]
+    duration = flight(env)
+    assert duration > 15
+    shown += [go(env, EAST) for _ in range(math.ceil(duration + sensing) - 1)]
+    for seconds, td in enumerate(shown, start=1):
+        assert td["agents", "ready"].item() == (seconds >= duration + sensing)
+        assert td["agents", "talks"].item() == (seconds >= duration)
+    assert shown[-1]["agents", "ready"].item()
+
+
+def test_in_flight_the_message_stays_the_last_one_and_its_time_does_too():
+    env = fresh(one_uav(motion=FLYING))
+    before = env.reset()["agents", "message"].clone()
+    flown = go(env, EAST)
+    duration, landing = flight(env), None
+    for _ in range(math.ceil(duration) - 1):
+        assert not flown["agents", "talks"].item()
+        assert same(flown["agents", "message"], before)
+        landing = flown = go(env, HERE)
+    message = landing["agents", "message"]
+    assert landing["agents", "talks"].item()
+    assert message["time"].item() == math.ceil(duration)
+    assert message["position"][0, 0].equal(env.simulation.points[env.state.goal.item()])
+    assert message["position"].equal(message["target"])
+    assert message["track"].item() == pytest.approx(math.pi / 2, abs=0.3)
+
+
+def test_in_flight_nobody_listens():
+    source = SourceConfig(level_db=130.0, position=[110.0, 100.0])  # On the way: 31.6 m are heard.
+    loud = one_uav(motion=MotionConfig("polynomial"), source=source)
+    loud.region.start_positions = [[20.0, 100.0]]
+    loud.actions.distances = [0.0, 200.0]
+    env = fresh(loud)
+    go(env, EAST)
+    near = False
+    for _ in range(math.ceil(flight(env)) - 2):
+        shown = go(env, HERE)
+        away = torch.linalg.vector_norm(env.state.position[0, 0, :2] - env.state.source[0])
+        near |= bool(away < 10)
+        assert not shown["agents", "message", "spotted"].item()
+    assert near
+    assert env.state.motions.item() == 1  # As after a detection it would not be.
+
+
+def test_a_hold_of_no_distance_keeps_the_point_and_counts_as_a_motion():
+    env = fresh(one_uav())
+    place = env.state.goal.clone()
+    shown = go(env, HERE, HERE, HERE)
+    assert env.state.goal.equal(place)
+    assert shown["agents", "message", "motions"].item() == 3
+
+
+def test_a_target_outside_the_region_holds():
+    env = fresh(one_uav())
+    place = env.state.goal.clone()
+    go(env, WEST)
+    assert env.state.goal.equal(place)
+    go(env, EAST)
+    assert not env.state.goal.equal(place)
+
+
+def test_motions_count_from_the_latest_detection():
+    env = fresh(one_uav(source=SourceConfig(level_db=130.0, position=[160.0, 100.0])))
+    counted = []
+    for action in (HERE, EAST, HERE, WEST, WEST, EAST):
+        message = go(env, action)["agents", "message"]
+        counted.append((message["spotted"].item(), message["motions"].item()))
+    assert counted == [(False, 1), (True, 2), (True, 1), (False, 1), (False, 2), (True, 3)]
+
+
+# Action masks.
+
+
+@pytest.mark.parametrize("energy", [False, True])
+def test_a_masked_action_holds_and_a_legal_one_that_leads_elsewhere_moves(energy):
+    battery = BatteryConfig(enabled=energy, capacity_kwh=0.05)
+    scenario = ScenarioConfig(
+        agents=1,
+        region=RegionConfig(min_area=20_000, max_area=50_000, pool=2, situations=8),
+        battery=battery,
+        episode=KEEPS_GOING,
+    )
+    n_actions = scenario.actions.n_actions
+    env = fresh(scenario, num_worlds=n_actions)
+    generator = torch.Generator().manual_seed(0)
+    masked = reached = 0
+    for _ in range(30):
+        act(env, random_actions(env, generator))
+        # World 0's situation everywhere; then each world tries another action.
+        alike = [field[:1].expand_as(field).contiguous() for field in env.state[:-1]]
+        level = 100 * torch.rand(1, generator=generator) if energy else torch.tensor([100.0])
+        state = State(*alike, env.state.sent)._replace(battery=level.expand(n_actions, 1).clone())
+        env.state = state
+        legal = env.simulation.action_mask(state)[0, 0]
+        act(env, torch.arange(n_actions)[:, None])
+        moved = (env.state.goal != state.goal).squeeze(-1)
+        assert not moved[~legal].any()
+        nearest = env.simulation.candidates.distance[state.goal[0, 0]]
+        assert moved[legal].equal(nearest[legal] > 0)
+        masked, reached = masked + int((~legal).sum()), reached + int(moved.sum())
+    assert masked > 100
+    assert reached > 100
+
+
+def test_in_flight_exactly_one_action_is_legal_and_it_holds():
+    env = fresh(everything("polynomial"), num_worlds=16)
+    generator = torch.Generator().manual_seed(0)
+    waiting = 0
+    for _ in range(20):
+        shown = act(env, random_actions(env, generator))
+        mask, ready = shown["agents", "action_mask"], shown["agents", "ready"]
+        assert (mask[~ready].sum(-1) == 1).all()
+        assert (mask[~ready].int().argmax(-1) == 0).all()
+        assert mask.any(-1).all()
+        waiting += int((~ready).sum())
+    assert waiting > 50
+
+
+def test_without_a_mask_none_is_shown():
+    assert "action_mask" not in UavEnv(usecase(2)).reset()["agents"]
+    assert "action_mask" in UavEnv(square()).reset()["agents"]
+
+
+@pytest.mark.parametrize("sensing_time", [0.0, 4.0])
+def test_the_trail_takes_one_place_for_each_decision_however_long_the_uav_senses(sensing_time):
+    scenario = everything("polynomial", episode=EpisodeConfig(max_steps=None))
+    scenario.motion.sensing_time = sensing_time
+    env = fresh(scenario, num_worlds=8)
+    generator = torch.Generator().manual_seed(0)
+    expected = env.state.sent.trail.tolist()
+    due = torch.zeros(8, env.n_agents, dtype=torch.bool)
+    landings = 0
+    for _ in range(60):
+        due |= env.simulation.ready(env.state)
+        shown = act(env, random_actions(env, generator))
+        for b, n in (due & shown["agents", "talks"]).nonzero().tolist():
+            expected[b][n] = [env.state.goal[b, n].item(), *expected[b][n][:-1]]
+            due[b, n] = False
+            landings += 1
+        assert env.state.sent.trail.tolist() == expected
+    assert landings > 50
+
+
+def test_a_uav_that_cannot_fly_there_keeps_nobody_else_from_a_point():
+    actions = ActionConfig(kind="continuous")
+    env = fresh(square(agents=2, battery=BatteryConfig(enabled=True), actions=actions))
+    aim, *pair = (env.simulation.points - 100.0).norm(dim=-1).argsort()[:3].tolist()
+    east, north = (env.simulation.points[aim] - env.simulation.points[pair]).unbind(-1)
+    bearing = torch.atan2(east, north) / math.tau % 1
+    action = torch.stack([torch.hypot(east, north) / max(actions.distances), bearing], -1)
+    state, goal = env.state, torch.tensor([pair])
+    for level, booked in ((100.0, [aim, None]), (0.0, [pair[0], aim])):
+        battery = torch.tensor([[level, 100.0]])
+        env.state = state._replace(goal=goal, origin=goal, battery=battery)
+        act(env, action[None])
+        first, second = env.state.goal[0].tolist()
+        assert first == booked[0]
+        assert (second == aim) == (booked[1] == aim)

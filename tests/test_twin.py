@@ -1,0 +1,158 @@
+"""Whole rollouts beside a slow, obvious twin, and the coverage beside exact geometry."""
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+import torch
+import twin
+from helpers import (
+    KEEPS_GOING,
+    act,
+    both_kinds,
+    clock,
+    everything,
+    fresh,
+    random_actions,
+)
+
+from damian.actions import ActionConfig
+from damian.env import UavEnv
+from damian.features import GLOBAL, LOCAL, ObservationConfig
+from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
+from damian.scenario import RegionConfig, ScenarioConfig
+from damian.world.source import SourceConfig
+
+# The slow twin.
+
+TWIN_FEATURES = [name for name in GLOBAL if name != "coverage"]
+SHOWN = [*TWIN_FEATURES, *LOCAL]
+
+
+def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
+    """Every term and feature but the coverage; odd distances, so that no two points tie."""
+    task = dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5) | {"coverage": 0.0}
+    return ScenarioConfig(
+        agents=n_agents,
+        region=RegionConfig(min_area=15_000, max_area=60_000, pool=3, situations=24),
+        source=SourceConfig(level_db=138.0),
+        actions=ActionConfig(
+            kind=kind,
+            distances=[0.0, 33.3, 71.9, 118.4],
+            headings=[-131.0, -77.7, -20.1, 11.3, 59.0, 123.4],
+        ),
+        observation=ObservationConfig(
+            local_features=list(LOCAL), global_features=TWIN_FEATURES, time_scale=9.0
+        ),
+        task=RewardConfig(**task, bonus=2.0, bonus_over_steps=True, penalty=0.5),
+        episode=EpisodeConfig(5, since_detection=since, success_share=None if since else 0.5),
+        clock=clock("2s"),
+    )
+
+
+def twins(env: UavEnv) -> list[twin.World]:
+    """The slow worlds that begin as the environment's do."""
+    airspace, state, worlds = env.simulation.airspace, env.state, []
+    for b, region in enumerate(state.region.tolist()):
+        points = airspace.points[region, : airspace.n_points[region]].tolist()
+        first = state.goal[b] - region * airspace.max_points
+        world = twin.World(
+            polygon=airspace.regions[region].polygon,
+            points=points,
+            source=tuple(state.source[b].tolist()),
+            radius=10 ** ((138.0 - 105.0) / 20),
+            scale=airspace.scale[region].item(),
+            time_scale=9.0,
+            dt=2.0,
+            task=env.scenario.task,
+            episode=env.scenario.episode,
+            uavs=[twin.Uav(tuple(points[p]), p) for p in first.tolist()],
+        )
+        world.begin()
+        worlds.append(world)
+    return worlds
+
+
+def check_shown(world: twin.World, seen: torch.Tensor):
+    """The critic's observation [N, G] of one world."""
+    columns = [
+        np.array(values).reshape(len(world.uavs), -1) for values in (world.observe()[name] for name in SHOWN)
+    ]
+    apart = np.abs(np.concatenate(columns, 1) - seen.numpy())
+    # Bearings and drifts are angles over a full turn: 0 is 1.
+    widths = np.cumsum([0, *[c.shape[1] for c in columns]])
+    for name in ("source_bearing", "source_drift"):
+        k = widths[SHOWN.index(name)]
+        apart[:, k] = np.minimum(apart[:, k], 1 - apart[:, k])
+    assert apart.max() < 1e-4
+
+
+@pytest.mark.parametrize("since", [False, True])
+@both_kinds
+@pytest.mark.parametrize("n_agents", [1, 2, 4])
+def test_rollouts_equal_those_of_a_slow_twin(n_agents, kind, since):
+    env = UavEnv(twin_scenario(n_agents, kind, since), num_worlds=12, seed=n_agents)
+    table = env.scenario.actions.table()
+    generator = torch.Generator().manual_seed(n_agents)
+    compared = ended = spotted = 0
+    for _ in range(3):
+        shown = env.reset()
+        worlds = twins(env)
+        for b, world in enumerate(worlds):
+            check_shown(world, shown["agents", "global_observation"][b])
+        for _ in range(8):
+            action = random_actions(env, generator)
+            moves = table[action] if kind == "discrete" else action * torch.tensor([118.4, math.tau])
+            shown = act(env, action)
+            for b, world in enumerate(worlds):
+                if any(world.ended):
+                    continue
+                rewards = world.step(moves[b].tolist())
+                places = [list(uav.place) for uav in world.uavs]
+                assert shown["agents", "message", "position"][b].tolist() == places
+                check_shown(world, shown["agents", "global_observation"][b])
+                ours = shown["agents", "reward"][b, :, 0].tolist()
+                assert ours == pytest.approx(rewards, abs=1e-4)
+                flags = [shown[k][b].item() for k in ("success", "terminated", "truncated")]
+                assert tuple(flags) == world.ended
+                spotted += sum(uav.spots for uav in world.uavs)
+                ended += any(world.ended)
+                compared += 1
+    assert compared > 60
+    assert ended > (0 if since else 20)
+    assert spotted > 10
+
+
+def test_the_coverage_counts_the_last_landing_points_within_a_hundredth():
+    window = 3
+    scenario = everything(
+        observation=ObservationConfig(global_features=["coverage"], window=window),
+        task=RewardConfig(spotted=0.0, coverage=1.0),
+        episode=KEEPS_GOING,
+    )
+    env = fresh(scenario, num_worlds=3)
+    generator = torch.Generator().manual_seed(0)
+    radius = env.simulation.radius
+    trails = env.state.position[..., :2].unsqueeze(2).expand(-1, -1, window, -1)
+    for _ in range(5):
+        shown = act(env, random_actions(env, generator))
+        newest = env.state.position[..., :2].unsqueeze(2)
+        trails = torch.cat([newest, trails[:, :, :-1]], 2)
+        for b, region in enumerate(env.state.region.tolist()):
+            polygon = env.simulation.airspace.regions[region].polygon
+            expected = exact_coverage(polygon, trails[b].double().numpy(), radius)
+            assert shown["agents", "reward"][b, :, 0].tolist() == pytest.approx(expected, abs=0.01)
+
+
+def exact_coverage(polygon, trails, radius):
+    """Shares of fresh footprints by shapely, UAV by UAV; the newest landing point comes first."""
+    discs = [[shapely.Point(p).buffer(radius, quad_segs=64) for p in trail] for trail in trails]
+    shares = []
+    for i, own in enumerate(discs):
+        areas = []
+        for k, disc in enumerate(own):
+            lost = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
+            areas.append((disc & polygon).difference(shapely.union_all(lost)).area)
+        shares.append(np.mean(areas) / (math.pi * radius**2))
+    return shares
