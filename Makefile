@@ -23,7 +23,7 @@ bench: $(VENV)/bench
 check: $(VENV)/dev
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
-	$(VENV)/bin/pyright
+	$(VENV)/bin/pyright --pythonpath $(PY)
 
 format: $(VENV)/dev
 	$(VENV)/bin/ruff format .
