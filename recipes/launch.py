@@ -239,7 +239,7 @@ def _one_line(error: BaseException) -> str:
         return _no_such_key(key[1])
     tails = ("full_key", "reference_type", "object_type", "Set the env")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    told, *more = [line for line in lines if not line.startswith(tails)]
+    told, *more = [line for line in lines if not line.startswith(tails)] or [type(error).__name__]
     told = " ".join([told, ", ".join(more).replace(":,", ":")]).strip()
     return f"{key[1]}: {told}" if key else told
 
