@@ -210,16 +210,7 @@ def _settle(
 
 
 @_settle.register_fake
-def _(
-    point: Tensor,
-    distance: Tensor,
-    row: Tensor,
-    standing: Tensor,
-    reach: Tensor,
-    choice: Tensor,
-    contested: Tensor,
-    n_points: int,
-) -> Tensor:
+def _(point, distance, row, standing, reach, choice, contested, n_points):  # for compilers: its shape
     return torch.empty_like(choice)
 
 

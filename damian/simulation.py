@@ -107,17 +107,18 @@ class Simulation:
         A single legal action has log-probability 0 and no gradient: in flight a policy learns nothing.
         """
         distance = rows(self.candidates.distance, state.goal)
-        valid = distance <= self.reach(state).clamp(min=0).unsqueeze(-1)
+        reach = self.reach(state).unsqueeze(-1)
+        valid = distance <= reach
         if not self.candidates.can_hold:
             valid = valid | ~valid.any(-1, keepdim=True)
         if not self.flies:
             return valid
-        return torch.where(self.ready(state).unsqueeze(-1), valid, self.candidates.hold)
+        return torch.where(reach >= 0, valid, self.candidates.hold)
 
     def reach(self, state: State) -> Tensor:
-        """How far the UAV may fly now [m], [B, N]; negative if it may not leave its point."""
+        """How far the UAV may fly now [m], [B, N]: 0 if it can only hold, negative if it may not choose."""
         if self.config.battery.enabled:
-            left = cruise_range(state.battery - self.vertical_drain, self.config.battery)
+            left = cruise_range(state.battery - self.vertical_drain, self.config.battery).clamp(min=0)
         else:
             left = torch.full_like(state.battery, MAX_COORDINATE_M)
         return torch.where(self.ready(state), left, -1.0)
@@ -129,8 +130,9 @@ class Simulation:
         base = state.region.unsqueeze(-1) * self.airspace.max_points
         standing = state.goal - base
         ranking, row = self.candidates.of(state.goal, state.region, action)
-        ready = self.ready(state)
-        goal = book(ranking, row, standing, self.reach(state), self.airspace.max_points) + base
+        reach = self.reach(state)
+        ready = reach >= 0
+        goal = book(ranking, row, standing, reach, self.airspace.max_points) + base
         departs = goal != state.goal
         east, north = (rows(self.points, goal) - rows(self.points, state.goal)).unbind(-1)
         heading = torch.remainder(torch.atan2(east, north), 2 * math.pi)
