@@ -13,14 +13,12 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Un
 from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
-from damian.features import Server, observe, stack
-from damian.rewards import Counters, final_reward, reward, status
+from damian.compiling import compiled
 from damian.scenario import ScenarioConfig
+from damian.server import Features, Server
 from damian.simulation import Simulation
 from damian.state import SITUATION, Rows, State, tree_map
 from damian.world import draws
-from damian.world.airspace import rows
-from damian.world.coverage import FootprintTables, build_tables
 
 Shown = dict[str, Any]
 """What a step shows, as nested dictionaries of tensors."""
@@ -29,7 +27,10 @@ EXTRAS = ("message", "state", "reward_terms")
 
 
 class UavEnv(EnvBase):
-    """B worlds in which N UAVs search for, track and cover things; nothing is delayed here.
+    """B worlds in which N UAVs search for, track and cover things.
+
+    Nothing is delayed here: whatever ``scenario.delay`` and the slower clocks of ``scenario.clock`` say is
+    the business of transforms (``damian.delayed.make_env`` puts them together).
 
     Batch size ``[B]``. What belongs to the UAVs stands under ``"agents"``, batch size ``[B, N]``:
 
@@ -37,11 +38,14 @@ class UavEnv(EnvBase):
     - ``action_mask``: discrete actions that would do something, [B, N, A] (if ``actions.mask``);
     - ``ready``: may the UAV choose now, [B, N];
     - ``observation``, ``global_observation``: features of the actor [B, N, F], of the critic [B, N, G];
-    - ``message``: the latest message of each UAV (the fields of ``Snapshot``), ``talks``: sent just now;
+    - ``message``: the latest message of each UAV, [B, N, M] (``Snapshot.unpack`` names its numbers), and
+      ``talks``: sent just now, [B, N];
     - ``reward``: eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
     At the root stand ``state`` (simulator truth: for drawing and reference arms, never for an actor),
-    ``success``, and TorchRL's ``done``, ``terminated``, ``truncated``.
+    ``success``, and TorchRL's ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also
+    ``source_over``. A step reads, beside the action, the flag ``("agents", "acts")`` [B, N] if there is one:
+    an action of a UAV whose flag is false is none, as if it were not ready.
 
     Args:
         scenario: what a world is made of.
@@ -50,6 +54,8 @@ class UavEnv(EnvBase):
         device: where everything lives.
         extras: which of ``message``, ``state`` and ``reward_terms`` are shown; each costs time, so leave
             out what nobody reads (delays read the messages).
+        serves: False leaves it to a ``ServerNode`` transform to make something of the messages: what it
+            writes is empty after a step.
 
     ``UavEnv(..., compile=True)`` compiles the step (half a minute at first, then up to twice as fast).
 
@@ -64,19 +70,20 @@ class UavEnv(EnvBase):
         seed: int = 0,
         device: torch.device | str = "cpu",
         extras: Collection[str] = EXTRAS,
+        serves: bool = True,
     ) -> None:
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
         self.scenario = scenario or ScenarioConfig()
         self.extras = frozenset(extras)
+        self.serves = serves
         self.simulation = Simulation(self.scenario, seed)
-        observation, task = self.scenario.observation, self.scenario.task
-        self._wanted = sorted({*observation.actor, *observation.critic, *task.terms})
-        self._footprints = self._build_footprints() if "coverage" in self._wanted else None
+        self.server = Server(self.scenario, self.simulation.airspace, self.simulation.radius)
         first = self.simulation.initial
-        self._first = self._show(first, self._features(first))
+        features = self.server.features(first.sent, first.steps)
+        self._first = _merged(self._show(first, features), self._nothing_yet(first))
         self._make_specs()
         self.set_seed(seed)
-        self._advance = self._play
+        self._advance = self._advance_some = self._play
         self.to(torch.device(device))
 
     def compile(self, **options: Any) -> "UavEnv":
@@ -85,11 +92,9 @@ class UavEnv(EnvBase):
         Args:
             options: for ``torch.compile``, in place of what suits a CPU.
         """
-        options = options or {"options": _INDUCTOR}
-        # Every environment has a graph of its own: it never meets another's scenario.
-        self._advance = torch.compile(  # type: ignore[call-overload]
-            self._play, fullgraph=True, isolate_recompiles=True, **options
-        )
+        # Two graphs, as whether there are flags is not checked by what is kept of the guards.
+        self._advance = compiled(self._play, **options)
+        self._advance_some = compiled(self._play, **options)
         return self
 
     def to(self, device: DEVICE_TYPING) -> "UavEnv":
@@ -101,8 +106,7 @@ class UavEnv(EnvBase):
         self.simulation.to(device)
         self._first = _map(lambda table: table.to(device), self._first)
         self._worlds = tree_map(lambda t: t.to(device), self._worlds)
-        if self._footprints is not None:
-            self._footprints = self._footprints.to(device)
+        self.server.to(device)
         return self
 
     @property
@@ -132,7 +136,12 @@ class UavEnv(EnvBase):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._worlds, shown = self._advance(self._worlds, tensordict["agents", "action"])
+        agents = tensordict.get("agents")
+        action, acts = agents.get("action"), agents.get("acts", None)
+        if acts is None:
+            self._worlds, shown = self._advance(self._worlds, action)
+        else:
+            self._worlds, shown = self._advance_some(self._worlds, action, acts)
         return self._tensordict(shown)
 
     @torch.no_grad()
@@ -147,66 +156,54 @@ class UavEnv(EnvBase):
 
     # Pure functions of the state; ``_play`` compiles.
 
-    def _play(self, worlds: Rows, action: Tensor) -> tuple[Rows, Shown]:
+    def _play(self, worlds: Rows, action: Tensor, acts: Tensor | None = None) -> tuple[Rows, Shown]:
         """One step: physics, then what the server makes of the messages."""
-        scenario, layout = self.scenario, self.simulation.layout
-        state = self.simulation.step(layout.unpack(worlds), action)
-        ended = status(
-            state.sent,
-            state.steps,
-            state.steps * self.simulation.dt,
-            state.source_over,
-            self.simulation.dt,
-            scenario.episode,
-        )
-        features = self._features(state)
-        counters = Counters(state.steps, state.sent.motions)
-        terms = reward(features, counters, scenario.task)
-        total = final_reward(ended, counters, scenario.task)
-        total = sum(terms.values(), start=total.unsqueeze(-1).expand_as(state.track))
+        state = self.simulation.step(self.simulation.layout.unpack(worlds), action, acts)
+        packed = self.simulation.layout.pack(state)
+        if not self.serves:
+            return packed, _merged(self._show(state), self._blank(state))
+        features = self.server.features(state.sent, state.steps)
         shown = self._show(state, features)
+        total, terms, ended = self.server.judge(features, state.sent, state.steps, state.source_over)
         shown["agents"]["reward"] = total.unsqueeze(-1)
         if "reward_terms" in self.extras:
             shown["agents"]["reward_terms"] = terms
-        return layout.pack(state), shown | {
-            "success": ended.success.unsqueeze(-1),
-            "done": (ended.terminated | ended.truncated).unsqueeze(-1),
-            "terminated": ended.terminated.unsqueeze(-1),
-            "truncated": ended.truncated.unsqueeze(-1),
-        }
+        done = ended.terminated | ended.truncated
+        ends = {"success": ended.success, "done": done}
+        ends |= {"terminated": ended.terminated, "truncated": ended.truncated}
+        return packed, shown | {key: value.unsqueeze(-1) for key, value in ends.items()}
 
-    def _features(self, state: State) -> dict[str, Tensor]:
-        airspace = self.simulation.airspace
-        server = Server(
-            now=state.steps * self.simulation.dt,
-            scale=rows(airspace.scale, state.region),
-            time_scale=self.scenario.time_scale,
-            battery=self.scenario.battery,
-            footprints=self._footprints,
-            points=self.simulation.points,
-        )
-        return observe(state.sent, server, self._wanted)
+    def _blank(self, state: State) -> Shown:
+        """In place of what a ``ServerNode`` will make of the messages."""
+        agents = self._first["agents"]
+        names = ("observation", "global_observation")
+        empty = {key: agents[key].new_zeros(*state.track.shape, agents[key].shape[-1]) for key in names}
+        empty["reward"] = torch.zeros_like(state.track).unsqueeze(-1)
+        return _merged(self._nothing_yet(state), {"agents": empty})
 
-    def _show(self, state: State, features: dict[str, Tensor]) -> Shown:
+    def _show(self, state: State, features: Features | None = None) -> Shown:
         """What is shown of a state, at a reset as after a step; terms and success have not come yet."""
-        observation = self.scenario.observation
-        agents: Shown = {
-            "observation": stack(features, observation.actor),
-            "global_observation": stack(features, observation.critic),
-            "ready": self.simulation.ready(state),
-        }
+        agents: Shown = {"ready": self.simulation.ready(state)}
+        if features is not None:
+            agents["observation"], agents["global_observation"] = self.server.observations(features)
         if self.scenario.actions.kind == "discrete" and self.scenario.actions.mask:
             agents["action_mask"] = self.simulation.action_mask(state)
-        if "reward_terms" in self.extras:
-            zero = torch.zeros_like(state.track)
-            agents["reward_terms"] = dict.fromkeys(self.scenario.task.terms, zero)
         if "message" in self.extras:
-            agents |= {"message": state.sent._asdict(), "talks": state.talks}
-        shown = {"agents": agents, **_nothing_yet(state)}
+            agents |= {"message": state.sent.pack(), "talks": state.talks}
+        shown: Shown = {"agents": agents}
+        if self.scenario.episode.end_with_source:
+            shown["source_over"] = state.source_over.unsqueeze(-1)
         if "state" in self.extras:
             truth = [state.position.flatten(1), state.battery, state.source]
             shown["state"] = torch.cat(truth, -1)
         return shown
+
+    def _nothing_yet(self, state: State) -> Shown:
+        """Rewards, success and ends before anything has happened; the terms only if they are shown."""
+        zero, no = torch.zeros_like(state.track), torch.zeros_like(state.source_over).unsqueeze(-1)
+        terms = dict.fromkeys(self.scenario.task.terms, zero)
+        agents = {"reward_terms": terms} if "reward_terms" in self.extras else {}
+        return {"agents": agents, **dict.fromkeys((*_DONE, "success"), no)}
 
     # Keys and specs.
 
@@ -239,26 +236,12 @@ class UavEnv(EnvBase):
         ends = {key: self._first[key] for key in _DONE}
         self.done_spec = _spec_of(ends, worlds, self.device, self.n_agents)
 
-    def _build_footprints(self) -> FootprintTables:
-        airspace = self.simulation.airspace
-        polygons = [region.polygon for region in airspace.regions]
-        places = airspace.points.double().numpy()
-        return build_tables(polygons, places, self.simulation.radius)
-
 
 _DONE = ("done", "terminated", "truncated")
 
-_INDUCTOR: dict[str, Any] = {
-    # Innermost loops run over a few UAVs: vectors of 16 lanes would be mostly idle, and slower.
-    "cpp.simdlen": 1,
-    # Shapes may change, the scenario never does: checking it takes as long as a kernel.
-    "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
-}
-
-
-def _nothing_yet(state: State) -> Shown:
-    """No end and no success at the beginning of an episode."""
-    return {key: torch.zeros_like(state.source_over).unsqueeze(-1) for key in (*_DONE, "success")}
+def _merged(some: Shown, others: Shown) -> Shown:
+    """Both, and both of what stands under ``agents``."""
+    return some | others | {"agents": some["agents"] | others["agents"]}
 
 
 def _map(function: Callable[[Tensor], Tensor], shown: Shown) -> Shown:

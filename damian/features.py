@@ -103,8 +103,32 @@ class Snapshot(NamedTuple):
     trail: Tensor
     """Flat ids of its last landing points, newest first, [*, N, window]."""
 
+    def pack(self) -> Tensor:
+        """Messages as they are sent: a row of numbers each, fields in order, [*, N, F] float32."""
+        fields = zip(self, _WIDTHS, strict=True)
+        columns = [(field.unsqueeze(-1) if width == 1 else field).float() for field, width in fields]
+        return torch.cat(columns, -1)
 
-class Server(NamedTuple):
+    @classmethod
+    def unpack(cls, messages: Tensor) -> "Snapshot":
+        """The fields of messages [*, N, F]; floats are views of them."""
+        window = messages.shape[-1] - sum(width or 0 for width in _WIDTHS)
+        columns = messages.split([width or window for width in _WIDTHS], -1)
+        fields = [c.squeeze(-1) if width == 1 else c for c, width in zip(columns, _WIDTHS, strict=True)]
+        snapshot = cls._make(fields)
+        return snapshot._replace(
+            spotted=snapshot.spotted > 0.5, motions=snapshot.motions.long(), trail=snapshot.trail.long()
+        )
+
+
+_WIDTHS = (1, 2, 2, 1, 1, 1, 1, 1, 2, None)
+"""Numbers that each field of a snapshot takes in a message; the trail, the rest."""
+
+EXACT = 2**24
+"""Whole numbers in a message are exact below this."""
+
+
+class Knowledge(NamedTuple):
     """What the server knows besides the messages."""
 
     now: Tensor
@@ -121,7 +145,7 @@ class Server(NamedTuple):
     """Landing points by flat id, [R*L, 2] metres."""
 
 
-def observe(snapshot: Snapshot, server: Server, names: list[str]) -> dict[str, Tensor]:
+def observe(snapshot: Snapshot, server: Knowledge, names: list[str]) -> dict[str, Tensor]:
     """Features by name (Table 2), each scaled to [0, 1].
 
     Args:
@@ -145,7 +169,7 @@ def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
 class _View:
     """A snapshot with what several features share, each computed once and only on demand."""
 
-    def __init__(self, snapshot: Snapshot, server: Server) -> None:
+    def __init__(self, snapshot: Snapshot, server: Knowledge) -> None:
         self.snapshot, self.server = snapshot, server
         self._shared: dict[Callable, Tensor] = {}
 

@@ -85,11 +85,17 @@ class Simulation:
         fresh.integers[:, EPISODE] = episode
         return tree_map(lambda old, new: old.index_copy(0, chosen, new), worlds, fresh)
 
-    def step(self, state: State, action: Tensor) -> State:
-        """One simulation step of ``dt``; actions of UAVs that are not ready change nothing."""
-        state = self._decide(state, action)
+    def step(self, state: State, action: Tensor, acts: Tensor | None = None) -> State:
+        """One simulation step of ``dt``; actions of UAVs that are not ready change nothing.
+
+        Args:
+            state: before it.
+            action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
+            acts: whose action counts, [B, N]; everybody's if not given.
+        """
+        state = self._decide(state, action, acts)
         state = self._fly(state) if self.flies else self._jump(state)
-        return self._sense(state._replace(steps=state.steps + 1))
+        return self._sense(state._replace(steps=state.steps + 1), acts)
 
     def ready(self, state: State) -> Tensor:
         """May the UAV choose now, [B, N]."""
@@ -125,12 +131,14 @@ class Simulation:
 
     # One step, in order.
 
-    def _decide(self, state: State, action: Tensor) -> State:
+    def _decide(self, state: State, action: Tensor, acts: Tensor | None) -> State:
         """Book landing points and start flights."""
         base = state.region.unsqueeze(-1) * self.airspace.max_points
         standing = state.goal - base
         ranking, row = self.candidates.of(state.goal, state.region, action)
         reach = self.reach(state)
+        if acts is not None:
+            reach = torch.where(acts, reach, -1.0)
         ready = reach >= 0
         goal = book(ranking, row, standing, reach, self.airspace.max_points) + base
         departs = goal != state.goal
@@ -182,7 +190,7 @@ class Simulation:
         drained = self._drain_or_charge(state, used - state.used, landed_before)
         return drained._replace(used=used)
 
-    def _sense(self, state: State) -> State:
+    def _sense(self, state: State, acts: Tensor | None = None) -> State:
         """Move the source, listen, and send messages."""
         now = (state.steps * self.dt).to(state.track.dtype)
         place, emits, over = self._source(state, now)
@@ -201,7 +209,7 @@ class Simulation:
             motions=state.motions,
             detected_time=torch.where(spotted, times, state.sent.detected_time),
             detected_position=torch.where(spotted.unsqueeze(-1), position, state.sent.detected_position),
-            trail=self._trail(state, talks),
+            trail=self._trail(state, talks, acts),
         )
         return state._replace(
             source=place,
@@ -213,11 +221,11 @@ class Simulation:
 
     # Parts.
 
-    def _trail(self, state: State, talks: Tensor) -> Tensor:
+    def _trail(self, state: State, talks: Tensor, acts: Tensor | None) -> Tensor:
         """The latest landing points, one for each decision, however long the UAV then senses there."""
         longer = torch.cat([state.goal.unsqueeze(-1), state.sent.trail[..., :-1]], -1)
         if not self.flies:
-            return longer
+            return longer if acts is None else torch.where(acts.unsqueeze(-1), longer, state.sent.trail)
         waited = (state.elapsed > self.dt + _TIME_EPS) & state.talks
         return torch.where((talks & ~waited).unsqueeze(-1), longer, state.sent.trail)
 

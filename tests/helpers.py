@@ -15,7 +15,7 @@ from twin import Uav
 
 from damian.actions import ActionConfig
 from damian.env import UavEnv
-from damian.features import GLOBAL, LOCAL, ObservationConfig, Server, Snapshot
+from damian.features import GLOBAL, LOCAL, ObservationConfig, Knowledge, Snapshot
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.scenario import ClockConfig, RegionConfig, ScenarioConfig
 from damian.state import State
@@ -217,7 +217,7 @@ def random_worlds(
     return worlds
 
 
-def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Snapshot, Server]:
+def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Snapshot, Knowledge]:
     """The same worlds in the package's own form, [B, N]."""
 
     def column(read: Callable[[Uav], Any], dtype: torch.dtype = torch.float32) -> Tensor:
@@ -236,7 +236,7 @@ def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Snapshot, Server
         detected_position=column(lambda uav: uav.heard_from),
         trail=torch.zeros(*place.shape[:-1], 2, dtype=torch.long),
     )
-    server = Server(
+    server = Knowledge(
         now=torch.tensor([now for now, _ in worlds]),
         scale=torch.full((len(worlds),), SCALE),
         time_scale=TIME_SCALE,

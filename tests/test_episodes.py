@@ -41,7 +41,7 @@ def test_success_needs_a_share_of_the_uavs_to_spot_at_once(share, needed):
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
         shown = act(env, random_actions(env, generator))
-        enough = shown["agents", "message", "spotted"].sum(-1, keepdim=True) >= needed
+        enough = told(shown).spotted.sum(-1, keepdim=True) >= needed
         assert enough.any()
         assert not enough.all()
         assert shown["success"].equal(enough)
@@ -96,11 +96,11 @@ def test_the_end_of_the_sources_walk_silences_it_and_terminates_if_wanted():
         episode = EpisodeConfig(max_steps=None, end_with_source=wanted)
         env = fresh(one_uav(source=source, episode=episode))
         shown = go(env, HERE)
-        assert shown["agents", "message", "spotted"].item()
+        assert told(shown).spotted.item()
         assert not shown["done"].item()
         shown = go(env, HERE)
         assert shown["terminated"].item() == wanted
-        assert not shown["agents", "message", "spotted"].item()
+        assert not told(shown).spotted.item()
 
 
 def test_a_persistent_task_never_ends():
@@ -239,7 +239,7 @@ def test_an_intermittent_source_is_heard_as_often_as_it_emits():
     )
     env = fresh(square(source=source, episode=KEEPS_GOING), num_worlds=400)
     heard = torch.stack(
-        [act(env, torch.zeros(400, 3).long())["agents", "message", "spotted"].clone() for _ in range(25)]
+        [told(act(env, torch.zeros(400, 3).long())).spotted for _ in range(25)]
     )
     assert heard.any(-1).equal(heard.all(-1))
     assert heard.float().mean().item() == pytest.approx(0.3, abs=0.02)

@@ -87,14 +87,14 @@ def test_uavs_stand_on_landing_points_of_their_own_inside_the_region(n_agents, k
 
 
 def test_starts_are_different_points_or_one_or_those_given():
-    apart = UavEnv(square(), num_worlds=64).reset()["agents", "message", "position"]
+    apart = told(UavEnv(square(), num_worlds=64).reset()).position
     assert (torch.cdist(apart, apart) + 1e9 * torch.eye(3)).min() > 1
     region = RegionConfig(kind="vertices", vertices=SQUARE, start_together=True)
     together = UavEnv(square(region=region), num_worlds=64).reset()
-    place = together["agents", "message", "position"]
+    place = told(together).position
     assert torch.cdist(place, place).max() == 0
     assert len({tuple(p) for p in place[:, 0].tolist()}) > 10
-    given = UavEnv(usecase(2)).reset()["agents", "message", "position"]
+    given = told(UavEnv(usecase(2)).reset()).position
     expected = [pytest.approx([62.85586449, -119.2183645], abs=1e-4)] * 3
     assert given[0].tolist() == expected
 
@@ -143,14 +143,14 @@ def test_in_flight_the_message_stays_the_last_one_and_its_time_does_too():
     duration, landing = flight(env), None
     for _ in range(math.ceil(duration) - 1):
         assert not flown["agents", "talks"].item()
-        assert same(flown["agents", "message"], before)
+        assert flown["agents", "message"].equal(before)
         landing = flown = go(env, HERE)
-    message = landing["agents", "message"]
+    message = told(landing)
     assert landing["agents", "talks"].item()
-    assert message["time"].item() == math.ceil(duration)
-    assert message["position"][0, 0].equal(env.simulation.points[env.state.goal.item()])
-    assert message["position"].equal(message["target"])
-    assert message["track"].item() == pytest.approx(math.pi / 2, abs=0.3)
+    assert message.time.item() == math.ceil(duration)
+    assert message.position[0, 0].equal(env.simulation.points[env.state.goal.item()])
+    assert message.position.equal(message.target)
+    assert message.track.item() == pytest.approx(math.pi / 2, abs=0.3)
 
 
 def test_in_flight_nobody_listens():
@@ -165,7 +165,7 @@ def test_in_flight_nobody_listens():
         shown = go(env, HERE)
         away = torch.linalg.vector_norm(env.state.position[0, 0, :2] - env.state.source[0])
         near |= bool(away < 10)
-        assert not shown["agents", "message", "spotted"].item()
+        assert not told(shown).spotted.item()
     assert near
     assert env.state.motions.item() == 1  # As after a detection it would not be.
 
@@ -175,7 +175,7 @@ def test_a_hold_of_no_distance_keeps_the_point_and_counts_as_a_motion():
     place = env.state.goal.clone()
     shown = go(env, HERE, HERE, HERE)
     assert env.state.goal.equal(place)
-    assert shown["agents", "message", "motions"].item() == 3
+    assert told(shown).motions.item() == 3
 
 
 def test_a_target_outside_the_region_holds():
@@ -191,8 +191,8 @@ def test_motions_count_from_the_latest_detection():
     env = fresh(one_uav(source=SourceConfig(level_db=130.0, position=[160.0, 100.0])))
     counted = []
     for action in (HERE, EAST, HERE, WEST, WEST, EAST):
-        message = go(env, action)["agents", "message"]
-        counted.append((message["spotted"].item(), message["motions"].item()))
+        message = told(go(env, action))
+        counted.append((message.spotted.item(), message.motions.item()))
     assert counted == [(False, 1), (True, 2), (True, 1), (False, 1), (False, 2), (True, 3)]
 
 

@@ -17,7 +17,7 @@ import torch
 from helpers import DATA, GOLDEN, act, nearest, usecase
 
 from damian.env import UavEnv
-from damian.features import Server, Snapshot, observe
+from damian.features import Knowledge, Snapshot, observe
 from damian.rewards import Counters, RewardConfig, final_reward, reward, status
 from damian.scenario import ScenarioConfig
 from damian.world.battery import BatteryConfig
@@ -194,7 +194,7 @@ def test_recorded_points_give_the_recorded_detections_and_motions(case, n_flags,
     assert (motions[side_effect] > 0).all()
 
 
-def scene(case: int, records: list[Move]) -> tuple[Snapshot, Server, Counters]:
+def scene(case: int, records: list[Move]) -> tuple[Snapshot, Knowledge, Counters]:
     """What the server knew after each transition; everybody believes in its estimate."""
     golden = GOLDEN[case]["scenario"]
     place = column(records, "positions")
@@ -217,7 +217,7 @@ def scene(case: int, records: list[Move]) -> tuple[Snapshot, Server, Counters]:
         detected_position=zeros[..., None] + estimate[:, None],
         trail=torch.zeros(*zeros.shape, 2, dtype=torch.long),
     )
-    server = Server(
+    server = Knowledge(
         now=number.float(),
         scale=torch.full((len(records),), golden["max_distance_normaliser_m"]),
         time_scale=golden["time_max_normaliser"],

@@ -110,7 +110,7 @@ def test_rollouts_equal_those_of_a_slow_twin(n_agents, kind, since):
                     continue
                 rewards = world.step(moves[b].tolist())
                 places = [list(uav.place) for uav in world.uavs]
-                assert shown["agents", "message", "position"][b].tolist() == places
+                assert told(shown).position[b].tolist() == places
                 check_shown(world, shown["agents", "global_observation"][b])
                 ours = shown["agents", "reward"][b, :, 0].tolist()
                 assert ours == pytest.approx(rewards, abs=1e-4)

@@ -1,0 +1,170 @@
+"""A scenario's environment with its delays, losses and clocks: the one place that knows their order."""
+
+from collections.abc import Collection, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+
+from damian.actions import ActionConfig
+from damian.delays import law_of
+from damian.env import UavEnv
+from damian.scenario import ScenarioConfig
+from damian.server import Server
+from damian.transforms import (
+    ActionDelay,
+    ActionHistory,
+    Clock,
+    CumulativeReward,
+    ObservationDelay,
+    RewardDelay,
+    ServerNode,
+)
+from damian.transforms.stateful import Stateful
+
+ACTION, REWARD, SEEN = ("agents", "action"), ("agents", "reward"), ("agents", "observation")
+
+
+class DelayedEnv(TransformedEnv):
+    """A ``TransformedEnv`` whose seed reaches its transforms, and whose ``compile`` compiles them too."""
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        for number, transform in enumerate(self._stateful()):
+            transform.set_seed(None if seed is None else seed + 7919 * (number + 1))
+        return super().set_seed(seed, static_seed)
+
+    def seed_worlds(self, seeds: Tensor) -> None:
+        """Give every world its own streams, [B] integers: alone it does what it does among others."""
+        self.base_env.seed_worlds(seeds)
+        for number, transform in enumerate(self._stateful()):
+            transform.seed_worlds(seeds + number + 1)
+
+    def compile(self, **options: Any) -> "DelayedEnv":
+        """Compile what a step computes: a graph for the environment, and one for each transform."""
+        self.base_env.compile(**options)
+        for transform in self._stateful():
+            transform.compile()
+        return self
+
+    def _stateful(self) -> Iterator[Stateful]:
+        for module in self.transform.modules():
+            if isinstance(module, Stateful):
+                yield module
+
+
+def make_env(
+    scenario: ScenarioConfig,
+    num_worlds: int = 1,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    extras: Collection[str] = (),
+) -> EnvBase:
+    """The environment of a scenario with everything that is late in it.
+
+    Args:
+        scenario: with its ``delay`` and ``clock``.
+        num_worlds: B.
+        seed: of the worlds, and of the delays.
+        device: where everything lives.
+        extras: as in ``UavEnv``; with ``message`` also ``("agents", "received")``: what the server holds.
+
+    Raises:
+        InputError: the scenario asks for something impossible.
+    """
+    late = messages_are_late(scenario)
+    shown = {*extras, "message"} if late else extras
+    env = UavEnv(scenario, num_worlds, seed, device, shown, serves=not late)
+    transforms = [*deciding(scenario), *(serving(scenario, env.server, extras) if late else [])]
+    transforms += [*paying(scenario), *seeing(scenario)]
+    if not transforms:
+        return env
+    delayed = DelayedEnv(env, Compose(*transforms))
+    delayed.set_seed(seed)
+    return delayed
+
+
+# The parts of the chain, in its order. What the policy chooses passes it backwards.
+
+
+def deciding(scenario: ScenarioConfig) -> list[Transform]:
+    """Actions on their way to the UAVs; one that was not ready when it chose has chosen nothing."""
+    delay, clock = scenario.delay, scenario.clock
+    if not is_late(delay.act, clock.dt) and clock.steps("agents") == 1:
+        return []
+    act = law_of(delay.act, "delay.act")
+    hold = holding(scenario.actions)
+    return [ActionDelay(act, ACTION, default=hold, dt=clock.dt, sent_key="ready", fresh_key="acts")]
+
+
+def messages_are_late(scenario: ScenarioConfig) -> bool:
+    """Does the server hold anything else than what was just sent."""
+    return scenario.delay.loss > 0 or is_late(scenario.delay.obs, scenario.clock.dt)
+
+
+def serving(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
+    """Messages on their way to the server node, and what it makes of those that have arrived."""
+    delay = scenario.delay
+    uplink = ObservationDelay(
+        law_of(delay.obs, "delay.obs"),
+        [("agents", "message")],
+        [("agents", "received")],
+        loss=delay.loss,
+        order=delay.order,
+        dt=scenario.clock.dt,
+        sent_key="talks",
+        age_key="age",
+        delay_key="delay" if "message" in extras else None,
+    )
+    unread = [] if "message" in extras else [("agents", k) for k in ("message", "received", "talks")]
+    return [uplink, ServerNode(server, drop=unread, terms="reward_terms" in extras)]
+
+
+def paying(scenario: ScenarioConfig) -> list[Transform]:
+    """Rewards on their way."""
+    delay, dt = scenario.delay, scenario.clock.dt
+    late = [RewardDelay(law_of(delay.rew, "delay.rew"), REWARD, dt=dt)] if is_late(delay.rew, dt) else []
+    window = delay.reward_window
+    summed = [CumulativeReward(window, delay.reward_discount, REWARD)] if window > 1 else []
+    return [*late, *summed]
+
+
+def seeing(scenario: ScenarioConfig) -> list[Transform]:
+    """When the server broadcasts, when the UAVs listen, and what they remember by themselves."""
+    clock, n_actions = scenario.clock, scenario.delay.history
+    transforms: list[Transform] = []
+    if clock.steps("server") > 1:
+        transforms.append(Clock(clock.steps("server"), [SEEN, ("agents", "global_observation")]))
+    if clock.steps("agents") > 1:
+        transforms.append(Clock(clock.steps("agents"), [SEEN], ready_key=("agents", "ready")))
+    if n_actions:
+        history = ActionHistory(
+            n_actions,
+            ACTION,
+            append_to=SEEN,
+            codes=action_codes(scenario.actions),
+            default=holding(scenario.actions),
+            recorded_key="ready",
+        )
+        transforms.append(history)
+    return transforms
+
+
+def is_late(law: Any, dt: float) -> bool:
+    """Does a law, as a person writes it, delay anything."""
+    return law_of(law).sampler(dt).certain != 0
+
+
+def holding(actions: ActionConfig) -> int:
+    """The action that holds the position, or the first one if there is none (discrete); distance 0."""
+    discrete = actions.kind == "discrete" and 0.0 in actions.distances
+    return actions.distances.index(0.0) * len(actions.headings) if discrete else 0
+
+
+def action_codes(actions: ActionConfig) -> Tensor | None:
+    """Discrete actions as an actor sees its past ones, in [0, 1]: distance, east, north, [A, 3]."""
+    if actions.kind == "continuous":
+        return None
+    distance, heading = actions.table().unbind(-1)
+    sides = [(1 + heading.sin()) / 2, (1 + heading.cos()) / 2]
+    return torch.stack([distance / distance.max(), *sides], -1)

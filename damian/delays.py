@@ -1,0 +1,281 @@
+"""How late messages arrive: delay laws, in steps (``3``) or in time (``"3s"``, ``"0.5m"``).
+
+A law says how likely each delay is; ``sampler`` turns it into a table from which delays are drawn, one
+hash and one search per message. The transforms that hold messages back are in ``damian.transforms``.
+"""
+
+import csv
+import io
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from damian import checks
+from damian.errors import InputError
+from damian.sampling import Recorded, Sampler
+from damian.world.reading import named, near, read_text, show
+
+Delay = int | str
+"""Whole steps, or a time with its unit."""
+
+LONGEST = 10_000
+"""Steps; longer delays are refused, as every message on its way takes memory."""
+
+LOST = "lost"
+"""What a trace writes for a message that never arrives."""
+
+
+@dataclass(frozen=True)
+class Law(ABC):
+    """A delay per message, drawn independently of what the message says."""
+
+    @abstractmethod
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        """Something to draw from.
+
+        Args:
+            dt: length of a step [s].
+            loss: probability that a message is lost, whatever its delay.
+            key: what errors call the law.
+
+        Raises:
+            InputError: a value is impossible.
+        """
+
+
+@dataclass(frozen=True)
+class Constant(Law):
+    """Every message takes as long."""
+
+    delay: Delay = 0
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        return Sampler([_certain(in_steps(key, self.delay, dt))], loss=loss)
+
+
+@dataclass(frozen=True)
+class Uniform(Law):
+    """With a probability, a delay between ``low`` and ``high``; else none (the paper, section 5).
+
+    Whole steps are equally likely, both ends included. Times are continuous and rounded up to a whole
+    step, so that 3 to 7 s at a step of 1 s are 4, 5, 6 or 7 steps.
+    """
+
+    low: Delay = 0
+    high: Delay = 0
+    probability: float = 1.0
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        checks.in_range(f"{key}.probability", self.probability, 0.0, 1.0)
+        low, high = in_steps(f"{key}.low", self.low, dt), in_steps(f"{key}.high", self.high, dt)
+        ordered = low <= high and isinstance(self.low, str) == isinstance(self.high, str)
+        should = f"and high={self.high} are not two steps or two times in order"
+        checks.require(ordered, f"{key}.low", self.low, should)
+        if isinstance(self.low, str):
+            chances = _rounded_up(seconds(f"{key}.low", self.low) / dt, seconds(f"{key}.high", self.high) / dt)
+        else:
+            chances = [float(low <= k) / (high - low + 1) for k in range(high + 1)]
+        late = [self.probability * chance for chance in chances]
+        return Sampler([[late[0] + 1 - self.probability, *late[1:]]], loss=loss)
+
+
+@dataclass(frozen=True)
+class Geometric(Law):
+    """A message arrives in each step with the same probability: retransmission until it gets through.
+
+    The mean is before the cut: what would take longer than ``longest`` takes just that.
+    """
+
+    mean: Delay = 1
+    longest: Delay = 20
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        longest = in_steps(f"{key}.longest", self.longest, dt)
+        mean = seconds(f"{key}.mean", self.mean) / dt if isinstance(self.mean, str) else self.mean
+        checks.in_range(f"{key}.mean", mean, 0.0, unit="steps")
+        fails = mean / (1 + mean)
+        chances = [(1 - fails) * fails**k for k in range(longest)]
+        return Sampler([[*chances, fails**longest]], loss=loss)
+
+
+@dataclass(frozen=True)
+class Burst(Law):
+    """A channel that is good or bad for a while (Gilbert 1960, Elliott 1963), one for each sender."""
+
+    enter: float = 0.05
+    """Probability that a good channel turns bad, per step."""
+    leave: float = 0.25
+    """Probability that a bad channel turns good, per step."""
+    good: Any = 0
+    """Law of the delays while it is good; it must be memoryless."""
+    bad: Any = 5
+    """Law of the delays while it is bad."""
+    good_loss: float = 0.0
+    """Probability that a message is lost while it is good."""
+    bad_loss: float = 0.5
+    """Probability that a message is lost while it is bad."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        for name in ("enter", "leave", "good_loss", "bad_loss"):
+            checks.in_range(f"{key}.{name}", getattr(self, name), 0.0, 1.0)
+        checks.above(f"{key}.enter + leave", self.enter + self.leave, 0.0)
+        states = []
+        for name in ("good", "bad"):
+            inner_key = f"{key}.{name}"
+            inner = law_of(getattr(self, name), inner_key).sampler(
+                dt, getattr(self, f"{name}_loss"), inner_key
+            )
+            memoryless = len(inner.chances) == 1 and not isinstance(inner, Recorded)
+            checks.require(memoryless, inner_key, show(getattr(self, name)), "is not a memoryless law")
+            states.append(inner.chances[0].tolist()[:-1])
+        turns = [[1 - self.enter, self.enter], [self.leave, 1 - self.leave]]
+        return Sampler(states, turns, loss)
+
+
+@dataclass(frozen=True)
+class Trace(Law):
+    """Delays measured elsewhere, one per step in the order of a file; each sender begins anywhere in it.
+
+    A CSV file with a column ``delay``: steps, times with their unit, or ``lost``.
+    """
+
+    path: str = ""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        checks.require(bool(self.path), f"{key}.path", "it", "is missing: the file with the delays")
+        with named(self.path):
+            table = csv.DictReader(io.StringIO(read_text(Path(self.path))))
+            if "delay" not in (table.fieldnames or ()):
+                raise InputError(f"line 1: no column delay; {near('delay', table.fieldnames or ())}")
+            delays = [self._read(row["delay"], f"line {table.line_num}: delay", dt) for row in table]
+            if not delays:
+                raise InputError("line 2: there is no delay under the header")
+        return Recorded(delays, loss)
+
+    def _read(self, written: str | None, key: str, dt: float) -> int:
+        written = (written or "").strip()
+        return -1 if written == LOST else in_steps(key, _number(written), dt)
+
+
+LAWS: dict[str, type[Law]] = {
+    "constant": Constant,
+    "uniform": Uniform,
+    "geometric": Geometric,
+    "burst": Burst,
+    "trace": Trace,
+}
+
+
+def law_of(written: Any, key: str = "delay") -> Law:
+    """A law as a person writes it: a law, steps, a time, or ``{law: uniform, low: 3s, high: 7s}``.
+
+    Raises:
+        InputError: it means nothing.
+    """
+    if isinstance(written, Law):
+        return written
+    if not isinstance(written, Mapping):
+        return Constant(_number(written))
+    kind = written.get("law")
+    checks.one_of(f"{key}.law", kind, LAWS)
+    values = {name: _number(value) for name, value in written.items() if name != "law"}
+    known = [field.name for field in fields(LAWS[str(kind)])]
+    for name in values:
+        should = f"is no setting of the law {kind}, which has {', '.join(known)}"
+        checks.require(name in known, f"{key}.{name}", values[name], should)
+    return LAWS[str(kind)](**values)
+
+
+def in_steps(key: str, delay: Delay, dt: float) -> int:
+    """Whole steps, a time being rounded up.
+
+    Raises:
+        InputError: neither steps nor a time, or too long.
+    """
+    if isinstance(delay, str):
+        steps = math.ceil(seconds(key, delay) / dt - 1e-9)
+    else:
+        whole = isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
+        checks.require(whole, key, delay, "is neither whole steps such as 3 nor a time such as 3s or 0.5m")
+        steps = delay
+    checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
+    return steps
+
+
+def seconds(key: str, delay: Delay) -> float:
+    """A time with its unit [s]; ``0s`` is one."""
+    text = str(delay)
+    unit = text[-1:] in "smh"
+    return 0.0 if unit and _is_zero(text[:-1]) else checks.seconds(key, text if unit else f"{text}?")
+
+
+def _is_zero(text: str) -> bool:
+    try:
+        return float(text) == 0
+    except ValueError:
+        return False
+
+
+def _number(written: Any) -> Any:
+    """Digits as a number: Hydra and CSV files may hand over either."""
+    if isinstance(written, str) and written.strip().isdigit():
+        return int(written)
+    return written
+
+
+def _certain(steps: int) -> list[float]:
+    return [0.0] * steps + [1.0]
+
+
+def _rounded_up(low: float, high: float) -> list[float]:
+    """Chance of each whole number of steps, of a time uniform in [low, high] steps and rounded up."""
+    last = math.ceil(high - 1e-9)
+    if high - low < 1e-9:
+        return _certain(last)
+    return [max(0.0, min(k, high) - max(k - 1, low)) / (high - low) for k in range(last + 1)]
+
+
+@dataclass
+class DelayConfig:
+    """What arrives late, and what is done about it. A law is steps, a time, or a mapping (``law_of``)."""
+
+    obs: Any = 0
+    """Delay of each UAV's messages to the server node."""
+    act: Any = 0
+    """Delay between a UAV's choice and its execution; until the first arrives it holds."""
+    rew: Any = 0
+    """Delay of the rewards."""
+    loss: float = 0.0
+    """Probability that a message is lost."""
+    order: str = "generation"
+    """The server believes the message that was generated last (``generation``, the age of what it knows
+    grows by at most a step each step) or that arrived last (``arrival``)."""
+    history: int = 0
+    """How many of its own latest actions a UAV sees."""
+    reward_window: int = 1
+    """Steps over which rewards are summed up (eq. 4)."""
+    reward_discount: float = 0.9
+    """Gamma of eq. 4."""
+
+    def __post_init__(self) -> None:
+        checks.in_range("delay.loss", self.loss, 0.0, 1.0)
+        checks.one_of("delay.order", self.order, ORDERS)
+        checks.in_range("delay.history", self.history, 0, 1000)
+        checks.in_range("delay.reward_window", self.reward_window, 1, LONGEST)
+        checks.in_range("delay.reward_discount", self.reward_discount, 0.0, 1.0)
+
+    def check(self, dt: float) -> None:
+        """Make sure that the laws mean something at this length of a step [s].
+
+        Raises:
+            InputError: names the one that does not.
+        """
+        for name in ("obs", "act", "rew"):
+            key = f"delay.{name}"
+            law_of(getattr(self, name), key).sampler(dt, key=key)
+
+
+ORDERS = ("generation", "arrival")
