@@ -1,11 +1,12 @@
 """A scenario's environment with its delays, losses and clocks: the one place that knows their order."""
 
+import math
 from collections.abc import Collection, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian.actions import ActionConfig
 from damian.delays import law_of
@@ -36,7 +37,7 @@ class DelayedEnv(TransformedEnv):
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own streams, [B] integers: alone it does what it does among others."""
-        self.base_env.seed_worlds(seeds)
+        self.base_env.seed_worlds(seeds)  # type: ignore[operator]
         for number, transform in enumerate(self._stateful()):
             transform.seed_worlds(seeds + number + 1)
 
@@ -59,7 +60,7 @@ def make_env(
     seed: int = 0,
     device: torch.device | str = "cpu",
     extras: Collection[str] = (),
-) -> EnvBase:
+) -> DelayedEnv:
     """The environment of a scenario with everything that is late in it.
 
     Args:
@@ -67,7 +68,8 @@ def make_env(
         num_worlds: B.
         seed: of the worlds, and of the delays.
         device: where everything lives.
-        extras: as in ``UavEnv``; with ``message`` also ``("agents", "received")``: what the server holds.
+        extras: as in ``UavEnv``; with ``message`` also ``received`` (what the
+            server holds), its ``age`` [steps], and the ``delay`` of what is sent, under ``"agents"``.
 
     Raises:
         InputError: the scenario asks for something impossible.
@@ -77,9 +79,7 @@ def make_env(
     env = UavEnv(scenario, num_worlds, seed, device, shown, serves=not late)
     transforms = [*deciding(scenario), *(serving(scenario, env.server, extras) if late else [])]
     transforms += [*paying(scenario), *seeing(scenario)]
-    if not transforms:
-        return env
-    delayed = DelayedEnv(env, Compose(*transforms))
+    delayed = DelayedEnv(env, Compose(*transforms))  # type: ignore[arg-type]
     delayed.set_seed(seed)
     return delayed
 
@@ -113,7 +113,7 @@ def serving(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -
         order=delay.order,
         dt=scenario.clock.dt,
         sent_key="talks",
-        age_key="age",
+        age_key="age" if "message" in extras else None,
         delay_key="delay" if "message" in extras else None,
     )
     unread = [] if "message" in extras else [("agents", k) for k in ("message", "received", "talks")]
@@ -162,9 +162,8 @@ def holding(actions: ActionConfig) -> int:
 
 
 def action_codes(actions: ActionConfig) -> Tensor | None:
-    """Discrete actions as an actor sees its past ones, in [0, 1]: distance, east, north, [A, 3]."""
+    """Discrete actions as an actor sees its past ones: distance and heading, each in [0, 1], [A, 2]."""
     if actions.kind == "continuous":
-        return None
+        return None  # they are just that
     distance, heading = actions.table().unbind(-1)
-    sides = [(1 + heading.sin()) / 2, (1 + heading.cos()) / 2]
-    return torch.stack([distance / distance.max(), *sides], -1)
+    return torch.stack([distance / distance.max(), (heading / (2 * math.pi)) % 1], -1)

@@ -75,7 +75,9 @@ class Uniform(Law):
         should = f"and high={self.high} are not two steps or two times in order"
         checks.require(ordered, f"{key}.low", self.low, should)
         if isinstance(self.low, str):
-            chances = _rounded_up(seconds(f"{key}.low", self.low) / dt, seconds(f"{key}.high", self.high) / dt)
+            chances = _rounded_up(
+                seconds(f"{key}.low", self.low) / dt, seconds(f"{key}.high", self.high) / dt
+            )
         else:
             chances = [float(low <= k) / (high - low + 1) for k in range(high + 1)]
         late = [self.probability * chance for chance in chances]
@@ -183,9 +185,9 @@ def law_of(written: Any, key: str = "delay") -> Law:
     checks.one_of(f"{key}.law", kind, LAWS)
     values = {name: _number(value) for name, value in written.items() if name != "law"}
     known = [field.name for field in fields(LAWS[str(kind)])]
-    for name in values:
+    for name, value in values.items():
         should = f"is no setting of the law {kind}, which has {', '.join(known)}"
-        checks.require(name in known, f"{key}.{name}", values[name], should)
+        checks.require(name in known, f"{key}.{name}", value, should)
     return LAWS[str(kind)](**values)
 
 

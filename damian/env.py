@@ -239,6 +239,7 @@ class UavEnv(EnvBase):
 
 _DONE = ("done", "terminated", "truncated")
 
+
 def _merged(some: Shown, others: Shown) -> Shown:
     """Both, and both of what stands under ``agents``."""
     return some | others | {"agents": some["agents"] | others["agents"]}

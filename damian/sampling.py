@@ -35,7 +35,7 @@ class Sampler(nn.Module):
         joint = (turn.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)  # next state and delay at once
         self.register_buffer("_boundaries", joint.cumsum(-1)[:, :-1].float(), persistent=False)
         self._bad = (turn[0, 1] / (turn[0, 1] + turn[1, 0])).item() if turns else 0.0
-        likely = chances[0].argmax().item()
+        likely = int(chances[0].argmax())
         self.certain = likely if len(states) == 1 and chances[0, likely] == 1 else None
         """The only delay there is, if it is one."""
 

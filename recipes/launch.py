@@ -86,13 +86,18 @@ class TrainConfig(ScenarioConfig):
         if self.episodes is not None:
             checks.in_range("episodes", self.episodes, 1)
         checks.device("device", self.device)
-        batch = self.worlds * self.algo.steps
+        batch = self.worlds * self.update_steps
         checks.require(
             batch % self.algo.minibatches == 0,
             "algo.minibatches",
             self.algo.minibatches,
-            f"does not divide a batch of worlds x algo.steps = {batch}",
+            f"does not divide a batch of worlds x steps = {batch}",
         )
+
+    @property
+    def update_steps(self) -> int:
+        """Steps of every world between two updates: the system clock's, or the algorithm's."""
+        return self.clock.steps("system") if self.clock.system else self.algo.steps
 
     @property
     def horizon(self) -> int:

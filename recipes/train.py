@@ -23,11 +23,11 @@ from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs import RewardSum, StepCounter
 from torchrl.objectives.multiagent import MAPPOLoss
 from tqdm import tqdm
 
-from damian.env import UavEnv
+from damian.delayed import DelayedEnv, make_env
 from damian.losses import MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.models import make_actor, make_critic, random_policy
@@ -55,13 +55,15 @@ class Progress:
         self.frames, self.updates = int(state["frames"]), int(state["updates"])
 
 
-def make_env(config: TrainConfig, worlds: int, seed: int) -> TransformedEnv:
+def learning_env(config: TrainConfig, worlds: int, seed: int) -> DelayedEnv:
     """The environment that policies are trained and evaluated in."""
-    env = UavEnv(config, worlds, seed, config.device, extras=["reward_terms"])
+    env = make_env(config, worlds, seed, config.device, extras=["reward_terms"])
     if config.compile:
         env.compile()
     episode_reward = RewardSum(in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")])
-    return TransformedEnv(env, Compose(episode_reward, StepCounter()))  # type: ignore[call-arg]
+    env.append_transform(episode_reward)
+    env.append_transform(StepCounter())
+    return env
 
 
 def update(
@@ -90,12 +92,12 @@ def update(
 
 def train(config: TrainConfig, folder: Path) -> None:
     """Learn, then evaluate and fill the run folder."""
-    env = make_env(config, config.worlds, config.seed)
-    unseen = make_env(config, config.eval_episodes, config.seed + 10_000)
+    env = learning_env(config, config.worlds, config.seed)
+    unseen = learning_env(config, config.eval_episodes, config.seed + 10_000)
     actor, critic = make_actor(env, config.model), make_critic(env, config.model)
     loss = mappo_loss(actor, critic, config.algo)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.algo.lr)
-    frames = config.worlds * config.algo.steps
+    frames = config.worlds * config.update_steps
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(frames, device=config.device),
         sampler=SamplerWithoutReplacement(),
@@ -151,7 +153,7 @@ def mean_terms(batch: TensorDictBase) -> dict[str, float]:
 
 
 def report(
-    config: TrainConfig, folder: Path, unseen: TransformedEnv, actor: torch.nn.Module, log: MetricsLog
+    config: TrainConfig, folder: Path, unseen: DelayedEnv, actor: torch.nn.Module, log: MetricsLog
 ) -> None:
     """Evaluate on situations that were not trained on, and write figure and table."""
 

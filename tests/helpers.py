@@ -15,7 +15,7 @@ from twin import Uav
 
 from damian.actions import ActionConfig
 from damian.env import UavEnv
-from damian.features import GLOBAL, LOCAL, ObservationConfig, Knowledge, Snapshot
+from damian.features import GLOBAL, LOCAL, Knowledge, ObservationConfig, Snapshot
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.scenario import ClockConfig, RegionConfig, ScenarioConfig
 from damian.state import State
@@ -166,6 +166,11 @@ def play(
         after, td = env.step_and_maybe_reset(td)
         shown += [after["next"].clone(), td.exclude(("agents", "action"))]
     return shown
+
+
+def told(shown: TensorDictBase) -> Snapshot:
+    """The messages that the UAVs sent last, field by field."""
+    return Snapshot.unpack(shown["agents", "message"])
 
 
 def same(one: TensorDictBase, other: TensorDictBase) -> bool:

@@ -23,6 +23,7 @@ from helpers import (
     one_uav,
     random_actions,
     square,
+    told,
     walking,
 )
 
@@ -238,9 +239,7 @@ def test_an_intermittent_source_is_heard_as_often_as_it_emits():
         level_db=160.0, position=[100.0, 100.0], emission="per_step", emission_probability=0.3
     )
     env = fresh(square(source=source, episode=KEEPS_GOING), num_worlds=400)
-    heard = torch.stack(
-        [told(act(env, torch.zeros(400, 3).long())).spotted for _ in range(25)]
-    )
+    heard = torch.stack([told(act(env, torch.zeros(400, 3).long())).spotted for _ in range(25)])
     assert heard.any(-1).equal(heard.all(-1))
     assert heard.float().mean().item() == pytest.approx(0.3, abs=0.02)
     # Neither worlds nor steps go together.

@@ -26,6 +26,7 @@ from helpers import (
     random_actions,
     same,
     square,
+    told,
     usecase,
 )
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pytest
 import shapely
 import torch
-from helpers import DATA, GOLDEN, act, nearest, usecase
+from helpers import DATA, GOLDEN, act, nearest, told, usecase
 
 from damian.env import UavEnv
 from damian.features import Knowledge, Snapshot, observe
@@ -148,14 +148,14 @@ def test_recorded_moves_lead_to_the_recorded_points(case, compared, reasons):
     records = moves(case, EPISODES, PERSISTENT, CUMULATIVE)
     env = ready_env(usecase(case), len(records))
     put(env, records, [move.places for move in records])
-    after = act(env, column(records, "actions"))["agents", "message"]
+    after = told(act(env, column(records, "actions")))
     counts = Counter()
     for world, move in enumerate(records):
         for uav, place in enumerate(move.after["positions"]):
             reason = why_not_moved(case, move, uav)
             counts[reason] += 1
             if reason is None:
-                ours = after["position"][world, uav].tolist()
+                ours = after.position[world, uav].tolist()
                 assert ours == pytest.approx(place, abs=TOLERANCE), (move, uav)
     assert counts.pop(None) == compared
     assert counts == reasons
@@ -166,12 +166,12 @@ def test_a_move_that_may_hover_holds(case, expected):
     records = moves(case, EPISODES, PERSISTENT, CUMULATIVE)
     env = ready_env(usecase(case), len(records))
     put(env, records, [move.places for move in records])
-    after = act(env, column(records, "actions"))["agents", "message"]
+    after = told(act(env, column(records, "actions")))
     held = 0
     for world, move in enumerate(records):
         for uav, place in enumerate(move.places):
             if why_not_moved(case, move, uav) == "it may hover":
-                ours = after["position"][world, uav].tolist()
+                ours = after.position[world, uav].tolist()
                 assert ours == pytest.approx(place, abs=TOLERANCE)
                 held += 1
     assert held == expected
@@ -182,9 +182,9 @@ def test_recorded_points_give_the_recorded_detections_and_motions(case, n_flags,
     records = moves(case, EPISODES, PERSISTENT, CUMULATIVE)
     env = ready_env(usecase(case), len(records))
     put(env, records, [move.after["positions"] for move in records])
-    spotted = act(env, torch.zeros(len(records), env.n_agents).long())["agents", "message"]
+    spotted = told(act(env, torch.zeros(len(records), env.n_agents).long())).spotted
     theirs = column(records, "spotting_true").bool()
-    assert spotted["spotted"].equal(theirs)
+    assert spotted.equal(theirs)
     assert theirs.numel() == n_flags
     motions, recorded = env.state.motions, column(records, "motions_counter_after")
     # In the original the counter of a UAV stays at 0 for some steps after a detection.

@@ -15,6 +15,7 @@ from helpers import (
     everything,
     fresh,
     random_actions,
+    told,
 )
 
 from damian.actions import ActionConfig

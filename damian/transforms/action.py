@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import OneHot, TensorSpec
+from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
 from damian.delays import law_of
@@ -21,6 +21,10 @@ class Actions(NamedTuple):
     """One for each world, or for each agent of each world."""
     initial: Tensor
     """Taken before the first choice counts, [M, ...]."""
+    low: Tensor
+    """Least value of each number of an action."""
+    width: Tensor
+    """From the least to the largest; 1 where actions have no bounds, or are not numbers."""
 
 
 def actions_of(env: EnvBase, key: NestedKey, default: Any) -> Actions:
@@ -41,8 +45,20 @@ def actions_of(env: EnvBase, key: NestedKey, default: Any) -> Actions:
         initial = torch.nn.functional.one_hot(index, spec.shape[-1]).to(spec.dtype)
     else:
         initial = value.to(spec.dtype).expand(spec.shape).clone()
-        initial = spec.project(initial) if default is None else initial
-    return Actions(spec, rows, as_rows(initial, rows))
+        initial = spec.project(initial) if default is None else initial  # type: ignore[arg-type]
+    return Actions(spec, rows, as_rows(initial, rows), *_range(spec, rows))
+
+
+def _range(spec: TensorSpec, rows: torch.Size) -> tuple[Tensor, Tensor]:
+    """Least value and width of each number of an action."""
+    if isinstance(spec, Categorical | MultiCategorical):
+        width = torch.as_tensor(spec.n if isinstance(spec, Categorical) else spec.nvec) - 1
+        return torch.zeros_like(width), width.clamp(min=1).to(spec.device)
+    if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
+        low, high = (as_rows(bound, rows)[0] for bound in (spec.low, spec.high))
+        bounded = (high - low).isfinite()
+        return torch.where(bounded, low, 0), torch.where(bounded, high - low, 1)
+    return torch.zeros((), device=spec.device), torch.ones((), device=spec.device)
 
 
 class OnActions(Stateful):

@@ -4,12 +4,14 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
 
 from damian import checks
+from damian.compiling import compiled
 from damian.transforms.action import OnActions
-from damian.transforms.stateful import Order, as_rows, beside, flag_rows, wide
+from damian.transforms.stateful import Order, beside, flag_rows, wide
+from damian.world.airspace import rows
 
 
 class ActionHistory(OnActions):
@@ -31,7 +33,10 @@ class ActionHistory(OnActions):
             beside the action, if a bare name.
     """
 
-    recent: Tensor | None
+    first: Tensor
+    """Shown after a reset, [M, steps * A]."""
+    recent: Tensor
+    """Shown now, likewise."""
 
     def __init__(
         self,
@@ -48,32 +53,37 @@ class ActionHistory(OnActions):
         super().__init__(action_key, default)
         appended = [append_to] if append_to is not None else []
         self.in_keys, self.out_keys = appended, appended or [beside(self.action_key, out_key)]
-        self.steps, self.codes = steps, codes
-        self.recorded_key = beside(self.action_key, recorded_key)
+        self.steps, self.recorded_key = steps, beside(self.action_key, recorded_key)
+        self.register_buffer("first", None)
         self.register_buffer("recent", None)
+        self.codes = None if codes is None else nn.Buffer(codes, persistent=False)
+        self._advance = self._remember
 
     @property
     def order(self) -> Order:
         return Order(appends=self.in_keys, records=[self.action_key])
 
+    def compile(self) -> None:  # type: ignore[override]
+        """Compile what a step computes."""
+        self._advance = compiled(self._remember)
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        first = self._encode(self.actions.initial).repeat(1, self.steps)
         mask = flag_rows(tensordict, "_reset", self.action_key, self.actions.rows)
+        if self.first is None:
+            self.first = self._encode(self.actions.initial).repeat(1, self.steps)
         if self.recent is None or mask is None:
-            self.recent = first
+            self.recent = self.first
         else:
-            self.recent = torch.where(wide(mask, first), first, self.recent)
+            self.recent = torch.where(wide(mask, self.first), self.first, self.recent)
         return self._show(tensordict_reset)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.container is None or self.recent is None:
             self._refuse()
-        latest = self._encode(self._chosen(tensordict))
-        recent = torch.cat([self.recent[:, latest.shape[-1] :], latest], -1)
         taken = self._flag(tensordict, self.recorded_key)
-        if taken is not None:
-            recent = torch.where(wide(taken, recent), recent, self.recent)
-        self.recent = recent
+        if taken is None:
+            taken = torch.ones(len(self.recent), dtype=torch.bool, device=self.recent.device)
+        self.recent = self._advance(self.recent, self._chosen(tensordict), taken)
         return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -85,20 +95,20 @@ class ActionHistory(OnActions):
             shown = torch.cat([tensordict.get(self.in_keys[0]), shown], -1)
         return tensordict.set(self.out_keys[0], shown)
 
+    def _remember(self, recent: Tensor, action: Tensor, taken: Tensor) -> Tensor:
+        """Push the latest action in, and the oldest out, [M, steps * A]."""
+        latest = self._encode(action)
+        longer = torch.cat([recent[:, latest.shape[-1] :], latest], -1)
+        return torch.where(wide(taken, longer), longer, recent)
+
     def _encode(self, action: Tensor) -> Tensor:
         """Actions [M, ...] as numbers [M, A]."""
-        spec = self.actions.spec
         if self.codes is not None:
-            return self.codes.to(action.device)[action]
-        if isinstance(spec, Categorical):
-            return (action / max(spec.n - 1, 1)).view(len(action), -1)
-        if isinstance(spec, Bounded):
-            low, high = (as_rows(bound, self.actions.rows)[:1] for bound in (spec.low, spec.high))
-            if (high - low).isfinite().all():
-                action = (action - low) / (high - low)
-        return action.flatten(1).float()
+            return rows(self.codes, action)
+        scaled = (action - self.actions.low) / self.actions.width
+        return scaled.view(len(action), -1).float()
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         width = self.steps * self._encode(self.actions.initial).shape[-1]
         key, device = self.out_keys[0], observation_spec.device
         if not self.in_keys:

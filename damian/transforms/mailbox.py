@@ -22,6 +22,12 @@ class Delivery(NamedTuple):
     delay: Tensor
     """Of the messages sent just now [steps], [M]; ``Sampler.lost`` if lost, or not sent at all."""
 
+    @classmethod
+    def at_once(cls, values: list[Tensor]) -> "Delivery":
+        """Every message is there as it is generated."""
+        zero = torch.zeros(len(values[0]), dtype=torch.long, device=values[0].device)
+        return cls(values, zero, zero == 0, zero)
+
 
 class Post(NamedTuple):
     """What is on its way and what is held; M senders, K slots for the steps to come and one for the lost."""
@@ -111,9 +117,7 @@ class Mailbox(Lazy):
             setattr(self, name, held)
         return delivery
 
-    def _exchange(
-        self, post: Post, values: list[Tensor], sent: Tensor | None
-    ) -> tuple[Post, Delivery]:
+    def _exchange(self, post: Post, values: list[Tensor], sent: Tensor | None) -> tuple[Post, Delivery]:
         """Pure but for the slots, which are written in place."""
         clock = post.clock + 1
         n_slots, n_senders = self.sampler.lost, len(post.since)
@@ -138,8 +142,8 @@ class Mailbox(Lazy):
         return post, Delivery(held, clock - since, fresh, delay)
 
     def _post(self) -> Post:
-        slots, held = ([getattr(self, name) for name in names] for names in self._tables)
-        return Post(*(getattr(self, name) for name in _SINGLE), slots, held)
+        tables = ([getattr(self, name) for name in names] for names in self._tables)
+        return Post._make([*(getattr(self, name) for name in _SINGLE), *tables])
 
 
 _SINGLE = ("clock", "streams", "memory", "began", "since", "stamps")

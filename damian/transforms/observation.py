@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
@@ -81,8 +81,7 @@ class ObservationDelay(Stateful):
             streams = self._streams(tensordict_reset.batch_size, shape, values[0].device)
             self.mailbox.allocate(values, streams)
         self.mailbox.begin(values, flag_rows(tensordict, "_reset", self._first, shape))
-        zero = torch.zeros(shape.numel(), dtype=torch.long, device=values[0].device)
-        return self._show(tensordict_reset, shape, Delivery(values, zero, zero == 0, zero))
+        return self._show(tensordict_reset, shape, Delivery.at_once(values))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if not self.mailbox.begun:
@@ -107,7 +106,7 @@ class ObservationDelay(Stateful):
             tensordict.set(self.delay_key, delay.view(*shape, 1))
         return tensordict
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if out_key != key:
                 observation_spec[out_key] = observation_spec[key].clone()

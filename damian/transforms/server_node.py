@@ -69,7 +69,9 @@ class ServerNode(Stateful):
             self.elapsed = torch.zeros(n, dtype=torch.long, device=device)
         else:
             self.elapsed = self.elapsed.masked_fill(mask, 0)
-        return tensordict_reset.exclude(*self.drop) if self.drop else tensordict_reset
+        for key in self.drop:
+            tensordict_reset.pop(key)
+        return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self.elapsed is None:
@@ -101,7 +103,7 @@ class ServerNode(Stateful):
         judged = self.server.judge(features, snapshot, elapsed, source_over)
         return elapsed, self.server.observations(features), judged
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key in self.drop:
             del observation_spec[key]
         return observation_spec

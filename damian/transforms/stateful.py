@@ -22,13 +22,15 @@ class Lazy(nn.Module):
             if isinstance(module, Lazy):
                 module._buffers.update(dict.fromkeys(module._buffers))
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
         for name, buffer in self._buffers.items():
             saved = state_dict.get(f"{prefix}{name}")
             if saved is not None:
                 device = saved.device if buffer is None else buffer.device
                 self._buffers[name] = saved.detach().clone().to(device)
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
 class Order(NamedTuple):
@@ -70,10 +72,7 @@ class Stateful(Transform, Lazy):
         seed: int | None = None,
     ) -> None:
         super().__init__(
-            *(
-                [unravel_key(key) for key in keys]
-                for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)
-            )
+            *([unravel_key(key) for key in keys] for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv))
         )
         self._seed: int | None = seed
         self._world_seeds: Tensor | None = None
@@ -177,9 +176,7 @@ def _both(some: Sequence[NestedKey], others: Sequence[NestedKey]) -> list[Nested
 
 def _leaves(compose: Compose) -> list[Transform]:
     """The transforms of nested Composes, in order."""
-    return [
-        leaf for t in compose.transforms for leaf in (_leaves(t) if isinstance(t, Compose) else [t])
-    ]
+    return [leaf for t in compose for leaf in (_leaves(t) if isinstance(t, Compose) else [t])]
 
 
 def row_shape(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:

@@ -1,0 +1,396 @@
+"""Delay laws: the frequencies they promise, traces played back, and every way to write one wrong."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from damian.delays import (
+    LONGEST,
+    Burst,
+    Constant,
+    DelayConfig,
+    Geometric,
+    Law,
+    Trace,
+    Uniform,
+    in_steps,
+    law_of,
+)
+from damian.errors import InputError
+from damian.sampling import Sampler
+from damian.scenario import ScenarioConfig
+from damian.world import draws
+
+STREAMS, STEPS = 1000, 100
+"""10^5 messages."""
+
+
+def drawn(sampler: Sampler, n_streams: int = STREAMS, n_steps: int = STEPS) -> Tensor:
+    """Delays of messages, [T, M]."""
+    streams = draws.world_seeds(5, n_streams)
+    memory, delays = sampler.begin(streams), []
+    for clock in range(1, n_steps + 1):
+        delay, memory = sampler(streams, torch.tensor(clock), memory)
+        delays.append(delay)
+    return torch.stack(delays)
+
+
+def check_chances(sampler: Sampler, chances: dict[int, float], delays: Tensor) -> None:
+    """Frequencies against exact chances; what is missing to 1 is lost. Five deviations of chi-square."""
+    expected = torch.zeros(sampler.lost + 1, dtype=torch.float64)
+    for delay, chance in chances.items():
+        expected[delay] = chance
+    expected[sampler.lost] = max(round(1 - sum(chances.values()), 9), 0)
+    expected *= delays.numel()
+    counts = delays.flatten().bincount(minlength=len(expected)).double()
+    possible = expected > 0
+    assert len(counts) == len(expected)
+    assert counts[~possible].sum() == 0
+    excess = ((counts - expected)[possible].square() / expected[possible]).sum().item()
+    freedom = int(possible.sum()) - 1
+    assert excess <= freedom + 5 * math.sqrt(2 * freedom)
+
+
+PAPER = Uniform("3s", "7s", 0.15)
+
+LAWS: dict[str, tuple[Law, float, dict[int, float]]] = {
+    "none": (Constant(), 1.0, {0: 1.0}),
+    "steps": (Constant(3), 1.0, {3: 1.0}),
+    "a time, rounded up": (Constant("0.5m"), 20.0, {2: 1.0}),
+    "a time of whole steps": (Constant("0.3s"), 0.1, {3: 1.0}),
+    "uniform steps": (Uniform(2, 5), 1.0, dict.fromkeys((2, 3, 4, 5), 0.25)),
+    "uniform steps, rarely": (Uniform(0, 4, 0.5), 1.0, {0: 0.6} | dict.fromkeys((1, 2, 3, 4), 0.1)),
+    "the paper's": (PAPER, 1.0, {0: 0.85} | dict.fromkeys((4, 5, 6, 7), 0.0375)),
+    "the paper's at a coarser step": (PAPER, 2.0, {0: 0.85, 2: 0.0375, 3: 0.075, 4: 0.0375}),
+    "uniform within a step": (Uniform("0.5s", "2s"), 1.0, {1: 1 / 3, 2: 2 / 3}),
+    "a single time": (Uniform("2s", "2s", 0.25), 1.0, {0: 0.75, 2: 0.25}),
+    "uniform, never": (Uniform(3, 7, 0.0), 1.0, {0: 1.0}),
+    "geometric": (Geometric(2, 6), 1.0, {k: 2**k / 3 ** (k + 1) for k in range(6)} | {6: (2 / 3) ** 6}),
+    "geometric in time": (
+        Geometric("1s", "2s"),
+        0.5,
+        {k: 2**k / 3 ** (k + 1) for k in range(4)} | {4: 16 / 81},
+    ),
+    "geometric of mean 0": (Geometric(0), 1.0, {0: 1.0}),
+    "a burst that never begins": (Burst(enter=0.0), 1.0, {0: 1.0}),
+    "a burst that never ends": (Burst(leave=0.0, bad=2, bad_loss=0.25), 1.0, {2: 0.75}),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("loss", [0.0, 0.3, 1.0])
+def test_delays_and_losses_are_as_frequent_as_the_law_says(name, loss):
+    law, dt, chances = LAWS[name]
+    sampler = law.sampler(dt, loss)
+    check_chances(sampler, {k: chance * (1 - loss) for k, chance in chances.items()}, drawn(sampler))
+
+
+def test_a_law_tells_its_longest_delay_and_whether_there_is_a_single_one():
+    told = {name: (law.sampler(dt).longest, law.sampler(dt).certain) for name, (law, dt, _) in LAWS.items()}
+    assert told == {
+        "none": (0, 0),
+        "steps": (3, 3),
+        "a time, rounded up": (2, 2),
+        "a time of whole steps": (3, 3),
+        "uniform steps": (5, None),
+        "uniform steps, rarely": (4, None),
+        "the paper's": (7, None),
+        "the paper's at a coarser step": (4, None),
+        "uniform within a step": (2, None),
+        "a single time": (2, None),
+        "uniform, never": (7, 0),
+        "geometric": (6, None),
+        "geometric in time": (4, None),
+        "geometric of mean 0": (20, 0),
+        "a burst that never begins": (5, None),
+        "a burst that never ends": (2, None),
+    }
+
+
+@pytest.mark.parametrize("name", ["uniform steps", "the paper's", "geometric"])
+def test_each_delay_is_independent_of_the_one_before(name):
+    law, dt, chances = LAWS[name]
+    sampler = law.sampler(dt)
+    delays = drawn(sampler)
+    before = delays[:-1][delays[1:] == max(chances)]
+    check_chances(sampler, chances, before)
+    check_chances(sampler, chances, delays[:, :-1][delays[:, 1:] == max(chances)])
+
+
+def test_a_sender_draws_the_same_delays_among_others_as_alone():
+    sampler = Burst(bad=PAPER).sampler()
+    streams = draws.world_seeds(5, 8)
+    alone = [sampler(one, torch.tensor(9), torch.ones(1, dtype=torch.long))[0] for one in streams.split(1)]
+    together, _ = sampler(streams, torch.tensor(9), torch.ones(8, dtype=torch.long))
+    assert together.equal(torch.cat(alone))
+
+
+# Bursts.
+
+
+def within(found: float, exact: float, deviation: float) -> bool:
+    """Five standard deviations."""
+    return abs(found - exact) <= 5 * deviation
+
+
+def share(flags: Tensor) -> tuple[float, int]:
+    """Mean and number of flags."""
+    return flags.double().mean().item(), flags.numel()
+
+
+BURST = Burst(enter=0.05, leave=0.2, good=0, bad=5, bad_loss=0.0)
+
+
+def test_a_channel_is_bad_as_often_as_in_the_long_run_from_the_first_step_on():
+    bad = drawn(BURST.sampler(), 50_000, 2) == 5
+    for step in bad:
+        found, n = share(step)
+        assert within(found, 0.05 / 0.25, math.sqrt(0.2 * 0.8 / n))
+
+
+def test_a_channel_turns_bad_and_good_again_with_its_chances_so_that_a_burst_lasts_1_over_leave():
+    bad = drawn(BURST.sampler()) == 5
+    before, after = bad[:-1], bad[1:]
+    for turned, chance in ((after[~before], 0.05), (~after[before], 0.2)):
+        found, n = share(turned)
+        assert within(found, chance, math.sqrt(chance * (1 - chance) / n))
+    n_bursts = (after & ~before).sum().item()
+    mean_length = after.sum().item() / n_bursts
+    assert within(mean_length, 5.0, math.sqrt(2 * 0.8) / 0.2 / math.sqrt(n_bursts))
+
+
+def test_a_bad_channel_has_its_own_losses_and_the_general_ones():
+    law = Burst(enter=0.5, leave=0.5, good=1, bad=PAPER, good_loss=0.1, bad_loss=0.5)
+    sampler, kept = law.sampler(loss=0.2), 0.5 * 0.8
+    late = {0: 0.85 * 0.5 * kept, 1: 0.9 * kept} | dict.fromkeys((4, 5, 6, 7), 0.0375 * 0.5 * kept)
+    check_chances(sampler, late, drawn(sampler))  # turning with 1/2 each way makes the steps independent
+
+
+# Traces.
+
+
+def trace(tmp_path, *rows: str, header: str = "delay") -> Trace:
+    file = tmp_path / "trace.csv"
+    file.write_text("\n".join([header, *rows]) + "\n")
+    return Trace(str(file))
+
+
+def test_a_trace_is_played_in_its_order_from_anywhere_and_begins_again_at_its_end(tmp_path):
+    recorded = [4, 0, 7, 1, 0, 2, 9]
+    delays = drawn(trace(tmp_path, *map(str, recorded)).sampler(), 300, 20).T.tolist()
+    starts = {tuple(row[:7]): row for row in delays}
+    turned = [recorded[k:] + recorded[:k] for k in range(7)]
+    assert sorted(starts) == sorted(map(tuple, turned))
+    assert all(row == (row[:7] * 3)[:20] for row in delays)
+
+
+def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
+    rows = ['2021,"2s"', "2022,lost", "2023, 3 ", "2024,0s", "2025,0.1m"]
+    sampler = trace(tmp_path, *rows, header="when,delay").sampler(dt=1.5)
+    assert (sampler.longest, sampler.lost, sampler.certain) == (4, 5, None)
+    first = drawn(sampler, 100, 5).T.tolist()
+    assert {tuple(row) for row in first} == {tuple(([2, 5, 3, 0, 4] * 2)[k : k + 5]) for k in range(5)}
+
+
+def test_a_trace_loses_further_messages_at_random(tmp_path):
+    sampler = trace(tmp_path, "1", "1", "2", "lost").sampler(loss=0.25)
+    check_chances(sampler, {1: 0.375, 2: 0.1875}, drawn(sampler, 4000, 25))
+
+
+def test_a_trace_of_nothing_but_losses_delivers_nothing(tmp_path):
+    sampler = trace(tmp_path, "lost").sampler()
+    assert (drawn(sampler, 10, 10) == sampler.lost).all()
+
+
+# What a person writes.
+
+
+@pytest.mark.parametrize(
+    ("written", "law"),
+    [
+        (3, Constant(3)),
+        ("3", Constant(3)),
+        ("3s", Constant("3s")),
+        (Uniform(1, 2), Uniform(1, 2)),
+        ({"law": "constant", "delay": "2"}, Constant(2)),
+        ({"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}, PAPER),
+        ({"law": "geometric", "mean": 1.5, "longest": "9"}, Geometric(1.5, 9)),
+        ({"law": "burst", "bad": {"law": "uniform", "high": 3}}, Burst(bad={"law": "uniform", "high": 3})),
+        ({"law": "trace", "path": "a.csv"}, Trace("a.csv")),
+    ],
+)
+def test_a_law_is_written_as_steps_a_time_or_a_mapping(written, law):
+    assert law_of(written) == law
+
+
+@pytest.mark.parametrize(
+    ("delay", "dt", "steps"),
+    [
+        (0, 1.0, 0),
+        (3, 0.1, 3),
+        ("3s", 1.0, 3),
+        ("3.01s", 1.0, 4),
+        ("0s", 1.0, 0),
+        ("0.5m", 1.0, 30),
+        ("1h", 60.0, 60),
+        ("0.3s", 0.1, 3),
+        ("1s", 60.0, 1),
+        (LONGEST, 1.0, LONGEST),
+    ],
+)
+def test_a_time_is_rounded_up_to_whole_steps(delay, dt, steps):
+    assert in_steps("delay", delay, dt) == steps
+
+
+STEPS_OR_TIME = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
+NO_TIME = "is not a time such as 2s, 0.5m or 1h"
+
+WRONG = [
+    (-1, "delay.obs: -1 " + STEPS_OR_TIME),
+    (1.5, "delay.obs: 1.5 " + STEPS_OR_TIME),
+    (2.0, "delay.obs: 2.0 " + STEPS_OR_TIME),
+    (True, "delay.obs: True " + STEPS_OR_TIME),
+    (None, "delay.obs: None " + STEPS_OR_TIME),
+    (math.nan, "delay.obs: nan " + STEPS_OR_TIME),
+    (math.inf, "delay.obs: inf " + STEPS_OR_TIME),
+    ([3], "delay.obs: [3] " + STEPS_OR_TIME),
+    (LONGEST + 1, f"delay.obs: {LONGEST + 1} is more than {LONGEST} steps"),
+    ("3h", f"delay.obs: 3h is more than {LONGEST} steps"),
+    ("xs", f"delay.obs: xs {NO_TIME}"),
+    ("s", f"delay.obs: s {NO_TIME}"),
+    ("-3s", "delay.obs: -3.0 s is not above 0 s"),
+    ("nans", "delay.obs: nan s is not above 0 s"),
+    ("infs", "delay.obs: inf s is not above 0 s"),
+    ({}, "delay.obs.law: None is not one of constant, uniform, geometric, burst, trace"),
+    ({"law": "gauss"}, "delay.obs.law: gauss is not one of constant, uniform, geometric, burst, trace"),
+    ({"law": ["uniform"]}, "delay.obs.law: ['uniform'] is not one of constant,"),
+    (
+        {"law": "uniform", "lo": 3},
+        "delay.obs.lo: 3 is no setting of the law uniform, which has low, high, pro",
+    ),
+    ({"law": "constant", 3: 3}, "delay.obs.3: 3 is no setting of the law constant, which has delay"),
+    ({"law": "uniform", "low": -1, "high": 2}, "delay.obs.low: -1 " + STEPS_OR_TIME),
+    ({"law": "uniform", "low": 0.5, "high": 2}, "delay.obs.low: 0.5 " + STEPS_OR_TIME),
+    ({"law": "uniform", "high": True}, "delay.obs.high: True " + STEPS_OR_TIME),
+    ({"law": "uniform", "low": 4, "high": 2}, "delay.obs.low: 4 and high=2 are not two steps or two times"),
+    ({"law": "uniform", "low": "4s", "high": "2s"}, "delay.obs.low: 4s and high=2s are not two steps or two"),
+    (
+        {"law": "uniform", "low": 2, "high": "4s"},
+        "delay.obs.low: 2 and high=4s are not two steps or two times",
+    ),
+    (
+        {"law": "uniform", "low": "2s", "high": 4},
+        "delay.obs.low: 2s and high=4 are not two steps or two times",
+    ),
+    ({"law": "uniform", "high": 2, "probability": 1.5}, "delay.obs.probability: 1.5 is not between 0 and 1"),
+    (
+        {"law": "uniform", "high": 2, "probability": -0.1},
+        "delay.obs.probability: -0.1 is not between 0 and 1",
+    ),
+    (
+        {"law": "uniform", "high": 2, "probability": math.nan},
+        "delay.obs.probability: nan is not between 0 and",
+    ),
+    (
+        {"law": "uniform", "high": 2, "probability": "often"},
+        "delay.obs.probability: often is not between 0 an",
+    ),
+    ({"law": "uniform", "high": "3h"}, f"delay.obs.high: 3h is more than {LONGEST} steps"),
+    ({"law": "geometric", "mean": -1}, "delay.obs.mean: -1 steps is not at least 0 steps"),
+    ({"law": "geometric", "mean": math.nan}, "delay.obs.mean: nan steps is not at least 0 steps"),
+    ({"law": "geometric", "mean": math.inf}, "delay.obs.mean: inf steps is not at least 0 steps"),
+    ({"law": "geometric", "mean": None}, "delay.obs.mean: None steps is not at least 0 steps"),
+    ({"law": "geometric", "mean": "xs"}, f"delay.obs.mean: xs {NO_TIME}"),
+    ({"law": "geometric", "longest": 2.5}, "delay.obs.longest: 2.5 " + STEPS_OR_TIME),
+    ({"law": "geometric", "longest": LONGEST + 1}, f"delay.obs.longest: {LONGEST + 1} is more than"),
+    ({"law": "burst", "enter": 1.5}, "delay.obs.enter: 1.5 is not between 0 and 1"),
+    ({"law": "burst", "leave": -1}, "delay.obs.leave: -1 is not between 0 and 1"),
+    ({"law": "burst", "enter": 0, "leave": 0}, "delay.obs.enter + leave: 0 is not above 0"),
+    ({"law": "burst", "good_loss": 2}, "delay.obs.good_loss: 2 is not between 0 and 1"),
+    ({"law": "burst", "bad_loss": -0.1}, "delay.obs.bad_loss: -0.1 is not between 0 and 1"),
+    ({"law": "burst", "bad": -3}, "delay.obs.bad: -3 " + STEPS_OR_TIME),
+    ({"law": "burst", "good": {"law": "gauss"}}, "delay.obs.good.law: gauss is not one of constant,"),
+    ({"law": "burst", "bad": {"law": "burst"}}, "delay.obs.bad: {'law': 'burst'} is not a memoryless law"),
+    ({"law": "trace"}, "delay.obs.path: it is missing: the file with the delays"),
+]
+
+
+@pytest.mark.parametrize(("written", "error"), WRONG, ids=lambda value: str(value)[:50])
+@pytest.mark.parametrize("name", ["obs", "act", "rew"])
+def test_a_law_that_means_nothing_is_refused_on_one_line_that_names_its_key(name, written, error):
+    with pytest.raises(InputError) as caught:
+        ScenarioConfig(delay=DelayConfig(**{name: written}))
+    message = str(caught.value)
+    assert message.startswith(error.replace("delay.obs", f"delay.{name}"))
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("written", "error"),
+    [
+        ({"loss": -0.1}, "delay.loss: -0.1 is not between 0 and 1"),
+        ({"loss": 2}, "delay.loss: 2 is not between 0 and 1"),
+        ({"loss": math.nan}, "delay.loss: nan is not between 0 and 1"),
+        ({"loss": "0.1"}, "delay.loss: 0.1 is not between 0 and 1"),
+        ({"order": "newest"}, "delay.order: newest is not one of generation, arrival"),
+        ({"order": None}, "delay.order: None is not one of generation, arrival"),
+        ({"history": -1}, "delay.history: -1 is not between 0 and 1000"),
+        ({"history": 1001}, "delay.history: 1001 is not between 0 and 1000"),
+        ({"history": "4"}, "delay.history: 4 is not between 0 and 1000"),
+        ({"reward_window": 0}, "delay.reward_window: 0 is not between 1 and 10000"),
+        ({"reward_discount": 1.1}, "delay.reward_discount: 1.1 is not between 0 and 1"),
+        ({"reward_discount": math.nan}, "delay.reward_discount: nan is not between 0 and 1"),
+    ],
+    ids=str,
+)
+def test_an_impossible_setting_of_the_delays_is_refused_by_name(written, error):
+    with pytest.raises(InputError) as caught:
+        DelayConfig(**written)
+    assert str(caught.value) == error
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", "is empty"),
+        ("when,late\n1,2\n", "line 1: no column delay; the file has 'late', 'when'"),
+        ("Delay\n2\n", "line 1: no column delay; did you mean 'Delay'?"),
+        ("delay\n", "line 2: there is no delay under the header"),
+        ("delay\n2\nsoon\n", "line 3: delay: soon"),
+        ("delay\n2\n\n3\n-1\n", "line 5: delay: -1"),
+        ("delay\n1.5\n", "line 2: delay: 1.5"),
+        ("when,delay\n1,2\n2\n", "line 3: delay:"),
+        (f"delay\n0\n{LONGEST + 1}\n", f"line 3: delay: {LONGEST + 1} is more than {LONGEST} steps"),
+        (b"delay\n\xff\n", "byte 6 is not UTF-8 text"),
+    ],
+    ids=str,
+)
+def test_an_error_in_a_trace_names_the_file_and_the_line(tmp_path, text, error):
+    file = tmp_path / "trace.csv"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputError) as caught:
+        DelayConfig(obs={"law": "trace", "path": str(file)}).check(1.0)
+    assert str(caught.value).startswith(f"{file}: {error}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "error"), [("none.csv", "no such file"), ("", "is not a file")])
+def test_a_trace_that_is_not_there_is_named(tmp_path, name, error):
+    file = tmp_path / name
+    with pytest.raises(InputError) as caught:
+        DelayConfig(act={"law": "trace", "path": str(file)}).check(1.0)
+    assert str(caught.value) == f"{file}: {error}"
+
+
+def test_a_burst_of_a_trace_is_refused_as_a_trace_has_a_memory(tmp_path):
+    with pytest.raises(InputError) as caught:
+        Burst(good=trace(tmp_path, "1")).sampler(key="delay.obs")
+    assert str(caught.value).startswith("delay.obs.good: Trace(path=")
+
+
+def test_a_loss_of_a_law_lies_between_0_and_1():
+    for loss in (-0.1, 2, math.nan):
+        with pytest.raises(InputError, match=r"loss: .* is not between 0 and 1"):
+            Constant(1).sampler(loss=loss)
