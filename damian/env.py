@@ -83,7 +83,7 @@ class UavEnv(EnvBase):
         self._first = _merged(self._show(first, features), self._nothing_yet(first))
         self._make_specs()
         self.set_seed(seed)
-        self._advance = self._advance_some = self._play
+        self._advance = self._advance_some = self.play
         self.to(torch.device(device))
 
     def compile(self, **options: Any) -> "UavEnv":
@@ -93,8 +93,8 @@ class UavEnv(EnvBase):
             options: for ``torch.compile``, in place of what suits a CPU.
         """
         # Two graphs, as whether there are flags is not checked by what is kept of the guards.
-        self._advance = compiled(self._play, **options)
-        self._advance_some = compiled(self._play, **options)
+        self._advance = compiled(self.play, **options)
+        self._advance_some = compiled(self.play, **options)
         return self
 
     def to(self, device: DEVICE_TYPING) -> "UavEnv":
@@ -105,7 +105,7 @@ class UavEnv(EnvBase):
         super().to(device)
         self.simulation.to(device)
         self._first = _map(lambda table: table.to(device), self._first)
-        self._worlds = tree_map(lambda t: t.to(device), self._worlds)
+        self.worlds = tree_map(lambda t: t.to(device), self.worlds)
         self.server.to(device)
         return self
 
@@ -117,11 +117,11 @@ class UavEnv(EnvBase):
     @property
     def state(self) -> State:
         """Everything that changes; assign it to put the worlds into a situation of your own."""
-        return self.simulation.layout.unpack(self._worlds)
+        return self.simulation.layout.unpack(self.worlds)
 
     @state.setter
     def state(self, state: State) -> None:
-        self._worlds = self.simulation.layout.pack(state)
+        self.worlds = self.simulation.layout.pack(state)
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own stream, [B] integers; the next reset is its first episode."""
@@ -139,24 +139,24 @@ class UavEnv(EnvBase):
         agents = tensordict.get("agents")
         action, acts = agents.get("action"), agents.get("acts", None)
         if acts is None:
-            self._worlds, shown = self._advance(self._worlds, action)
+            self.worlds, shown = self._advance(self.worlds, action)
         else:
-            self._worlds, shown = self._advance_some(self._worlds, action, acts)
-        return self._tensordict(shown)
+            self.worlds, shown = self._advance_some(self.worlds, action, acts)
+        return self.tensordict(shown)
 
     @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        self._worlds = self.simulation.reset(self._worlds, mask.view(-1))
-        situation = self._worlds.integers[:, SITUATION]
+        self.worlds = self.simulation.reset(self.worlds, mask.view(-1))
+        situation = self.worlds.integers[:, SITUATION]
         shown = _map(lambda table: table.index_select(0, situation), self._first)
-        return self._tensordict(shown)  # TorchRL keeps what the other worlds showed
+        return self.tensordict(shown)  # TorchRL keeps what the other worlds showed
 
-    # Pure functions of the state; ``_play`` compiles.
+    # Pure functions of the state; ``play`` compiles.
 
-    def _play(self, worlds: Rows, action: Tensor, acts: Tensor | None = None) -> tuple[Rows, Shown]:
+    def play(self, worlds: Rows, action: Tensor, acts: Tensor | None = None) -> tuple[Rows, Shown]:
         """One step: physics, then what the server makes of the messages."""
         state = self.simulation.step(self.simulation.layout.unpack(worlds), action, acts)
         packed = self.simulation.layout.pack(state)
@@ -207,7 +207,8 @@ class UavEnv(EnvBase):
 
     # Keys and specs.
 
-    def _tensordict(self, shown: Shown) -> TensorDict:
+    def tensordict(self, shown: Shown) -> TensorDict:
+        """What is shown, with batch sizes."""
         agents = shown.pop("agents")
         shape = (*self.batch_size, self.n_agents)
         nested = {

@@ -9,11 +9,12 @@ config.yaml, belief.png, and belief.csv with a row for each instant and UAV.
 """
 
 import csv
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
 
 import hydra
+import numpy as np
 import torch
 from launch import CONF, TrainConfig, launch, prepare, reported, save_config
 from omegaconf import DictConfig
@@ -32,43 +33,71 @@ POSITIONS = ("true_east_m", "true_north_m", "believed_east_m", "believed_north_m
 COLUMNS = ("time_s", "uav", *POSITIONS, "age_s", "arrived", "lost")
 
 
-@dataclass
-class Flight:
-    """One flight as the environment showed it: T steps, T + 1 instants, N UAVs."""
+def fly(config: TrainConfig) -> Beliefs:
+    """One episode of the random policy."""
+    env = make_env(config, 1, config.seed, config.device, extras=["message", "state", "reward_terms"])
+    flight = env.rollout(config.horizon, random_policy(env))[0].cpu()
+    keys = ["state", *(("agents", name) for name in ("message", "talks", "received", "delay"))]
+    parts = [part.select(*keys, strict=False) for part in (flight[:1], flight["next"])]
+    return beliefs(cast(TensorDictBase, torch.cat(parts)), cast(UavEnv, env.base_env))  # type: ignore[arg-type]
 
-    env: UavEnv
-    """In the flight's last state."""
-    shown: TensorDictBase
-    """[T + 1]."""
 
-    @property
-    def sent(self) -> Snapshot:
-        """The latest message of each UAV, [T + 1, N]."""
-        return Snapshot.unpack(self.shown["agents", "message"])
+def beliefs(shown: TensorDictBase, env: UavEnv) -> Beliefs:
+    """What was shown at each instant, [T + 1], by name; ``env`` is where the flight has left it."""
+    agents, state = cast(TensorDictBase, shown["agents"]), cast(Tensor, shown["state"])
+    message, talks = cast(Tensor, agents["message"]), cast(Tensor, agents["talks"]).clone()
+    talks[0] = False  # what is held after a reset
+    held = Snapshot.unpack(agents.get("received", message))
+    dt, steps = env.scenario.clock.dt, torch.arange(len(state), dtype=torch.float64)
+    positions = state[:, : 3 * env.n_agents].unflatten(-1, (env.n_agents, 3))[..., :2]
+    return Beliefs(
+        time=np.asarray(steps * dt),
+        true=np.asarray(positions),
+        believed=np.asarray(held.position),
+        age=np.asarray((steps.unsqueeze(-1) - held.time / dt).round() * dt),  # times are float32
+        sent=np.asarray(talks),
+        delay=np.asarray(agents.get("delay", torch.zeros_like(talks[..., None], dtype=torch.long))[..., 0]),
+        source=np.asarray(state[:, -2:]),
+        region=env.simulation.airspace.regions[int(env.state.region)].polygon,
+        radius=env.simulation.radius,
+        jumps=not env.simulation.flies,
+    )
 
-    @property
-    def received(self) -> Snapshot:
-        """The message of each UAV that the server holds, [T + 1, N]; the latest, if nothing is late."""
-        key = "received" if "received" in self.shown["agents"].keys() else "message"
-        return Snapshot.unpack(self.shown["agents", key])
 
-    @property
-    def talks(self) -> Tensor:
-        """Was a message sent just now, [T + 1, N]; the first one needs no channel."""
-        talks = self.shown["agents", "talks"].clone()
-        talks[0] = False
-        return talks
+def rows(flight: Beliefs) -> Iterator[tuple[float | int, ...]]:
+    """The flight as a table, instant by instant."""
+    arrived, lost = flight.arrived.astype(int), flight.lost.astype(int)
+    for step, uav in np.ndindex(flight.age.shape):
+        places = (*flight.true[step, uav].tolist(), *flight.believed[step, uav].tolist())
+        now, age = float(flight.time[step]), float(flight.age[step, uav])
+        yield (now, uav, *places, age, int(arrived[step, uav]), int(lost[step, uav]))
 
-    @property
-    def delay(self) -> Tensor:
-        """Of the messages sent just now [steps], [T + 1, N]; -1 if lost, or not sent at all."""
-        delay = self.shown["agents"].get("delay", None)
-        return torch.where(self.talks, 0, -1) if delay is None else torch.where(self.talks, delay[..., 0], -1)
 
-    @property
-    def arrived(self) -> Tensor:
-        """Did a message arrive just now, if only to find a newer one there, [T + 1, N]."""
-        step, uav = torch.nonzero(self.delay >= 0, as_tuple=True)
-        arrives = step + self.delay[step, uav]
-        counts = torch.zeros(int(arrives.max()) + 1)
+def report(flight: Beliefs, folder: Path) -> None:
+    """Write table and figure, and say how old and how late things were."""
+    with (folder / TABLE).open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows(rows(flight))
+    plot_beliefs(flight, folder / FIGURE)
+    n_sent = max(int(flight.sent.sum()), 1)
+    print(f"mean age: {flight.age.mean():.2f} s")
+    print(f"late messages: {flight.late.sum() / n_sent:.1%}")
+    print(f"lost messages: {flight.lost.sum() / n_sent:.1%}")
 
+
+@hydra.main(version_base=None, config_path=CONF, config_name="belief")
+@reported
+def main(written: DictConfig) -> None:
+    if written.resume is not None:
+        raise InputError("resume: a flight of the random policy has nothing to go on with")
+    config, folder = prepare(written)
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    flight = fly(config)
+    save_config(config, folder)
+    report(flight, folder)
+
+
+if __name__ == "__main__":
+    launch(main)

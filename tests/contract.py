@@ -8,7 +8,7 @@ from helpers import square
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from damian.env import UavEnv
 from damian.transforms import (
@@ -40,7 +40,7 @@ class Drift(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         again = torch.ones(3, dtype=torch.bool)
-        if tensordict is not None and "_reset" in tensordict.keys():
+        if tensordict is not None and "_reset" in tensordict:
             again = tensordict["_reset"].view(3)
         first = torch.arange(6.0).view(3, 2)
         if again.all():
@@ -58,11 +58,6 @@ class Drift(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         """Nothing is drawn."""
-
-
-def cartpole() -> EnvBase:
-    """One world, no batch."""
-    return GymEnv("CartPole-v1", categorical_actions=True)
 
 
 def uavs() -> EnvBase:
@@ -91,33 +86,29 @@ def _served() -> Transform:
 
 
 CASES = {
-    "ActionDelay, one world": Case(cartpole, lambda: ActionDelay(LATE)),
     "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
-    "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready", fresh_key="acts")),
-    "ActionHistory, one world": Case(cartpole, lambda: ActionHistory(2, append_to="observation")),
+    "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),
     "ActionHistory, worlds": Case(Drift, lambda: ActionHistory(3)),
     "ActionHistory, agents": Case(
         uavs, lambda: ActionHistory(2, ACTION, append_to=SEEN, recorded_key="ready")
     ),
-    "Clock, one world": Case(cartpole, lambda: Clock(3)),
     "Clock, worlds": Case(Drift, lambda: Clock(2, in_keys_inv=["action"])),
     "Clock, agents": Case(uavs, lambda: Clock("2s", [SEEN], [ACTION], ready_key=("agents", "ready"))),
-    "CumulativeReward, one world": Case(cartpole, lambda: CumulativeReward(3)),
     "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
     "CumulativeReward, agents": Case(uavs, lambda: CumulativeReward(3, 0.5, REWARD)),
-    "ObservationDelay, one world": Case(cartpole, lambda: ObservationDelay(LATE)),
     "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"}, fresh_key="fresh")),
     "ObservationDelay, agents": Case(
         uavs, lambda: ObservationDelay(LATE, [SEEN], loss=0.2, delay_key="delay", sent_key="talks")
     ),
-    "RewardDelay, one world": Case(cartpole, lambda: RewardDelay(LATE)),
     "RewardDelay, worlds": Case(Drift, lambda: RewardDelay({"law": "geometric"})),
     "RewardDelay, agents": Case(uavs, lambda: RewardDelay(LATE, REWARD)),
     "ServerNode": Case(unserved, _served),
 }
 """Every transform on an environment of every kind that it works on, named after it."""
 
-DRAWS = [name for name in CASES if name.split(",")[0] in ("ActionDelay", "ObservationDelay", "RewardDelay")]
+DRAWS = [
+    CASES[name] for name in CASES if name.split(",")[0] in ("ActionDelay", "ObservationDelay", "RewardDelay")
+]
 """Those that draw random numbers."""
 
 
@@ -141,4 +132,13 @@ def begun(env: EnvBase, n_steps: int = 5, seed: int = 0) -> TensorDictBase:
 
 def memory(transform: Transform) -> list[Tensor]:
     """Everything that it remembers."""
-    return [value for value in transform.state_dict().values()]
+    return [value for value in transform.state_dict().values() if value is not None]
+
+
+def flat(state: dict) -> dict[str, Tensor]:
+    """Nested dictionaries of tensors as one."""
+    found = {}
+    for key, value in state.items():
+        inner = flat(value) if isinstance(value, dict) else {"": value}
+        found |= {f"{key}.{name}".rstrip("."): tensor for name, tensor in inner.items()}
+    return found

@@ -14,7 +14,17 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from damian.sampling import Sampler
 from damian.world import draws
+
+
+def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
+    """Delays of the messages sent at the steps 1, 2, ... by senders with these streams [M], [T, M]."""
+    memory, delays = sampler.begin(streams), []
+    for clock in range(1, n_steps + 1):
+        delay, memory = sampler(streams, torch.tensor(clock), memory)
+        delays.append(delay)
+    return torch.stack(delays)
 
 
 class Message(NamedTuple):
@@ -86,7 +96,8 @@ class Counting(EnvBase):
     """A deterministic world whose numbers tell where they come from; episodes end at random.
 
     Its number x goes on by x' = 3 x + a + 1 (mod 101) with the action a that it executes. Shown are, for
-    each agent, [world, agent, steps in all, episode, x, action executed]; the reward is x + 100 * world.
+    each agent, [world, agent, steps in all, episode, x, action executed, does it act]; the reward is
+    x + 100 * world.
 
     Args:
         worlds: their names, integers; alone, a world does what it does among others.
@@ -118,7 +129,7 @@ class Counting(EnvBase):
         if continuous:
             action = Bounded(-1.0, 3.0, shape=(*agents, 2))
         flag = Binary(shape=agents, n=n_agents, dtype=torch.bool)
-        seen = Unbounded((*agents, 6), dtype=torch.float64)
+        seen = Unbounded((*agents, 7), dtype=torch.float64)
         self.action_spec = group(action=action)
         self.observation_spec = group(observation=seen, talks=flag, ready=flag.clone())
         self.reward_spec = group(reward=Unbounded((*agents, 1)))
@@ -129,7 +140,7 @@ class Counting(EnvBase):
         shape = (*self.batch_size, self.n_agents)
         x = (7 * self.names.unsqueeze(-1) + torch.arange(self.n_agents)) % 101
         self.x = torch.where(mask.unsqueeze(-1), x, self.x if hasattr(self, "x") else x)
-        self.executed = torch.zeros(shape)
+        self.executed, self.acts = torch.zeros(shape), torch.ones(shape)
 
     def _flag(self, salt: int) -> Tensor:
         """A flag that is true two times out of three, [B, N]."""
@@ -140,7 +151,7 @@ class Counting(EnvBase):
         shape = (*self.batch_size, self.n_agents)
         names, agents = self.names.unsqueeze(-1).expand(shape), torch.arange(self.n_agents).expand(shape)
         total, episode = torch.full(shape, self.total), self.episode.unsqueeze(-1).expand(shape)
-        seen = torch.stack([names, agents, total, episode, self.x, self.executed], -1).double()
+        seen = torch.stack([names, agents, total, episode, self.x, self.executed, self.acts], -1).double()
         lies = torch.zeros(shape, dtype=torch.bool)
         if self.tampered is not None and self.tampered[2] == self.total:
             lies[self.tampered[:2]] = True
@@ -163,6 +174,7 @@ class Counting(EnvBase):
             action = (action * action.new_tensor([1.0, 10.0])).round().sum(-1)
         self.x = (3 * self.x + action.long() + 1) % 101
         self.executed = action
+        self.acts = tensordict.get(("agents", "acts"), self.acts)
         shown = self._show()
         reward = (self.x + 100 * self.names.unsqueeze(-1) - 1000 * self.lies).float()
         shown["agents"].set("reward", reward.unsqueeze(-1))

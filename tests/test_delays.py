@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from delay_twin import drawn
 from torch import Tensor
 
 from damian.delays import (
@@ -27,14 +28,9 @@ STREAMS, STEPS = 1000, 100
 """10^5 messages."""
 
 
-def drawn(sampler: Sampler, n_streams: int = STREAMS, n_steps: int = STEPS) -> Tensor:
+def sample(sampler: Sampler, n_streams: int = STREAMS, n_steps: int = STEPS) -> Tensor:
     """Delays of messages, [T, M]."""
-    streams = draws.world_seeds(5, n_streams)
-    memory, delays = sampler.begin(streams), []
-    for clock in range(1, n_steps + 1):
-        delay, memory = sampler(streams, torch.tensor(clock), memory)
-        delays.append(delay)
-    return torch.stack(delays)
+    return drawn(sampler, draws.world_seeds(5, n_streams), n_steps)
 
 
 def check_chances(sampler: Sampler, chances: dict[int, float], delays: Tensor) -> None:
@@ -84,7 +80,7 @@ LAWS: dict[str, tuple[Law, float, dict[int, float]]] = {
 def test_delays_and_losses_are_as_frequent_as_the_law_says(name, loss):
     law, dt, chances = LAWS[name]
     sampler = law.sampler(dt, loss)
-    check_chances(sampler, {k: chance * (1 - loss) for k, chance in chances.items()}, drawn(sampler))
+    check_chances(sampler, {k: chance * (1 - loss) for k, chance in chances.items()}, sample(sampler))
 
 
 def test_a_law_tells_its_longest_delay_and_whether_there_is_a_single_one():
@@ -113,7 +109,7 @@ def test_a_law_tells_its_longest_delay_and_whether_there_is_a_single_one():
 def test_each_delay_is_independent_of_the_one_before(name):
     law, dt, chances = LAWS[name]
     sampler = law.sampler(dt)
-    delays = drawn(sampler)
+    delays = sample(sampler)
     before = delays[:-1][delays[1:] == max(chances)]
     check_chances(sampler, chances, before)
     check_chances(sampler, chances, delays[:, :-1][delays[:, 1:] == max(chances)])
@@ -144,14 +140,14 @@ BURST = Burst(enter=0.05, leave=0.2, good=0, bad=5, bad_loss=0.0)
 
 
 def test_a_channel_is_bad_as_often_as_in_the_long_run_from_the_first_step_on():
-    bad = drawn(BURST.sampler(), 50_000, 2) == 5
+    bad = sample(BURST.sampler(), 50_000, 2) == 5
     for step in bad:
         found, n = share(step)
         assert within(found, 0.05 / 0.25, math.sqrt(0.2 * 0.8 / n))
 
 
 def test_a_channel_turns_bad_and_good_again_with_its_chances_so_that_a_burst_lasts_1_over_leave():
-    bad = drawn(BURST.sampler()) == 5
+    bad = sample(BURST.sampler()) == 5
     before, after = bad[:-1], bad[1:]
     for turned, chance in ((after[~before], 0.05), (~after[before], 0.2)):
         found, n = share(turned)
@@ -165,7 +161,7 @@ def test_a_bad_channel_has_its_own_losses_and_the_general_ones():
     law = Burst(enter=0.5, leave=0.5, good=1, bad=PAPER, good_loss=0.1, bad_loss=0.5)
     sampler, kept = law.sampler(loss=0.2), 0.5 * 0.8
     late = {0: 0.85 * 0.5 * kept, 1: 0.9 * kept} | dict.fromkeys((4, 5, 6, 7), 0.0375 * 0.5 * kept)
-    check_chances(sampler, late, drawn(sampler))  # turning with 1/2 each way makes the steps independent
+    check_chances(sampler, late, sample(sampler))  # turning with 1/2 each way makes the steps independent
 
 
 # Traces.
@@ -179,7 +175,7 @@ def trace(tmp_path, *rows: str, header: str = "delay") -> Trace:
 
 def test_a_trace_is_played_in_its_order_from_anywhere_and_begins_again_at_its_end(tmp_path):
     recorded = [4, 0, 7, 1, 0, 2, 9]
-    delays = drawn(trace(tmp_path, *map(str, recorded)).sampler(), 300, 20).T.tolist()
+    delays = sample(trace(tmp_path, *map(str, recorded)).sampler(), 300, 20).T.tolist()
     starts = {tuple(row[:7]): row for row in delays}
     turned = [recorded[k:] + recorded[:k] for k in range(7)]
     assert sorted(starts) == sorted(map(tuple, turned))
@@ -190,18 +186,18 @@ def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
     rows = ['2021,"2s"', "2022,lost", "2023, 3 ", "2024,0s", "2025,0.1m"]
     sampler = trace(tmp_path, *rows, header="when,delay").sampler(dt=1.5)
     assert (sampler.longest, sampler.lost, sampler.certain) == (4, 5, None)
-    first = drawn(sampler, 100, 5).T.tolist()
+    first = sample(sampler, 100, 5).T.tolist()
     assert {tuple(row) for row in first} == {tuple(([2, 5, 3, 0, 4] * 2)[k : k + 5]) for k in range(5)}
 
 
 def test_a_trace_loses_further_messages_at_random(tmp_path):
     sampler = trace(tmp_path, "1", "1", "2", "lost").sampler(loss=0.25)
-    check_chances(sampler, {1: 0.375, 2: 0.1875}, drawn(sampler, 4000, 25))
+    check_chances(sampler, {1: 0.375, 2: 0.1875}, sample(sampler, 4000, 25))
 
 
 def test_a_trace_of_nothing_but_losses_delivers_nothing(tmp_path):
     sampler = trace(tmp_path, "lost").sampler()
-    assert (drawn(sampler, 10, 10) == sampler.lost).all()
+    assert (sample(sampler, 10, 10) == sampler.lost).all()
 
 
 # What a person writes.

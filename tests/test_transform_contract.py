@@ -7,27 +7,57 @@ import pickle
 
 import pytest
 import torch
-from contract import CASES, DRAWS, LATE, REWARD, SEEN, Case, Drift, begun, memory, onward, uavs, unserved
+from contract import (
+    ACTION,
+    CASES,
+    DRAWS,
+    LATE,
+    REWARD,
+    SEEN,
+    Drift,
+    begun,
+    flat,
+    memory,
+    onward,
+    uavs,
+    unserved,
+)
 from helpers import all_same, same, square
-from tensordict import TensorDict
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import Compose, ParallelEnv, SerialEnv, Transform, TransformedEnv
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, Transform, TransformedEnv
+from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
-from damian.delayed import DelayedEnv
+from damian.delayed import make_env
+from damian.delays import DelayConfig
 from damian.errors import InputError
-from damian.transforms import *
+from damian.transforms import (
+    ActionDelay,
+    ActionHistory,
+    Clock,
+    CumulativeReward,
+    ObservationDelay,
+    RewardDelay,
+    ServerNode,
+    Stateful,
+)
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+AGENTS = {name: case for name, case in CASES.items() if case.env in (uavs, unserved)}
+AT_RESET = {name: case for name, case in CASES.items() if "Reward" not in name}
+"""Those whose memory begins at a reset: no reward is there before the first step."""
+VECTORED = {name: case for name, case in CASES.items() if name != "ServerNode"}
+vectored = pytest.mark.parametrize("case", VECTORED.values(), ids=VECTORED)
+in_agents = pytest.mark.parametrize("case", AGENTS.values(), ids=AGENTS)
 
 
 def test_the_contract_covers_every_transform():
     exported = {name: getattr(damian.transforms, name) for name in damian.transforms.__all__}
     concrete = {
-        name for name, what in exported.items()
+        name
+        for name, what in exported.items()
         if inspect.isclass(what) and issubclass(what, Transform) and what is not Stateful
     }
     assert concrete == {name.split(",")[0] for name in CASES}
@@ -41,14 +71,14 @@ def test_the_contract_covers_every_transform():
 def test_a_single_environment_keeps_to_its_specs(case):
     env = case.build()
     check_env_specs(env, break_when_any_done="both")
-    assert env.rollout(12, break_when_any_done=False)["next", "done"].shape[-2] == 12
+    assert env.rollout(12, break_when_any_done=False).shape == (*env.batch_size, 12)
 
 
 @every_case
 def test_composed_and_appended_a_transform_does_the_same(case):
     variants = [
         case.build(),
-        TransformedEnv(case.env(), Compose(Compose(case.make()))),
+        TransformedEnv(case.env(), Compose(case.make())),
         TransformedEnv(case.env()).append_transform(case.make()),
         TransformedEnv(TransformedEnv(case.env()), case.make()),
     ]
@@ -56,7 +86,7 @@ def test_composed_and_appended_a_transform_does_the_same(case):
     assert all(all_same(one, shown[0]) for one in shown[1:])
 
 
-@every_case
+@vectored
 def test_around_a_vector_of_environments_it_works(case):
     env = TransformedEnv(SerialEnv(2, case.env), case.make())
     check_env_specs(env, break_when_any_done="both")
@@ -70,12 +100,384 @@ def test_inside_a_vector_of_environments_it_works(case):
     assert env.rollout(12, break_when_any_done=False).shape == (2, *case.env().batch_size, 12)
 
 
-@every_case
-def test_worker_processes_do_what_a_loop_does(case):
-    shown = []
-    for vector in (SerialEnv(2, case.build), ParallelEnv(2, case.build, mp_start_method="fork")):
+@in_agents
+def test_in_worker_processes_it_works(case):
+    env = ParallelEnv(2, case.build, mp_start_method="fork")
+    try:
+        check_env_specs(env, break_when_any_done="both")
+        assert env.rollout(8, break_when_any_done=False).shape == (2, 2, 8)
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("case", [case for case in AGENTS.values() if case in DRAWS])
+def test_worker_processes_draw_apart_and_the_same_again_from_the_same_seed(case):
+    shown, drawn = [], []
+    for _ in range(2):
+        env = ParallelEnv(2, case.build, mp_start_method="fork")
         try:
-            shown.append(onward(vector, begun(vector)))
+            shown.append(onward(env, begun(env, 0, seed=3), 8))
+            drawn.append([v for key, v in flat(env.state_dict()).items() if key.endswith("streams")])
         finally:
-            vector.close()
+            env.close()
     assert all_same(*shown)
+    (one, other), again = drawn
+    assert not set(one.tolist()) & set(other.tolist())
+    assert all(a.equal(b) for a, b in zip((one, other), again, strict=True))
+
+
+@pytest.mark.parametrize("case", [case for case in AGENTS.values() if case.env is uavs])
+def test_around_worker_processes_it_does_what_it_does_around_a_loop(case):
+    shown = []
+    for vector in (SerialEnv(2, case.env), ParallelEnv(2, case.env, mp_start_method="fork")):
+        env = TransformedEnv(vector, case.make())
+        try:
+            shown.append(onward(env, begun(env), 8))
+        finally:
+            env.close()
+    assert all_same(*shown)
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_delayed_environments_in_a_vector_draw_apart_and_the_same_again(processes):
+    vector = ParallelEnv(2, delayed, mp_start_method="fork") if processes else SerialEnv(2, delayed)
+    try:
+        one, other, again = (delays_of(vector, seed) for seed in (3, 4, 3))
+    finally:
+        vector.close()
+    assert one.equal(again)
+    assert not one.equal(other)
+    assert not one[0].equal(one[1])
+
+
+def delayed():
+    return make_env(square(delay=DelayConfig(obs=LATE, act=LATE, rew=LATE, history=2)), 2, extras=["message"])
+
+
+def delays_of(env, seed):
+    """What the messages take after seeding, [2, T, B, N]; torch's generator stands elsewhere each time."""
+    env.set_seed(seed)
+    torch.manual_seed(seed + torch.seed() % 1000)
+    td, delays = env.reset(), []
+    for _ in range(8):
+        _, td = env.step_and_maybe_reset(td.set(ACTION, torch.zeros(2, 2, 3, dtype=torch.long)))
+        delays.append(td["agents", "delay"].squeeze(-1))
+    return torch.stack(delays, 1)
+
+
+@every_case
+def test_outside_an_environment_it_says_what_to_do(case):
+    transform = case.make()
+    env = case.env()
+    td = env.rand_step(env.reset())
+    names = f"{type(transform).__name__}.*TransformedEnv"
+    buffered = [] if transform.in_keys_inv else [in_a_buffer(transform)]
+    for use in (nn.Sequential(transform), Compose(transform), *buffered):
+        with pytest.raises(RuntimeError, match=names):
+            use(td.clone())
+
+
+def in_a_buffer(transform):
+    """What stores data in a replay buffer that has the transform, and samples it."""
+
+    def use(td):
+        data = td.unsqueeze(0).flatten()
+        buffer = ReplayBuffer(storage=LazyTensorStorage(len(data)), transform=transform, batch_size=1)
+        buffer.extend(data)
+        buffer.sample()
+
+    return use
+
+
+@pytest.mark.parametrize("case", AT_RESET.values(), ids=AT_RESET)
+def test_before_the_first_reset_a_step_is_refused(case):
+    env = case.build()
+    td = env.rand_action(env.base_env.reset())
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(td)
+
+
+# Copies.
+
+
+COPIES = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "deepcopy": copy.deepcopy}
+
+
+@every_case
+@pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
+@pytest.mark.parametrize("n_steps", [0, 5])
+def test_a_copy_in_mid_episode_goes_on_as_the_original(case, copied, n_steps):
+    env = case.build()
+    td = begun(env, n_steps)
+    twin = copied(env)
+    there = onward(twin, td.clone())
+    assert all_same(onward(env, td.clone()), there)
+
+
+@every_case
+def test_a_clone_shares_no_memory(case):
+    env, control = case.build(), case.build()
+    td, _ = begun(env), begun(control)
+    clone = env.transform.clone()
+    assert not memory(clone)
+    other = TransformedEnv(case.env(), clone)
+    onward(other, begun(other, seed=9), seed=9)
+    assert all_same(onward(env, td.clone()), onward(control, td.clone()))
+
+
+@every_case
+def test_a_clone_of_an_unused_transform_works(case):
+    original = case.make()
+    env, expected = TransformedEnv(case.env(), original.clone()), case.build()
+    assert all_same(onward(env, begun(env)), onward(expected, begun(expected)))
+    assert not memory(original)
+
+
+# Checkpoints.
+
+
+@every_case
+@pytest.mark.parametrize("n_steps", [0, 5])
+@pytest.mark.parametrize("whole", [True, False], ids=["environment", "transform"])
+@pytest.mark.parametrize("used", [True, False], ids=["used", "fresh"])
+def test_a_loaded_checkpoint_goes_on_bit_for_bit(case, n_steps, whole, used):
+    env = case.build()
+    td = begun(env, n_steps)
+    transform = case.make()
+    if used:
+        begun(TransformedEnv(case.env(), transform), 3, seed=9)
+        transform.reset_parent()
+    twin = TransformedEnv(copy.deepcopy(env.base_env), transform)
+    saved, into = (env, twin) if whole else (env.transform, twin.transform)
+    into.load_state_dict(through_a_file(saved.state_dict()))
+    assert all_same(onward(env, td.clone()), onward(twin, td.clone()))
+
+
+def through_a_file(state):
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+@every_case
+def test_a_checkpoint_stays_what_it_was(case):
+    env = case.build()
+    td = begun(env)
+    saved = env.transform.state_dict()
+    before = copy.deepcopy(saved)
+    twin = case.make()
+    twin.load_state_dict(saved)
+    env.transform.load_state_dict(twin.state_dict())
+    onward(TransformedEnv(copy.deepcopy(env.base_env), twin), td)
+    assert saved.keys() == before.keys()
+    assert all(saved[key].equal(before[key]) for key in saved)
+
+
+@every_case
+def test_everything_remembered_is_saved(case):
+    env = case.build()
+    begun(env)
+    saved = {value.data_ptr() for value in memory(env.transform)}
+    assert saved
+    for module in env.transform.modules():
+        kept = [v for k, v in module.__dict__.items() if isinstance(v, torch.Tensor) and k not in CONSTANT]
+        assert not kept
+        fixed = set(module._non_persistent_buffers_set)
+        assert fixed <= CONSTANT
+
+
+CONSTANT = {"chances", "_boundaries", "_delays", "codes"}
+"""Tensors that never change after construction."""
+
+
+# Graphs.
+
+
+@every_case
+def test_a_step_compiles_as_one_graph_and_does_the_same(case):
+    env, twin = case.build(), case.build()
+    td, _ = begun(env), begun(twin)
+    torch._dynamo.reset()
+    compiled = torch.compile(passed(twin.transform), fullgraph=True, backend="eager")
+    for _ in range(4):
+        td = env.rand_action(td)
+        after = env.base_env.step(td)["next"]
+        one, other = passed(env.transform)(td, after.clone()), compiled(td, after.clone())
+        assert same(one, other)
+    assert all(a.equal(b) for a, b in zip(memory(env.transform), memory(twin.transform), strict=True))
+
+
+def passed(transform):
+    """A step through a transform: backwards with the action, forwards with what comes of it."""
+
+    def step(td, after):
+        return transform._step(transform.inv(td), after)
+
+    return step
+
+
+# Gradients.
+
+
+@every_case
+def test_a_rollout_with_gradients_keeps_no_graph(case):
+    env = case.build()
+    td, weight, sizes = begun(env, 0), torch.ones((), requires_grad=True), []
+    for t in range(24):
+        td = env.rand_action(td)
+        if td[env.action_key].is_floating_point():
+            td.set(env.action_key, td[env.action_key] * weight)
+        after, td = env.step_and_maybe_reset(td)
+        assert not any(value.requires_grad for value in memory(env.transform)), t
+        sizes.append(sum(nodes(value) for value in after["next"].values(True, True)))
+    assert max(sizes[12:]) <= max(sizes[:12])
+
+
+def nodes(value):
+    """How many operations a tensor's gradient goes through."""
+    found, ahead = set(), [value.grad_fn]
+    while ahead:
+        node = ahead.pop()
+        if node is not None and node not in found:
+            found.add(node)
+            ahead += [before for before, _ in node.next_functions]
+    return len(found)
+
+
+# Collectors.
+
+
+@every_case
+def test_a_collector_gets_what_a_rollout_gives(case):
+    env, twin = case.build(), case.build()
+    for each in (env, twin):
+        each.set_seed(0)
+        each.transform.set_seed(0)
+    n_worlds = env.batch_size.numel()
+    torch.manual_seed(5)
+    policy = RandomPolicy(env.full_action_spec)
+    collector = Collector(env, policy, frames_per_batch=6 * n_worlds, total_frames=12 * n_worlds)
+    torch.manual_seed(5)
+    batches = [batch.clone() for batch in collector]
+    torch.manual_seed(5)
+    rollout = twin.rollout(12, policy, break_when_any_done=False)
+    collected = torch.cat(batches, -1).select(*rollout.keys(True, True))
+    assert rollout["next", "done"].any()
+    assert same(collected, rollout)
+
+
+@every_case
+def test_partial_resets_leave_the_other_worlds_alone(case):
+    env, twin = case.build(), case.build()
+    td, _ = begun(env, 2), begun(twin, 2)
+    again = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
+    again[0] = True
+    reset = env.reset(td.clone().set("_reset", again))
+    assert same(reset[1:], td[1:].select(*reset.keys(True, True)))
+    torch.manual_seed(0)
+    actions = twin.rand_action(td.clone()).select(env.action_key)
+    shown = [each.step(state.clone().update(actions))["next"] for each, state in ((env, reset), (twin, td))]
+    assert same(shown[0][1:], shown[1][1:])
+
+
+# The order of a chain.
+
+
+def delay(**options):
+    return ObservationDelay(LATE, **options)
+
+
+WRONG = {
+    "a history before an action delay": (lambda: ActionHistory(2), lambda: ActionDelay(LATE)),
+    "a history before a clock of actions": (
+        lambda: ActionHistory(2),
+        lambda: Clock(2, in_keys_inv=["action"]),
+    ),
+    "an observation delay after a history that appends": (
+        lambda: ActionHistory(2, append_to="observation"),
+        delay,
+    ),
+    "a clock after a history that appends": (
+        lambda: ActionHistory(2, append_to="observation"),
+        lambda: Clock(2),
+    ),
+    "a history that appends to what is made later": (
+        lambda: ActionHistory(2, append_to="late"),
+        lambda: delay(out_keys=["late"]),
+    ),
+}
+RIGHT = {
+    "a history after an action delay": (lambda: ActionDelay(LATE), lambda: ActionHistory(2)),
+    "a history that appends after a delay": (delay, lambda: ActionHistory(2, append_to="observation")),
+    "a history that appends after a clock": (
+        lambda: Clock(2, in_keys_inv=["action"]),
+        lambda: ActionHistory(2, append_to="observation"),
+    ),
+    "a clock after a history that stands alone": (lambda: ActionHistory(2), lambda: Clock(2)),
+    "an action delay after an observation delay": (delay, lambda: ActionDelay(LATE)),
+    "sums of late rewards": (lambda: RewardDelay(LATE), lambda: CumulativeReward(3)),
+    "late sums of rewards": (lambda: CumulativeReward(3), lambda: RewardDelay(LATE)),
+    "two delays of one observation": (delay, lambda: ObservationDelay(1, age_key=None)),
+}
+
+
+def appended_inside(env, one, other):
+    inner = Compose(RewardSum())
+    env = TransformedEnv(env, Compose(one, inner))
+    inner.append(other)
+    return env
+
+
+WAYS = {
+    "Compose": lambda env, one, other: TransformedEnv(env, Compose(one, other)),
+    "nested first": lambda env, one, other: TransformedEnv(env, Compose(RewardSum(), Compose(one), other)),
+    "nested second": lambda env, one, other: TransformedEnv(env, Compose(one, Compose(other))),
+    "append": lambda env, one, other: TransformedEnv(env, one).append_transform(other),
+    "append nested": lambda env, one, other: TransformedEnv(env, Compose(one)).append_transform(
+        Compose(RewardSum(), other)
+    ),
+    "append inside": appended_inside,
+    "insert": lambda env, one, other: TransformedEnv(env, other).insert_transform(0, one),
+    "around a transformed environment": lambda env, one, other: TransformedEnv(
+        TransformedEnv(env, one), other
+    ),
+}
+every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+
+
+@every_way
+@pytest.mark.parametrize("pair", WRONG.values(), ids=WRONG)
+def test_a_wrong_order_is_refused_where_it_comes_about(pair, way):
+    one, other = (make() for make in pair)
+    names = f"{type(one).__name__} must come after {type(other).__name__}"
+    with pytest.raises(InputError, match=names):
+        way(Drift(), one, other)
+
+
+@every_way
+@pytest.mark.parametrize("pair", RIGHT.values(), ids=RIGHT)
+def test_a_right_order_works(pair, way):
+    env = way(Drift(), *(make() for make in pair))
+    assert env.rollout(6, break_when_any_done=False).shape == (3, 6)
+
+
+MESSAGE, RECEIVED = ("agents", "message"), ("agents", "received")
+
+
+def uplink():
+    return ObservationDelay(LATE, [MESSAGE], [RECEIVED])
+
+
+def server():
+    return ServerNode(unserved().server)
+
+
+@pytest.mark.parametrize("late", [uplink, lambda: RewardDelay(2, REWARD), lambda: Clock(2, [SEEN])])
+def test_a_server_node_stands_between_what_it_reads_and_what_reads_it(late):
+    chain = [uplink, server, late] if late is not uplink else [uplink, server]
+    env = TransformedEnv(unserved(), Compose(*(make() for make in chain)))
+    assert env.rollout(4).shape == (2, 4)
+    wrong = [server, uplink] if late is uplink else [uplink, late, server]
+    with pytest.raises(InputError, match="order of transforms"):
+        Compose(*(make() for make in wrong))

@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from damian.delays import law_of
 from damian.transforms.mailbox import Mailbox
-from damian.transforms.stateful import Order, Stateful, as_rows, beside, flag_rows
+from damian.transforms.stateful import Change, Entries, Memory, Order, Stateful, as_rows, beside, from_rows
 
 
 class Actions(NamedTuple):
@@ -70,30 +70,26 @@ class OnActions(Stateful):
         self.default = default
 
     @property
+    def row_key(self) -> NestedKey:
+        return self.action_key
+
+    def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
+        return self.actions.rows
+
+    @property
     def actions(self) -> Actions:
         """What the environment's specs say, read once."""
         if "_actions" not in self.__dict__:
-            if self.parent is None:
-                self._refuse()
-            self.__dict__["_actions"] = actions_of(self.parent, self.action_key, self.default)
+            self.__dict__["_actions"] = actions_of(self.env, self.action_key, self.default)
         return self.__dict__["_actions"]
 
     def empty_cache(self) -> None:
         super().empty_cache()
         self.__dict__.pop("_actions", None)
 
-    def set_container(self, container: Any) -> None:
-        super().set_container(container)
+    def reset_parent(self) -> None:
+        super().reset_parent()
         self.__dict__.pop("_actions", None)
-
-    def _chosen(self, tensordict: TensorDictBase) -> Tensor:
-        """The actions that the policy chose, [M, ...]."""
-        return as_rows(tensordict.get(self.action_key), self.actions.rows)
-
-    def _flag(self, tensordict: TensorDictBase, key: NestedKey | None) -> Tensor | None:
-        """A flag for each row, [M]; None if there is none."""
-        flag = tensordict.get(key, None) if key else None
-        return None if flag is None else flag.reshape(-1)
 
 
 class ActionDelay(OnActions):
@@ -133,35 +129,30 @@ class ActionDelay(OnActions):
         seed: int | None = None,
     ) -> None:
         super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed)
-        self.mailbox = Mailbox(law_of(delay).sampler(dt, loss), "generation", 1)
+        self.sampler = law_of(delay).sampler(dt, loss)
+        self.mailbox = Mailbox(self.sampler, "generation")
         self.sent_key, self.fresh_key = (beside(self.action_key, key) for key in (sent_key, fresh_key))
-
-    def compile(self) -> None:  # type: ignore[override]
-        """Compile what a step computes."""
-        self.mailbox.compile()
+        self.act_keys = [self.action_key, *([self.sent_key] if self.sent_key else [])]
 
     @property
     def order(self) -> Order:
         return Order(replaces=[self.action_key])
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        rows, initial = self.actions.rows, self.actions.initial
-        if not self.mailbox.begun:
-            streams = self._streams(tensordict_reset.batch_size, rows, initial.device)
-            self.mailbox.allocate([initial], streams)
-        self.mailbox.begin([initial], flag_rows(tensordict, "_reset", self.action_key, rows))
-        return tensordict_reset
+    def allocate(self, tensordict: TensorDictBase) -> Memory:
+        initial = self.actions.initial
+        streams = self.streams(tensordict.batch_size, initial.device)
+        return self.mailbox.allocate([initial], streams) | {"initial": initial}
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.container is None or not self.mailbox.begun:
-            self._refuse()
-        chosen, rows = self._chosen(tensordict), self.actions.rows
-        came = self.mailbox.exchange([chosen], self._flag(tensordict, self.sent_key))
-        tensordict.set(self.action_key, came.held[0].view(*rows, *chosen.shape[1:]))
+    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory, _ = self.mailbox.begin(memory, [memory["initial"]], mask)
+        return memory, {}
+
+    def act(self, memory: Memory, entries: Entries) -> Change:
+        chosen = as_rows(entries[self.action_key], self.rows)
+        sent = entries[self.sent_key].reshape(-1) if self.sent_key in entries else None
+        memory, came = self.mailbox.exchange(memory, [chosen], sent)
+        executed: Entries = {self.action_key: from_rows(came.held[0], self.rows)}
         if self.fresh_key:
-            waiting = self.mailbox.since == self.mailbox.began
-            tensordict.set(self.fresh_key, (came.fresh | waiting).view(rows))
-        return tensordict
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict
+            waiting = memory["since"] == memory["began"]
+            executed[self.fresh_key] = (came.fresh | waiting).view(self.rows)
+        return memory, executed

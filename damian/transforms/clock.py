@@ -8,7 +8,17 @@ from torch import Tensor
 
 from damian import checks
 from damian.delays import Delay, in_steps
-from damian.transforms.stateful import Order, Stateful, as_rows, flag_rows, row_shape, wide
+from damian.transforms.stateful import (
+    Change,
+    Entries,
+    Memory,
+    Order,
+    Stateful,
+    as_rows,
+    from_rows,
+    taken,
+    wide,
+)
 
 
 class Clock(Stateful):
@@ -27,8 +37,6 @@ class Clock(Stateful):
         InputError: an impossible period.
     """
 
-    elapsed: Tensor
-
     def __init__(
         self,
         period: Delay,
@@ -42,59 +50,52 @@ class Clock(Stateful):
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
         self.ready_key = ready_key
-        self._held = {key: f"held_{i}" for i, key in enumerate([*self.in_keys, *self.in_keys_inv])}
-        for name in ("elapsed", *self._held.values()):
-            self.register_buffer(name, None)
+        self.act_keys = self.in_keys_inv
+        self.see_keys = [*self.in_keys, *([ready_key] if ready_key else [])]
 
     @property
     def order(self) -> Order:
-        ready = [self.ready_key] if self.ready_key else []
-        return Order(reads=ready, holds=self.in_keys, replaces=self.in_keys_inv)
+        return Order(reads=self.see_keys, holds=self.in_keys, replaces=self.in_keys_inv)
 
-    @property
-    def ticks(self) -> Tensor:
-        """Is this step a tick, [M] bool."""
-        return self.elapsed % self.period == 0
+    def allocate(self, tensordict: TensorDictBase) -> Memory:
+        seen = taken(tensordict, self.in_keys)
+        device = seen[self.in_keys[0]].device
+        elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
+        held = {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(seen.values())}
+        specs = self.env.full_action_spec
+        acted = {
+            f"acted_{i}": as_rows(specs[key].zero(), self.rows) for i, key in enumerate(self.in_keys_inv)
+        }
+        return {"elapsed": elapsed, **held, **acted}
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        rows = row_shape(tensordict_reset, self.in_keys[0])
-        mask = flag_rows(tensordict, "_reset", self.in_keys[0], rows)
-        if self.elapsed is None or mask is None:
-            device = tensordict_reset.get(self.in_keys[0]).device
-            self.elapsed = torch.zeros(rows.numel(), dtype=torch.long, device=device)
-            mask = torch.ones_like(self.elapsed, dtype=torch.bool)
-        self.elapsed = self.elapsed.masked_fill(mask, 0)
-        for key in self.in_keys:
-            self._hold(tensordict_reset, key, mask, rows)
-        return tensordict_reset  # TorchRL keeps what the other worlds showed
+    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
+        return self._hold(memory, entries, self.in_keys, "held", mask)
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if not self.in_keys_inv:
-            return tensordict
-        if self.container is None or self.elapsed is None:
-            self._refuse()
-        for key in self.in_keys_inv:
-            rows = row_shape(tensordict, key)
-            tensordict.set(key, self._hold(tensordict, key, self.ticks, rows))
-        return tensordict
+    def act(self, memory: Memory, entries: Entries) -> Change:
+        return self._hold(memory, entries, self.in_keys_inv, "acted", self._ticks(memory))
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self.elapsed is None:
-            self._refuse()
-        self.elapsed = self.elapsed + 1
-        ticks = self.ticks
-        rows = row_shape(next_tensordict, self.in_keys[0])
-        for key in self.in_keys:
-            next_tensordict.set(key, self._hold(next_tensordict, key, ticks, rows))
+    def see(self, memory: Memory, entries: Entries) -> Change:
+        memory = memory | {"elapsed": memory["elapsed"] + 1}
+        ticks = self._ticks(memory)
+        memory, shown = self._hold(memory, entries, self.in_keys, "held", ticks)
         if self.ready_key:
-            ready = next_tensordict.get(self.ready_key)
-            next_tensordict.set(self.ready_key, ready & ticks.view_as(ready))
-        return next_tensordict
+            ready = entries[self.ready_key]
+            shown[self.ready_key] = ready & ticks.view_as(ready)
+        return memory, shown
 
-    def _hold(self, tensordict: TensorDictBase, key: NestedKey, take: Tensor, rows: torch.Size) -> Tensor:
-        """What is held of an entry, after taking it where it may be taken, [*rows, ...]."""
-        value, name = tensordict.get(key), self._held[key]
-        new, old = as_rows(value, rows), getattr(self, name)
-        held = new if old is None else torch.where(wide(take, new), new, old)
-        setattr(self, name, held)
-        return held.view_as(value)
+    def _ticks(self, memory: Memory) -> Tensor:
+        """Is this step a tick, [M]."""
+        return memory["elapsed"] % self.period == 0
+
+    def _hold(
+        self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, take: Tensor
+    ) -> Change:
+        """Take the entries where they may be taken [M], and show what is held."""
+        shown: Entries = {}
+        for i, key in enumerate(keys):
+            new, old = as_rows(entries[key], self.rows), memory[f"{name}_{i}"]
+            held = torch.where(wide(take, new), new, old)
+            memory = memory | {f"{name}_{i}": held}
+            shown[key] = from_rows(held, self.rows)
+        return memory, shown

@@ -4,13 +4,12 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from damian import checks
-from damian.compiling import compiled
 from damian.transforms.action import OnActions
-from damian.transforms.stateful import Order, beside, flag_rows, wide
+from damian.transforms.stateful import Change, Entries, Memory, Order, as_rows, beside, from_rows, wide
 from damian.world.airspace import rows
 
 
@@ -33,11 +32,6 @@ class ActionHistory(OnActions):
             beside the action, if a bare name.
     """
 
-    first: Tensor
-    """Shown after a reset, [M, steps * A]."""
-    recent: Tensor
-    """Shown now, likewise."""
-
     def __init__(
         self,
         steps: int,
@@ -54,62 +48,47 @@ class ActionHistory(OnActions):
         appended = [append_to] if append_to is not None else []
         self.in_keys, self.out_keys = appended, appended or [beside(self.action_key, out_key)]
         self.steps, self.recorded_key = steps, beside(self.action_key, recorded_key)
-        self.register_buffer("first", None)
-        self.register_buffer("recent", None)
-        self.codes = None if codes is None else nn.Buffer(codes, persistent=False)
-        self._advance = self._remember
+        self.codes = codes
+        self.act_keys = [self.action_key, *([self.recorded_key] if self.recorded_key else [])]
+        self.see_keys = self.in_keys
 
     @property
     def order(self) -> Order:
         return Order(appends=self.in_keys, records=[self.action_key])
 
-    def compile(self) -> None:  # type: ignore[override]
-        """Compile what a step computes."""
-        self._advance = compiled(self._remember)
+    def allocate(self, tensordict: TensorDictBase) -> Memory:
+        actions = self.actions
+        scale = {"low": actions.low, "width": actions.width}
+        scale |= {} if self.codes is None else {"codes": self.codes.to(actions.initial.device)}
+        first = self._encode(scale, actions.initial).repeat(1, self.steps)
+        return scale | {"first": first, "recent": first}
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        mask = flag_rows(tensordict, "_reset", self.action_key, self.actions.rows)
-        if self.first is None:
-            self.first = self._encode(self.actions.initial).repeat(1, self.steps)
-        if self.recent is None or mask is None:
-            self.recent = self.first
-        else:
-            self.recent = torch.where(wide(mask, self.first), self.first, self.recent)
-        return self._show(tensordict_reset)
+    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        first = memory["first"]
+        memory = memory | {"recent": torch.where(wide(mask, first), first, memory["recent"])}
+        return self.see(memory, entries)
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.container is None or self.recent is None:
-            self._refuse()
-        taken = self._flag(tensordict, self.recorded_key)
-        if taken is None:
-            taken = torch.ones(len(self.recent), dtype=torch.bool, device=self.recent.device)
-        self.recent = self._advance(self.recent, self._chosen(tensordict), taken)
-        return tensordict
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._show(next_tensordict)
-
-    def _show(self, tensordict: TensorDictBase) -> TensorDictBase:
-        shown = self.recent.view(*self.actions.rows, -1)
-        if self.in_keys:
-            shown = torch.cat([tensordict.get(self.in_keys[0]), shown], -1)
-        return tensordict.set(self.out_keys[0], shown)
-
-    def _remember(self, recent: Tensor, action: Tensor, taken: Tensor) -> Tensor:
-        """Push the latest action in, and the oldest out, [M, steps * A]."""
-        latest = self._encode(action)
+    def act(self, memory: Memory, entries: Entries) -> Change:
+        recent = memory["recent"]
+        latest = self._encode(memory, as_rows(entries[self.action_key], self.rows))
         longer = torch.cat([recent[:, latest.shape[-1] :], latest], -1)
-        return torch.where(wide(taken, longer), longer, recent)
+        if self.recorded_key in entries:
+            longer = torch.where(entries[self.recorded_key].reshape(-1, 1), longer, recent)
+        return memory | {"recent": longer}, {}
 
-    def _encode(self, action: Tensor) -> Tensor:
+    def see(self, memory: Memory, entries: Entries) -> Change:
+        shown, key = from_rows(memory["recent"], self.rows), self.out_keys[0]
+        return memory, {key: torch.cat([entries[key], shown], -1) if key in entries else shown}
+
+    def _encode(self, scale: Memory, action: Tensor) -> Tensor:
         """Actions [M, ...] as numbers [M, A]."""
         if self.codes is not None:
-            return rows(self.codes, action)
-        scaled = (action - self.actions.low) / self.actions.width
-        return scaled.view(len(action), -1).float()
+            return rows(scale["codes"], action)
+        return ((action - scale["low"]) / scale["width"]).view(len(action), -1).float()
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        width = self.steps * self._encode(self.actions.initial).shape[-1]
+        example = self.actions.initial[:1]
+        width = self.steps * (example.numel() if self.codes is None else self.codes.shape[-1])
         key, device = self.out_keys[0], observation_spec.device
         if not self.in_keys:
             observation_spec[key] = Unbounded(torch.Size((*self.actions.rows, width)), device=device)

@@ -5,9 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.compiling import compiled
 from damian.sampling import Sampler
-from damian.transforms.stateful import Lazy, wide
+from damian.transforms.stateful import Memory, wide
 
 
 class Delivery(NamedTuple):
@@ -22,129 +21,88 @@ class Delivery(NamedTuple):
     delay: Tensor
     """Of the messages sent just now [steps], [M]; ``Sampler.lost`` if lost, or not sent at all."""
 
-    @classmethod
-    def at_once(cls, values: list[Tensor]) -> "Delivery":
-        """Every message is there as it is generated."""
-        zero = torch.zeros(len(values[0]), dtype=torch.long, device=values[0].device)
-        return cls(values, zero, zero == 0, zero)
 
+class Mailbox:
+    """Delays rows of values by a law; each of M senders sends at most one message per step.
 
-class Post(NamedTuple):
-    """What is on its way and what is held; M senders, K slots for the steps to come and one for the lost."""
+    A message is written at once into the slot of the step at which it will arrive, where a later one that
+    arrives at the same time replaces it. Pure but for the slots, which are written in place. It remembers
 
-    clock: Tensor
-    """Steps so far, []."""
-    streams: Tensor
-    """Random stream of each sender, [M]."""
-    memory: Tensor
-    """State of each channel, [M]."""
-    began: Tensor
-    """Clock at the latest reset, [M]."""
-    since: Tensor
-    """Clock when what is held was generated, [M]."""
-    stamps: Tensor
-    """Clock when the message in a slot was generated, [K + 1, M]."""
-    slots: list[Tensor]
-    """Values by the step at which they arrive, [K + 1, M, ...] each."""
-    held: list[Tensor]
-    """[M, ...] each."""
-
-
-class Mailbox(Lazy):
-    """Delays rows of values by a law; each of M senders sends at most one per step.
-
-    A message is written at once into the slot of the step at which it will arrive, where a later one
-    that arrives at the same time replaces it. ``allocate`` makes the buffers.
+    - ``clock``: steps so far, [], and ``today``: the slot of this step, [];
+    - ``streams``: random stream of each sender, [M], and ``channel``: state of its channel, [M];
+    - ``began``: clock at its latest reset, [M], and ``since``: when what is held was generated, [M];
+    - ``stamps``: when the message in a slot was generated, [K + 1, M]: K slots for the steps to come, and
+      one for the messages that never arrive;
+    - ``slots_i``: the values of the messages, [K + 1, M, ...], and ``held_i``: of those held, [M, ...].
 
     Args:
         sampler: the delays.
-        order: hold the message ``generation``-ated last, or that came last (``arrival``).
-        n_values: tensors in a message.
+        order: hold the message that was generated last (``generation``) or that came last (``arrival``).
     """
 
-    def __init__(self, sampler: Sampler, order: str, n_values: int) -> None:
-        super().__init__()
+    def __init__(self, sampler: Sampler, order: str) -> None:
         self.sampler = sampler
         self._newest = order == "generation"
-        self._tables = [f"slots_{i}" for i in range(n_values)], [f"held_{i}" for i in range(n_values)]
-        for name in (*_SINGLE, *self._tables[0], *self._tables[1]):
-            self.register_buffer(name, None)
-        self._advance, self._compiled = self._exchange, False
 
-    def compile(self) -> None:  # type: ignore[override]
-        """Compile what a step computes."""
-        self._advance, self._compiled = compiled(self._exchange), True
-
-    @property
-    def begun(self) -> bool:
-        """Is there anything yet."""
-        return self.clock is not None
-
-    def allocate(self, values: list[Tensor], streams: Tensor) -> None:
-        """Make the buffers, for values [M, ...] and senders with these random streams [M]."""
+    def allocate(self, values: list[Tensor], streams: Tensor) -> Memory:
+        """The memory for messages of these values [M, ...] and senders of these random streams [M]."""
         n_slots, zero = self.sampler.lost + 1, torch.zeros_like(streams)
-        self.clock, self.streams, self.memory = zero.new_zeros(()), streams, self.sampler.begin(streams)
-        self.began, self.since = zero, zero.clone()
-        self.stamps = zero.new_full((n_slots, len(streams)), -1)
-        for slots, held, value in zip(*self._tables, values, strict=True):
-            setattr(self, slots, value.new_zeros(n_slots, *value.shape))
-            setattr(self, held, value.clone())
+        memory = {
+            "clock": zero.new_zeros(()),
+            "today": zero.new_zeros(()),
+            "streams": streams,
+            "channel": self.sampler.begin(streams),
+            "began": zero,
+            "since": zero.clone(),
+            "stamps": zero.new_full((n_slots, len(streams)), -1),
+        }
+        for i, value in enumerate(values):
+            memory[f"slots_{i}"] = value.new_zeros(n_slots, *value.shape)
+            memory[f"held_{i}"] = value.clone()
+        return memory
 
-    def begin(self, values: list[Tensor], mask: Tensor | None) -> None:
-        """Hold these values [M, ...], generated now; forget what is on its way.
+    def begin(self, memory: Memory, values: list[Tensor], mask: Tensor) -> tuple[Memory, Delivery]:
+        """Where the mask [M] says so, hold these values [M, ...] from now on; forget what is on its way."""
+        clock = memory["clock"]
+        memory = memory | {name: torch.where(mask, clock, memory[name]) for name in ("began", "since")}
+        for i, new in enumerate(values):
+            memory[f"held_{i}"] = torch.where(wide(mask, new), new, memory[f"held_{i}"])
+        zero = torch.zeros_like(memory["since"])
+        return memory, Delivery(values, zero, zero == 0, zero)
 
-        Only where the mask [M] says so; everywhere, if there is none.
-        """
-        mask = torch.ones_like(self.since, dtype=torch.bool) if mask is None else mask
-        self.began = torch.where(mask, self.clock, self.began)
-        self.since = torch.where(mask, self.clock, self.since)
-        for name, new in zip(self._tables[1], values, strict=True):
-            setattr(self, name, torch.where(wide(mask, new), new, getattr(self, name)))
-
-    def exchange(self, values: list[Tensor], sent: Tensor | None = None) -> Delivery:
-        """Let a step pass: send these values [M, ...] and deliver what arrives.
+    def exchange(self, memory: Memory, values: list[Tensor], sent: Tensor | None) -> tuple[Memory, Delivery]:
+        """Let a step pass: send these values [M, ...], deliver what arrives.
 
         Args:
+            memory: before it.
             values: to be sent.
             sent: which are really sent, [M]; all of them if not given.
         """
-        if sent is None and self._compiled:  # one graph, whose guards do not see what is missing
-            sent = torch.ones_like(self.since, dtype=torch.bool)
-        post, delivery = self._advance(self._post(), values, sent)
-        for name in _CHANGING:
-            setattr(self, name, getattr(post, name))
-        for name, held in zip(self._tables[1], post.held, strict=True):
-            setattr(self, name, held)
-        return delivery
-
-    def _exchange(self, post: Post, values: list[Tensor], sent: Tensor | None) -> tuple[Post, Delivery]:
-        """Pure but for the slots, which are written in place."""
-        clock = post.clock + 1
-        n_slots, n_senders = self.sampler.lost, len(post.since)
-        delay, memory = self.sampler(post.streams, clock, post.memory)
+        clock, since = memory["clock"] + 1, memory["since"]
+        n_slots, n_senders = self.sampler.lost, len(since)
+        today = after(memory["today"], 1, n_slots)
+        delay, channel = self.sampler(memory["streams"], clock, memory["channel"])
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
-        arrives = torch.where(delay < n_slots, (clock + delay) % n_slots, n_slots)
+        arrives = torch.where(delay < n_slots, after(today, delay, n_slots), n_slots)
         row = arrives * n_senders + torch.arange(n_senders, device=arrives.device)
-        post.stamps.view(-1).index_copy_(0, row, clock.expand(n_senders))
-        for slots, value in zip(post.slots, values, strict=True):
-            slots.flatten(0, 1).index_copy_(0, row, value)
-        today = (clock % n_slots).view(1)
-        stamp = post.stamps.index_select(0, today).squeeze(0)
-        older = post.since if self._newest else torch.maximum(post.began, clock - n_slots)
+        memory["stamps"].view(-1).index_copy_(0, row, clock.expand(n_senders))
+        stamp = memory["stamps"].index_select(0, today.view(1)).squeeze(0)
+        older = since if self._newest else torch.maximum(memory["began"], clock - n_slots)
         fresh = stamp > older
-        since = torch.where(fresh, stamp, post.since)
-        held = [
-            torch.where(wide(fresh, old), slots.index_select(0, today).squeeze(0), old)
-            for slots, old in zip(post.slots, post.held, strict=True)
-        ]
-        post = post._replace(clock=clock, memory=memory, since=since, held=held)
-        return post, Delivery(held, clock - since, fresh, delay)
+        since = torch.where(fresh, stamp, since)
+        memory = memory | {"clock": clock, "today": today, "channel": channel, "since": since}
+        held = []
+        for i, value in enumerate(values):
+            slots, old = memory[f"slots_{i}"], memory[f"held_{i}"]
+            slots.flatten(0, 1).index_copy_(0, row, value)
+            new = slots.index_select(0, today.view(1)).squeeze(0)
+            held.append(torch.where(wide(fresh, old), new, old))
+            memory[f"held_{i}"] = held[i]
+        return memory, Delivery(held, clock - since, fresh, delay)
 
-    def _post(self) -> Post:
-        tables = ([getattr(self, name) for name in names] for names in self._tables)
-        return Post._make([*(getattr(self, name) for name in _SINGLE), *tables])
 
-
-_SINGLE = ("clock", "streams", "memory", "began", "since", "stamps")
-_CHANGING = ("clock", "memory", "since")
+def after(slot: Tensor, steps: Tensor | int, n_slots: int) -> Tensor:
+    """The slot some steps (fewer than there are slots) later; a division for each element would cost more."""
+    later = slot + steps
+    return torch.where(later < n_slots, later, later - n_slots)

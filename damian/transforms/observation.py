@@ -11,7 +11,17 @@ from torchrl.data import Binary, Composite, Unbounded
 from damian import checks
 from damian.delays import ORDERS, law_of
 from damian.transforms.mailbox import Delivery, Mailbox
-from damian.transforms.stateful import Order, Stateful, as_rows, beside, flag_rows, row_shape
+from damian.transforms.stateful import (
+    Change,
+    Entries,
+    Memory,
+    Order,
+    Stateful,
+    as_rows,
+    beside,
+    from_rows,
+    taken,
+)
 
 
 class ObservationDelay(Stateful):
@@ -58,61 +68,47 @@ class ObservationDelay(Stateful):
     ) -> None:
         checks.one_of("order", order, ORDERS)
         super().__init__(in_keys, out_keys or in_keys, seed=seed)
-        self.mailbox = Mailbox(law_of(delay).sampler(dt, loss), order, len(self.in_keys))
-        self._first: NestedKey = self.in_keys[0]
+        self.sampler = law_of(delay).sampler(dt, loss)
+        self.mailbox = Mailbox(self.sampler, order)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
-            beside(self._first, key) for key in (age_key, fresh_key, delay_key, sent_key)
+            beside(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
-
-    def compile(self) -> None:  # type: ignore[override]
-        """Compile what a step computes."""
-        self.mailbox.compile()
+        self.see_keys = [*self.in_keys, *([self.sent_key] if self.sent_key else [])]
 
     @property
     def order(self) -> Order:
-        sent = [self.sent_key] if self.sent_key else []
         made = [key for key in self.out_keys if key not in self.in_keys]
-        return Order(reads=[*self.in_keys, *sent], holds=self.in_keys, makes=made)
+        return Order(reads=self.see_keys, holds=self.in_keys, makes=made)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        shape = row_shape(tensordict_reset, self._first)
-        values = self._values(tensordict_reset, shape)
-        if not self.mailbox.begun:
-            streams = self._streams(tensordict_reset.batch_size, shape, values[0].device)
-            self.mailbox.allocate(values, streams)
-        self.mailbox.begin(values, flag_rows(tensordict, "_reset", self._first, shape))
-        return self._show(tensordict_reset, shape, Delivery.at_once(values))
+    def allocate(self, tensordict: TensorDictBase) -> Memory:
+        values = self._values(taken(tensordict, self.in_keys))
+        return self.mailbox.allocate(values, self.streams(tensordict.batch_size, values[0].device))
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if not self.mailbox.begun:
-            self._refuse()
-        shape = row_shape(next_tensordict, self._first)
-        sent = next_tensordict.get(self.sent_key).reshape(-1) if self.sent_key else None
-        delivery = self.mailbox.exchange(self._values(next_tensordict, shape), sent)
-        return self._show(next_tensordict, shape, delivery)
+    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory, delivery = self.mailbox.begin(memory, self._values(entries), mask)
+        return memory, self._shown(delivery)
 
-    def _values(self, tensordict: TensorDictBase, shape: torch.Size) -> list[Tensor]:
-        return [as_rows(tensordict.get(key), shape) for key in self.in_keys]
+    def see(self, memory: Memory, entries: Entries) -> Change:
+        sent = entries[self.sent_key].reshape(-1) if self.sent_key else None
+        memory, delivery = self.mailbox.exchange(memory, self._values(entries), sent)
+        return memory, self._shown(delivery)
 
-    def _show(self, tensordict: TensorDictBase, shape: torch.Size, what: Delivery) -> TensorDictBase:
-        for key, held in zip(self.out_keys, what.held, strict=True):
-            tensordict.set(key, held.view(*shape, *held.shape[1:]))
-        if self.age_key:
-            tensordict.set(self.age_key, what.age.float().view(*shape, 1))
-        if self.fresh_key:
-            tensordict.set(self.fresh_key, what.fresh.view(*shape, 1))
+    def _values(self, entries: Entries) -> list[Tensor]:
+        return [as_rows(entries[key], self.rows) for key in self.in_keys]
+
+    def _shown(self, what: Delivery) -> Entries:
+        shown = {key: from_rows(held, self.rows) for key, held in zip(self.out_keys, what.held, strict=True)}
+        flags = {self.age_key: what.age.float(), self.fresh_key: what.fresh}
         if self.delay_key:
-            delay = torch.where(what.delay < self.mailbox.sampler.lost, what.delay, -1)
-            tensordict.set(self.delay_key, delay.view(*shape, 1))
-        return tensordict
+            flags[self.delay_key] = torch.where(what.delay < self.sampler.lost, what.delay, -1)
+        return shown | {key: flag.view(*self.rows, 1) for key, flag in flags.items() if key is not None}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if out_key != key:
                 observation_spec[out_key] = observation_spec[key].clone()
-        inner = observation_spec
-        if isinstance(self._first, tuple):
-            inner = observation_spec[self._first[:-1]]
+        key = self.row_key
+        inner = observation_spec[key[:-1]] if isinstance(key, tuple) else observation_spec
         shape, device = torch.Size((*inner.shape, 1)), observation_spec.device
         if self.age_key:
             observation_spec[self.age_key] = Unbounded(shape, device=device)

@@ -7,35 +7,48 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian import checks
-from damian.compiling import compiled
 from damian.delays import law_of
-from damian.transforms.stateful import Order, Stateful, as_rows, flag_rows, row_shape, wide
+from damian.transforms.mailbox import after
+from damian.transforms.stateful import (
+    Change,
+    Entries,
+    Memory,
+    Order,
+    Stateful,
+    as_rows,
+    flag_keys,
+    flag_rows,
+    from_rows,
+    wide,
+)
 
 
 class OnRewards(Stateful):
-    """A transform that remembers rewards, in a buffer [K, M, ...]."""
+    """A transform that remembers rewards, as ``past`` [K, M, ...]."""
 
-    past: Tensor
+    n_past: int
+    """K."""
 
     def __init__(self, reward_key: NestedKey, seed: int | None = None) -> None:
         super().__init__([reward_key], [reward_key], seed=seed)
         self.reward_key: NestedKey = self.in_keys[0]
-        self.register_buffer("past", None)
+        self.see_keys = [self.reward_key, *flag_keys("done", self.reward_key)]
 
     @property
     def order(self) -> Order:
         return Order(holds=[self.reward_key])
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self.past is None:  # made by the first step, as a reset shows no reward
-            return tensordict_reset
-        rows = row_shape(tensordict_reset, self.reward_key)
-        mask = flag_rows(tensordict, "_reset", self.reward_key, rows)
-        if mask is None:
-            self.past = torch.zeros_like(self.past)
-        else:
-            self.past = self.past.masked_fill(wide(mask, self.past[0]), 0)
-        return tensordict_reset
+    def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
+        specs, key = self.env.full_reward_spec, self.reward_key
+        return (specs[key[:-1]] if isinstance(key, tuple) else specs).shape
+
+    def allocate(self, tensordict: TensorDictBase) -> Memory:
+        example = as_rows(self.env.full_reward_spec[self.reward_key].zero(), self.rows)
+        return {"past": example.new_zeros(self.n_past, *example.shape)}
+
+    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        past = memory["past"]
+        return memory | {"past": past.masked_fill(wide(mask, past[0]), 0)}, {}
 
 
 class RewardDelay(OnRewards):
@@ -54,10 +67,6 @@ class RewardDelay(OnRewards):
         InputError: an impossible law, or one that loses rewards.
     """
 
-    clock: Tensor
-    streams: Tensor
-    memory: Tensor
-
     def __init__(
         self, delay: Any, reward_key: NestedKey = "reward", *, dt: float = 1.0, seed: int | None = None
     ) -> None:
@@ -65,52 +74,32 @@ class RewardDelay(OnRewards):
         self.sampler = law_of(delay).sampler(dt)
         loses = (self.sampler.chances[:, -1] > 1e-9).any().item()
         checks.require(not loses, "delay", delay, "loses messages, but no reward may be lost")
-        for name in ("clock", "streams", "memory"):
-            self.register_buffer(name, None)
-        self._advance = self._pay
+        self.n_past = self.sampler.longest + 1
 
-    def compile(self) -> None:  # type: ignore[override]
-        """Compile what a step computes."""
-        self._advance = compiled(self._pay)
+    def allocate(self, tensordict: TensorDictBase) -> Memory:
+        memory = super().allocate(tensordict)
+        streams = self.streams(tensordict.batch_size, memory["past"].device)
+        channel = self.sampler.begin(streams)
+        zero = streams.new_zeros(())
+        return memory | {"clock": zero, "today": zero, "streams": streams, "channel": channel}
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        rows = row_shape(next_tensordict, self.reward_key)
-        reward = as_rows(next_tensordict.get(self.reward_key), rows)
-        if self.past is None:
-            self._allocate(reward, self._streams(next_tensordict.batch_size, rows, reward.device))
-        done = flag_rows(next_tensordict, "done", self.reward_key, rows)
-        if done is None:
-            done = torch.zeros_like(self.streams, dtype=torch.bool)
-        state = self.clock, self.streams, self.memory, self.past
-        self.clock, self.memory, self.past, paid = self._advance(*state, reward, done)
-        return next_tensordict.set(self.reward_key, paid.view(*rows, *reward.shape[1:]))
-
-    def _pay(
-        self,
-        clock: Tensor,
-        streams: Tensor,
-        memory: Tensor,
-        pending: Tensor,
-        reward: Tensor,
-        done: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """New clock, channels' memory and pending rewards [K, M, ...], and what is paid now [M, ...]."""
-        clock = clock + 1
-        n_slots, n_rows = pending.shape[:2]
-        delay, memory = self.sampler(streams, clock, memory)
-        row = (clock + delay) % n_slots * n_rows + torch.arange(n_rows, device=delay.device)
-        pending = pending.flatten(0, 1).index_add(0, row, reward).view_as(pending)
-        today = (clock % n_slots).view(1)
-        due = pending.index_select(0, today).squeeze(0)
-        over = wide(done, due)
-        paid = torch.where(over, pending.sum(0), due)
-        pending = pending.index_fill(0, today, 0).masked_fill(over, 0)
-        return clock, memory, pending, paid
-
-    def _allocate(self, reward: Tensor, streams: Tensor) -> None:
-        self.clock, self.streams = streams.new_zeros(()), streams
-        self.memory = self.sampler.begin(streams)
-        self.past = reward.new_zeros(self.sampler.longest + 1, *reward.shape)
+    def see(self, memory: Memory, entries: Entries) -> Change:
+        clock, owed = memory["clock"] + 1, memory["past"]
+        reward = as_rows(entries[self.reward_key], self.rows)
+        delay, channel = self.sampler(memory["streams"], clock, memory["channel"])
+        today = after(memory["today"], 1, self.n_past)
+        due = after(today, delay, self.n_past)
+        row = due * len(reward) + torch.arange(len(reward), device=delay.device)
+        owed = owed.flatten(0, 1).index_add(0, row, reward).view_as(owed)
+        paid = owed.index_select(0, today.view(1)).squeeze(0)
+        owed = owed.index_fill(0, today.view(1), 0)
+        done = flag_rows(entries, "done", self.reward_key, self.rows)
+        if done is not None:
+            over = wide(done, paid)
+            paid = torch.where(over, paid + owed.sum(0), paid)
+            owed = owed.masked_fill(over, 0)
+        memory = memory | {"clock": clock, "today": today, "channel": channel, "past": owed}
+        return memory, {self.reward_key: from_rows(paid, self.rows)}
 
 
 class CumulativeReward(OnRewards):
@@ -130,14 +119,12 @@ class CumulativeReward(OnRewards):
         checks.above("gamma", gamma, 0.0)
         checks.in_range("gamma", gamma, 0.0, 1.0)
         super().__init__(reward_key)
-        self.steps = steps
+        self.n_past = steps
         self.weights = [gamma**age for age in range(steps)]
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        rows = row_shape(next_tensordict, self.reward_key)
-        reward = as_rows(next_tensordict.get(self.reward_key), rows)
-        if self.past is None:
-            self.past = reward.new_zeros(self.steps, *reward.shape)
-        self.past = torch.cat([reward.unsqueeze(0), self.past[:-1]])
-        total = torch.tensordot(reward.new_tensor(self.weights), self.past, 1)
-        return next_tensordict.set(self.reward_key, total.view(*rows, *reward.shape[1:]))
+    def see(self, memory: Memory, entries: Entries) -> Change:
+        reward = as_rows(entries[self.reward_key], self.rows)
+        past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
+        weights = torch.tensor(self.weights, dtype=reward.dtype, device=reward.device)
+        total = (weights.view(-1, *[1] * reward.dim()) * past).sum(0)
+        return memory | {"past": past}, {self.reward_key: from_rows(total, self.rows)}

@@ -3,26 +3,16 @@
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from damian.compiling import compiled
 from damian.features import Snapshot
-from damian.server import Judgement, Server
-from damian.transforms.stateful import Order, Stateful, flag_rows
+from damian.server import Server
+from damian.transforms.stateful import Change, Entries, Memory, Order, Stateful
 
-_TERMS = ("agents", "reward_terms")
-_MADE = [
-    ("agents", "observation"),
-    ("agents", "global_observation"),
-    ("agents", "reward"),
-    _TERMS,
-    "success",
-    "done",
-    "terminated",
-    "truncated",
-]
+_AGENTS = ("observation", "global_observation", "reward")
+_TASK = ("success", "done", "terminated", "truncated")
 
 
 class ServerNode(Stateful):
@@ -38,8 +28,6 @@ class ServerNode(Stateful):
         terms: write ``("agents", "reward_terms")`` too.
     """
 
-    elapsed: Tensor
-
     def __init__(
         self,
         server: Server,
@@ -48,60 +36,39 @@ class ServerNode(Stateful):
         drop: Sequence[NestedKey] = (),
         terms: bool = False,
     ) -> None:
-        made = [key for key in _MADE if terms or key != _TERMS]
-        super().__init__([message_key], made)
+        named = server.config.task.terms if terms else []
+        made = [("agents", name) for name in _AGENTS] + [("agents", "reward_terms", name) for name in named]
+        super().__init__([message_key], [*made, *_TASK])
         self.server, self.drop, self.terms = server, list(drop), terms
-        self.register_buffer("elapsed", None)
-        self._advance = self._serve
+        self.see_keys = [*self.in_keys, "source_over"]
 
-    def compile(self) -> None:  # type: ignore[override]
-        """Compile what a step computes."""
-        self._advance = compiled(self._serve)
+    @property
+    def row_key(self) -> NestedKey:
+        return "done"
 
     @property
     def order(self) -> Order:
         return Order(reads=self.in_keys, makes=self.out_keys)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        mask = flag_rows(tensordict, "_reset", "done", tensordict_reset.batch_size)
-        if self.elapsed is None or mask is None:
-            n, device = tensordict_reset.batch_size.numel(), tensordict_reset.device
-            self.elapsed = torch.zeros(n, dtype=torch.long, device=device)
-        else:
-            self.elapsed = self.elapsed.masked_fill(mask, 0)
-        for key in self.drop:
-            tensordict_reset.pop(key)
-        return tensordict_reset
+    def allocate(self, tensordict: TensorDictBase) -> Memory:
+        messages = tensordict.get(self.in_keys[0])
+        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=messages.device)}
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self.elapsed is None:
-            self._refuse()
-        over = next_tensordict.get("source_over", None)
-        over = torch.zeros_like(self.elapsed, dtype=torch.bool) if over is None else over.squeeze(-1)
-        messages = next_tensordict.get(self.in_keys[0])
-        self.elapsed, seen, judged = self._advance(self.elapsed, messages, over)
-        for key in self.drop:
-            next_tensordict.pop(key)
-        agents = next_tensordict.get("agents")
-        agents.set("observation", seen[0])
-        agents.set("global_observation", seen[1])
-        agents.set("reward", judged.reward.unsqueeze(-1))
-        if self.terms:
-            agents.set("reward_terms", TensorDict(judged.terms, agents.batch_size))
-        ended = judged.status
-        next_tensordict.set("success", ended.success.unsqueeze(-1))
-        next_tensordict.set("terminated", ended.terminated.unsqueeze(-1))
-        next_tensordict.set("truncated", ended.truncated.unsqueeze(-1))
-        return next_tensordict.set("done", (ended.terminated | ended.truncated).unsqueeze(-1))
+    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        return {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, {}
 
-    def _serve(
-        self, elapsed: Tensor, messages: Tensor, source_over: Tensor
-    ) -> tuple[Tensor, tuple[Tensor, Tensor], Judgement]:
-        """Steps of the episode [B], observations, and what they are worth."""
-        elapsed, snapshot = elapsed + 1, Snapshot.unpack(messages)
+    def see(self, memory: Memory, entries: Entries) -> Change:
+        elapsed, snapshot = memory["elapsed"] + 1, Snapshot.unpack(entries[self.in_keys[0]])
+        over = entries.get("source_over", torch.zeros_like(elapsed, dtype=torch.bool)).view(-1)
         features = self.server.features(snapshot, elapsed)
-        judged = self.server.judge(features, snapshot, elapsed, source_over)
-        return elapsed, self.server.observations(features), judged
+        reward, terms, ended = self.server.judge(features, snapshot, elapsed, over)
+        seen = [*self.server.observations(features), reward.unsqueeze(-1)]
+        done = ended.terminated | ended.truncated
+        flags = [flag.unsqueeze(-1) for flag in (ended.success, done, ended.terminated, ended.truncated)]
+        made: Entries = {("agents", name): value for name, value in zip(_AGENTS, seen, strict=True)}
+        if self.terms:
+            made |= {("agents", "reward_terms", name): term for name, term in terms.items()}
+        return {"elapsed": elapsed}, made | dict(zip(_TASK, flags, strict=True))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key in self.drop:

@@ -1,36 +1,25 @@
-"""What the transforms share: state that lives in buffers from step to step, seeds, and their order."""
+"""What the transforms share: a memory that lives in buffers, seeds, and their order."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torch import Tensor, nn
-from torchrl.envs import Compose, Transform
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase, Transform
 
 from damian.errors import InputError
 from damian.world import draws
 
+Memory = dict[str, Tensor]
+"""What a transform remembers, by the name of its buffer."""
 
-class Lazy(nn.Module):
-    """A module whose buffers begin as None, and take the shapes of what they first hold or load."""
+Entries = dict[NestedKey, Tensor]
+"""Entries of a TensorDict, by key."""
 
-    def forget(self) -> None:
-        """Begin again: the next reset is the first."""
-        for module in self.modules():
-            if isinstance(module, Lazy):
-                module._buffers.update(dict.fromkeys(module._buffers))
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        for name, buffer in self._buffers.items():
-            saved = state_dict.get(f"{prefix}{name}")
-            if saved is not None:
-                device = saved.device if buffer is None else buffer.device
-                self._buffers[name] = saved.detach().clone().to(device)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+Change = tuple[Memory, Entries]
+"""What is remembered from now on, and the entries that are written."""
 
 
 class Order(NamedTuple):
@@ -50,7 +39,7 @@ class Order(NamedTuple):
     """Actions that are remembered as they were chosen."""
 
 
-class Stateful(Transform, Lazy):
+class Stateful(Transform):
     """A transform with a memory: one row for each world, or for each agent of each world.
 
     An entry under a nested key, such as ``("agents", "observation")``, has a row for each element of the
@@ -58,10 +47,20 @@ class Stateful(Transform, Lazy):
     at the first reset, and kept in buffers: it is saved with ``state_dict``, moves with ``to``, and travels
     into worker processes.
 
+    What a subclass does is written as pure functions of its memory and of entries, ``begin`` (after a
+    reset), ``act`` (before a step) and ``see`` (after it), so that a whole chain compiles into one graph.
+
     Args:
         seed: of everything that is drawn; without one, drawn from torch's global generator at the first
             reset.
     """
+
+    act_keys: Sequence[NestedKey] = ()
+    """Entries that ``act`` is given, if they are there."""
+    see_keys: Sequence[NestedKey] = ()
+    """Entries that ``begin`` and ``see`` are given, if they are there."""
+    drop: Sequence[NestedKey] = ()
+    """Entries that are not passed on."""
 
     def __init__(
         self,
@@ -74,8 +73,135 @@ class Stateful(Transform, Lazy):
         super().__init__(
             *([unravel_key(key) for key in keys] for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv))
         )
+        self._rows: torch.Size | None = None
         self._seed: int | None = seed
         self._world_seeds: Tensor | None = None
+
+    # Pure, for subclasses.
+
+    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        """Forget the rows of the mask [M], which begin with these entries of a reset."""
+        return memory, {}
+
+    def act(self, memory: Memory, entries: Entries) -> Change:
+        """What the environment is told, of what the policy chose."""
+        return memory, {}
+
+    def see(self, memory: Memory, entries: Entries) -> Change:
+        """What is shown, of what the environment shows after a step."""
+        return memory, {}
+
+    # Once, for subclasses.
+
+    def allocate(self, tensordict: TensorDictBase) -> Memory:
+        """The memory before the first reset, whose entries are given."""
+        return {}
+
+    def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
+        """The shape of the rows, at the first reset."""
+        return row_shape(tensordict, self.row_key)
+
+    @property
+    def row_key(self) -> NestedKey:
+        """An entry whose place says what a row is."""
+        return self.in_keys[0]
+
+    @property
+    def order(self) -> Order:
+        """What this transform does with which keys."""
+        return Order()
+
+    # TorchRL's hooks.
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        mask = None
+        if self.begun:
+            mask = flag_rows(tensordict, "_reset", self.row_key, self.rows)
+        else:
+            self._rows = self.find_rows(tensordict_reset)
+            self.remember(self.allocate(tensordict_reset))
+        if mask is None:
+            device = tensordict_reset.device or torch.get_default_device()
+            mask = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
+        change = self.begin(self.memory, taken(tensordict_reset, self.see_keys), mask)
+        return self._write(tensordict_reset, change)  # TorchRL keeps what the other worlds showed
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.act_keys:
+            return tensordict
+        self.check()
+        return self._write(tensordict, self.act(self.memory, taken(tensordict, self.act_keys)))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.check()
+        return self._write(next_tensordict, self.see(self.memory, taken(next_tensordict, self.see_keys)))
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._reset(tensordict, tensordict_reset)
+
+    def _write(self, tensordict: TensorDictBase, change: Change) -> TensorDictBase:
+        memory, entries = change
+        self.remember(memory)
+        for key, value in entries.items():
+            tensordict.set(key, value)
+        for key in self.drop:
+            tensordict.pop(key, None)
+        return tensordict
+
+    # The memory.
+
+    @property
+    def begun(self) -> bool:
+        """Is there a memory yet."""
+        return self._rows is not None
+
+    @property
+    def rows(self) -> torch.Size:
+        """The shape of the rows, M in all."""
+        assert self._rows is not None
+        return self._rows
+
+    @property
+    def memory(self) -> Memory:
+        """Everything that changes."""
+        return {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
+
+    def remember(self, memory: Memory) -> None:
+        """Put what has changed in the place of what was."""
+        self._buffers.update(memory)
+
+    def forget(self) -> None:
+        """Begin anew: the next reset is the first."""
+        self._rows = None
+        self._buffers.clear()
+
+    def get_extra_state(self) -> Tensor | None:
+        """The shape of the rows, for ``state_dict``."""
+        return None if self._rows is None else torch.tensor(self._rows, dtype=torch.long)
+
+    def set_extra_state(self, state: Tensor | None) -> None:
+        """From ``state_dict``."""
+        self._rows = None if state is None else torch.Size(state.tolist())
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        inner = {
+            name.removeprefix(prefix): value for name, value in state_dict.items() if name.startswith(prefix)
+        }
+        saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
+        devices = {name: buffer.device for name, buffer in self.memory.items()}
+        self._buffers.clear()
+        self.remember({k: v.detach().clone().to(devices.get(k, v.device)) for k, v in saved.items()})
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def clone(self) -> "Stateful":
+        """The same transform, with a memory of its own that is still empty."""
+        copied = super().clone()
+        copied.forget()
+        return copied
 
     # Seeds.
 
@@ -89,7 +215,7 @@ class Stateful(Transform, Lazy):
         self._seed, self._world_seeds = None, seeds
         self.forget()
 
-    def _streams(self, batch: torch.Size, rows: torch.Size, device: torch.device) -> Tensor:
+    def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
         """A random stream for each row, [M]."""
         n_worlds = batch.numel()
         if self._world_seeds is not None:
@@ -98,15 +224,10 @@ class Stateful(Transform, Lazy):
             worlds = draws.world_seeds(self._seed, n_worlds, device)
         else:
             worlds = torch.randint(2**32, (n_worlds,)).to(device)
-        each = torch.arange(rows.numel() // n_worlds, device=device)
+        each = torch.arange(self.rows.numel() // n_worlds, device=device)
         return draws.bits(worlds.view(-1, 1), each).flatten()
 
-    # The order of a chain.
-
-    @property
-    def order(self) -> Order:
-        """What this transform does with which keys."""
-        return Order()
+    # Where it may stand.
 
     def set_container(self, container: Any) -> None:
         super().set_container(container)
@@ -115,19 +236,18 @@ class Stateful(Transform, Lazy):
             above = container.__dict__.get("_container")
             container = above() if above is not None else None
 
-    def clone(self) -> "Stateful":
-        """The same transform, with a memory of its own that is still empty."""
-        copied = super().clone()
-        for name, module in list(copied._modules.items()):
-            if isinstance(module, Lazy):
-                twin = module.__class__.__new__(module.__class__)
-                twin.__dict__.update(module.__dict__)
-                twin._buffers = dict(module._buffers)
-                copied._modules[name] = twin
-        copied.forget()
-        return copied
+    @property
+    def env(self) -> EnvBase:
+        """The environment with the transforms in front of this one."""
+        parent = self.parent
+        if parent is None:
+            self._refuse()
+        return parent
 
-    # Outside an environment there are no steps.
+    def check(self) -> None:
+        """Refuse to work without an environment that has been reset."""
+        if self.container is None or not self.begun:
+            self._refuse()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._refuse()
@@ -141,11 +261,6 @@ class Stateful(Transform, Lazy):
             f"{name} remembers earlier steps, so it works only on an environment that is reset and "
             f"stepped: TransformedEnv(env, {name}(...))"
         )
-
-    def _reset_on_native_autoreset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self._reset(tensordict, tensordict_reset)
 
 
 def check_order(chain: Sequence[Transform]) -> None:
@@ -185,23 +300,41 @@ def row_shape(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
     return inner.batch_size
 
 
-def as_rows(value: Tensor, shape: torch.Size) -> Tensor:
-    """An entry [*shape, ...] as [M, ...], without its gradient."""
-    return value.detach().reshape(shape.numel(), *value.shape[len(shape) :])
+def as_rows(value: Tensor, rows: torch.Size) -> Tensor:
+    """An entry [*rows, ...] as [M, ...]."""
+    return value.reshape(rows.numel(), *value.shape[len(rows) :])
 
 
-def flag_rows(tensordict: TensorDictBase, name: str, key: NestedKey, shape: torch.Size) -> Tensor | None:
+def from_rows(value: Tensor, rows: torch.Size) -> Tensor:
+    """Back again: [M, ...] as [*rows, ...]."""
+    return value.view(*rows, *value.shape[1:])
+
+
+def taken(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
+    """Those of the entries that are there, without their gradients."""
+    found = {key: tensordict.get(key, None) for key in keys}
+    return {key: value.detach() for key, value in found.items() if value is not None}
+
+
+def flag_rows(
+    tensordict: TensorDictBase | Mapping[NestedKey, Tensor], name: str, key: NestedKey, rows: torch.Size
+) -> Tensor | None:
     """The flag ``name`` (such as ``_reset`` or ``done``) that governs an entry, for each of its rows [M].
 
     The one nearest to the entry counts, from its own TensorDict outwards; None if there is none.
     """
-    path = key[:-1] if isinstance(key, tuple) else ()
-    for depth in range(len(path), -1, -1):
-        flag = tensordict.get((*path[:depth], name), None)
+    for flag_key in flag_keys(name, key):
+        flag = tensordict.get(flag_key, None)
         if flag is not None:
             flag = flag.any(-1)
-            return flag.view(*flag.shape, *[1] * (len(shape) - flag.dim())).expand(shape).reshape(-1)
+            return flag.view(*flag.shape, *[1] * (len(rows) - flag.dim())).expand(rows).reshape(-1)
     return None
+
+
+def flag_keys(name: str, key: NestedKey) -> list[NestedKey]:
+    """Where a flag may stand that governs an entry, the nearest place first."""
+    path = key[:-1] if isinstance(key, tuple) else ()
+    return [(*path[:depth], name) for depth in range(len(path), 0, -1)] + [name]
 
 
 def beside(key: NestedKey, name: NestedKey | None) -> NestedKey | None:

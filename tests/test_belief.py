@@ -1,0 +1,150 @@
+"""The belief recipe as a person runs it: what its table and figure say, and what it refuses."""
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from belief import main
+from launch import launch
+from matplotlib.image import imread
+from omegaconf import OmegaConf
+
+UNDELAYED = ["delay.obs=0", "delay.loss=0"]
+FLYING = ["motion=polynomial", "motion.max_speed=20"]
+BADLY = ["delay=none", "delay.obs={law: uniform, low: 0, high: 5}", "delay.loss=0.3"]
+"""Messages that overtake each other or are lost: every case in a short flight."""
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Run the recipe with overrides in an empty folder; returns its run folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_recipe(*overrides: str, folder: str = "run") -> Path:
+        monkeypatch.setattr(sys, "argv", ["belief.py", *overrides, f"hydra.run.dir={folder}"])
+        launch(main)
+        return tmp_path / folder
+
+    return run_recipe
+
+
+def table(folder: Path) -> dict[str, np.ndarray]:
+    """Columns of the table by name, [T + 1, N] each; positions [T + 1, N, 2]."""
+    with (folder / "belief.csv").open(newline="") as file:
+        rows = [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
+    n_agents = OmegaConf.load(folder / "config.yaml").agents
+    columns = {name: np.array([row[name] for row in rows]).reshape(-1, n_agents) for name in rows[0]}
+    for kind in ("true", "believed"):
+        columns[kind] = np.stack([columns[f"{kind}_east_m"], columns[f"{kind}_north_m"]], -1)
+    return columns
+
+
+def told(capsys) -> list[str]:
+    """What the recipe has printed, line by line."""
+    return capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize(
+    "overrides", [[], ["delay=none", "agents=1"], [*BADLY, "scenario=tracking", "agents=8"]]
+)
+def test_a_run_folder_holds_configuration_table_and_figure(run, capsys, overrides):
+    folder = run(*overrides, "episode.max_steps=10")
+    assert {path.name for path in folder.iterdir()} == {"config.yaml", "belief.csv", "belief.png"}
+    assert [line.split(":")[0] for line in told(capsys)] == ["mean age", "late messages", "lost messages"]
+    picture = imread(folder / "belief.png")
+    assert picture.shape[1] == 1400
+    assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 10
+
+
+def test_the_table_has_a_row_for_every_instant_and_uav(run):
+    columns = table(run("agents=2", "episode.max_steps=7", "clock.simulation=2s"))
+    assert columns["time_s"].tolist() == [[2.0 * step] * 2 for step in range(8)]
+    assert columns["uav"].tolist() == [[0, 1]] * 8
+
+
+@pytest.mark.parametrize("motion", [[], FLYING])
+@pytest.mark.parametrize("order", ["generation", "arrival"])
+def test_the_belief_is_the_truth_as_old_as_the_table_says(run, motion, order):
+    columns = table(run(*BADLY, *motion, f"delay.order={order}"))
+    step, uav = np.indices(columns["age_s"].shape)
+    generated = step - columns["age_s"].astype(int)
+    assert columns["age_s"].max() > 3
+    assert (columns["believed"] == columns["true"][generated, uav]).all()
+
+
+@pytest.mark.parametrize("motion", [[], FLYING])
+def test_without_delay_and_loss_the_server_knows_the_latest_message(run, capsys, motion):
+    columns = table(run(*UNDELAYED, *motion))
+    talks = columns["arrived"] == 1
+    assert (columns["believed"] == columns["true"])[talks].all()
+    assert (columns["age_s"] == 0)[talks].all()
+    assert talks.all() == (motion == [])
+    assert (columns["lost"] == 0).all()
+    assert told(capsys)[1:] == ["late messages: 0.0%", "lost messages: 0.0%"]
+
+
+def test_a_constant_delay_shifts_the_truth(run, capsys):
+    columns = table(run("delay.obs=3s", "clock.simulation=0.5s", "episode.max_steps=20"))
+    age = np.minimum(columns["time_s"], 3.0)
+    assert (columns["age_s"] == age).all()
+    assert (columns["believed"][6:] == columns["true"][:-6]).all()
+    assert columns["arrived"][:, 0].tolist() == [1] + [0] * 6 + [1] * 14
+    assert told(capsys) == [f"mean age: {age.mean():.2f} s", "late messages: 100.0%", "lost messages: 0.0%"]
+
+
+def test_a_belief_grows_older_unless_a_message_arrives(run):
+    columns = table(run(*BADLY, "clock.simulation=0.1s"))
+    quiet = columns["arrived"][1:] == 0
+    assert (np.diff(columns["age_s"], axis=0)[quiet].round(9) == 0.1).all()
+    assert 0 < quiet.mean() < 1
+
+
+def test_a_lost_message_is_never_believed(run, capsys):
+    columns = table(run(*BADLY))
+    generated = (columns["time_s"] - columns["age_s"]).astype(int)
+    believed = {(step, uav) for row in generated for uav, step in enumerate(row)}
+    lost = set(zip(*map(np.ndarray.tolist, np.nonzero(columns["lost"])), strict=True))
+    assert lost
+    assert not lost & believed
+    share = len(lost) / columns["lost"][1:].size
+    assert told(capsys)[2] == f"lost messages: {share:.1%}"
+
+
+def test_nothing_arrives_where_everything_is_lost(run, capsys):
+    columns = table(run("delay.obs=0", "delay.loss=1", "episode.max_steps=10"))
+    assert columns["arrived"].tolist() == [[1] * 3] + [[0] * 3] * 10
+    assert (columns["age_s"] == columns["time_s"]).all()
+    assert told(capsys) == ["mean age: 5.00 s", "late messages: 0.0%", "lost messages: 100.0%"]
+
+
+def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
+    one, same, other = (
+        run(*BADLY, f"seed={seed}", folder=folder) for seed, folder in ((0, "one"), (0, "same"), (1, "other"))
+    )
+    assert (one / "belief.csv").read_text() == (same / "belief.csv").read_text()
+    assert (one / "belief.csv").read_text() != (other / "belief.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["delai=burst"], "delai"),
+        (["delay.los=0.1"], "delay.los: no such key; did you mean delay.loss?"),
+        (["+delay.foo=3"], "delay.foo: no such key"),
+        (["delay.obs=soon"], "delay.obs: soon? is not a time"),
+        (["delay=sometimes"], "'delay/sometimes'"),
+        (["resume=runs/last"], "resume: a flight of the random policy has nothing to go on with"),
+        (["region.id=Nope"], "Nope"),
+    ],
+)
+def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(run, capsys, tmp_path, overrides, message):
+    with pytest.raises(SystemExit) as stopped:
+        run(*overrides)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert message in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
