@@ -1,4 +1,4 @@
-"""How fast the environment is beside VMAS, how it grows, and what memory it takes.
+"""How fast the environment is beside VMAS, what delays cost, how it grows, and what memory it takes.
 
     python recipes/bench.py            (a few minutes)
     python recipes/bench.py --quick    (seconds: does it run?)
@@ -25,12 +25,17 @@ from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
 from tqdm import tqdm
 
+from damian.delayed import make_env
+from damian.delays import DelayConfig
 from damian.env import EXTRAS, UavEnv
 from damian.features import GLOBAL, LOCAL, ObservationConfig
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
-from damian.scenario import BatteryConfig, MotionConfig, ScenarioConfig
+from damian.scenario import BatteryConfig, ClockConfig, MotionConfig, ScenarioConfig
 
-RIVAL = "VMAS discovery"
+RIVAL, BARE = "VMAS discovery", "bare"
+COMPILED_TOO = (BARE, "whole chain", "every transform")
+"""What is compiled of the delays; each takes ten seconds."""
+
 Scenarios = dict[str, ScenarioConfig]
 
 
@@ -97,13 +102,7 @@ def step_times(envs: Mapping[str, EnvBase], steps: int, repeats: int) -> dict[st
 
 def comparison(presets: Scenarios, sizes: Sizes) -> str:
     """Steps of worlds per second beside VMAS, if that is installed."""
-    envs: dict[str, EnvBase] = {}
-    if importlib.util.find_spec("vmas"):
-        envs[RIVAL] = VmasEnv(
-            "discovery", num_envs=sizes.worlds, n_agents=3, device="cpu", continuous_actions=True
-        )
-    else:
-        print("VMAS is not installed, so there are no ratios: pip install -e '.[bench]'")
+    envs = rival(sizes)
     for name, scenario in presets.items():
         for shown, extras in (("bare", ()), ("all extras", EXTRAS)):
             for mode in sizes.modes:
@@ -111,14 +110,67 @@ def comparison(presets: Scenarios, sizes: Sizes) -> str:
                 envs[f"{name}, {shown}, {mode}"] = env.compile() if mode == "compiled" else env
     times = step_times(envs, sizes.steps, sizes.repeats)
     rows = [
-        (name, f"{ms:.2f}", f"{sizes.worlds / ms * 1e3:,.0f}", f"{times.get(RIVAL, 0) / ms:.1f}")
-        for name, ms in times.items()
+        (name, f"{ms:.2f}", f"{sizes.worlds / ms * 1e3:,.0f}", ratio(times, ms)) for name, ms in times.items()
     ]
     return table(
         f"{sizes.worlds} worlds, 3 UAVs; median of {sizes.repeats} rollouts of {sizes.steps} steps",
         ("environment", "ms/step", "steps of worlds/s", "times VMAS"),
-        rows if RIVAL in envs else [(*row[:-1], "-") for row in rows],
+        rows,
     )
+
+
+def rival(sizes: Sizes) -> dict[str, EnvBase]:
+    """VMAS with as many worlds, if it is installed."""
+    if not importlib.util.find_spec("vmas"):
+        print("VMAS is not installed, so there are no ratios: pip install -e '.[bench]'")
+        return {}
+    env = VmasEnv("discovery", num_envs=sizes.worlds, n_agents=3, device="cpu", continuous_actions=True)
+    return {RIVAL: env}
+
+
+def ratio(times: Mapping[str, float], ms: float) -> str:
+    """How many times as fast as VMAS."""
+    return f"{times[RIVAL] / ms:.1f}" if RIVAL in times else "-"
+
+
+def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
+    """Time of a step with each kind of delay, beside the bare environment and VMAS."""
+    envs: dict[str, EnvBase] = rival(sizes)
+    for name, scenario in presets.items():
+        for mode in sizes.modes:
+            chosen = delays() if mode == "eager" else {k: delays()[k] for k in COMPILED_TOO}
+            for what, changed in chosen.items():
+                delayed = make_env(replace(scenario, **changed), sizes.worlds)
+                env = delayed if changed else delayed.base_env  # the bare one without transforms
+                envs[f"{name}, {mode}: {what}"] = env.compile() if mode == "compiled" else env
+    times = step_times(envs, sizes.steps, sizes.repeats)
+    rows = []
+    for name, ms in times.items():
+        bare = times.get(f"{name.split(':')[0]}: {BARE}", ms)
+        rows.append((name, f"{ms:.2f}", f"{ms / bare:.2f}", ratio(times, ms)))
+    return table(
+        f"What delays cost: {sizes.worlds} worlds, 3 UAVs",
+        ("environment", "ms/step", "times bare", "times VMAS"),
+        rows,
+    )
+
+
+def delays() -> dict[str, dict[str, Any]]:
+    """What is changed in a scenario, by name; "whole chain" is the paper's delay with four past actions."""
+    paper = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
+    everything = DelayConfig(obs=paper, act=1, rew=2, history=4, loss=0.1, reward_window=3)
+    slow = ClockConfig(agents="2s", server="4s")
+    return {
+        BARE: {},
+        "ObservationDelay, ServerNode": {"delay": DelayConfig(obs=paper)},
+        "ActionDelay": {"delay": DelayConfig(act=2)},
+        "RewardDelay": {"delay": DelayConfig(rew=2)},
+        "CumulativeReward": {"delay": DelayConfig(reward_window=3)},
+        "Clock (agents, server)": {"clock": slow},
+        "ActionHistory": {"delay": DelayConfig(history=4)},
+        "whole chain": {"delay": DelayConfig(obs=paper, history=4)},
+        "every transform": {"delay": everything, "clock": slow},
+    }
 
 
 def growth_with_worlds(presets: Scenarios, sizes: Sizes) -> str:
@@ -152,9 +204,7 @@ def memory(presets: Scenarios) -> str:
             sum(x.nbytes for x in tensors(e.rand_step(e.reset()).select("next").to_dict())) // 2
             for e in (bare, env)
         ]
-        shared = {
-            x.data_ptr(): x.nbytes for x in tensors([vars(bare.simulation), bare.__dict__["_footprints"]])
-        }
+        shared = {x.data_ptr(): x.nbytes for x in tensors([vars(bare.simulation), vars(bare.server)])}
         rows.append((name, state, *shown, f"{sum(shared.values()) / 2**20:.1f} MiB"))
     return table(
         "Memory: bytes of a world with 3 UAVs",
@@ -204,6 +254,7 @@ def main() -> None:
     report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]
     for part in (
         comparison(presets, sizes),
+        cost_of_delays(presets, sizes),
         growth_with_worlds(presets, sizes),
         growth_with_uavs(presets, sizes),
         memory(presets),

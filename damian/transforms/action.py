@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from damian.delays import law_of
 from damian.transforms.mailbox import Mailbox
-from damian.transforms.stateful import Change, Entries, Memory, Order, Stateful, as_rows, beside, from_rows
+from damian.transforms.stateful import Change, Entries, Memory, Stateful, Uses, as_rows, beside, from_rows
 
 
 class Actions(NamedTuple):
@@ -135,8 +135,8 @@ class ActionDelay(OnActions):
         self.act_keys = [self.action_key, *([self.sent_key] if self.sent_key else [])]
 
     @property
-    def order(self) -> Order:
-        return Order(replaces=[self.action_key])
+    def uses(self) -> Uses:
+        return Uses(replaces=[self.action_key])
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
         initial = self.actions.initial

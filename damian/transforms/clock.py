@@ -12,8 +12,8 @@ from damian.transforms.stateful import (
     Change,
     Entries,
     Memory,
-    Order,
     Stateful,
+    Uses,
     as_rows,
     from_rows,
     taken,
@@ -54,8 +54,8 @@ class Clock(Stateful):
         self.see_keys = [*self.in_keys, *([ready_key] if ready_key else [])]
 
     @property
-    def order(self) -> Order:
-        return Order(reads=self.see_keys, holds=self.in_keys, replaces=self.in_keys_inv)
+    def uses(self) -> Uses:
+        return Uses(reads=self.see_keys, holds=self.in_keys, replaces=self.in_keys_inv)
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
         seen = taken(tensordict, self.in_keys)

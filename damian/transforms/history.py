@@ -9,7 +9,7 @@ from torchrl.data import Composite, Unbounded
 
 from damian import checks
 from damian.transforms.action import OnActions
-from damian.transforms.stateful import Change, Entries, Memory, Order, as_rows, beside, from_rows, wide
+from damian.transforms.stateful import Change, Entries, Memory, Uses, as_rows, beside, from_rows, wide
 from damian.world.airspace import rows
 
 
@@ -53,8 +53,8 @@ class ActionHistory(OnActions):
         self.see_keys = self.in_keys
 
     @property
-    def order(self) -> Order:
-        return Order(appends=self.in_keys, records=[self.action_key])
+    def uses(self) -> Uses:
+        return Uses(appends=self.in_keys, records=[self.action_key])
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
         actions = self.actions

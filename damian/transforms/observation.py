@@ -15,8 +15,8 @@ from damian.transforms.stateful import (
     Change,
     Entries,
     Memory,
-    Order,
     Stateful,
+    Uses,
     as_rows,
     beside,
     from_rows,
@@ -76,9 +76,9 @@ class ObservationDelay(Stateful):
         self.see_keys = [*self.in_keys, *([self.sent_key] if self.sent_key else [])]
 
     @property
-    def order(self) -> Order:
+    def uses(self) -> Uses:
         made = [key for key in self.out_keys if key not in self.in_keys]
-        return Order(reads=self.see_keys, holds=self.in_keys, makes=made)
+        return Uses(reads=self.see_keys, holds=self.in_keys, makes=made)
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(taken(tensordict, self.in_keys))

@@ -13,8 +13,8 @@ from damian.transforms.stateful import (
     Change,
     Entries,
     Memory,
-    Order,
     Stateful,
+    Uses,
     as_rows,
     flag_keys,
     flag_rows,
@@ -35,8 +35,8 @@ class OnRewards(Stateful):
         self.see_keys = [self.reward_key, *flag_keys("done", self.reward_key)]
 
     @property
-    def order(self) -> Order:
-        return Order(holds=[self.reward_key])
+    def uses(self) -> Uses:
+        return Uses(holds=[self.reward_key])
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         specs, key = self.env.full_reward_spec, self.reward_key

@@ -9,7 +9,7 @@ from torchrl.data import Composite
 
 from damian.features import Snapshot
 from damian.server import Server
-from damian.transforms.stateful import Change, Entries, Memory, Order, Stateful
+from damian.transforms.stateful import Change, Entries, Memory, Stateful, Uses
 
 _AGENTS = ("observation", "global_observation", "reward")
 _TASK = ("success", "done", "terminated", "truncated")
@@ -47,8 +47,8 @@ class ServerNode(Stateful):
         return "done"
 
     @property
-    def order(self) -> Order:
-        return Order(reads=self.in_keys, makes=self.out_keys)
+    def uses(self) -> Uses:
+        return Uses(reads=self.in_keys, makes=self.out_keys)
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
         messages = tensordict.get(self.in_keys[0])

@@ -22,7 +22,7 @@ Change = tuple[Memory, Entries]
 """What is remembered from now on, and the entries that are written."""
 
 
-class Order(NamedTuple):
+class Uses(NamedTuple):
     """What a transform does with keys: decides which of two must come first."""
 
     reads: Sequence[NestedKey] = ()
@@ -107,9 +107,9 @@ class Stateful(Transform):
         return self.in_keys[0]
 
     @property
-    def order(self) -> Order:
+    def uses(self) -> Uses:
         """What this transform does with which keys."""
-        return Order()
+        return Uses()
 
     # TorchRL's hooks.
 
@@ -121,7 +121,7 @@ class Stateful(Transform):
             self._rows = self.find_rows(tensordict_reset)
             self.remember(self.allocate(tensordict_reset))
         if mask is None:
-            device = tensordict_reset.device or torch.get_default_device()
+            device = next((value.device for value in self.memory.values()), None)
             mask = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
         change = self.begin(self.memory, taken(tensordict_reset, self.see_keys), mask)
         return self._write(tensordict_reset, change)  # TorchRL keeps what the other worlds showed
@@ -271,7 +271,7 @@ def check_order(chain: Sequence[Transform]) -> None:
     """
     ours = [transform for transform in chain if isinstance(transform, Stateful)]
     for early, late in itertools.combinations(ours, 2):
-        a, b = early.order, late.order
+        a, b = early.uses, late.uses
         for key in _both([*a.reads, *a.holds, *a.appends], b.makes):
             raise _wrong(late, early, f"{key} is made there and used here")
         for key in _both(a.records, b.replaces):
