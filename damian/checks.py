@@ -25,6 +25,13 @@ def in_range(key: str, value: float, low: float, high: float = math.inf, unit: s
     require(good, key, f"{value}{unit}", f"is not {bounds}{unit}")
 
 
+def whole(key: str, value: Any, low: int, high: float = math.inf, unit: str = "") -> None:
+    """Require a whole number ``low <= value <= high``."""
+    good = isinstance(value, int) and not isinstance(value, bool)
+    require(good, key, f"{value} {unit}".strip(), "is not a whole number")
+    in_range(key, value, low, high, unit)
+
+
 def above(key: str, value: float, low: float, unit: str = "") -> None:
     """Require a finite number above ``low``."""
     unit = f" {unit}" if unit else ""

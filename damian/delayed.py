@@ -26,6 +26,7 @@ from damian.transforms import (
     ServerNode,
 )
 from damian.transforms.stateful import Entries, Memory, Stateful, taken
+from damian.world import draws
 
 ACTION, REWARD, SEEN = ("agents", "action"), ("agents", "reward"), ("agents", "observation")
 
@@ -55,7 +56,7 @@ class DelayedEnv(TransformedEnv):
         """Give every world its own streams, [B] integers: alone it does what it does among others."""
         self.worlds.seed_worlds(seeds)
         for number, transform in enumerate(self._stateful()):
-            transform.seed_worlds(seeds + number + 1)
+            transform.seed_worlds(draws.bits(seeds, torch.full_like(seeds, number)))
 
     def compile(self, **options: Any) -> "DelayedEnv":
         """Compile a step of ``UavEnv`` with its delays, as one graph, in place of TorchRL's bookkeeping.

@@ -24,6 +24,8 @@ Delay = int | str
 LONGEST = 10_000
 """Steps; longer delays are refused, as every message on its way takes memory."""
 
+LOSES = "loses messages, but no reward may be lost"
+
 LOST = "lost"
 """What a trace writes for a message that never arrives."""
 
@@ -71,10 +73,13 @@ class Uniform(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.in_range(f"{key}.probability", self.probability, 0.0, 1.0)
         low, high = in_steps(f"{key}.low", self.low, dt), in_steps(f"{key}.high", self.high, dt)
-        ordered = low <= high and isinstance(self.low, str) == isinstance(self.high, str)
+        timed = isinstance(self.low, str), isinstance(self.high, str)
+        ordered = low <= high and timed[0] == timed[1]
+        if all(timed):
+            ordered = seconds(f"{key}.low", self.low) <= seconds(f"{key}.high", self.high)
         should = f"and high={self.high} are not two steps or two times in order"
         checks.require(ordered, f"{key}.low", self.low, should)
-        if isinstance(self.low, str):
+        if all(timed):
             chances = _rounded_up(
                 seconds(f"{key}.low", self.low) / dt, seconds(f"{key}.high", self.high) / dt
             )
@@ -183,7 +188,7 @@ def law_of(written: Any, key: str = "delay") -> Law:
         return Constant(_number(written))
     kind = written.get("law")
     checks.one_of(f"{key}.law", kind, LAWS)
-    values = {name: _number(value) for name, value in written.items() if name != "law"}
+    values = {k: str(v) if k == "path" else _number(v) for k, v in written.items() if k != "law"}
     known = [field.name for field in fields(LAWS[str(kind)])]
     for name, value in values.items():
         should = f"is no setting of the law {kind}, which has {', '.join(known)}"
@@ -198,7 +203,7 @@ def in_steps(key: str, delay: Delay, dt: float) -> int:
         InputError: neither steps nor a time, or too long.
     """
     if isinstance(delay, str):
-        steps = math.ceil(seconds(key, delay) / dt - 1e-9)
+        steps = math.ceil(min(seconds(key, delay) / dt, LONGEST + 1) - 1e-9)
     else:
         whole = isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
         checks.require(whole, key, delay, "is neither whole steps such as 3 nor a time such as 3s or 0.5m")
@@ -209,9 +214,10 @@ def in_steps(key: str, delay: Delay, dt: float) -> int:
 
 def seconds(key: str, delay: Delay) -> float:
     """A time with its unit [s]; ``0s`` is one."""
-    text = str(delay)
-    unit = text[-1:] in "smh"
-    return 0.0 if unit and _is_zero(text[:-1]) else checks.seconds(key, text if unit else f"{text}?")
+    number, unit = str(delay)[:-1], str(delay)[-1:]
+    should = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
+    checks.require(unit in ("s", "m", "h"), key, delay, should)
+    return 0.0 if _is_zero(number) else checks.seconds(key, str(delay))
 
 
 def _is_zero(text: str) -> bool:
@@ -223,9 +229,8 @@ def _is_zero(text: str) -> bool:
 
 def _number(written: Any) -> Any:
     """Digits as a number: Hydra and CSV files may hand over either."""
-    if isinstance(written, str) and written.strip().isdigit():
-        return int(written)
-    return written
+    text = written.strip() if isinstance(written, str) else ""
+    return int(text) if text.isdecimal() and len(text) < 10 else written
 
 
 def _certain(steps: int) -> list[float]:
@@ -265,8 +270,9 @@ class DelayConfig:
     def __post_init__(self) -> None:
         checks.in_range("delay.loss", self.loss, 0.0, 1.0)
         checks.one_of("delay.order", self.order, ORDERS)
-        checks.in_range("delay.history", self.history, 0, 1000)
-        checks.in_range("delay.reward_window", self.reward_window, 1, LONGEST)
+        checks.whole("delay.history", self.history, 0, 1000, "actions")
+        checks.whole("delay.reward_window", self.reward_window, 1, LONGEST, "steps")
+        checks.above("delay.reward_discount", self.reward_discount, 0.0)
         checks.in_range("delay.reward_discount", self.reward_discount, 0.0, 1.0)
 
     def check(self, dt: float) -> None:
@@ -275,9 +281,11 @@ class DelayConfig:
         Raises:
             InputError: names the one that does not.
         """
-        for name in ("obs", "act", "rew"):
-            key = f"delay.{name}"
-            law_of(getattr(self, name), key).sampler(dt, key=key)
+        samplers = {
+            name: law_of(getattr(self, name), f"delay.{name}").sampler(dt, key=f"delay.{name}")
+            for name in ("obs", "act", "rew")
+        }
+        checks.require(not samplers["rew"].loses, "delay.rew", show(self.rew), LOSES)
 
 
 ORDERS = ("generation", "arrival")

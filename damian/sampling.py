@@ -28,8 +28,8 @@ class Sampler(nn.Module):
         self.longest = max(map(len, states)) - 1
         arrive = torch.zeros(len(states), self.longest + 1, dtype=torch.float64)
         for row, chances in zip(arrive, states, strict=True):
-            row[: len(chances)] = torch.tensor(chances) * (1 - loss)
-        chances = torch.cat([arrive, 1 - arrive.sum(-1, keepdim=True)], -1)
+            row[: len(chances)] = torch.tensor(chances, dtype=torch.float64) * (1 - loss)
+        chances = torch.cat([arrive, (1 - arrive.sum(-1, keepdim=True)).clamp(min=0)], -1)
         self.register_buffer("chances", chances, persistent=False)
         turn = torch.tensor(turns or [[1.0]], dtype=torch.float64)
         joint = (turn.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)  # next state and delay at once
@@ -43,6 +43,11 @@ class Sampler(nn.Module):
     def lost(self) -> int:
         """The "delay" of a message that never arrives."""
         return self.longest + 1
+
+    @property
+    def loses(self) -> bool:
+        """May a message never arrive."""
+        return bool((self.chances[:, -1] > 1e-9).any())
 
     def begin(self, streams: Tensor) -> Tensor:
         """State of each channel at first, from its stream of random numbers [M]."""

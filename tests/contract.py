@@ -8,7 +8,7 @@ from helpers import square
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
 
 from damian.env import UavEnv
 from damian.transforms import (
@@ -60,6 +60,11 @@ class Drift(EnvBase):
         """Nothing is drawn."""
 
 
+def cartpole() -> EnvBase:
+    """One world, no batch."""
+    return GymEnv("CartPole-v1", categorical_action_encoding=True, max_episode_steps=4)
+
+
 def uavs() -> EnvBase:
     """Two worlds of three agents, what belongs to them under a nested key."""
     return UavEnv(square(), num_worlds=2, extras=["message"])
@@ -86,20 +91,26 @@ def _served() -> Transform:
 
 
 CASES = {
+    "ActionDelay, one world": Case(cartpole, lambda: ActionDelay(LATE)),
     "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
     "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),
+    "ActionHistory, one world": Case(cartpole, lambda: ActionHistory(2, append_to="observation")),
     "ActionHistory, worlds": Case(Drift, lambda: ActionHistory(3)),
     "ActionHistory, agents": Case(
         uavs, lambda: ActionHistory(2, ACTION, append_to=SEEN, recorded_key="ready")
     ),
+    "Clock, one world": Case(cartpole, lambda: Clock(3)),
     "Clock, worlds": Case(Drift, lambda: Clock(2, in_keys_inv=["action"])),
     "Clock, agents": Case(uavs, lambda: Clock("2s", [SEEN], [ACTION], ready_key=("agents", "ready"))),
+    "CumulativeReward, one world": Case(cartpole, lambda: CumulativeReward(3)),
     "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
     "CumulativeReward, agents": Case(uavs, lambda: CumulativeReward(3, 0.5, REWARD)),
+    "ObservationDelay, one world": Case(cartpole, lambda: ObservationDelay(LATE)),
     "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"}, fresh_key="fresh")),
     "ObservationDelay, agents": Case(
         uavs, lambda: ObservationDelay(LATE, [SEEN], loss=0.2, delay_key="delay", sent_key="talks")
     ),
+    "RewardDelay, one world": Case(cartpole, lambda: RewardDelay(LATE)),
     "RewardDelay, worlds": Case(Drift, lambda: RewardDelay({"law": "geometric"})),
     "RewardDelay, agents": Case(uavs, lambda: RewardDelay(LATE, REWARD)),
     "ServerNode": Case(unserved, _served),

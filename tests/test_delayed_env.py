@@ -9,7 +9,7 @@ import torch
 from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, random_actions, square
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, Transform
+from torchrl.envs import Compose, EnvBase, GymEnv, RewardSum, StepCounter, Transform
 from torchrl.envs.utils import check_env_specs
 
 from damian.delayed import ACTION, REWARD, SEEN, DelayedEnv, holding, make_env, serving
@@ -422,3 +422,20 @@ def test_an_action_chosen_while_not_ready_is_never_executed(act, motion, agents)
         lives.append(shown)
     assert all_same(*lives)
     assert ignored > 50
+
+
+@both_motions
+@pytest.mark.parametrize("changed", [*DELAYS.values(), {}], ids=[*DELAYS, "nothing"])
+def test_a_compiled_step_does_what_each_transform_does_by_itself(motion, changed):
+    scenario = everything(motion, **changed)
+    plain, whole = delayed(scenario), delayed(scenario).compile(backend="eager")
+    for env in (plain, whole):
+        env.append_transform(RewardSum([REWARD], [("agents", "episode_reward")]))
+        env.append_transform(StepCounter())
+    actions = choices(plain, 30)
+    assert all_same(play(plain, actions), play(whole, actions))
+
+
+def test_only_worlds_of_uavs_compile_with_their_delays():
+    with pytest.raises(TypeError, match="needs a UavEnv, not GymEnv"):
+        DelayedEnv(GymEnv("Pendulum-v1"), RewardDelay(2)).compile()

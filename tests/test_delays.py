@@ -22,6 +22,7 @@ from damian.delays import (
 from damian.errors import InputError
 from damian.sampling import Sampler
 from damian.scenario import ScenarioConfig
+from damian.transforms import RewardDelay
 from damian.world import draws
 
 STREAMS, STEPS = 1000, 100
@@ -332,12 +333,16 @@ def test_a_law_that_means_nothing_is_refused_on_one_line_that_names_its_key(name
         ({"loss": "0.1"}, "delay.loss: 0.1 is not between 0 and 1"),
         ({"order": "newest"}, "delay.order: newest is not one of generation, arrival"),
         ({"order": None}, "delay.order: None is not one of generation, arrival"),
-        ({"history": -1}, "delay.history: -1 is not between 0 and 1000"),
-        ({"history": 1001}, "delay.history: 1001 is not between 0 and 1000"),
-        ({"history": "4"}, "delay.history: 4 is not between 0 and 1000"),
-        ({"reward_window": 0}, "delay.reward_window: 0 is not between 1 and 10000"),
+        ({"history": -1}, "delay.history: -1 actions is not between 0 and 1000 actions"),
+        ({"history": 1001}, "delay.history: 1001 actions is not between 0 and 1000 actions"),
+        ({"history": "4"}, "delay.history: 4 actions is not a whole number"),
+        ({"history": 2.5}, "delay.history: 2.5 actions is not a whole number"),
+        ({"history": True}, "delay.history: True actions is not a whole number"),
+        ({"reward_window": 2.5}, "delay.reward_window: 2.5 steps is not a whole number"),
+        ({"reward_discount": 0}, "delay.reward_discount: 0 is not above 0"),
+        ({"reward_window": 0}, "delay.reward_window: 0 steps is not between 1 and 10000 steps"),
         ({"reward_discount": 1.1}, "delay.reward_discount: 1.1 is not between 0 and 1"),
-        ({"reward_discount": math.nan}, "delay.reward_discount: nan is not between 0 and 1"),
+        ({"reward_discount": math.nan}, "delay.reward_discount: nan is not above 0"),
     ],
     ids=str,
 )
@@ -390,3 +395,32 @@ def test_a_loss_of_a_law_lies_between_0_and_1():
     for loss in (-0.1, 2, math.nan):
         with pytest.raises(InputError, match=r"loss: .* is not between 0 and 1"):
             Constant(1).sampler(loss=loss)
+
+
+@pytest.mark.parametrize("longest", [24, 29, 31, 41, 50])
+def test_a_law_without_losses_loses_nothing_by_rounding(longest):
+    sampler = Uniform(0, longest).sampler()
+    assert not sampler.loses
+    RewardDelay(Uniform(0, longest))
+
+
+@pytest.mark.parametrize(
+    ("written", "error"),
+    [
+        ("\u00b2", "delay.obs: \u00b2 is neither whole steps"),
+        ("9" * 5000, "is neither whole steps"),
+        ({"law": "trace", "path": "5"}, "5: no such file"),
+        ("1e308s", "is more than 10000 steps"),
+        ({"law": "uniform", "low": "2.9s", "high": "2.1s"}, "are not two steps or two times in order"),
+    ],
+)
+def test_what_looks_like_a_delay_but_is_none_is_refused_in_one_line(written, error):
+    with pytest.raises(InputError) as caught:
+        DelayConfig(obs=written).check(1.0)
+    assert error in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_rewards_must_not_be_lost():
+    with pytest.raises(InputError, match="no reward may be lost"):
+        DelayConfig(rew={"law": "burst"}).check(1.0)

@@ -16,6 +16,7 @@ from contract import (
     SEEN,
     Drift,
     begun,
+    cartpole,
     flat,
     memory,
     onward,
@@ -48,8 +49,7 @@ every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 AGENTS = {name: case for name, case in CASES.items() if case.env in (uavs, unserved)}
 AT_RESET = {name: case for name, case in CASES.items() if "Reward" not in name}
 """Those whose memory begins at a reset: no reward is there before the first step."""
-VECTORED = {name: case for name, case in CASES.items() if name != "ServerNode"}
-vectored = pytest.mark.parametrize("case", VECTORED.values(), ids=VECTORED)
+BATCHED = {name: case for name, case in CASES.items() if case.env is not cartpole}
 in_agents = pytest.mark.parametrize("case", AGENTS.values(), ids=AGENTS)
 
 
@@ -86,7 +86,7 @@ def test_composed_and_appended_a_transform_does_the_same(case):
     assert all(all_same(one, shown[0]) for one in shown[1:])
 
 
-@vectored
+@every_case
 def test_around_a_vector_of_environments_it_works(case):
     env = TransformedEnv(SerialEnv(2, case.env), case.make())
     check_env_specs(env, break_when_any_done="both")
@@ -171,8 +171,7 @@ def test_outside_an_environment_it_says_what_to_do(case):
     env = case.env()
     td = env.rand_step(env.reset())
     names = f"{type(transform).__name__}.*TransformedEnv"
-    buffered = [] if transform.in_keys_inv else [in_a_buffer(transform)]
-    for use in (nn.Sequential(transform), Compose(transform), *buffered):
+    for use in (nn.Sequential(transform), Compose(transform), in_a_buffer(transform)):
         with pytest.raises(RuntimeError, match=names):
             use(td.clone())
 
@@ -367,7 +366,7 @@ def test_a_collector_gets_what_a_rollout_gives(case):
     assert same(collected, rollout)
 
 
-@every_case
+@pytest.mark.parametrize("case", BATCHED.values(), ids=BATCHED)
 def test_partial_resets_leave_the_other_worlds_alone(case):
     env, twin = case.build(), case.build()
     td, _ = begun(env, 2), begun(twin, 2)

@@ -107,7 +107,8 @@ class ActionDelay(OnActions):
         dt: length of a step [s], for laws in time.
         sent_key: flag that the policy sees: only where it is true is there a choice to be sent, [...] bool.
         fresh_key: written for the environment: is something executed for the first time (or the default),
-            [...] bool.
+            [...] bool. The environment under the transform must read it itself: a ``SerialEnv`` passes it on,
+            a ``ParallelEnv`` only what its specs name.
         seed: of the delays.
 
     A bare name for one of the last keys means one beside the action.

@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian import checks
-from damian.delays import law_of
+from damian.delays import LOSES, law_of
 from damian.transforms.mailbox import after
 from damian.transforms.stateful import (
     Change,
@@ -72,8 +72,7 @@ class RewardDelay(OnRewards):
     ) -> None:
         super().__init__(reward_key, seed)
         self.sampler = law_of(delay).sampler(dt)
-        loses = (self.sampler.chances[:, -1] > 1e-9).any().item()
-        checks.require(not loses, "delay", delay, "loses messages, but no reward may be lost")
+        checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
@@ -125,6 +124,6 @@ class CumulativeReward(OnRewards):
     def see(self, memory: Memory, entries: Entries) -> Change:
         reward = as_rows(entries[self.reward_key], self.rows)
         past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
-        weights = torch.tensor(self.weights, dtype=reward.dtype, device=reward.device)
+        weights = torch.tensor(self.weights, device=reward.device)
         total = (weights.view(-1, *[1] * reward.dim()) * past).sum(0)
-        return memory | {"past": past}, {self.reward_key: from_rows(total, self.rows)}
+        return memory | {"past": past}, {self.reward_key: from_rows(total.to(reward.dtype), self.rows)}

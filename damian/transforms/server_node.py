@@ -59,9 +59,10 @@ class ServerNode(Stateful):
 
     def see(self, memory: Memory, entries: Entries) -> Change:
         elapsed, snapshot = memory["elapsed"] + 1, Snapshot.unpack(entries[self.in_keys[0]])
-        over = entries.get("source_over", torch.zeros_like(elapsed, dtype=torch.bool)).view(-1)
-        features = self.server.features(snapshot, elapsed)
-        reward, terms, ended = self.server.judge(features, snapshot, elapsed, over)
+        steps = elapsed.view(self.rows)
+        over = entries.get("source_over", torch.zeros_like(steps, dtype=torch.bool)).view(self.rows)
+        features = self.server.features(snapshot, steps)
+        reward, terms, ended = self.server.judge(features, snapshot, steps, over)
         seen = [*self.server.observations(features), reward.unsqueeze(-1)]
         done = ended.terminated | ended.truncated
         flags = [flag.unsqueeze(-1) for flag in (ended.success, done, ended.terminated, ended.truncated)]

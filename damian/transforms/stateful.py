@@ -246,7 +246,7 @@ class Stateful(Transform):
 
     def check(self) -> None:
         """Refuse to work without an environment that has been reset."""
-        if self.container is None or not self.begun:
+        if not self.begun or self.container is None:
             self._refuse()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -307,7 +307,7 @@ def as_rows(value: Tensor, rows: torch.Size) -> Tensor:
 
 def from_rows(value: Tensor, rows: torch.Size) -> Tensor:
     """Back again: [M, ...] as [*rows, ...]."""
-    return value.view(*rows, *value.shape[1:])
+    return value.view((*rows, *value.shape[1:]))
 
 
 def taken(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
@@ -327,7 +327,7 @@ def flag_rows(
         flag = tensordict.get(flag_key, None)
         if flag is not None:
             flag = flag.any(-1)
-            return flag.view(*flag.shape, *[1] * (len(rows) - flag.dim())).expand(rows).reshape(-1)
+            return flag.view((*flag.shape, *[1] * (len(rows) - flag.dim()))).expand(rows).reshape(-1)
     return None
 
 
