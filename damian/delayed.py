@@ -1,21 +1,19 @@
 """A scenario's environment with its delays, losses and clocks: the one place that knows their order."""
 
 import math
-from collections.abc import Callable, Collection, Iterator
-from typing import Any, cast
+from collections.abc import Collection
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, Transform, TransformedEnv
+from torchrl.envs import Compose, Transform
 
 from damian.actions import ActionConfig
-from damian.compiling import compiled
+from damian.chain import ACTION, DelayedEnv
 from damian.delays import law_of
-from damian.env import Shown, UavEnv
+from damian.env import UavEnv
 from damian.scenario import ScenarioConfig
 from damian.server import Server
-from damian.state import Rows
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
@@ -25,126 +23,8 @@ from damian.transforms import (
     RewardDelay,
     ServerNode,
 )
-from damian.transforms.stateful import Entries, Memory, Stateful, taken
-from damian.world import draws
 
-ACTION, REWARD, SEEN = ("agents", "action"), ("agents", "reward"), ("agents", "observation")
-
-
-class DelayedEnv(TransformedEnv):
-    """A ``TransformedEnv`` whose seed reaches its transforms, and whose step compiles as a whole."""
-
-    _compiled: Callable[..., Any] | None = None
-
-    @property
-    def worlds(self) -> UavEnv:
-        """The environment under the transforms.
-
-        Raises:
-            TypeError: it is another one, which has no worlds to seed or to compile.
-        """
-        if not isinstance(self.base_env, UavEnv):
-            raise TypeError(f"this needs a UavEnv, not {type(self.base_env).__name__}")
-        return self.base_env
-
-    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        for number, transform in enumerate(self._stateful()):
-            transform.set_seed(None if seed is None else seed + 7919 * (number + 1))
-        return super().set_seed(seed, static_seed)
-
-    def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world its own streams, [B] integers: alone it does what it does among others."""
-        self.worlds.seed_worlds(seeds)
-        for number, transform in enumerate(self._stateful()):
-            transform.seed_worlds(draws.bits(seeds, torch.full_like(seeds, number)))
-
-    def compile(self, **options: Any) -> "DelayedEnv":
-        """Compile a step of ``UavEnv`` with its delays, as one graph, in place of TorchRL's bookkeeping.
-
-        Args:
-            options: for ``torch.compile``, in place of what suits a CPU.
-        """
-        _ = self.worlds  # refuses another environment
-        object.__setattr__(self, "_compiled", compiled(self._whole_step, **options))
-        return self
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._compiled is None or "_step" in tensordict or "next" in tensordict:
-            return super()._step(tensordict)
-        chain, later = self._split()
-        if later:
-            tensordict = tensordict.clone(False)
-            for transform in reversed(later):
-                tensordict = transform._inv_call(tensordict)
-        shown = self._step_at_once(chain, tensordict)
-        for transform in later:
-            shown = transform._step(tensordict, shown)
-        return shown
-
-    @torch.no_grad()
-    def _step_at_once(self, chain: list[Stateful], tensordict: TensorDictBase) -> TensorDictBase:
-        env, entries = self.worlds, taken(tensordict, [ACTION])
-        memories: list[Memory] = []
-        for transform in chain:
-            transform.check()
-            entries |= taken(tensordict, transform.act_keys)
-            memories.append(transform.memory)
-        assert self._compiled is not None
-        env.worlds, memories, shown = self._compiled(env.worlds, memories, entries)
-        for transform, memory in zip(chain, memories, strict=True):
-            transform.remember(memory)
-        return env.tensordict(shown)
-
-    def _whole_step(
-        self, worlds: Rows, memories: list[Memory], entries: Entries
-    ) -> tuple[Rows, list[Memory], Shown]:
-        """A step of the worlds and of every transform in front of TorchRL's own; pure, as they are."""
-        (chain, _), memories = self._split(), list(memories)
-        for i, transform in reversed(list(enumerate(chain))):
-            memories[i], changed = transform.act(memories[i], entries)
-            entries = entries | changed
-        worlds, shown = self.worlds.play(worlds, entries[ACTION], entries.get(("agents", "acts")))
-        entries = flat(shown)
-        for i, transform in enumerate(chain):
-            memories[i], changed = transform.see(memories[i], entries)
-            entries = entries | changed
-            entries = {key: value for key, value in entries.items() if key not in transform.drop}
-        return worlds, memories, nested(entries)
-
-    def _split(self) -> tuple[list[Stateful], list[Transform]]:
-        """The transforms in front that are ours, and all that come later."""
-        transform = self.transform
-        transforms: list[Any] = [*transform] if isinstance(transform, Compose) else [transform]
-        n = next((i for i, t in enumerate(transforms) if not isinstance(t, Stateful)), len(transforms))
-        return transforms[:n], transforms[n:]
-
-    def _stateful(self) -> Iterator[Stateful]:
-        for module in self.transform.modules():
-            if isinstance(module, Stateful):
-                yield module
-
-
-def flat(shown: Shown) -> Entries:
-    """Nested dictionaries as entries by key."""
-    entries: Entries = {}
-    for name, value in shown.items():
-        if isinstance(value, dict):
-            entries |= {(name, *([k] if isinstance(k, str) else k)): v for k, v in flat(value).items()}
-        else:
-            entries[name] = value
-    return entries
-
-
-def nested(entries: Entries) -> Shown:
-    """Entries by key as nested dictionaries."""
-    shown: Shown = {}
-    for key, value in entries.items():
-        *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
-        level = shown
-        for step in path:
-            level = level.setdefault(step, {})
-        level[name] = value
-    return shown
+REWARD, SEEN = ("agents", "reward"), ("agents", "observation")
 
 
 def make_env(
