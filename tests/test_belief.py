@@ -112,11 +112,14 @@ def test_a_lost_message_is_never_believed(run, capsys):
     assert told(capsys)[2] == f"lost messages: {share:.1%}"
 
 
-def test_nothing_arrives_where_everything_is_lost(run, capsys):
-    columns = table(run("delay.obs=0", "delay.loss=1", "episode.max_steps=10"))
-    assert columns["arrived"].tolist() == [[1] * 3] + [[0] * 3] * 10
+@pytest.mark.parametrize("motion", [[], FLYING])
+def test_where_everything_is_lost_nothing_arrives_and_only_what_is_sent_is_lost(run, capsys, motion):
+    columns = table(run("delay.obs=0", "delay.loss=1", *motion, "episode.max_steps=60"))
+    assert columns["arrived"].tolist() == [[1] * 3] + [[0] * 3] * 60
+    assert columns["lost"].any()
+    assert columns["lost"][1:].all() == (motion == [])
     assert (columns["age_s"] == columns["time_s"]).all()
-    assert told(capsys) == ["mean age: 5.00 s", "late messages: 0.0%", "lost messages: 100.0%"]
+    assert told(capsys) == ["mean age: 30.00 s", "late messages: 0.0%", "lost messages: 100.0%"]
 
 
 def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):

@@ -1,0 +1,130 @@
+"""A replay-buffer storage that puts late messages in their place (SPEC 4, back-updating)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage
+
+from damian.features import Snapshot
+from damian.hindsight import Mail, hindsight, over_before
+from damian.server import Server
+
+Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
+"""From steps [T, B] and what was known after each, [T, B, N, F]: the entries after the step, corrected."""
+
+_STATUS = ("success", "done", "terminated", "truncated")
+
+
+class BackupdateStorage(LazyTensorStorage):
+    """Keeps steps in order of time, [T, B], and corrects them as late messages arrive.
+
+    Whenever steps are written, the latest of them and those before to which a message may still have
+    belonged are seen again with all that has arrived by the last one: what follows from the messages (the
+    entries that ``recompute`` returns) is replaced, and so is the critic's observation at the next step of
+    the same episode. What the actor saw, did, and with which probability stays.
+
+    Two entries are added: ``valid``, [T, B, 1], false where the episode had ended already as one knows now
+    (``losses_of`` leaves such steps out), and ``cut``, true where the environment was really reset. Where it
+    was, but the task had not ended after all, the step is truncated.
+
+    The writer must be a round robin (TorchRL's default) over steps of the same B worlds.
+
+    Args:
+        max_size: steps of worlds, T times B.
+        recompute: what follows from messages (``server_view``).
+        longest: largest delay of a message [steps].
+        group: the TensorDict of the agents, with ``message``, ``received``, ``delay``, ``age`` and
+            ``global_observation``.
+        begins_key: steps of the episode so far, [T, B, 1] (``StepCounter``); 0 where it begins.
+        options: of ``LazyTensorStorage``.
+    """
+
+    def __init__(
+        self,
+        max_size: int,
+        recompute: Recompute,
+        longest: int,
+        *,
+        group: str = "agents",
+        begins_key: NestedKey = "step_count",
+        **options: Any,
+    ) -> None:
+        super().__init__(max_size, ndim=2, **options)
+        self.recompute, self.longest, self.group, self.begins_key = recompute, longest, group, begins_key
+
+    def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
+        """Write steps [T, B] at these places of the first dimension, and look back."""
+        done = data["next", "done"]
+        data = data.copy().update({"valid": torch.ones_like(done), "cut": done.clone()})
+        super().set(cursor, data, set_cursor=set_cursor)
+        self.look_back(len(data) + self.longest)
+
+    def look_back(self, n_steps: int) -> None:
+        """Correct the latest steps with all that has arrived by the last one."""
+        index = self.latest(n_steps + self.longest)  # what was sent before them may belong to them
+        corrected = self.corrected(self._storage[index])
+        rows = index[-n_steps:]
+        for key, value in corrected.items():
+            self._storage.get(key)[rows] = value[-len(rows) :]
+        self._bump_mutation_revision()
+
+    def latest(self, n_steps: int) -> Tensor:
+        """Places of the latest steps, in order of time, [min(n_steps, T)]."""
+        stored = self._len_along_dim0
+        last = int(torch.as_tensor(self._last_cursor).view(-1)[-1])
+        return torch.arange(last - min(n_steps, stored) + 1, last + 1) % stored
+
+    def corrected(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """The entries of consecutive steps [T, B] as they are known after the last of them."""
+        group, begins = self.group, steps[self.begins_key].squeeze(-1) == 0
+        after = steps["next", group]
+        mail = Mail(
+            sent=after["message"],
+            delay=after["delay"].squeeze(-1),
+            held=after["received"],
+            age=after["age"].squeeze(-1).long(),
+            begins=begins.unsqueeze(-1).expand(after.batch_size),
+        )
+        beliefs = hindsight(mail)
+        after = self.recompute(steps, beliefs)
+        cut, terminated = steps["cut"], after["next", "terminated"]
+        after["next", "truncated"] = after["next", "truncated"] | (cut & ~terminated)
+        after["next", "done"] = after["next", "done"] | cut
+        already = ~steps["valid"][0].squeeze(-1) & ~begins[0]
+        over = over_before(after["next", "done"].squeeze(-1), begins, already)
+        seen = after["next", group, "global_observation"]
+        before = torch.cat([seen[:1], seen[:-1]])
+        keep = begins.clone()
+        keep[0] = True
+        keep = keep.view(*keep.shape, *[1] * (seen.dim() - 2))
+        critic = torch.where(keep, steps[group, "global_observation"], before)
+        return {**after, (group, "global_observation"): critic, "valid": ~over.unsqueeze(-1)}
+
+
+def server_view(server: Server, terms: bool = False) -> Recompute:
+    """What the server node makes of messages, for a ``BackupdateStorage``.
+
+    Args:
+        server: of the environment.
+        terms: correct ``reward_terms`` too.
+    """
+
+    def recompute(steps: TensorDictBase, beliefs: Tensor) -> dict[NestedKey, Tensor]:
+        snapshot, elapsed = Snapshot.unpack(beliefs), steps["next", "step_count"].squeeze(-1)
+        over = steps.get(("next", "source_over"), torch.zeros_like(steps["cut"])).squeeze(-1)
+        features = server.features(snapshot, elapsed)
+        judged = server.judge(features, snapshot, elapsed, over)
+        ended = judged.status
+        flags = (ended.success, ended.terminated | ended.truncated, ended.terminated, ended.truncated)
+        entries: dict[NestedKey, Tensor] = {
+            ("next", "agents", "global_observation"): server.observations(features)[1],
+            ("next", "agents", "reward"): judged.reward.unsqueeze(-1),
+        }
+        if terms:
+            entries |= {("next", "agents", "reward_terms", k): v for k, v in judged.terms.items()}
+        return entries | {("next", k): v.unsqueeze(-1) for k, v in zip(_STATUS, flags, strict=True)}
+
+    return recompute
