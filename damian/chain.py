@@ -1,10 +1,10 @@
 """An environment with a chain of transforms that is seeded as one, and steps as one compiled graph."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform, TransformedEnv
 
@@ -20,7 +20,8 @@ ACTION = ("agents", "action")
 class DelayedEnv(TransformedEnv):
     """A ``TransformedEnv`` whose seed reaches its transforms, and whose step compiles as a whole."""
 
-    _compiled: Callable[..., Any] | None = None
+    _compiled: tuple[Callable[..., Any], Callable[..., Any]] | None = None
+    """A step and a reset."""
 
     @property
     def worlds(self) -> UavEnv:
@@ -51,7 +52,8 @@ class DelayedEnv(TransformedEnv):
             options: for ``torch.compile``, in place of what suits a CPU.
         """
         _ = self.worlds  # refuses another environment
-        object.__setattr__(self, "_compiled", compiled(self._whole_step, **options))
+        pair = (compiled(self._whole_step, **options), compiled(self._whole_reset, **options))
+        object.__setattr__(self, "_compiled", pair)
         return self
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -72,11 +74,12 @@ class DelayedEnv(TransformedEnv):
         env, entries = self.worlds, taken(tensordict, [ACTION])
         memories: list[Memory] = []
         for transform in chain:
-            transform.check()
+            if not transform.begun:
+                transform.check()  # says what is wrong
             entries |= taken(tensordict, transform.act_keys)
             memories.append(transform.memory)
         assert self._compiled is not None
-        env.worlds, memories, shown = self._compiled(env.worlds, memories, entries)
+        env.worlds, memories, shown = self._compiled[0](env.worlds, memories, entries)
         for transform, memory in zip(chain, memories, strict=True):
             transform.remember(memory)
         return env.tensordict(shown)
@@ -93,8 +96,35 @@ class DelayedEnv(TransformedEnv):
         entries = flat(shown)
         for i, transform in enumerate(chain):
             memories[i], changed = transform.see(memories[i], entries)
-            entries = entries | changed
-            entries = {key: value for key, value in entries.items() if key not in transform.drop}
+            entries = without(entries | changed, transform.drop)
+        return worlds, memories, nested(entries)
+
+    @torch.no_grad()
+    def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
+        chain, later = self._split()
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if self._compiled is None or mask is None or not all(transform.begun for transform in chain):
+            return super()._reset(tensordict, **options)
+        env, memories = self.worlds, [transform.memory for transform in chain]
+        env.worlds, memories, shown = self._compiled[1](env.worlds, memories, mask)
+        for transform, memory in zip(chain, memories, strict=True):
+            transform.remember(memory)
+        reset = env.tensordict(shown)
+        for transform in later:
+            reset = transform._reset(tensordict, reset)
+        return reset
+
+    def _whole_reset(
+        self, worlds: Rows, memories: list[Memory], mask: Tensor
+    ) -> tuple[Rows, list[Memory], Shown]:
+        """A reset of some worlds, [B, 1], and of what every transform remembers of them; pure."""
+        (chain, _), memories = self._split(), list(memories)
+        worlds, shown = self.worlds.begin(worlds, mask.view(-1))
+        entries = flat(shown)
+        for i, transform in enumerate(chain):
+            rows = mask.expand(-1, transform.rows.numel() // len(mask)).reshape(-1)
+            memories[i], changed = transform.begin(memories[i], entries, rows)
+            entries = without(entries | changed, transform.drop)
         return worlds, memories, nested(entries)
 
     def _split(self) -> tuple[list[Stateful], list[Transform]]:
@@ -108,6 +138,11 @@ class DelayedEnv(TransformedEnv):
         for module in self.transform.modules():
             if isinstance(module, Stateful):
                 yield module
+
+
+def without(entries: Entries, keys: Sequence[NestedKey]) -> Entries:
+    """All other entries."""
+    return {key: value for key, value in entries.items() if key not in keys}
 
 
 def flat(shown: Shown) -> Entries:

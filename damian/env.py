@@ -84,6 +84,7 @@ class UavEnv(EnvBase):
         self._make_specs()
         self.set_seed(seed)
         self._advance = self._advance_some = self.play
+        self._restart = self._begin_few
         self.to(torch.device(device))
 
     def compile(self, **options: Any) -> "UavEnv":
@@ -95,6 +96,7 @@ class UavEnv(EnvBase):
         # Two graphs, as whether there are flags is not checked by what is kept of the guards.
         self._advance = compiled(self.play, **options)
         self._advance_some = compiled(self.play, **options)
+        self._restart = compiled(self.begin, **options)
         return self
 
     def to(self, device: DEVICE_TYPING) -> "UavEnv":
@@ -149,12 +151,25 @@ class UavEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        self.worlds = self.simulation.reset(self.worlds, mask.view(-1))
-        situation = self.worlds.integers[:, SITUATION]
-        shown = _map(lambda table: table.index_select(0, situation), self._first)
+        self.worlds, shown = self._restart(self.worlds, mask.view(-1))
         return self.tensordict(shown)  # TorchRL keeps what the other worlds showed
 
-    # Pure functions of the state; ``play`` compiles.
+    # Pure functions of the state; ``play`` and ``begin`` compile.
+
+    def begin(self, worlds: Rows, mask: Tensor) -> tuple[Rows, Shown]:
+        """New episodes in the worlds of the mask [B], and the first that each of all worlds would show."""
+        fresh = self.simulation.next_episode(worlds)
+        worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
+        return worlds, self._beginning(worlds)
+
+    def _begin_few(self, worlds: Rows, mask: Tensor) -> tuple[Rows, Shown]:
+        """The same, at less cost if it is not compiled."""
+        worlds = self.simulation.reset(worlds, mask)
+        return worlds, self._beginning(worlds)
+
+    def _beginning(self, worlds: Rows) -> Shown:
+        situation = worlds.integers[:, SITUATION]
+        return _map(lambda table: table.index_select(0, situation), self._first)
 
     def play(self, worlds: Rows, action: Tensor, acts: Tensor | None = None) -> tuple[Rows, Shown]:
         """One step: physics, then what the server makes of the messages."""

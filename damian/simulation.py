@@ -77,13 +77,16 @@ class Simulation:
     def reset(self, worlds: Rows, mask: Tensor) -> Rows:
         """Begin a new episode in the worlds of the mask [B]; the others stay as they are."""
         chosen = mask.nonzero().squeeze(-1)  # mostly few
-        seed = worlds.integers[chosen, SEED]
-        episode = worlds.integers[chosen, EPISODE] + 1
+        fresh = self.next_episode(tree_map(lambda rows: rows.index_select(0, chosen), worlds))
+        return tree_map(lambda old, new: old.index_copy(0, chosen, new), worlds, fresh)
+
+    def next_episode(self, worlds: Rows) -> Rows:
+        """A new episode in each of these worlds."""
+        seed, episode = worlds.integers[:, SEED], worlds.integers[:, EPISODE] + 1
         situation = draws.bits(seed, episode) % self.n_situations
         fresh = tree_map(lambda table: table.index_select(0, situation), self.beginnings)
-        fresh.integers[:, SEED] = seed
-        fresh.integers[:, EPISODE] = episode
-        return tree_map(lambda old, new: old.index_copy(0, chosen, new), worlds, fresh)
+        kept = torch.stack([seed, episode], 1)  # the first two columns
+        return fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
 
     def step(self, state: State, action: Tensor, acts: Tensor | None = None) -> State:
         """One simulation step of ``dt``; actions of UAVs that are not ready change nothing.
