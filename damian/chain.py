@@ -6,7 +6,7 @@ from typing import Any, cast
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from damian.compiling import compiled
 from damian.env import Shown, UavEnv
@@ -18,10 +18,18 @@ ACTION = ("agents", "action")
 
 
 class DelayedEnv(TransformedEnv):
-    """A ``TransformedEnv`` whose seed reaches its transforms, and whose step compiles as a whole."""
+    """A ``TransformedEnv`` whose seed reaches its transforms, and that steps a ``UavEnv`` as a whole.
 
-    _compiled: tuple[Callable[..., Any], Callable[..., Any]] | None = None
-    """A step and a reset."""
+    It does what TorchRL does transform by transform, without building a TensorDict in between, and so that it
+    compiles into one graph.
+    """
+
+    _step_and_reset: tuple[Callable[..., Any], Callable[..., Any]] | None = None
+
+    def __init__(self, env: EnvBase, transform: Transform | None = None, **options: Any) -> None:
+        super().__init__(env, transform, **options)
+        if isinstance(self.base_env, UavEnv):
+            self._set_functions(self._whole_step, self._whole_reset)
 
     @property
     def worlds(self) -> UavEnv:
@@ -52,12 +60,15 @@ class DelayedEnv(TransformedEnv):
             options: for ``torch.compile``, in place of what suits a CPU.
         """
         _ = self.worlds  # refuses another environment
-        pair = (compiled(self._whole_step, **options), compiled(self._whole_reset, **options))
-        object.__setattr__(self, "_compiled", pair)
+        functions = (compiled(f, **options) for f in (self._whole_step, self._whole_reset))
+        self._set_functions(*functions)
         return self
 
+    def _set_functions(self, step: Callable[..., Any], reset: Callable[..., Any]) -> None:
+        object.__setattr__(self, "_step_and_reset", (step, reset))  # TorchRL's own is for specs
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._compiled is None or "_step" in tensordict or "next" in tensordict:
+        if self._step_and_reset is None or "_step" in tensordict or "next" in tensordict:
             return super()._step(tensordict)
         chain, later = self._split()
         if later:
@@ -78,8 +89,8 @@ class DelayedEnv(TransformedEnv):
                 transform.check()  # says what is wrong
             entries |= taken(tensordict, transform.act_keys)
             memories.append(transform.memory)
-        assert self._compiled is not None
-        env.worlds, memories, shown = self._compiled[0](env.worlds, memories, entries)
+        assert self._step_and_reset is not None
+        env.worlds, memories, shown = self._step_and_reset[0](env.worlds, memories, entries)
         for transform, memory in zip(chain, memories, strict=True):
             transform.remember(memory)
         return env.tensordict(shown)
@@ -103,10 +114,10 @@ class DelayedEnv(TransformedEnv):
     def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
         chain, later = self._split()
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if self._compiled is None or mask is None or not all(transform.begun for transform in chain):
+        if self._step_and_reset is None or mask is None or not all(transform.begun for transform in chain):
             return super()._reset(tensordict, **options)
         env, memories = self.worlds, [transform.memory for transform in chain]
-        env.worlds, memories, shown = self._compiled[1](env.worlds, memories, mask)
+        env.worlds, memories, shown = self._step_and_reset[1](env.worlds, memories, mask)
         for transform, memory in zip(chain, memories, strict=True):
             transform.remember(memory)
         reset = env.tensordict(shown)

@@ -50,14 +50,16 @@ def make_env(
     late = messages_are_late(scenario)
     shown = {*extras, "message"} if late else extras
     env = UavEnv(scenario, num_worlds, seed, device, shown, serves=not late)
-    transforms = [*deciding(scenario), *(serving(scenario, env.server, extras) if late else [])]
-    transforms += [*paying(scenario), *seeing(scenario)]
-    delayed = DelayedEnv(env, Compose(*transforms))  # type: ignore[arg-type]
+    delayed = DelayedEnv(env, chain(scenario, env.server, extras))
     delayed.set_seed(seed)
     return delayed
 
 
-# The parts of the chain, in its order. What the policy chooses passes it backwards.
+def chain(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> Compose:
+    """The transforms of a scenario in their order; what the policy chooses passes them backwards."""
+    served = serving(scenario, server, extras) if messages_are_late(scenario) else []
+    parts = [*deciding(scenario), *served, *paying(scenario), *seeing(scenario)]
+    return Compose(*parts)  # type: ignore[arg-type]
 
 
 def deciding(scenario: ScenarioConfig) -> list[Transform]:

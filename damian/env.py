@@ -81,10 +81,11 @@ class UavEnv(EnvBase):
         first = self.simulation.initial
         features = self.server.features(first.sent, first.steps)
         self._first = _merged(self._show(first, features), self._nothing_yet(first))
+        self._blank = self._empty()
         self._make_specs()
         self.set_seed(seed)
         self._advance = self._advance_some = self.play
-        self._restart = self._begin_few
+        self._restart = self.begin
         self.to(torch.device(device))
 
     def compile(self, **options: Any) -> "UavEnv":
@@ -106,7 +107,9 @@ class UavEnv(EnvBase):
             return self
         super().to(device)
         self.simulation.to(device)
-        self._first = _map(lambda table: table.to(device), self._first)
+        self._first, self._blank = (
+            _map(lambda table: table.to(device), shown) for shown in (self._first, self._blank)
+        )
         self.worlds = tree_map(lambda t: t.to(device), self.worlds)
         self.server.to(device)
         return self
@@ -157,26 +160,21 @@ class UavEnv(EnvBase):
     # Pure functions of the state; ``play`` and ``begin`` compile.
 
     def begin(self, worlds: Rows, mask: Tensor) -> tuple[Rows, Shown]:
-        """New episodes in the worlds of the mask [B], and the first that each of all worlds would show."""
-        fresh = self.simulation.next_episode(worlds)
-        worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
-        return worlds, self._beginning(worlds)
-
-    def _begin_few(self, worlds: Rows, mask: Tensor) -> tuple[Rows, Shown]:
-        """The same, at less cost if it is not compiled."""
-        worlds = self.simulation.reset(worlds, mask)
-        return worlds, self._beginning(worlds)
-
-    def _beginning(self, worlds: Rows) -> Shown:
+        """New episodes in the worlds of the mask [B], and what each world begins with."""
+        if torch.compiler.is_compiling():  # no shapes that depend on data
+            fresh = self.simulation.next_episode(worlds)
+            worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
+        else:
+            worlds = self.simulation.reset(worlds, mask)
         situation = worlds.integers[:, SITUATION]
-        return _map(lambda table: table.index_select(0, situation), self._first)
+        return worlds, _map(lambda table: table.index_select(0, situation), self._first)
 
     def play(self, worlds: Rows, action: Tensor, acts: Tensor | None = None) -> tuple[Rows, Shown]:
         """One step: physics, then what the server makes of the messages."""
         state = self.simulation.step(self.simulation.layout.unpack(worlds), action, acts)
         packed = self.simulation.layout.pack(state)
         if not self.serves:
-            return packed, _merged(self._show(state), self._blank(state))
+            return packed, _merged(self._show(state), self._blank)
         features = self.server.features(state.sent, state.steps)
         shown = self._show(state, features)
         total, terms, ended = self.server.judge(features, state.sent, state.steps, state.source_over)
@@ -187,14 +185,6 @@ class UavEnv(EnvBase):
         ends = {"success": ended.success, "done": done}
         ends |= {"terminated": ended.terminated, "truncated": ended.truncated}
         return packed, shown | {key: value.unsqueeze(-1) for key, value in ends.items()}
-
-    def _blank(self, state: State) -> Shown:
-        """In place of what a ``ServerNode`` will make of the messages."""
-        agents = self._first["agents"]
-        names = ("observation", "global_observation")
-        empty = {key: agents[key].new_zeros(*state.track.shape, agents[key].shape[-1]) for key in names}
-        empty["reward"] = torch.zeros_like(state.track).unsqueeze(-1)
-        return _merged(self._nothing_yet(state), {"agents": empty})
 
     def _show(self, state: State, features: Features | None = None) -> Shown:
         """What is shown of a state, at a reset as after a step; terms and success have not come yet."""
@@ -212,6 +202,15 @@ class UavEnv(EnvBase):
             truth = [state.position.flatten(1), state.battery, state.source]
             shown["state"] = torch.cat(truth, -1)
         return shown
+
+    def _empty(self) -> Shown:
+        """In place of what a ``ServerNode`` will make of the messages."""
+        made = {key: self._first[key] for key in (*_DONE, "success")}
+        names = ("observation", "global_observation", "reward_terms")
+        agents = {key: value for key, value in self._first["agents"].items() if key in names}
+        agents["reward"] = self._first["agents"]["observation"][..., :1]
+        n_worlds = self.batch_size[0]
+        return _map(lambda x: x.new_zeros(n_worlds, *x.shape[1:]), made | {"agents": agents})
 
     def _nothing_yet(self, state: State) -> Shown:
         """Rewards, success and ends before anything has happened; the terms only if they are shown."""

@@ -33,7 +33,8 @@ class Sampler(nn.Module):
         self.register_buffer("chances", chances, persistent=False)
         turn = torch.tensor(turns or [[1.0]], dtype=torch.float64)
         joint = (turn.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)  # next state and delay at once
-        self.register_buffer("_boundaries", joint.cumsum(-1)[:, :-1].float(), persistent=False)
+        boundaries = (joint.cumsum(-1)[:, :-1] * 2**32).round().long()
+        self.register_buffer("_boundaries", boundaries, persistent=False)
         self._bad = (turn[0, 1] / (turn[0, 1] + turn[1, 0])).item() if turns else 0.0
         likely = int(chances[0].argmax())
         self.certain = likely if len(states) == 1 and chances[0, likely] == 1 else None
@@ -57,7 +58,7 @@ class Sampler(nn.Module):
         """Delays [M] of the messages sent at ``clock``, and the channels' next states [M]."""
         if self.certain is not None:
             return torch.full_like(streams, self.certain), memory
-        chance = draws.uniform(streams, clock)
+        chance = draws.bits(streams, clock)
         if len(self.chances) == 1:
             return torch.bucketize(chance, self._boundaries[0], right=True), memory
         outcome = (chance.unsqueeze(-1) >= self._boundaries[memory]).sum(-1)

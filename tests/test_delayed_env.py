@@ -9,10 +9,10 @@ import torch
 from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, random_actions, square
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, GymEnv, RewardSum, StepCounter, Transform
+from torchrl.envs import Compose, EnvBase, GymEnv, RewardSum, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from damian.delayed import ACTION, REWARD, SEEN, DelayedEnv, holding, make_env, serving
+from damian.delayed import ACTION, REWARD, SEEN, DelayedEnv, chain, holding, make_env, serving
 from damian.delays import DelayConfig, law_of
 from damian.env import EXTRAS, UavEnv
 from damian.features import Snapshot
@@ -426,14 +426,20 @@ def test_an_action_chosen_while_not_ready_is_never_executed(act, motion, agents)
 
 @both_motions
 @pytest.mark.parametrize("changed", [*DELAYS.values(), {}], ids=[*DELAYS, "nothing"])
-def test_a_compiled_step_does_what_each_transform_does_by_itself(motion, changed):
+def test_a_step_at_once_does_what_each_transform_does_by_itself(motion, changed):
     scenario = everything(motion, **changed)
-    plain, whole = delayed(scenario), delayed(scenario).compile(backend="eager")
-    for env in (plain, whole):
+    whole, graph = delayed(scenario), delayed(scenario).compile(backend="eager")
+    world = UavEnv(scenario, 4, extras=EXTRAS, serves=whole.base_env.serves)
+    plain = TransformedEnv(world, chain(scenario, world.server, EXTRAS))  # transform by transform
+    for number, transform in enumerate(plain.transform):
+        transform.set_seed(7919 * (number + 1))
+    for env in (plain, whole, graph):
         env.append_transform(RewardSum([REWARD], [("agents", "episode_reward")]))
         env.append_transform(StepCounter())
     actions = choices(plain, 30)
-    assert all_same(play(plain, actions), play(whole, actions))
+    by_itself = play(plain, actions)
+    assert all_same(by_itself, play(whole, actions))
+    assert all_same(by_itself, play(graph, actions))
 
 
 def test_only_worlds_of_uavs_compile_with_their_delays():

@@ -220,5 +220,3 @@ def test_the_message_of_a_uav_says_when_it_was_sent():
     late = flight(replace(square(), delay=DelayConfig(obs=LATE)), 12)
     sent = Snapshot.unpack(late["next", "agents", "message"])
     assert sent.time.equal(late["next", "step_count"].float().expand_as(sent.time))
-
-

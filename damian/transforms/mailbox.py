@@ -31,6 +31,7 @@ class Mailbox:
     - ``clock``: steps so far, [], and ``today``: the slot of this step, [];
     - ``streams``: random stream of each sender, [M], and ``channel``: state of its channel, [M];
     - ``began``: clock at its latest reset, [M], and ``since``: when what is held was generated, [M];
+    - ``senders``: 0, 1, ..., M - 1;
     - ``stamps``: when the message in a slot was generated, [K + 1, M]: K slots for the steps to come, and
       one for the messages that never arrive;
     - ``slots_i``: the values of the messages, [K + 1, M, ...], and ``held_i``: of those held, [M, ...].
@@ -54,6 +55,7 @@ class Mailbox:
             "channel": self.sampler.begin(streams),
             "began": zero,
             "since": zero.clone(),
+            "senders": torch.arange(len(streams), device=streams.device),
             "stamps": zero.new_full((n_slots, len(streams)), -1),
         }
         for i, value in enumerate(values):
@@ -85,7 +87,7 @@ class Mailbox:
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
         arrives = torch.where(delay < n_slots, after(today, delay, n_slots), n_slots)
-        row = arrives * n_senders + torch.arange(n_senders, device=arrives.device)
+        row = arrives * n_senders + memory["senders"]
         memory["stamps"].view(-1).index_copy_(0, row, clock.expand(n_senders))
         stamp = memory["stamps"].index_select(0, today.view(1)).squeeze(0)
         older = since if self._newest else torch.maximum(memory["began"], clock - n_slots)
