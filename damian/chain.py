@@ -6,7 +6,7 @@ from typing import Any, cast
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian.compiling import compiled
 from damian.env import Shown, UavEnv
@@ -24,12 +24,8 @@ class DelayedEnv(TransformedEnv):
     compiles into one graph.
     """
 
-    _step_and_reset: tuple[Callable[..., Any], Callable[..., Any]] | None = None
-
-    def __init__(self, env: EnvBase, transform: Transform | None = None, **options: Any) -> None:
-        super().__init__(env, transform, **options)
-        if isinstance(self.base_env, UavEnv):
-            self._set_functions(self._whole_step, self._whole_reset)
+    _compiled: tuple[Callable[..., Any], Callable[..., Any]] | None = None
+    """A step and a reset."""
 
     @property
     def worlds(self) -> UavEnv:
@@ -60,15 +56,13 @@ class DelayedEnv(TransformedEnv):
             options: for ``torch.compile``, in place of what suits a CPU.
         """
         _ = self.worlds  # refuses another environment
-        functions = (compiled(f, **options) for f in (self._whole_step, self._whole_reset))
-        self._set_functions(*functions)
+        pair = (compiled(self._whole_step, **options), compiled(self._whole_reset, **options))
+        object.__setattr__(self, "_compiled", pair)  # TorchRL's own is for specs
         return self
 
-    def _set_functions(self, step: Callable[..., Any], reset: Callable[..., Any]) -> None:
-        object.__setattr__(self, "_step_and_reset", (step, reset))  # TorchRL's own is for specs
-
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._step_and_reset is None or "_step" in tensordict or "next" in tensordict:
+        plain = "_step" in tensordict or "next" in tensordict
+        if plain or not isinstance(self.base_env, UavEnv):
             return super()._step(tensordict)
         chain, later = self._split()
         if later:
@@ -89,8 +83,8 @@ class DelayedEnv(TransformedEnv):
                 transform.check()  # says what is wrong
             entries |= taken(tensordict, transform.act_keys)
             memories.append(transform.memory)
-        assert self._step_and_reset is not None
-        env.worlds, memories, shown = self._step_and_reset[0](env.worlds, memories, entries)
+        step = self._compiled[0] if self._compiled else self._whole_step
+        env.worlds, memories, shown = step(env.worlds, memories, entries)
         for transform, memory in zip(chain, memories, strict=True):
             transform.remember(memory)
         return env.tensordict(shown)
@@ -114,16 +108,18 @@ class DelayedEnv(TransformedEnv):
     def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
         chain, later = self._split()
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if self._step_and_reset is None or mask is None or not all(transform.begun for transform in chain):
+        whole = isinstance(self.base_env, UavEnv) and all(transform.begun for transform in chain)
+        if mask is None or not whole:
             return super()._reset(tensordict, **options)
         env, memories = self.worlds, [transform.memory for transform in chain]
-        env.worlds, memories, shown = self._step_and_reset[1](env.worlds, memories, mask)
+        reset = self._compiled[1] if self._compiled else self._whole_reset
+        env.worlds, memories, shown = reset(env.worlds, memories, mask)
         for transform, memory in zip(chain, memories, strict=True):
             transform.remember(memory)
-        reset = env.tensordict(shown)
+        began = env.tensordict(shown)
         for transform in later:
-            reset = transform._reset(tensordict, reset)
-        return reset
+            began = transform._reset(tensordict, began)
+        return began
 
     def _whole_reset(
         self, worlds: Rows, memories: list[Memory], mask: Tensor

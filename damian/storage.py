@@ -1,7 +1,7 @@
 """A replay-buffer storage that puts late messages in their place (SPEC 4, back-updating)."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -26,8 +26,8 @@ class BackupdateStorage(LazyTensorStorage):
     entries that ``recompute`` returns) is replaced, and so is the critic's observation at the next step of
     the same episode. What the actor saw, did, and with which probability stays.
 
-    Two entries are added: ``valid``, [T, B, 1], false where the episode had ended already as one knows now
-    (``losses_of`` leaves such steps out), and ``cut``, true where the environment was really reset. Where it
+    Two entries are added: ``valid``, [T, B, 1], false where the episode had ended already as one knows now (a
+    learner leaves such steps out), and ``cut``, true where the environment was really reset. Where it
     was, but the task had not ended after all, the step is truncated.
 
     The writer must be a round robin (TorchRL's default) over steps of the same B worlds.
@@ -55,7 +55,9 @@ class BackupdateStorage(LazyTensorStorage):
         super().__init__(max_size, ndim=2, **options)
         self.recompute, self.longest, self.group, self.begins_key = recompute, longest, group, begins_key
 
-    def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
+    def set(  # type: ignore[override]
+        self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True
+    ) -> None:
         """Write steps [T, B] at these places of the first dimension, and look back."""
         done = data["next", "done"]
         data = data.copy().update({"valid": torch.ones_like(done), "cut": done.clone()})
@@ -73,14 +75,14 @@ class BackupdateStorage(LazyTensorStorage):
 
     def latest(self, n_steps: int) -> Tensor:
         """Places of the latest steps, in order of time, [min(n_steps, T)]."""
-        stored = self._len_along_dim0
+        stored = cast(int, self._len_along_dim0)
         last = int(torch.as_tensor(self._last_cursor).view(-1)[-1])
         return torch.arange(last - min(n_steps, stored) + 1, last + 1) % stored
 
     def corrected(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
         """The entries of consecutive steps [T, B] as they are known after the last of them."""
         group, begins = self.group, steps[self.begins_key].squeeze(-1) == 0
-        after = steps["next", group]
+        after = cast(TensorDictBase, steps["next", group])
         mail = Mail(
             sent=after["message"],
             delay=after["delay"].squeeze(-1),

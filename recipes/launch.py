@@ -66,6 +66,9 @@ class TrainConfig(ScenarioConfig):
     """Episodes of each evaluation at the end."""
     checkpoint_every: int = 20
     """Updates between two checkpoints."""
+    backupdate: bool = False
+    """Put late messages in their place before learning from the steps that they belong to (SPEC 4): what the
+    critic sees, rewards and ends of episodes; what the actor saw stays."""
     resume: str | None = None
     """Run folder to go on with."""
     device: str = "cpu"
@@ -86,6 +89,12 @@ class TrainConfig(ScenarioConfig):
         if self.episodes is not None:
             checks.in_range("episodes", self.episodes, 1)
         checks.device("device", self.device)
+        checks.require(
+            not self.backupdate or self.delay.reward_window == 1,
+            "delay.reward_window",
+            self.delay.reward_window,
+            "steps do not go with backupdate=true, which corrects single rewards",
+        )
         batch = self.worlds * self.update_steps
         checks.require(
             batch % self.algo.minibatches == 0,

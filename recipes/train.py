@@ -27,7 +27,9 @@ from torchrl.envs import RewardSum, StepCounter
 from torchrl.objectives.multiagent import MAPPOLoss
 from tqdm import tqdm
 
-from damian.delayed import DelayedEnv, make_env
+from damian.chain import DelayedEnv
+from damian.delayed import make_env, messages_are_late
+from damian.delays import law_of
 from damian.losses import MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.models import make_actor, make_critic, random_policy
@@ -39,6 +41,7 @@ from damian.runs import (
     plot_learning_curve,
     results_table,
 )
+from damian.storage import BackupdateStorage, server_view
 
 
 @dataclass
@@ -57,13 +60,40 @@ class Progress:
 
 def learning_env(config: TrainConfig, worlds: int, seed: int) -> DelayedEnv:
     """The environment that policies are trained and evaluated in."""
-    env = make_env(config, worlds, seed, config.device, extras=["reward_terms"])
+    extras = ["reward_terms", "message"] if looks_back(config) else ["reward_terms"]
+    env = make_env(config, worlds, seed, config.device, extras)
     if config.compile:
         env.compile()
     episode_reward = RewardSum(in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")])
     env.append_transform(episode_reward)
     env.append_transform(StepCounter())
     return env
+
+
+def looks_back(config: TrainConfig) -> bool:
+    """Is there anything to correct, and should it be."""
+    return config.backupdate and messages_are_late(config)
+
+
+def make_memory(config: TrainConfig, env: DelayedEnv) -> TensorDictReplayBuffer | None:
+    """What keeps the latest steps until late messages have arrived; None if nothing is corrected."""
+    if not looks_back(config):
+        return None
+    longest = law_of(config.delay.obs).sampler(config.clock.dt).longest
+    view = server_view(env.worlds.server, terms=True)
+    capacity = (config.update_steps + 2 * longest) * config.worlds
+    return TensorDictReplayBuffer(storage=BackupdateStorage(capacity, view, longest, device=config.device))
+
+
+def known_now(memory: TensorDictReplayBuffer | None, batch: TensorDictBase) -> TensorDictBase:
+    """A batch [B, T] as the server knows it by now; what came after an episode's end is no decision."""
+    if memory is None:
+        return batch
+    memory.extend(batch)
+    storage = cast(BackupdateStorage, memory.storage)
+    known = storage[storage.latest(batch.shape[1])].transpose(0, 1)
+    known["agents", "ready"] = known["agents", "ready"] & known["valid"]
+    return known
 
 
 def update(
@@ -103,6 +133,7 @@ def train(config: TrainConfig, folder: Path) -> None:
         sampler=SamplerWithoutReplacement(),
         batch_size=frames // config.algo.minibatches,
     )
+    memory = make_memory(config, env)
     progress, episodes = Progress(), EpisodeLog()
     checkpoint = Checkpoint(
         actor=actor,
@@ -124,7 +155,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     with closing(log), closing(bar), Interrupt() as interrupt:
         for batch in collector if not enough(config, progress, episodes) else ():
             episodes.add(batch)
-            losses = update(batch, loss, optimizer, buffer, config.algo)
+            losses = update(known_now(memory, batch), loss, optimizer, buffer, config.algo)
             progress.frames += batch.numel()
             progress.updates += 1
             log.add(progress.frames, {**episodes.means(), **mean_terms(batch), **losses})
