@@ -260,6 +260,8 @@ def _one_line(error: BaseException) -> str:
 
 def _no_such_key(key: str) -> str:
     """The message for an unknown key, with the nearest known one."""
+    if re.match(r"delay\.(obs|act|rew)\.", key):
+        return f"{key}: no setting of the law that is there already; write another law over delay=none"
     known = [str(name) for name in _keys(OmegaConf.structured(TrainConfig))]
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.75)
     return f"{key}: no such key" + (f"; did you mean {near[0]}?" if near else "")

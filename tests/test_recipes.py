@@ -41,6 +41,11 @@ def metrics(folder: Path) -> list[dict[str, float]]:
         ["scenario=energy", "motion=polynomial", "observation.ctde=true"],
         ["scenario=mixed", "logger=csv", "agents=1"],
         ["scenario=spotting", "task=tracking", "region=usecase", "actions=continuous"],
+        ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
+        ["delay=paper", "aware=both", "motion=polynomial"],
+        ["delay=burst", "aware=backupdate", "scenario=mixed", "delay.order=arrival"],
+        ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
+        ["aware=backupdate"],
     ],
 )
 def test_a_run_folder_explains_itself(run, capsys, overrides):
@@ -68,6 +73,8 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
         (["+delay.foo=3"], "delay.foo: no such key"),
         (["delay.obs=-3"], "delay.obs: -3 is neither whole steps such as 3 nor a time such as 3s"),
         (["delay.act=3.5"], "delay.act: 3.5 is neither whole steps"),
+        (["backupdate=true", "delay.reward_window=3"], "delay.reward_window: 3 steps do not go with"),
+        (["delay=paper", "delay.obs={law: burst, enter: 0.1}"], "write another law over delay=none"),
         (["delay=papers"], "'delay/papers'"),
         (["delay=paper", "delay.obs.high=1s"], "delay.obs.low: 3s and high=1s are not two"),
         (["delay.obs={law: poisson}"], "delay.obs.law: poisson is not one of constant, uniform"),
@@ -201,6 +208,17 @@ def test_a_run_without_a_single_decision_in_a_batch_goes_on(run):
         "model.hidden=[8]",
     )
     assert len(metrics(folder)) == 15
+
+
+def test_what_came_late_changes_what_is_learnt(run):
+    slow = ["delay.obs=4", "scenario=tracking"]
+    naive, aware, undelayed = (
+        metrics(run(*TINY, *overrides, folder=name))
+        for name, overrides in (("a", slow), ("b", [*slow, "backupdate=true"]), ("c", ["scenario=tracking"]))
+    )
+    assert naive[0]["episode_return"] == pytest.approx(aware[0]["episode_return"], nan_ok=True)
+    assert naive[0]["loss_critic"] != aware[0]["loss_critic"]
+    assert naive[-1]["loss_critic"] != undelayed[-1]["loss_critic"]
 
 
 def test_a_sweep_fills_one_folder_per_run(run, tmp_path):
