@@ -135,24 +135,32 @@ def ratio(times: Mapping[str, float], ms: float) -> str:
 
 def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
     """Time of a step with each kind of delay, beside the bare environment and VMAS."""
-    envs: dict[str, EnvBase] = rival(sizes)
+    rows = []
     for name, scenario in presets.items():
         for mode in sizes.modes:
-            chosen = delays() if mode == "eager" else {k: delays()[k] for k in COMPILED_TOO}
-            for what, changed in chosen.items():
-                delayed = make_env(replace(scenario, **changed), sizes.worlds)
-                env = delayed if changed else delayed.base_env  # the bare one without transforms
-                envs[f"{name}, {mode}: {what}"] = env.compile() if mode == "compiled" else env
-    times = step_times(envs, sizes.steps, sizes.repeats)
-    rows = []
-    for name, ms in times.items():
-        bare = times.get(f"{name.split(':')[0]}: {BARE}", ms)
-        rows.append((name, f"{ms:.2f}", f"{ms / bare:.2f}", ratio(times, ms)))
+            times = step_times(rival(sizes) | delayed(scenario, mode, sizes), sizes.steps, sizes.repeats)
+            rows += [
+                (f"{name}, {mode}: {what}", f"{ms:.2f}", f"{ms / times[BARE]:.2f}", ratio(times, ms))
+                for what, ms in times.items()
+                if what != RIVAL
+            ]
     return table(
         f"What delays cost: {sizes.worlds} worlds, 3 UAVs",
         ("environment", "ms/step", "times bare", "times VMAS"),
         rows,
     )
+
+
+def delayed(scenario: ScenarioConfig, mode: str, sizes: Sizes) -> dict[str, EnvBase]:
+    """The scenario with each kind of delay, by name."""
+    envs: dict[str, EnvBase] = {}
+    for what, changed in delays().items():
+        if mode == "compiled" and what not in COMPILED_TOO:
+            continue
+        env = make_env(replace(scenario, **changed), sizes.worlds)
+        bare = env if changed else env.worlds  # without any transforms
+        envs[what] = bare.compile() if mode == "compiled" else bare
+    return envs
 
 
 def delays() -> dict[str, dict[str, Any]]:
