@@ -14,7 +14,7 @@ from damian.state import Rows
 from damian.transforms.stateful import Entries, Memory, Stateful, taken
 from damian.world import draws
 
-ACTION = ("agents", "action")
+ACTION, ACTS = ("agents", "action"), ("agents", "acts")
 
 
 class DelayedEnv(TransformedEnv):
@@ -24,8 +24,8 @@ class DelayedEnv(TransformedEnv):
     compiles into one graph.
     """
 
-    _compiled: tuple[Callable[..., Any], Callable[..., Any]] | None = None
-    """A step and a reset."""
+    _options: dict[str, Any] | None = None
+    """For ``torch.compile``; None if nothing is compiled."""
 
     @property
     def worlds(self) -> UavEnv:
@@ -39,6 +39,7 @@ class DelayedEnv(TransformedEnv):
         return self.base_env
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Seed everything that is drawn; the next reset, which must come before a step, is the first."""
         for number, transform in enumerate(self._stateful()):
             transform.set_seed(None if seed is None else seed + 7919 * (number + 1))
         return super().set_seed(seed, static_seed)
@@ -56,9 +57,23 @@ class DelayedEnv(TransformedEnv):
             options: for ``torch.compile``, in place of what suits a CPU.
         """
         _ = self.worlds  # refuses another environment
-        pair = (compiled(self._whole_step, **options), compiled(self._whole_reset, **options))
-        object.__setattr__(self, "_compiled", pair)  # TorchRL's own is for specs
+        for name, value in (("_options", options), ("_graphs", {})):
+            object.__setattr__(self, name, value)  # TorchRL's own is for specs
         return self
+
+    def _function(self, *kind: Any) -> Callable[..., Any]:
+        """The function of a name, or its graph, one for each chain and set of entries: no guard sees them."""
+        if self._options is None:
+            return getattr(self, kind[0])
+        graphs = self.__dict__["_graphs"]
+        if kind not in graphs:
+            graphs[kind] = compiled(getattr(self, kind[0]), **self._options)
+        return graphs[kind]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the graphs: a copy compiles its own."""
+        state = dict(cast(dict[str, Any], super().__getstate__()))
+        return state | ({"_graphs": {}} if "_graphs" in state else {})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         plain = "_step" in tensordict or "next" in tensordict
@@ -76,14 +91,14 @@ class DelayedEnv(TransformedEnv):
 
     @torch.no_grad()
     def _step_at_once(self, chain: list[Stateful], tensordict: TensorDictBase) -> TensorDictBase:
-        env, entries = self.worlds, taken(tensordict, [ACTION])
+        env, entries = self.worlds, taken(tensordict, [ACTION, ACTS])
         memories: list[Memory] = []
         for transform in chain:
             if not transform.begun:
                 transform.check()  # says what is wrong
             entries |= taken(tensordict, transform.act_keys)
             memories.append(transform.memory)
-        step = self._compiled[0] if self._compiled else self._whole_step
+        step = self._function("_whole_step", *chain, *entries)
         env.worlds, memories, shown = step(env.worlds, memories, entries)
         for transform, memory in zip(chain, memories, strict=True):
             transform.remember(memory)
@@ -97,7 +112,7 @@ class DelayedEnv(TransformedEnv):
         for i, transform in reversed(list(enumerate(chain))):
             memories[i], changed = transform.act(memories[i], entries)
             entries = entries | changed
-        worlds, shown = self.worlds.play(worlds, entries[ACTION], entries.get(("agents", "acts")))
+        worlds, shown = self.worlds.play(worlds, entries[ACTION], entries.get(ACTS))
         entries = flat(shown)
         for i, transform in enumerate(chain):
             memories[i], changed = transform.see(memories[i], entries)
@@ -112,7 +127,7 @@ class DelayedEnv(TransformedEnv):
         if mask is None or not whole:
             return super()._reset(tensordict, **options)
         env, memories = self.worlds, [transform.memory for transform in chain]
-        reset = self._compiled[1] if self._compiled else self._whole_reset
+        reset = self._function("_whole_reset", *chain)
         env.worlds, memories, shown = reset(env.worlds, memories, mask)
         for transform, memory in zip(chain, memories, strict=True):
             transform.remember(memory)

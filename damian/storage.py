@@ -26,14 +26,14 @@ class BackupdateStorage(LazyTensorStorage):
     entries that ``recompute`` returns) is replaced, and so is the critic's observation at the next step of
     the same episode. What the actor saw, did, and with which probability stays.
 
-    Two entries are added: ``valid``, [T, B, 1], false where the episode had ended already as one knows now (a
-    learner leaves such steps out), and ``cut``, true where the environment was really reset. Where it
-    was, but the task had not ended after all, the step is truncated.
+    Two entries are added, [T, B, 1]: ``valid``, false where the episode had ended already as one knows now,
+    and ``cut``, true where the environment was really reset. Where it was, but the task had not ended after
+    all, the step is truncated.
 
     The writer must be a round robin (TorchRL's default) over steps of the same B worlds.
 
     Args:
-        max_size: steps of worlds, T times B.
+        max_size: steps of worlds, T times B; T must be at least a batch's steps and twice ``longest``.
         recompute: what follows from messages (``server_view``).
         longest: largest delay of a message [steps].
         group: the TensorDict of the agents, with ``message``, ``received``, ``delay``, ``age`` and
@@ -59,10 +59,22 @@ class BackupdateStorage(LazyTensorStorage):
         self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True
     ) -> None:
         """Write steps [T, B] at these places of the first dimension, and look back."""
+        self._check(data)
         done = data["next", "done"]
         data = data.copy().update({"valid": torch.ones_like(done), "cut": done.clone()})
         super().set(cursor, data, set_cursor=set_cursor)
         self.look_back(len(data) + self.longest)
+
+    def _check(self, data: TensorDictBase) -> None:
+        needs, n_worlds = len(data) + 2 * self.longest, data.shape[1]
+        if self.max_size < needs * n_worlds:
+            raise ValueError(
+                f"max_size: {self.max_size} is too little for batches of {len(data)} steps and delays of "
+                f"up to {self.longest}: {needs} steps of {n_worlds} worlds are {needs * n_worlds}"
+            )
+        longest = int(data["next", self.group, "delay"].max())
+        if longest > self.longest:
+            raise ValueError(f"longest: a message takes {longest} steps, more than {self.longest}")
 
     def look_back(self, n_steps: int) -> None:
         """Correct the latest steps with all that has arrived by the last one."""
@@ -100,7 +112,7 @@ class BackupdateStorage(LazyTensorStorage):
         seen = after["next", group, "global_observation"]
         before = torch.cat([seen[:1], seen[:-1]])
         keep = begins.clone()
-        keep[0] = True
+        keep[0] = True  # the step before it is not at hand
         keep = keep.view(*keep.shape, *[1] * (seen.dim() - 2))
         critic = torch.where(keep, steps[group, "global_observation"], before)
         return {**after, (group, "global_observation"): critic, "valid": ~over.unsqueeze(-1)}

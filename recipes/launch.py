@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import Checkpoint
 
 from damian import checks
+from damian.delayed import is_late
 from damian.errors import InputError
 from damian.losses import MappoConfig
 from damian.models import ModelConfig
@@ -89,12 +90,7 @@ class TrainConfig(ScenarioConfig):
         if self.episodes is not None:
             checks.in_range("episodes", self.episodes, 1)
         checks.device("device", self.device)
-        checks.require(
-            not self.backupdate or self.delay.reward_window == 1,
-            "delay.reward_window",
-            self.delay.reward_window,
-            "steps do not go with backupdate=true, which corrects single rewards",
-        )
+        self._check_backupdate()
         batch = self.worlds * self.update_steps
         checks.require(
             batch % self.algo.minibatches == 0,
@@ -102,6 +98,17 @@ class TrainConfig(ScenarioConfig):
             self.algo.minibatches,
             f"does not divide a batch of worlds x steps = {batch}",
         )
+
+    def _check_backupdate(self) -> None:
+        """What is corrected are single rewards, and what the server knows at every step."""
+        others = {
+            "delay.reward_window": (self.delay.reward_window, self.delay.reward_window > 1),
+            "delay.rew": (self.delay.rew, is_late(self.delay.rew, self.clock.dt)),
+            "clock.server": (self.clock.server, self.clock.steps("server") > 1),
+        }
+        for key, (value, set_) in others.items():
+            should = "does not go with backupdate=true, which would undo it"
+            checks.require(not (self.backupdate and set_), key, value, should)
 
     @property
     def update_steps(self) -> int:

@@ -86,14 +86,15 @@ def make_memory(config: TrainConfig, env: DelayedEnv) -> TensorDictReplayBuffer 
 
 
 def known_now(memory: TensorDictReplayBuffer | None, batch: TensorDictBase) -> TensorDictBase:
-    """A batch [B, T] as the server knows it by now; what came after an episode's end is no decision."""
+    """A batch [B, T] as the server knows it by now.
+
+    Steps after an end that the server learnt of late count too: until it does, a UAV must not undo it.
+    """
     if memory is None:
         return batch
     memory.extend(batch)
     storage = cast(BackupdateStorage, memory.storage)
-    known = storage[storage.latest(batch.shape[1])].transpose(0, 1)
-    known["agents", "ready"] = known["agents", "ready"] & known["valid"]
-    return known
+    return storage[storage.latest(batch.shape[1])].transpose(0, 1)
 
 
 def update(
@@ -189,7 +190,7 @@ def report(
     """Evaluate on situations that were not trained on, and write figure and table."""
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
-        unseen.set_seed(config.seed)  # the same episodes for every policy
+        unseen.set_seed(config.seed + 10_000)  # the same episodes for every policy
         return evaluate(unseen, policy, config.horizon, sample)
 
     random = fly(random_policy(unseen))

@@ -151,7 +151,7 @@ def test_in_pieces_and_around_the_ring_the_same_is_known_as_at_once(order):
     scenario = everything("instant", episode=EpisodeConfig(max_steps=7))
     delay = DelayConfig(obs={"law": "burst", "bad": LONGEST, "bad_loss": 0.3}, loss=0.1, order=order)
     late = flight(replace(scenario, delay=delay), 60)
-    whole, ring = buffer(scenario, 64), buffer(scenario, 25)
+    whole, ring = buffer(scenario, 80), buffer(scenario, 25)
     whole.extend(late)
     for part in late.split(4, 1):
         ring.extend(part)
@@ -179,7 +179,7 @@ def test_a_success_that_was_learnt_of_late_ends_the_episode_where_it_happened():
     scenario = square(episode=EpisodeConfig(max_steps=12, success_share=0.3))
     undelayed = flight(scenario, 60, 16)
     late = flight(replace(scenario, delay=DelayConfig(obs=3)), 60, 16)
-    stored = buffer(scenario, 64, 16)
+    stored = buffer(scenario, 80, 16)
     stored.extend(late)
     known = in_order(stored, 60).transpose(0, 1)
     first = known["step_count"].squeeze(-1).cumsum(1) == torch.arange(60).cumsum(0)  # of each world
@@ -191,6 +191,16 @@ def test_a_success_that_was_learnt_of_late_ends_the_episode_where_it_happened():
             assert ends[b, steps].tolist() == true_ends[b, : len(steps)].tolist()
     assert (~known["valid"]).any()
     assert known["next", "done"][known["cut"]].all()
+
+
+def test_what_it_cannot_hold_is_refused():
+    scenario = everything("instant", episode=PERSISTENT)
+    late = flight(replace(scenario, delay=DelayConfig(obs=LATE)), 20)
+    with pytest.raises(ValueError, match="max_size: 116 is too little for batches of 20 steps"):
+        buffer(scenario, 29).extend(late)
+    later = flight(replace(scenario, delay=DelayConfig(obs=LONGEST + 1)), 20)
+    with pytest.raises(ValueError, match="longest: a message takes 6 steps, more than 5"):
+        buffer(scenario, 64).extend(later)
 
 
 @pytest.mark.parametrize(

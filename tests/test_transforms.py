@@ -10,7 +10,18 @@ from delay_twin import Counting, Purse, Receiver, drawn, last_actions, looking_b
 from helpers import all_same, play, same
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, GymEnv, SerialEnv, TransformedEnv
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    TensorSpec,
+    Unbounded,
+)
+from torchrl.envs import Compose, EnvBase, GymEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from damian.delays import Burst, Geometric, Trace, Uniform
@@ -525,3 +536,53 @@ def test_observations_late_by_i_and_actions_by_j_are_observations_late_by_their_
     assert both[1].equal(summed[1])
     assert both[2].equal(summed[2])
     assert len(both[1].unique()) > 3
+
+
+# Actions of every kind.
+
+GROUP = (len(WORLDS), N_AGENTS)
+ACTIONS = {
+    "numbers": Categorical(5, shape=GROUP),
+    "two numbers": MultiCategorical([3, 4], shape=(*GROUP, 2)),
+    "one-hot": OneHot(4, shape=(*GROUP, 4)),
+    "two one-hots": MultiOneHot([3, 4], shape=(*GROUP, 7)),
+    "flags": Binary(3, shape=(*GROUP, 3)),
+    "bounded": Bounded(-2.0, 2.0, shape=(*GROUP, 2)),
+    "unbounded": Unbounded((*GROUP, 2)),
+}
+
+
+class Takes(Transform):
+    """Lets an environment of numbered actions take others, which it notes."""
+
+    def __init__(self, spec: TensorSpec) -> None:
+        super().__init__(in_keys_inv=[ACTION])
+        self.spec, self.taken = spec, []
+
+    def _inv_call(self, td: TensorDictBase) -> TensorDictBase:
+        self.taken.append(td[ACTION].clone())
+        return td.set(ACTION, torch.zeros(GROUP, dtype=torch.long))
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        input_spec["full_action_spec"][ACTION] = self.spec
+        return input_spec
+
+
+@pytest.mark.parametrize("spec", ACTIONS.values(), ids=ACTIONS)
+def test_actions_of_every_kind_are_delayed_and_remembered(spec):
+    end = Takes(spec)
+    chain = Compose(end, ActionDelay(2, ACTION), ActionHistory(2, ACTION))
+    env = TransformedEnv(Counting(WORLDS, ends=0.0), chain)
+    td, chosen = env.reset(), []
+    for _ in range(6):
+        td = env.rand_action(td)
+        chosen.append(td[ACTION].clone())
+        td = env.step_mdp(env.step(td))
+    assert spec.is_in(end.taken[0])
+    assert end.taken[0].equal(end.taken[1])
+    assert all(late.equal(early) for late, early in zip(end.taken[2:], chosen, strict=False))
+    shown = td["agents", "action_history"]
+    assert shown.shape[-1] == 2 * (chosen[0].numel() // len(WORLDS) // N_AGENTS)
+    if not isinstance(spec, Unbounded):
+        assert ((shown >= 0) & (shown <= 1)).all()
+    assert shown.dtype == torch.float32

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
+from torchrl.data import Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
 from damian.delays import law_of
@@ -40,7 +40,11 @@ def actions_of(env: EnvBase, key: NestedKey, default: Any) -> Actions:
     spec = specs[key]
     rows = (specs[key[:-1]] if isinstance(key, tuple) else specs).shape
     value = torch.as_tensor(0 if default is None else default, device=spec.device)
-    if isinstance(spec, OneHot):
+    if isinstance(spec, MultiOneHot):
+        blocks = [one.n for one in spec.space]
+        first = torch.cat([torch.nn.functional.one_hot(torch.tensor(0), n) for n in blocks])
+        initial = (first if default is None else value).to(spec.device, spec.dtype).expand(spec.shape).clone()
+    elif isinstance(spec, OneHot):
         index = value.long().expand(spec.shape[:-1])
         initial = torch.nn.functional.one_hot(index, spec.shape[-1]).to(spec.dtype)
     else:
@@ -51,9 +55,12 @@ def actions_of(env: EnvBase, key: NestedKey, default: Any) -> Actions:
 
 def _range(spec: TensorSpec, rows: torch.Size) -> tuple[Tensor, Tensor]:
     """Least value and width of each number of an action."""
-    if isinstance(spec, Categorical | MultiCategorical):
-        width = torch.as_tensor(spec.n if isinstance(spec, Categorical) else spec.nvec) - 1
+    if isinstance(spec, MultiCategorical):  # which is a Categorical, too
+        width = spec.nvec.view(-1, spec.shape[-1])[0] - 1
         return torch.zeros_like(width), width.clamp(min=1).to(spec.device)
+    if isinstance(spec, Categorical):
+        width = torch.tensor(max(spec.n - 1, 1), device=spec.device)
+        return torch.zeros_like(width), width
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         low, high = (as_rows(bound, rows)[0] for bound in (spec.low, spec.high))
         bounded = (high - low).isfinite()

@@ -43,7 +43,7 @@ class ActionHistory(OnActions):
         default: Any = None,
         recorded_key: NestedKey | None = None,
     ) -> None:
-        checks.in_range("steps", steps, 1)
+        checks.whole("steps", steps, 1)
         super().__init__(action_key, default)
         appended = [append_to] if append_to is not None else []
         self.in_keys, self.out_keys = appended, appended or [beside(self.action_key, out_key)]
@@ -84,7 +84,7 @@ class ActionHistory(OnActions):
         """Actions [M, ...] as numbers [M, A]."""
         if self.codes is not None:
             return rows(scale["codes"], action)
-        return ((action - scale["low"]) / scale["width"]).view(len(action), -1).float()
+        return ((action.float() - scale["low"]) / scale["width"]).view(len(action), -1).float()
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         example = self.actions.initial[:1]
@@ -94,6 +94,9 @@ class ActionHistory(OnActions):
             observation_spec[key] = Unbounded(torch.Size((*self.actions.rows, width)), device=device)
             return observation_spec
         old = observation_spec[key]
+        flat = old.dtype.is_floating_point and len(old.shape) == len(self.actions.rows) + 1
+        should = "is no row of floats, to which actions could be appended; take out_key instead"
+        checks.require(flat, "append_to", key, should)
         shape = torch.Size((*old.shape[:-1], old.shape[-1] + width))
         observation_spec[key] = Unbounded(shape, dtype=old.dtype, device=device)
         return observation_spec

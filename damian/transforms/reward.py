@@ -54,6 +54,8 @@ class OnRewards(Stateful):
 class RewardDelay(OnRewards):
     """Pays each reward some steps later; what is still owed when an episode ends is paid with its last step.
 
+    It must come after whatever ends episodes (such as a ``StepCounter`` with a limit).
+
     Without a delay nothing changes, bit for bit.
 
     Args:
@@ -114,7 +116,7 @@ class CumulativeReward(OnRewards):
     """
 
     def __init__(self, steps: int, gamma: float = 0.9, reward_key: NestedKey = "reward") -> None:
-        checks.in_range("steps", steps, 1)
+        checks.whole("steps", steps, 1)
         checks.above("gamma", gamma, 0.0)
         checks.in_range("gamma", gamma, 0.0, 1.0)
         super().__init__(reward_key)
@@ -124,6 +126,7 @@ class CumulativeReward(OnRewards):
     def see(self, memory: Memory, entries: Entries) -> Change:
         reward = as_rows(entries[self.reward_key], self.rows)
         past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
-        weights = torch.tensor(self.weights, device=reward.device)
+        dtype = reward.dtype if reward.dtype.is_floating_point else torch.get_default_dtype()
+        weights = torch.tensor(self.weights, dtype=dtype, device=reward.device)
         total = (weights.view(-1, *[1] * reward.dim()) * past).sum(0)
         return memory | {"past": past}, {self.reward_key: from_rows(total.to(reward.dtype), self.rows)}

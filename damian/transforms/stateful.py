@@ -44,8 +44,8 @@ class Stateful(Transform):
 
     An entry under a nested key, such as ``("agents", "observation")``, has a row for each element of the
     batch size of its innermost TensorDict; an entry at the root has one for each world. The memory is made
-    at the first reset, and kept in buffers: it is saved with ``state_dict``, moves with ``to``, and travels
-    into worker processes.
+    at the first reset, and kept in buffers: it is saved with ``state_dict`` (not as a copy: some of it is
+    written in place), moves with ``to``, and travels into worker processes. The worlds are not in it.
 
     What a subclass does is written as pure functions of its memory and of entries, ``begin`` (after a
     reset), ``act`` (before a step) and ``see`` (after it), so that a whole chain compiles into one graph.
@@ -116,6 +116,7 @@ class Stateful(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = None
         if self.begun:
+            self._check_rows(tensordict_reset)
             mask = flag_rows(tensordict, "_reset", self.row_key, self.rows)
         else:
             self._rows = self.find_rows(tensordict_reset)
@@ -125,6 +126,14 @@ class Stateful(Transform):
             mask = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
         change = self.begin(self.memory, taken(tensordict_reset, self.see_keys), mask)
         return self._write(tensordict_reset, change)  # TorchRL keeps what the other worlds showed
+
+    def _check_rows(self, tensordict: TensorDictBase) -> None:
+        rows = self.find_rows(tensordict)
+        if rows != self.rows:
+            raise RuntimeError(
+                f"{type(self).__name__} remembers rows of {tuple(self.rows)}, but the environment has "
+                f"{tuple(rows)}: the state of another one was loaded"
+            )
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self.act_keys:
@@ -193,7 +202,7 @@ class Stateful(Transform):
         }
         saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
         devices = {name: buffer.device for name, buffer in self.memory.items()}
-        self._buffers.clear()
+        self.forget()  # TorchRL also loads what holds nothing of ours: then the next reset is the first
         self.remember({k: v.detach().clone().to(devices.get(k, v.device)) for k, v in saved.items()})
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
