@@ -1,7 +1,10 @@
 """A scenario with its delays and clocks: the invariants that hold whatever is late."""
 
+import copy
 import math
+import pickle
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import pytest
@@ -9,7 +12,16 @@ import torch
 from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, random_actions, square
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, GymEnv, RewardSum, StepCounter, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    GymEnv,
+    ParallelEnv,
+    RewardSum,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from damian.delayed import ACTION, REWARD, SEEN, DelayedEnv, chain, holding, make_env, serving
@@ -445,3 +457,60 @@ def test_a_step_at_once_does_what_each_transform_does_by_itself(motion, changed)
 def test_only_worlds_of_uavs_compile_with_their_delays():
     with pytest.raises(TypeError, match="needs a UavEnv, not GymEnv"):
         DelayedEnv(GymEnv("Pendulum-v1"), RewardDelay(2)).compile()
+
+
+# Life of a compiled environment.
+
+
+def quick(**changed: Any) -> DelayedEnv:
+    """Compiled, but not by much."""
+    return delayed(everything("instant", **changed)).compile(backend="eager")
+
+
+def test_a_copy_of_a_compiled_environment_compiles_its_own():
+    env = quick(**DELAYS["paper"])
+    actions = choices(env, 12)
+    play(env, actions)
+    twin, pickled = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    shown = play(env, actions)
+    assert all_same(shown, play(twin, actions))
+    assert all_same(shown, play(pickled, actions))
+
+
+def test_a_transform_that_is_appended_later_is_compiled_too():
+    env, plain = quick(delay=DelayConfig(rew=1)), delayed(everything("instant", delay=DelayConfig(rew=1)))
+    actions = choices(env, 10)
+    play(env, actions)
+    for each in (env, plain):
+        each.append_transform(CumulativeReward(3, 0.5, REWARD))
+        each.set_seed(3)
+    assert all_same(play(env, actions), play(plain, actions))
+
+
+@pytest.mark.parametrize("compiles", [False, True])
+def test_the_flag_of_those_who_act_reaches_the_worlds(compiles):
+    env = delayed(square())
+    env = env.compile(backend="eager") if compiles else env
+    td = env.rand_action(env.reset())
+    env.step(td.clone())
+    td = env.rand_action(env.reset())
+    td["agents", "acts"] = torch.zeros(4, 3, dtype=torch.bool)
+    before = env.worlds.state.goal.clone()
+    assert env.step(td)["next", "agents", "ready"].all()
+    assert env.worlds.state.goal.equal(before)
+
+
+def test_environments_that_exist_already_go_into_workers():
+    envs = [make_env(square(delay=DelayConfig(obs=PAPER, act=1)), 2, seed=i) for i in range(2)]
+    makers = [partial(envs.__getitem__, i) for i in range(2)]
+    workers = ParallelEnv(2, makers, mp_start_method="fork")
+    assert workers.rollout(4).batch_size == (2, 2, 4)
+    workers.close()
+
+
+def test_the_state_of_another_number_of_worlds_is_refused():
+    env, other = (delayed(square(delay=DelayConfig(act=2)), n) for n in (2, 5))
+    env.reset()
+    other.load_state_dict(env.state_dict())
+    with pytest.raises(RuntimeError, match=r"rows of \(2, 3\), but the environment has \(5, 3\)"):
+        other.reset()
