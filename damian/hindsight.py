@@ -21,8 +21,6 @@ class Mail(NamedTuple):
     """Held by the server after each step, [T, *, F]."""
     age: Tensor
     """Steps since that was generated, [T, *]."""
-    begins: Tensor
-    """Does an episode begin with this step, [T, *] bool."""
 
 
 def hindsight(mail: Mail, now: int | None = None) -> Tensor:
@@ -40,7 +38,7 @@ def hindsight(mail: Mail, now: int | None = None) -> Tensor:
     newest = torch.where(known, steps, -1).cummax(0).values
     # Under ``order=arrival`` the server may have held something newer before.
     held, held_at = (steps - mail.age).cummax(0)
-    late = (newest >= beginnings(mail.begins)) & (newest > held)
+    late = newest > held  # never of an earlier episode, of which nothing is as new as what is held
     return torch.where(late.unsqueeze(-1), _at(mail.sent, newest.clamp(min=0)), _at(mail.held, held_at))
 
 

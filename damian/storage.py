@@ -100,7 +100,6 @@ class BackupdateStorage(LazyTensorStorage):
             delay=after["delay"].squeeze(-1),
             held=after["received"],
             age=after["age"].squeeze(-1).long(),
-            begins=begins.unsqueeze(-1).expand(after.batch_size),
         )
         beliefs = hindsight(mail)
         after = self.recompute(steps, beliefs)

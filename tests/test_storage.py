@@ -27,8 +27,8 @@ WORLDS, UAVS = 3, 2
 # The pure function, against a loop.
 
 
-def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> Mail:
-    """Random messages that say when they were sent; what is held follows from their delays."""
+def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> tuple[Mail, Tensor]:
+    """Random messages that say when they were sent, what is held of them, and where episodes begin."""
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -46,7 +46,7 @@ def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> M
                 came = [g for g in range(start, t + 1) if 0 <= delay[g, b, i] <= t - g]
                 latest = [g for g in came if g + delay[g, b, i] == max(h + delay[h, b, i] for h in came)]
                 held[t, b, i] = max((came if order == "generation" else latest), default=start - 1)
-    return Mail(sent.unsqueeze(-1).float(), delay, held.unsqueeze(-1).float(), sent - held, begins)
+    return Mail(sent.unsqueeze(-1).float(), delay, held.unsqueeze(-1).float(), sent - held), begins
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])
@@ -54,19 +54,19 @@ def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> M
 def test_hindsight_does_what_a_loop_over_messages_does(loss, order):
     generator = torch.Generator().manual_seed(1)
     for _ in range(20):
-        given = mail(16, loss, order, generator)
+        given, begins = mail(16, loss, order, generator)
         now = int(torch.randint(16, (), generator=generator))
         known = hindsight(given, now)[..., 0]
         for b in range(WORLDS):
             for i in range(UAVS):
                 for t in range(now + 1):
-                    start = max(s for s in range(t + 1) if given.begins[s, b, i])
+                    start = max(s for s in range(t + 1) if begins[s, b, i])
                     came = [g for g in range(start, t + 1) if 0 <= given.delay[g, b, i] <= now - g]
                     assert known[t, b, i] == max(came, default=start - 1)
 
 
 def test_nothing_that_arrives_after_the_learning_instant_is_used():
-    given = mail(16, 0.2, "generation", torch.Generator().manual_seed(2))
+    given, _ = mail(16, 0.2, "generation", torch.Generator().manual_seed(2))
     now = 9
     arrives = torch.arange(16).view(-1, 1, 1) + given.delay
     later = (arrives > now) | (torch.arange(16).view(-1, 1, 1) > now)
@@ -173,6 +173,9 @@ def test_what_the_actor_saw_and_did_stays():
     assert ("agents", "action") not in changed
     assert ("next", "agents", "reward") in changed
     assert ("agents", "global_observation") in changed
+    begins, seen = late["step_count"].squeeze(-1) == 0, ("agents", "global_observation")
+    assert begins[:, 1:].any()
+    assert known[seen][begins].equal(late[seen][begins])
 
 
 def test_a_success_that_was_learnt_of_late_ends_the_episode_where_it_happened():
