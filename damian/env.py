@@ -181,10 +181,7 @@ class UavEnv(EnvBase):
         shown["agents"]["reward"] = total.unsqueeze(-1)
         if "reward_terms" in self.extras:
             shown["agents"]["reward_terms"] = terms
-        done = ended.terminated | ended.truncated
-        ends = {"success": ended.success, "done": done}
-        ends |= {"terminated": ended.terminated, "truncated": ended.truncated}
-        return packed, shown | {key: value.unsqueeze(-1) for key, value in ends.items()}
+        return packed, shown | ended.entries()
 
     def _show(self, state: State, features: Features | None = None) -> Shown:
         """What is shown of a state, at a reset as after a step; terms and success have not come yet."""

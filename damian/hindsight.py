@@ -55,9 +55,8 @@ def over_before(ended: Tensor, begins: Tensor, already: Tensor) -> Tensor:
         begins: does an episode really begin with this step, [T, *].
         already: had that of the first step, [*].
     """
-    latest = torch.where(ended, _steps(ended), -1).cummax(0).values
-    before = torch.cat([already.unsqueeze(0).long() - 1, latest[:-1]])
-    before = before.cummax(0).values
+    ends = torch.where(ended, _steps(ended), -1)
+    before = torch.cat([already.unsqueeze(0).long() - 1, ends[:-1]]).cummax(0).values
     return before >= beginnings(begins)
 
 

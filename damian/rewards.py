@@ -135,6 +135,13 @@ class Status(NamedTuple):
     terminated: Tensor
     truncated: Tensor
 
+    def entries(self) -> dict[str, Tensor]:
+        """As TorchRL shows it, with ``done``, each [*, 1]."""
+        done = self.terminated | self.truncated
+        flags = {"success": self.success, "done": done}
+        flags |= {"terminated": self.terminated, "truncated": self.truncated}
+        return {name: flag.unsqueeze(-1) for name, flag in flags.items()}
+
 
 def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig) -> dict[str, Tensor]:
     """Weighted reward terms by name (eq. 6 and 7); their sum is the reward (eq. 8).

@@ -15,8 +15,6 @@ from damian.server import Server
 Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
 """From steps [T, B] and what was known after each, [T, B, N, F]: the entries after the step, corrected."""
 
-_STATUS = ("success", "done", "terminated", "truncated")
-
 
 class BackupdateStorage(LazyTensorStorage):
     """Keeps steps in order of time, [T, B], and corrects them as late messages arrive.
@@ -130,14 +128,12 @@ def server_view(server: Server, terms: bool = False) -> Recompute:
         over = steps.get(("next", "source_over"), torch.zeros_like(steps["cut"])).squeeze(-1)
         features = server.features(snapshot, elapsed)
         judged = server.judge(features, snapshot, elapsed, over)
-        ended = judged.status
-        flags = (ended.success, ended.terminated | ended.truncated, ended.terminated, ended.truncated)
         entries: dict[NestedKey, Tensor] = {
             ("next", "agents", "global_observation"): server.observations(features)[1],
             ("next", "agents", "reward"): judged.reward.unsqueeze(-1),
         }
         if terms:
             entries |= {("next", "agents", "reward_terms", k): v for k, v in judged.terms.items()}
-        return entries | {("next", k): v.unsqueeze(-1) for k, v in zip(_STATUS, flags, strict=True)}
+        return entries | {("next", k): v for k, v in judged.status.entries().items()}
 
     return recompute

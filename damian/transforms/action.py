@@ -10,13 +10,22 @@ from torchrl.envs import EnvBase
 
 from damian.delays import law_of
 from damian.transforms.mailbox import Mailbox
-from damian.transforms.stateful import Change, Entries, Memory, Stateful, Uses, as_rows, beside, from_rows
+from damian.transforms.stateful import (
+    Change,
+    Entries,
+    Memory,
+    Stateful,
+    Uses,
+    as_rows,
+    beside,
+    from_rows,
+    spec_rows,
+)
 
 
 class Actions(NamedTuple):
     """What a transform must know of an environment's actions."""
 
-    spec: TensorSpec
     rows: torch.Size
     """One for each world, or for each agent of each world."""
     initial: Tensor
@@ -36,9 +45,7 @@ def actions_of(env: EnvBase, key: NestedKey, default: Any) -> Actions:
         default: the initial action: a number, or an action's values (an index, if actions are discrete); 0
             or what is nearest to it, if None.
     """
-    specs = env.full_action_spec
-    spec = specs[key]
-    rows = (specs[key[:-1]] if isinstance(key, tuple) else specs).shape
+    spec, rows = env.full_action_spec[key], spec_rows(env.full_action_spec, key)
     value = torch.as_tensor(0 if default is None else default, device=spec.device)
     if isinstance(spec, MultiOneHot):
         blocks = [one.n for one in spec.space]
@@ -50,7 +57,7 @@ def actions_of(env: EnvBase, key: NestedKey, default: Any) -> Actions:
     else:
         initial = value.to(spec.dtype).expand(spec.shape).clone()
         initial = spec.project(initial) if default is None else initial  # type: ignore[arg-type]
-    return Actions(spec, rows, as_rows(initial, rows), *_range(spec, rows))
+    return Actions(rows, as_rows(initial, rows), *_range(spec, rows))
 
 
 def _range(spec: TensorSpec, rows: torch.Size) -> tuple[Tensor, Tensor]:

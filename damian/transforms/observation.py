@@ -20,6 +20,7 @@ from damian.transforms.stateful import (
     as_rows,
     beside,
     from_rows,
+    spec_rows,
     taken,
 )
 
@@ -107,9 +108,8 @@ class ObservationDelay(Stateful):
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if out_key != key:
                 observation_spec[out_key] = observation_spec[key].clone()
-        key = self.row_key
-        inner = observation_spec[key[:-1]] if isinstance(key, tuple) else observation_spec
-        shape, device = torch.Size((*inner.shape, 1)), observation_spec.device
+        shape = torch.Size((*spec_rows(observation_spec, self.row_key), 1))
+        device = observation_spec.device
         if self.age_key:
             observation_spec[self.age_key] = Unbounded(shape, device=device)
         if self.fresh_key:

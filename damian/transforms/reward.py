@@ -19,6 +19,7 @@ from damian.transforms.stateful import (
     flag_keys,
     flag_rows,
     from_rows,
+    spec_rows,
     wide,
 )
 
@@ -39,8 +40,7 @@ class OnRewards(Stateful):
         return Uses(holds=[self.reward_key])
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
-        specs, key = self.env.full_reward_spec, self.reward_key
-        return (specs[key[:-1]] if isinstance(key, tuple) else specs).shape
+        return spec_rows(self.env.full_reward_spec, self.reward_key)
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
         example = as_rows(self.env.full_reward_spec[self.reward_key].zero(), self.rows)

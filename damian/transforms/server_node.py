@@ -64,12 +64,10 @@ class ServerNode(Stateful):
         features = self.server.features(snapshot, steps)
         reward, terms, ended = self.server.judge(features, snapshot, steps, over)
         seen = [*self.server.observations(features), reward.unsqueeze(-1)]
-        done = ended.terminated | ended.truncated
-        flags = [flag.unsqueeze(-1) for flag in (ended.success, done, ended.terminated, ended.truncated)]
         made: Entries = {("agents", name): value for name, value in zip(_AGENTS, seen, strict=True)}
         if self.terms:
             made |= {("agents", "reward_terms", name): term for name, term in terms.items()}
-        return {"elapsed": elapsed}, made | dict(zip(_TASK, flags, strict=True))
+        return {"elapsed": elapsed}, made | ended.entries()
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key in self.drop:

@@ -2,11 +2,12 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
+from torchrl.data import Composite
 from torchrl.envs import Compose, EnvBase, Transform
 
 from damian.errors import InputError
@@ -175,7 +176,7 @@ class Stateful(Transform):
     @property
     def memory(self) -> Memory:
         """Everything that changes."""
-        return {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
+        return cast(Memory, dict(self._buffers))
 
     def remember(self, memory: Memory) -> None:
         """Put what has changed in the place of what was."""
@@ -307,6 +308,11 @@ def row_shape(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
     """The batch size of the TensorDict in which an entry lies."""
     inner = tensordict.get(key[:-1]) if isinstance(key, tuple) and len(key) > 1 else tensordict
     return inner.batch_size
+
+
+def spec_rows(specs: Composite, key: NestedKey) -> torch.Size:
+    """The same, told by specs."""
+    return (specs[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else specs).shape
 
 
 def as_rows(value: Tensor, rows: torch.Size) -> Tensor:
