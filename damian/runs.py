@@ -3,6 +3,7 @@
 import csv
 import math
 import signal
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import matplotlib
@@ -17,6 +18,8 @@ METRICS = "metrics.csv"
 FIGURE = "learning_curve.png"
 CHECKPOINT = "checkpoint"
 CONFIG = "config.yaml"
+RESULTS = "result.csv"
+TABLE = "result.md"
 
 
 class MetricsLog:
@@ -124,14 +127,39 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
     plt.close(figure)
 
 
-def results_table(rows: dict[str, Evaluation], can_succeed: bool) -> str:
-    """Evaluations beside each other, as a Markdown table; a task without success shows none."""
-    lines = [
-        "| policy | success rate | steps | return | episodes |",
-        "|:--|--:|--:|--:|--:|",
+def save_results(rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool) -> str:
+    """Write evaluations to ``result.csv`` and, as the table that is returned, to ``result.md``."""
+    table = results_table(rows, can_succeed, late)
+    (folder / TABLE).write_text(table + "\n")
+    half = folder / f"{RESULTS}.part"  # a run with results is finished: all of them, or none
+    with half.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["policy", *(field.name for field in fields(Evaluation))])
+        writer.writeheader()
+        writer.writerows({"policy": name, **asdict(row)} for name, row in rows.items())
+    half.replace(folder / RESULTS)
+    return table
+
+
+def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
+    """Evaluations beside each other, as a Markdown table.
+
+    Args:
+        rows: by policy.
+        can_succeed: show success, and the steps that it takes.
+        late: what the server perceived is not what happened: show both, and the messages.
+    """
+    wins = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
+    columns = wins | {"return": "episode_return"}
+    if late:
+        columns |= {f"true {title}": f"true_{field}" for title, field in wins.items()}
+        columns |= {"true return": "true_return", "age": "age", "late": "late", "lost": "lost"}
+    columns |= {"episodes": "episodes"}
+    lines = [["policy", *columns], [":--", *["--:"] * len(columns)]]
+    lines += [
+        [name, *(_number(getattr(row, field)) for field in columns.values())] for name, row in rows.items()
     ]
-    for name, row in rows.items():
-        success = f"{row.success_rate:.2f}" if can_succeed else "-"
-        numbers = f"{row.steps:.2f} | {row.episode_return:.3f} | {row.episodes}"
-        lines.append(f"| {name} | {success} | {numbers} |")
-    return "\n".join(lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.2f}"

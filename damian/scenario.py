@@ -1,7 +1,5 @@
 """What a world is made of: every setting of the environment, with its unit, default and check."""
 
-import itertools
-import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -9,6 +7,7 @@ import numpy as np
 
 from damian import checks
 from damian.actions import ActionConfig
+from damian.clocks import ClockConfig
 from damian.delays import DelayConfig
 from damian.features import ObservationConfig
 from damian.rewards import EpisodeConfig, RewardConfig
@@ -99,43 +98,6 @@ class RegionConfig:
         else:
             polygons = [random_polygon(rng, self.min_area, self.max_area) for _ in range(self.pool)]
         return [Region(p, f"{self.kind} region {i}", None, None) for i, p in enumerate(polygons)]
-
-
-@dataclass
-class ClockConfig:
-    """Periods of the four clocks (paper, section 3.6), such as ``1s``, ``0.5m`` or ``1h``."""
-
-    simulation: str = "1s"
-    """Length of a simulation step, ``dt``."""
-    agents: str | None = None
-    """How often an agent observes and decides; as the simulation if not given."""
-    server: str | None = None
-    """How often the server node broadcasts; as the simulation if not given."""
-    system: str | None = None
-    """How often the learner takes what has been collected; every ``algo.steps`` steps if not given."""
-
-    def __post_init__(self) -> None:
-        written = {f.name: getattr(self, f.name) or self.simulation for f in fields(self)}
-        periods = {name: checks.seconds(f"clock.{name}", time) for name, time in written.items()}
-        for slow, fast in itertools.permutations(periods, 2):
-            ratio = periods[slow] / periods[fast]
-            checks.require(
-                (ratio < 1 and fast != "simulation")
-                or math.isclose(ratio, max(round(ratio), 1), rel_tol=1e-9),
-                f"clock.{slow}",
-                written[slow],
-                f"is not a multiple of clock.{fast}={written[fast]}",
-            )
-
-    @property
-    def dt(self) -> float:
-        """Simulation step [s]."""
-        return checks.seconds("clock.simulation", self.simulation)
-
-    def steps(self, name: str) -> int:
-        """Period of a clock, in simulation steps."""
-        written = getattr(self, name) or self.simulation
-        return round(checks.seconds(f"clock.{name}", written) / self.dt)
 
 
 @dataclass

@@ -30,6 +30,21 @@ class Judgement(NamedTuple):
     """[*]."""
 
 
+class Service(NamedTuple):
+    """All that the UAVs and the learner get from the server."""
+
+    observation: Tensor
+    """Of the actors, [*, N, F]."""
+    global_observation: Tensor
+    """Of the critic, [*, N, G]."""
+    reward: Tensor
+    """[*, N]."""
+    terms: dict[str, Tensor]
+    """[*, N]."""
+    status: Status
+    """[*]."""
+
+
 class Server:
     """Features, rewards and status of snapshots [*, N], with any leading dimensions.
 
@@ -101,6 +116,13 @@ class Server:
         terms = reward(features, counters, task)
         final = final_reward(ended, counters, task).unsqueeze(-1).expand_as(snapshot.track)
         return Judgement(sum(terms.values(), start=final), terms, ended)
+
+    def serve(self, snapshot: Snapshot, steps: Tensor, source_over: Tensor | None = None) -> Service:
+        """Everything at once; arguments as of ``judge``, with a source that never ends if not given."""
+        over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
+        features = self.features(snapshot, steps)
+        judged = self.judge(features, snapshot, steps, over.view(steps.shape))
+        return Service(*self.observations(features), *judged)
 
     def _scales(self, snapshot: Snapshot) -> Tensor:
         """Largest vertex distance of each world's region, which its landing points tell, [*]."""

@@ -16,17 +16,23 @@ Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
 """From steps [T, B] and what was known after each, [T, B, N, F]: the entries after the step, corrected."""
 
 
+SEEN = ("observation", "global_observation")
+"""Entries of the agents that are shown after a step and before the next."""
+
+
 class BackupdateStorage(LazyTensorStorage):
     """Keeps steps in order of time, [T, B], and corrects them as late messages arrive.
 
     Whenever steps are written, the latest of them and those before to which a message may still have
     belonged are seen again with all that has arrived by the last one: what follows from the messages (the
-    entries that ``recompute`` returns) is replaced, and so is the critic's observation at the next step of
-    the same episode. What the actor saw, did, and with which probability stays.
+    entries that ``recompute`` returns) is replaced, and so are observations among them at the next step of
+    the same episode. What is not among them, such as what the actor saw, did, and with which probability,
+    stays.
 
-    Two entries are added, [T, B, 1]: ``valid``, false where the episode had ended already as one knows now,
-    and ``cut``, true where the environment was really reset. Where it was, but the task had not ended after
-    all, the step is truncated.
+    Entries are added: ``valid`` [T, B, 1], false where the episode had ended already as one knows now;
+    ``cut`` [T, B, 1], true where the environment was really reset (where it was, but the task had not ended
+    after all, the step is truncated); ``(group, "backupdated")`` [T, B, N, 1], true where a message that
+    came late took the place of what was held.
 
     The writer must be a round robin (TorchRL's default) over steps of the same B worlds.
 
@@ -60,6 +66,8 @@ class BackupdateStorage(LazyTensorStorage):
         self._check(data)
         done = data["next", "done"]
         data = data.copy().update({"valid": torch.ones_like(done), "cut": done.clone()})
+        delay = data["next", self.group, "delay"]
+        data[self.group, "backupdated"] = torch.zeros_like(delay, dtype=torch.bool)
         super().set(cursor, data, set_cursor=set_cursor)
         self.look_back(len(data) + self.longest)
 
@@ -106,34 +114,44 @@ class BackupdateStorage(LazyTensorStorage):
         after["next", "done"] = after["next", "done"] | cut
         already = ~steps["valid"][0].squeeze(-1) & ~begins[0]
         over = over_before(after["next", "done"].squeeze(-1), begins, already)
-        seen = after["next", group, "global_observation"]
-        before = torch.cat([seen[:1], seen[:-1]])
-        keep = begins.clone()
-        keep[0] = True  # the step before it is not at hand
-        keep = keep.view(*keep.shape, *[1] * (seen.dim() - 2))
-        critic = torch.where(keep, steps[group, "global_observation"], before)
-        return {**after, (group, "global_observation"): critic, "valid": ~over.unsqueeze(-1)}
+        began = begins.clone()
+        began[0] = True  # the step before it is not at hand
+        before = {
+            (group, name): _one_later(after["next", group, name], steps[group, name], began)
+            for name in SEEN
+            if ("next", group, name) in after
+        }
+        replaced = (beliefs != mail.held).any(-1, keepdim=True)
+        return {**after, **before, (group, "backupdated"): replaced, "valid": ~over.unsqueeze(-1)}
 
 
-def server_view(server: Server, terms: bool = False) -> Recompute:
+def _one_later(after: Tensor, seen: Tensor, began: Tensor) -> Tensor:
+    """What was seen before each step [T, B, ...]: what is known after the one before, but at a beginning."""
+    before = torch.cat([after[:1], after[:-1]])
+    return torch.where(began.view(*began.shape, *[1] * (seen.dim() - 2)), seen, before)
+
+
+def server_view(server: Server, terms: bool = False, actor: bool = False) -> Recompute:
     """What the server node makes of messages, for a ``BackupdateStorage``.
 
     Args:
         server: of the environment.
         terms: correct ``reward_terms`` too.
+        actor: and what the server tells the actors, in front of what they remember by themselves.
     """
 
     def recompute(steps: TensorDictBase, beliefs: Tensor) -> dict[NestedKey, Tensor]:
-        snapshot, elapsed = Snapshot.unpack(beliefs), steps["next", "step_count"].squeeze(-1)
-        over = steps.get(("next", "source_over"), torch.zeros_like(steps["cut"])).squeeze(-1)
-        features = server.features(snapshot, elapsed)
-        judged = server.judge(features, snapshot, elapsed, over)
+        elapsed, over = steps["next", "step_count"].squeeze(-1), steps.get(("next", "source_over"), None)
+        served = server.serve(Snapshot.unpack(beliefs), elapsed, over)
         entries: dict[NestedKey, Tensor] = {
-            ("next", "agents", "global_observation"): server.observations(features)[1],
-            ("next", "agents", "reward"): judged.reward.unsqueeze(-1),
+            ("next", "agents", "global_observation"): served.global_observation,
+            ("next", "agents", "reward"): served.reward.unsqueeze(-1),
         }
+        if actor:
+            told, seen = served.observation, steps["next", "agents", "observation"]
+            entries["next", "agents", "observation"] = torch.cat([told, seen[..., told.shape[-1] :]], -1)
         if terms:
-            entries |= {("next", "agents", "reward_terms", k): v for k, v in judged.terms.items()}
-        return entries | {("next", k): v for k, v in judged.status.entries().items()}
+            entries |= {("next", "agents", "reward_terms", k): v for k, v in served.terms.items()}
+        return entries | {("next", k): v for k, v in served.status.entries().items()}
 
     return recompute

@@ -25,12 +25,13 @@ from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
 from tqdm import tqdm
 
+from damian.clocks import ClockConfig
 from damian.delayed import make_env
 from damian.delays import DelayConfig
 from damian.env import EXTRAS, UavEnv
 from damian.features import GLOBAL, LOCAL, ObservationConfig
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
-from damian.scenario import BatteryConfig, ClockConfig, MotionConfig, ScenarioConfig
+from damian.scenario import BatteryConfig, MotionConfig, ScenarioConfig
 
 RIVAL, BARE = "VMAS discovery", "bare"
 COMPILED_TOO = (BARE, "whole chain", "every transform")

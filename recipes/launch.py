@@ -9,7 +9,7 @@ import os
 import re
 import sys
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -29,7 +29,7 @@ from torchrl.checkpoint import Checkpoint
 from damian import checks
 from damian.delayed import is_late
 from damian.errors import InputError
-from damian.losses import MappoConfig
+from damian.mappo import MappoConfig
 from damian.models import ModelConfig
 from damian.runs import CHECKPOINT, CONFIG
 from damian.scenario import ScenarioConfig, leftovers
@@ -70,6 +70,13 @@ class TrainConfig(ScenarioConfig):
     backupdate: bool = False
     """Put late messages in their place before learning from the steps that they belong to (SPEC 4): what the
     critic sees, rewards and ends of episodes; what the actor saw stays."""
+    recompute_actor: bool = False
+    """The original authors' variant of ``backupdate``: late messages also rewrite what the actor saw and
+    the probability of what it did, as if it had known."""
+    checkpoint: str | None = None
+    """Run folder whose policy to begin with; its overrides hold too, where no others are given."""
+    overrides: list[str] = field(default_factory=list)
+    """What was asked for on the command line; filled in by the recipe."""
     resume: str | None = None
     """Run folder to go on with."""
     device: str = "cpu"
@@ -91,13 +98,7 @@ class TrainConfig(ScenarioConfig):
             checks.in_range("episodes", self.episodes, 1)
         checks.device("device", self.device)
         self._check_backupdate()
-        batch = self.worlds * self.update_steps
-        checks.require(
-            batch % self.algo.minibatches == 0,
-            "algo.minibatches",
-            self.algo.minibatches,
-            f"does not divide a batch of worlds x steps = {batch}",
-        )
+        checks.in_range("algo.minibatches", self.algo.minibatches, 1, self.worlds * self.update_steps)
 
     def _check_backupdate(self) -> None:
         """What is corrected are single rewards, and what the server knows at every step."""
@@ -109,10 +110,12 @@ class TrainConfig(ScenarioConfig):
         for key, (value, set_) in others.items():
             should = "does not go with backupdate=true, which would undo it"
             checks.require(not (self.backupdate and set_), key, value, should)
+        should = "needs backupdate=true: there is nothing else to recompute"
+        checks.require(self.backupdate or not self.recompute_actor, "recompute_actor", True, should)
 
     @property
     def update_steps(self) -> int:
-        """Steps of every world between two updates: the system clock's, or the algorithm's."""
+        """Steps of every world before the first update: the system clock's, or the algorithm's."""
         return self.clock.steps("system") if self.clock.system else self.algo.steps
 
     @property
@@ -152,11 +155,22 @@ def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:
         written = _resumed(folder, HydraConfig.get().overrides.task)
     elif (folder / CONFIG).exists():
         raise InputError(f"hydra.run.dir: {folder} holds a run already; resume={folder} goes on with it")
+    config = checked(written)
+    config.overrides = list(HydraConfig.get().overrides.task)
+    return config, folder
+
+
+def checked(written: DictConfig) -> TrainConfig:
+    """The configuration of what was composed.
+
+    Raises:
+        InputError: a value is impossible, or a key means nothing.
+    """
     config = OmegaConf.to_object(written)
     unknown = leftovers(written, config)
     if unknown:
-        raise InputError(_no_such_key(unknown[0]))
-    return cast(TrainConfig, config), folder
+        raise InputError(no_such_key(unknown[0]))
+    return cast(TrainConfig, config)
 
 
 def save_config(config: TrainConfig, folder: Path) -> None:
@@ -165,16 +179,16 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     OmegaConf.save(OmegaConf.structured(config), folder / CONFIG)
 
 
-def load(checkpoint: Checkpoint, folder: Path) -> None:
-    """Restore a checkpoint from a run folder.
+def load(checkpoint: Checkpoint, folder: Path, key: str, parts: Collection[str] | None = None) -> None:
+    """Restore a checkpoint, or some parts of it, from a run folder that ``key`` names.
 
     Raises:
         InputError: it is incomplete, or of another configuration.
     """
     try:
-        checkpoint.load(folder / CHECKPOINT)
+        checkpoint.load(folder / CHECKPOINT, components=parts)
     except Exception as error:  # whatever a spoilt file makes of itself
-        raise InputError(f"resume: {folder / CHECKPOINT}: {_one_line(error)}") from error
+        raise InputError(f"{key}: {folder / CHECKPOINT}: {one_line(error)}") from error
 
 
 def _resumed(folder: Path, overrides: Sequence[str]) -> DictConfig:
@@ -191,7 +205,7 @@ def _resumed(folder: Path, overrides: Sequence[str]) -> DictConfig:
     try:
         saved = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(folder / CONFIG))
     except Exception as error:
-        raise InputError(f"resume: {folder / CONFIG}: {_one_line(error)}") from None
+        raise InputError(f"resume: {folder / CONFIG}: {one_line(error)}") from None
     return cast(DictConfig, OmegaConf.merge(saved, OmegaConf.from_dotlist(list(overrides))))
 
 
@@ -216,9 +230,8 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
 
 def launch(main: Callable[[], Any]) -> None:
     """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
-    # Hydra reads a bare number as an integer, and null as None, which no option of a group may be.
-    groups = "|".join(folder.name for folder in Path(CONF).iterdir() if folder.is_dir())
-    sys.argv = [re.sub(rf"^(\+?(?:{groups})=)([\d,]+|null)$", _quoted, word) for word in sys.argv]
+    sys.argv[1:] = inherited(sys.argv[1:])
+    sys.argv[1:] = quoted(sys.argv[1:])
     _begun.clear()
     try:
         main()
@@ -228,12 +241,32 @@ def launch(main: Callable[[], Any]) -> None:
         _give_up(error)
 
 
+def inherited(words: list[str]) -> list[str]:
+    """Overrides, with those of the run whose ``checkpoint`` they name in front, where they give no others."""
+    folder = next((word.partition("=")[2] for word in words if word.startswith("checkpoint=")), None)
+    if not folder or not (Path(folder) / CONFIG).is_file():
+        return words  # whoever wants to load it will say so
+    saved = cast(DictConfig, OmegaConf.load(Path(folder) / CONFIG)).get("overrides", [])
+    given = {_key(word) for word in words}
+    return [word for word in saved if _key(word) not in given] + words
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
 def _give_up(error: Exception) -> NoReturn:
-    print(f"error: {_one_line(error)}", file=sys.stderr)
+    print(f"error: {one_line(error)}", file=sys.stderr)
     sys.exit(2)
 
 
-def _quoted(match: re.Match[str]) -> str:
+def quoted(words: list[str]) -> list[str]:
+    """Overrides with quotes where an option of a group looks like a number, or like nothing, to Hydra."""
+    groups = "|".join(folder.name for folder in Path(CONF).iterdir() if folder.is_dir())
+    return [re.sub(rf"^(\+?(?:{groups})=)([\d,]+|null)$", _with_quotes, word) for word in words]
+
+
+def _with_quotes(match: re.Match[str]) -> str:
     return match[1] + ",".join(f"'{number}'" for number in match[2].split(","))
 
 
@@ -250,14 +283,14 @@ def _drop_empty(folder: Path) -> None:
         around.rmdir()
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     """What is wrong, from the deepest cause, without Hydra's tails of types, paths and hints."""
     while isinstance(error.__cause__, OmegaConfBaseException):
         error = error.__cause__
     text, _, _ = str(error).partition("Config search path")
     key = re.search(r"full_key: (\S+)", text)
     if key and re.search(r"Key '.*' (is )?not in ", text):
-        return _no_such_key(key[1])
+        return no_such_key(key[1])
     tails = ("full_key", "reference_type", "object_type", "Set the env")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     told, *more = [line for line in lines if not line.startswith(tails)] or [type(error).__name__]
@@ -265,11 +298,11 @@ def _one_line(error: BaseException) -> str:
     return f"{key[1]}: {told}" if key else told
 
 
-def _no_such_key(key: str) -> str:
+def no_such_key(key: str, schema: type = TrainConfig) -> str:
     """The message for an unknown key, with the nearest known one."""
     if re.match(r"delay\.(obs|act|rew)\.", key):
         return f"{key}: no setting of the law that is there already; write another law over delay=none"
-    known = [str(name) for name in _keys(OmegaConf.structured(TrainConfig))]
+    known = [str(name) for name in _keys(OmegaConf.structured(schema))]
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.75)
     return f"{key}: no such key" + (f"; did you mean {near[0]}?" if near else "")
 

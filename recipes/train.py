@@ -1,15 +1,16 @@
 """Train UAVs with MAPPO, and show what they have learnt beside a random policy.
 
     python recipes/train.py agents=3 scenario=spotting motion=polynomial seed=1
-    python recipes/train.py +usecase=2
+    python recipes/train.py +usecase=2 delay=paper aware=both
     python recipes/train.py -m seed=0,1,2 agents=3,5
     python recipes/train.py resume=runs/2026-01-31_12-00-00
 
 The run folder explains itself: config.yaml, metrics.csv, TensorBoard events, checkpoint,
-learning_curve.png, result.md.
+learning_curve.png, result.csv, result.md.
 """
 
 import sys
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,25 +23,19 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import RewardSum, StepCounter
-from torchrl.objectives.multiagent import MAPPOLoss
 from tqdm import tqdm
 
 from damian.chain import DelayedEnv
+from damian.clocks import SystemClock
 from damian.delayed import make_env, messages_are_late
 from damian.delays import law_of
-from damian.losses import MappoConfig, add_advantages, losses_of, mappo_loss
+from damian.features import Snapshot
+from damian.mappo import Mappo
 from damian.metrics import EpisodeLog, Evaluation, evaluate
-from damian.models import make_actor, make_critic, random_policy
-from damian.runs import (
-    CHECKPOINT,
-    FIGURE,
-    Interrupt,
-    MetricsLog,
-    plot_learning_curve,
-    results_table,
-)
+from damian.models import random_policy
+from damian.runs import CHECKPOINT, FIGURE, Interrupt, MetricsLog, plot_learning_curve, save_results
 from damian.storage import BackupdateStorage, server_view
 
 
@@ -58,10 +53,10 @@ class Progress:
         self.frames, self.updates = int(state["frames"]), int(state["updates"])
 
 
-def learning_env(config: TrainConfig, worlds: int, seed: int) -> DelayedEnv:
-    """The environment that policies are trained and evaluated in."""
-    extras = ["reward_terms", "message"] if looks_back(config) else ["reward_terms"]
-    env = make_env(config, worlds, seed, config.device, extras)
+def learning_env(config: TrainConfig) -> DelayedEnv:
+    """The environment that policies are trained in."""
+    read = looks_back(config) or config.clock.trigger is not None
+    env = make_env(config, config.worlds, config.seed, config.device, ["reward_terms", *["message"] * read])
     if config.compile:
         env.compile()
     episode_reward = RewardSum(in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")])
@@ -75,93 +70,69 @@ def looks_back(config: TrainConfig) -> bool:
     return config.backupdate and messages_are_late(config)
 
 
-def make_memory(config: TrainConfig, env: DelayedEnv) -> TensorDictReplayBuffer | None:
+def make_memory(config: TrainConfig, env: DelayedEnv, clock: SystemClock) -> TensorDictReplayBuffer | None:
     """What keeps the latest steps until late messages have arrived; None if nothing is corrected."""
     if not looks_back(config):
         return None
     longest = law_of(config.delay.obs).sampler(config.clock.dt).longest
-    view = server_view(env.worlds.server, terms=True)
-    capacity = (config.update_steps + 2 * longest) * config.worlds
+    view = server_view(env.worlds.server, terms=True, actor=config.recompute_actor)
+    capacity = (clock.longest + 2 * longest) * config.worlds
     return TensorDictReplayBuffer(storage=BackupdateStorage(capacity, view, longest, device=config.device))
 
 
-def known_now(memory: TensorDictReplayBuffer | None, batch: TensorDictBase) -> TensorDictBase:
-    """A batch [B, T] as the server knows it by now.
+def ticks(collector: Collector, clock: SystemClock) -> Iterator[TensorDictBase]:
+    """What was collected between two ticks of the system clock, [B, T]."""
+    parts: list[TensorDictBase] = []
+    for part in collector:
+        parts.append(part)
+        if sum(part.shape[1] for part in parts) < clock.period:
+            continue
+        batch = cast(TensorDictBase, torch.cat(parts, 1)) if len(parts) > 1 else part  # type: ignore[arg-type]
+        if clock.change:
+            clock.tick(spotting(batch))
+        parts = []
+        yield batch
 
-    Steps after an end that the server learnt of late count too: until it does, a UAV must not undo it.
-    """
-    if memory is None:
-        return batch
-    memory.extend(batch)
-    storage = cast(BackupdateStorage, memory.storage)
-    return storage[storage.latest(batch.shape[1])].transpose(0, 1)
 
-
-def update(
-    batch: TensorDictBase,
-    loss: MAPPOLoss,
-    optimizer: torch.optim.Optimizer,
-    buffer: TensorDictReplayBuffer,
-    algo: MappoConfig,
-) -> dict[str, float]:
-    """One MAPPO update on a batch [B, T]; returns the mean losses."""
-    add_advantages(batch, loss, algo)
-    buffer.empty()
-    buffer.extend(batch.reshape(-1))
-    sums: dict[str, float] = {}
-    for _ in range(algo.epochs):
-        for part in buffer:
-            losses = losses_of(part, loss)
-            optimizer.zero_grad()
-            torch.stack([*losses.values()]).sum().backward()
-            torch.nn.utils.clip_grad_norm_(loss.parameters(), algo.max_grad_norm)
-            optimizer.step()
-            for term, value in losses.items():
-                sums[term] = sums.get(term, 0.0) + value.item()
-    return {term: total / (algo.epochs * algo.minibatches) for term, total in sums.items()}
+def spotting(batch: TensorDictBase) -> torch.Tensor:
+    """Which UAVs spot the source after a batch [B, T], as the server knows, [B, N]."""
+    agents = cast(TensorDictBase, batch["next", "agents"][:, -1])
+    return Snapshot.unpack(agents.get("received", agents["message"])).spotted
 
 
 def train(config: TrainConfig, folder: Path) -> None:
     """Learn, then evaluate and fill the run folder."""
-    env = learning_env(config, config.worlds, config.seed)
-    unseen = learning_env(config, config.eval_episodes, config.seed + 10_000)
-    actor, critic = make_actor(env, config.model), make_critic(env, config.model)
-    loss = mappo_loss(actor, critic, config.algo)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=config.algo.lr)
-    frames = config.worlds * config.update_steps
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(frames, device=config.device),
-        sampler=SamplerWithoutReplacement(),
-        batch_size=frames // config.algo.minibatches,
-    )
-    memory = make_memory(config, env)
+    env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
+    memory = make_memory(config, env, clock)
+    learner = Mappo(env, config.model, config.algo, memory, config.recompute_actor)
     progress, episodes = Progress(), EpisodeLog()
-    checkpoint = Checkpoint(
-        actor=actor,
-        critic=critic,
-        optimizer=optimizer,
-        progress=progress,
-        episodes=episodes,
-        rng=GlobalRNGState(),
-    )
+    state = {"progress": progress, "episodes": episodes, "clock": clock, "rng": GlobalRNGState()}
+    checkpoint = Checkpoint(**learner.parts(), **state)
+    if config.checkpoint:
+        load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", "critic"])
     if config.resume:
-        load(checkpoint, folder)
+        load(checkpoint, folder, "resume")
         env.set_seed(config.seed + progress.updates)  # not the first episodes once more
     save_config(config, folder)
     log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
     collector = Collector(
-        env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
+        env,
+        learner.actor,
+        frames_per_batch=config.worlds * clock.unit,
+        total_frames=-1,
+        auto_register_policy_transforms=True,
     )
-    bar = tqdm(total=config.frames, initial=progress.frames, unit=" steps", unit_scale=True)
+    bar = progress_bar(config, progress, episodes)
     with closing(log), closing(bar), Interrupt() as interrupt:
-        for batch in collector if not enough(config, progress, episodes) else ():
+        for batch in ticks(collector, clock) if not enough(config, progress, episodes) else ():
             episodes.add(batch)
-            losses = update(known_now(memory, batch), loss, optimizer, buffer, config.algo)
+            losses = learner.learn(batch)
             progress.frames += batch.numel()
             progress.updates += 1
-            log.add(progress.frames, {**episodes.means(), **mean_terms(batch), **losses})
+            means = {"episodes": float(episodes.finished), **episodes.means()}
+            log.add(progress.frames, {**means, **mean_terms(batch), **losses})
             bar.set_postfix({name: f"{mean:.2f}" for name, mean in episodes.means().items()})
-            bar.update(batch.numel())
+            bar.update((episodes.finished if config.episodes else progress.frames) - bar.n)
             over = enough(config, progress, episodes) or interrupt.asked
             if over or progress.updates % config.checkpoint_every == 0:
                 checkpoint.save(folder / CHECKPOINT)
@@ -170,7 +141,16 @@ def train(config: TrainConfig, folder: Path) -> None:
     collector.shutdown()
     if interrupt.asked:
         sys.exit(f"interrupted; go on with resume={folder}")
-    report(config, folder, unseen, actor, log)
+    random = report(config, folder, learner.actor)
+    plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, MAPPO")
+    print(f"learning curve: {folder / FIGURE}")
+
+
+def progress_bar(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> tqdm:
+    """Counts what the run is measured in."""
+    if config.episodes:
+        return tqdm(total=config.episodes, initial=episodes.finished, unit=" episodes")
+    return tqdm(total=config.frames, initial=progress.frames, unit=" steps", unit_scale=True)
 
 
 def enough(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> bool:
@@ -184,21 +164,24 @@ def mean_terms(batch: TensorDictBase) -> dict[str, float]:
     return {f"reward/{name}": term.mean().item() for name, term in terms.items()}
 
 
-def report(
-    config: TrainConfig, folder: Path, unseen: DelayedEnv, actor: torch.nn.Module, log: MetricsLog
-) -> None:
-    """Evaluate on situations that were not trained on, and write figure and table."""
+def report(config: TrainConfig, folder: Path, actor: torch.nn.Module) -> Evaluation:
+    """Evaluate in situations that were not trained on; results into the folder, and a table to read.
+
+    Returns:
+        what a random policy comes to.
+    """
+    seed = config.seed + 10_000
+    env = make_env(config, config.eval_episodes, seed, config.device, ["message"])
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
-        unseen.set_seed(config.seed + 10_000)  # the same episodes for every policy
-        return evaluate(unseen, policy, config.horizon, sample)
+        env.set_seed(seed)  # the same episodes for every policy
+        return evaluate(env, policy, config.horizon, sample)
 
-    random = fly(random_policy(unseen))
+    random = fly(random_policy(env))
     rows = {"trained, sampled": fly(actor), "trained, mode": fly(actor, False), "random": random}
-    table = results_table(rows, config.episode.success_share is not None)
-    (folder / "result.md").write_text(table + "\n")
-    plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, MAPPO")
-    print(f"\n{table}\n\nlearning curve: {folder / FIGURE}")
+    table = save_results(rows, folder, config.episode.success_share is not None, messages_are_late(config))
+    print(f"\n{table}\n")
+    return random
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

@@ -14,10 +14,11 @@ from torch import Tensor
 from twin import Uav
 
 from damian.actions import ActionConfig
+from damian.clocks import ClockConfig
 from damian.env import UavEnv
 from damian.features import GLOBAL, LOCAL, Knowledge, ObservationConfig, Snapshot
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
-from damian.scenario import ClockConfig, RegionConfig, ScenarioConfig
+from damian.scenario import RegionConfig, ScenarioConfig
 from damian.state import State
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig

@@ -24,12 +24,13 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
+from damian.clocks import ClockConfig
 from damian.delayed import ACTION, REWARD, SEEN, DelayedEnv, chain, holding, make_env, serving
 from damian.delays import DelayConfig, law_of
 from damian.env import EXTRAS, UavEnv
 from damian.features import Snapshot
 from damian.rewards import EpisodeConfig
-from damian.scenario import ClockConfig, ScenarioConfig
+from damian.scenario import ScenarioConfig
 from damian.transforms import ActionDelay, Clock, CumulativeReward, RewardDelay
 from damian.world.source import SourceConfig
 

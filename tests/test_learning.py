@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from damian.mappo import MappoConfig, add_advantages, losses_of, mappo_loss
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
@@ -12,7 +13,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from damian.actions import ActionConfig
 from damian.env import UavEnv
 from damian.errors import InputError
-from damian.losses import MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.models import ModelConfig, make_actor, make_critic, random_policy
 from damian.rewards import EpisodeConfig, RewardConfig

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from damian.clocks import ClockConfig
 from damian.errors import InputError
-from damian.scenario import ClockConfig, RegionConfig, ScenarioConfig, leftovers
+from damian.scenario import RegionConfig, ScenarioConfig, leftovers
 from damian.world.motion import MotionConfig
 
 

@@ -59,15 +59,12 @@ class ServerNode(Stateful):
 
     def see(self, memory: Memory, entries: Entries) -> Change:
         elapsed, snapshot = memory["elapsed"] + 1, Snapshot.unpack(entries[self.in_keys[0]])
-        steps = elapsed.view(self.rows)
-        over = entries.get("source_over", torch.zeros_like(steps, dtype=torch.bool)).view(self.rows)
-        features = self.server.features(snapshot, steps)
-        reward, terms, ended = self.server.judge(features, snapshot, steps, over)
-        seen = [*self.server.observations(features), reward.unsqueeze(-1)]
+        served = self.server.serve(snapshot, elapsed.view(self.rows), entries.get("source_over"))
+        seen = [served.observation, served.global_observation, served.reward.unsqueeze(-1)]
         made: Entries = {("agents", name): value for name, value in zip(_AGENTS, seen, strict=True)}
         if self.terms:
-            made |= {("agents", "reward_terms", name): term for name, term in terms.items()}
-        return {"elapsed": elapsed}, made | ended.entries()
+            made |= {("agents", "reward_terms", name): term for name, term in served.terms.items()}
+        return {"elapsed": elapsed}, made | served.status.entries()
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key in self.drop:

@@ -1,16 +1,21 @@
-"""MAPPO made from TorchRL's loss; keys are set here only."""
+"""MAPPO made from TorchRL's loss, on what the server knows by now; keys are set here only."""
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 
 from damian import checks
+from damian.models import ModelConfig, make_actor, make_critic
+from damian.storage import BackupdateStorage
 
 
 @dataclass
@@ -52,6 +57,76 @@ class MappoConfig:
             checks.in_range(f"algo.{name}", getattr(self, name), 0.0)
         for name in ("steps", "epochs", "minibatches"):
             checks.in_range(f"algo.{name}", getattr(self, name), 1)
+
+
+class Mappo:
+    """A learner: takes batches as they are collected, and improves its actor.
+
+    Args:
+        env: for the specs.
+        model: of actor and critic.
+        config: how to learn.
+        memory: buffer on a ``BackupdateStorage``; what is learnt from are the batches as it knows them.
+            None: what was perceived.
+        recompute_actor: the original authors' variant, in which the corrected observations also stand for
+            what the actor saw, as if it had chosen its action there.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        model: ModelConfig,
+        config: MappoConfig,
+        memory: TensorDictReplayBuffer | None = None,
+        recompute_actor: bool = False,
+    ) -> None:
+        self.config, self.memory, self.recompute_actor = config, memory, recompute_actor
+        self.actor, self.critic = make_actor(env, model), make_critic(env, model)
+        self.loss = mappo_loss(self.actor, self.critic, config)
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr)
+
+    def parts(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
+
+    def learn(self, batch: TensorDictBase) -> dict[str, float]:
+        """One update from a batch [B, T]; returns the mean losses, and what was corrected."""
+        known = self.known(batch)
+        add_advantages(known, self.loss, self.config)
+        replaced = {} if self.memory is None else {"backupdated": known["agents", "backupdated"]}
+        shares = {name: flag.float().mean().item() for name, flag in replaced.items()}
+        return {**shares, **self.optimize(known.reshape(-1))}
+
+    @torch.no_grad()
+    def known(self, batch: TensorDictBase) -> TensorDictBase:
+        """A batch [B, T] as the server knows it by now.
+
+        Steps after an end that the server learnt of late count too: until it does, a UAV must not undo it.
+        """
+        if self.memory is None:
+            return batch
+        self.memory.extend(batch)
+        storage = cast(BackupdateStorage, self.memory.storage)
+        batch = storage[storage.latest(batch.shape[1])].transpose(0, 1)
+        if self.recompute_actor:
+            chosen = self.actor.get_dist(batch).log_prob(batch["agents", "action"])
+            batch["agents", "action_log_prob"] = chosen
+        return batch
+
+    def optimize(self, steps: TensorDictBase) -> dict[str, float]:
+        """Some passes over steps [M] with advantages; returns the mean losses."""
+        sums: dict[str, float] = {}
+        for _ in range(self.config.epochs):
+            for index in torch.randperm(len(steps), device=steps.device).chunk(self.config.minibatches):
+                losses = losses_of(steps[index], self.loss)
+                self.optimizer.zero_grad()
+                torch.stack([*losses.values()]).sum().backward()
+                torch.nn.utils.clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
+                self.optimizer.step()
+                for term, value in losses.items():
+                    sums[term] = sums.get(term, 0.0) + value.item()
+        n_updates = self.config.epochs * self.config.minibatches
+        return {term: total / n_updates for term, total in sums.items()}
 
 
 def mappo_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig) -> MAPPOLoss:

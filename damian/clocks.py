@@ -1,0 +1,107 @@
+"""The four clocks: of the simulation, the agents, the server node, and the learner (paper, section 3.6)."""
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from damian import checks
+
+
+@dataclass
+class ClockConfig:
+    """Periods of the clocks, such as ``1s``, ``0.5m`` or ``1h``."""
+
+    simulation: str = "1s"
+    """Length of a simulation step, ``dt``."""
+    agents: str | None = None
+    """How often an agent observes and decides; as the simulation if not given."""
+    server: str | None = None
+    """How often the server node broadcasts; as the simulation if not given."""
+    system: str | None = None
+    """How often the learner takes what has been collected; every ``algo.steps`` steps if not given."""
+    trigger: str | None = None
+    """By how much the system clock's period shrinks at a tick while a UAV spots the source (in half of the
+    worlds or more), and grows otherwise; it is fixed if not given."""
+    shortest: str | None = None
+    """Least period of a triggered system clock; ``trigger``, if not given."""
+    longest: str | None = None
+    """Largest period of a triggered system clock; twice its first, if not given."""
+
+    def __post_init__(self) -> None:
+        fast, slow = ("simulation", "agents", "server"), ("trigger", "shortest", "longest")
+        for one, other in itertools.permutations((*fast, "system"), 2):
+            if self._seconds(one) >= self._seconds(other) or other == "simulation":
+                self._check_multiple(one, other)
+        given = [name for name in slow if getattr(self, name) is not None]
+        for one, other in itertools.product(given, fast):
+            checks.seconds(f"clock.{one}", getattr(self, one))
+            self._check_multiple(one, other)
+        should = "means nothing without clock.trigger: the system clock is fixed"
+        alone = given[0] if given and self.trigger is None else None
+        checks.require(alone is None, f"clock.{alone}", getattr(self, alone or "trigger"), should)
+
+    def _check_multiple(self, slow: str, fast: str) -> None:
+        ratio = self._seconds(slow) / self._seconds(fast)
+        whole = math.isclose(ratio, max(round(ratio), 1), rel_tol=1e-9)
+        should = f"is not a multiple of clock.{fast}={self._written(fast)}"
+        checks.require(whole, f"clock.{slow}", self._written(slow), should)
+
+    def _written(self, name: str) -> str:
+        return getattr(self, name) or self.simulation
+
+    def _seconds(self, name: str) -> float:
+        return checks.seconds(f"clock.{name}", self._written(name))
+
+    @property
+    def dt(self) -> float:
+        """Simulation step [s]."""
+        return self._seconds("simulation")
+
+    def steps(self, name: str) -> int:
+        """Period of a clock, in simulation steps."""
+        return round(self._seconds(name) / self.dt)
+
+
+class SystemClock:
+    """When the learner takes what has been collected: fixed, or triggered (paper, section 3.6).
+
+    Args:
+        config: of the clocks.
+        period: the first one [steps].
+
+    Raises:
+        InputError: the first period is out of the bounds.
+    """
+
+    def __init__(self, config: ClockConfig, period: int) -> None:
+        self.period, self.change = period, 0
+        self.shortest = self.longest = period
+        if config.trigger is not None:
+            self.change = config.steps("trigger")
+            self.shortest = config.steps("shortest") if config.shortest else self.change
+            self.longest = config.steps("longest") if config.longest else 2 * period
+            steps = f"{period} steps"
+            should = f"is out of clock.shortest, clock.longest = {self.shortest}, {self.longest} steps"
+            checks.require(self.shortest <= period <= self.longest, "clock.system", steps, should)
+
+    @property
+    def unit(self) -> int:
+        """Steps that every period is a multiple of."""
+        return math.gcd(self.period, self.change, self.shortest, self.longest)
+
+    def tick(self, spotting: Tensor) -> None:
+        """The next period follows from which UAVs spot the source, as the server knows, [B, N] bool."""
+        often = spotting.any(-1).float().mean() >= 0.5
+        changed = self.period - self.change if often else self.period + self.change
+        self.period = min(max(changed, self.shortest), self.longest)
+
+    def state_dict(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"period": self.period}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """From a checkpoint."""
+        self.period = int(state["period"])

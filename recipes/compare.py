@@ -1,0 +1,249 @@
+"""Arms x seeds, over tasks and delays, by one command: who copes with late messages, and how well.
+
+    python recipes/compare.py experiment=usecase2 seeds=10 processes=2
+    python recipes/compare.py experiment=delaybench "tasks=[tracking]" "arms=[undelayed,naive,both]"
+    python recipes/compare.py experiment=usecase2 seeds=2 "overrides=[frames=1000,eval_episodes=8]"
+    python recipes/compare.py experiment=usecase2 report_only=true
+
+conf/experiment says what is compared. Runs lie in runs/EXPERIMENT/TASK/DELAY/ARM/seed_N and print into
+log.txt there; what is finished is not run again, so that the same command goes on after Ctrl-C. Beside them:
+results.csv (every run), table.md and table.csv (means with 95 % intervals, J_norm, recovery), figure.png.
+"""
+
+import csv
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import hydra
+from hydra import compose
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from launch import CONF, checked, launch, no_such_key, one_line, quoted, reported
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from parallel import LOG, Run, check_stored, perform_all
+
+from damian import checks
+from damian.comparison import MODE, NOT_LATE, SAMPLED, SCORES, Arm, Comparison, lines
+from damian.comparison_report import markdown, plot_curves, plot_norms
+from damian.errors import InputError
+from damian.runs import read_metrics
+from damian.scenario import leftovers
+
+ALL_RESULTS, TABLE, MARKDOWN, FIGURE = "results.csv", "table.csv", "table.md", "figure.png"
+SEEDS, EPISODES = 10, 100
+"""At least so many for a number to be published (per seed and evaluation)."""
+POLICIES = {"sampled": SAMPLED, "mode": MODE}
+
+
+@dataclass
+class Experiment:
+    """What is compared: a file of conf/experiment. The lists are overrides of ``recipes/train.py``."""
+
+    tasks: dict[str, list[str]] = field(default_factory=dict)
+    delays: dict[str, list[str]] = field(default_factory=dict)
+    arms: dict[str, Arm] = field(default_factory=dict)
+    first_seed: int = 0
+    best: dict[str, float] = field(default_factory=dict)
+    """Dashed in the learning curves, by measure."""
+
+    def __post_init__(self) -> None:
+        for kind in ("tasks", "delays", "arms"):
+            for name in getattr(self, kind):
+                good = re.fullmatch(r"[\w.-]+", name) and name != NOT_LATE
+                checks.require(bool(good), f"experiment.{kind}", name, "is no name for a folder")
+        undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
+        should = "are not delayed: it must be one"
+        checks.require(len(undelayed) == 1, "experiment.arms", undelayed, should)
+        for name, arm in self.arms.items():
+            checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))
+
+
+@dataclass
+class CompareConfig:
+    """Everything that ``recipes/compare.py`` can be told."""
+
+    experiment: Experiment = MISSING
+    seeds: int = SEEDS
+    """How many, from ``experiment.first_seed`` on."""
+    processes: int = 1
+    """Runs at the same time, each with one thread if not said otherwise."""
+    tasks: list[str] | None = None
+    """Only these."""
+    delays: list[str] | None = None
+    """Only these."""
+    arms: list[str] | None = None
+    """Only these."""
+    overrides: list[str] = field(default_factory=list)
+    """Of ``recipes/train.py``, for every run."""
+    score: str = "true_return"
+    """The J of J_norm and recovery."""
+    policy: str = "sampled"
+    """Whose score: sampled or mode."""
+    report_only: bool = False
+    """Run nothing: tables and figure of what is there."""
+
+    def __post_init__(self) -> None:
+        checks.whole("seeds", self.seeds, 1, 10_000)
+        checks.whole("processes", self.processes, 1, 1024)
+        checks.one_of("score", self.score, SCORES)
+        checks.one_of("policy", self.policy, POLICIES)
+        for word in self.overrides:
+            ours = re.match(r"\+*(seed|resume|checkpoint|logger)\b", word)
+            checks.require(not ours, "overrides", word, "is not for all runs alike: the comparison sets it")
+        for kind in ("tasks", "delays", "arms"):
+            for name in getattr(self, kind) or ():
+                checks.one_of(kind, name, getattr(self.experiment, kind))
+        for name, arm in self.chosen("arms").items():
+            if arm.policy_of is not None:
+                sources = [name for name, arm in self.chosen("arms").items() if arm.policy_of is None]
+                checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, sources)
+
+    def chosen(self, kind: str) -> dict[str, Any]:
+        """What the experiment names, or the part of it that is asked for."""
+        known, only = getattr(self.experiment, kind), getattr(self, kind)
+        return {name: known[name] for name in known if only is None or name in only}
+
+
+ConfigStore.instance().store(name="compare_schema", node=CompareConfig)
+
+
+def plan(config: CompareConfig, folder: Path) -> list[Run]:
+    """Every run, with its checked configuration; those that fly what others have learnt come last."""
+    delays = {NOT_LATE: [], **config.chosen("delays")}
+    runs = [
+        run
+        for task, words in config.chosen("tasks").items()
+        for delay, late in delays.items()
+        for arm, how in config.chosen("arms").items()
+        if how.delayed == (delay != NOT_LATE)
+        for run in _seeds(config, folder / task / delay / arm, [*words, *late])
+    ]
+    return sorted(runs, key=lambda run: not run.trains)
+
+
+def _seeds(config: CompareConfig, folder: Path, words: list[str]) -> Iterator[Run]:
+    """The runs of one task, delay and arm."""
+    task, delay, arm = folder.parts[-3:]
+    how = config.experiment.arms[arm]
+    words = ["logger=csv", *words, *how.overrides, *config.overrides]
+    try:
+        first = checked(compose("train", quoted(words)))
+    except (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError) as error:
+        raise InputError(f"{task}/{delay}/{arm}: {one_line(error)}") from error
+    for seed in range(config.experiment.first_seed, config.experiment.first_seed + config.seeds):
+        last = f"seed_{seed}"
+        made = replace(first, seed=seed, overrides=[*words, f"seed={seed}"])
+        if how.policy_of:
+            source = config.experiment.arms[how.policy_of]
+            from_ = folder.parents[1] / (delay if source.delayed else NOT_LATE) / how.policy_of / last
+            made = replace(made, checkpoint=str(from_))
+        yield Run(task, delay, arm, made, folder / last, trains=how.policy_of is None)
+
+
+def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
+    """Write the tables and the figure of what is finished."""
+    done = [run for run in runs if run.finished]
+    if not done:
+        raise InputError(f"report_only: nothing is finished in {folder}")
+    arms = config.chosen("arms")
+    rows = [
+        {"task": run.task, "delay": run.delay, "arm": run.arm, "regime": arms[run.arm].regime, **seed, **row}
+        for run in done
+        for seed in [{"seed": run.config.seed}]
+        for row in run.results()
+    ]
+    comparison = Comparison(rows, arms, config.score, POLICIES[config.policy])
+    _write(folder / ALL_RESULTS, rows)
+    _write(folder / TABLE, [line.cells() for line in lines(comparison)])
+    never = {run.task for run in runs if run.config.episode.success_share is None}
+    lasted = {run.task: _lasted(run) for run in done}
+    (folder / MARKDOWN).write_text(markdown(comparison, _notes(config, runs, rows), lasted, never))
+    if len(comparison.tasks()) > 1:
+        plot_norms(comparison, folder / FIGURE)
+    else:
+        curves: dict[tuple[str, str, str], list[list[dict[str, float]]]] = {}
+        for run in done:
+            if run.trains:
+                curves.setdefault((run.task, run.delay, run.arm), []).append(read_metrics(run.folder))
+        plot_curves(comparison, curves, config.experiment.best, never, folder / FIGURE)
+
+
+def _write(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _lasted(run: Run) -> str:
+    """How long the runs of a task have learnt."""
+    limit = f" or {run.config.episodes} episodes, whatever comes first" if run.config.episodes else ""
+    return f"Trained for {run.config.frames} frames{limit}."
+
+
+def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
+    """How the numbers were made."""
+    seeds, episodes = sorted({row["seed"] for row in rows}), int(min(row["episodes"] for row in rows))
+    words = [word for word in HydraConfig.get().overrides.task if not word.startswith("report_only")]
+    words = [f'"{word}"' if re.search(r"[^\w=.,+/-]", word) else word for word in words]
+    missing = [run.name for run in runs if not run.finished]
+    notes = [
+        f"`{' '.join(['python recipes/compare.py', *words])}`",
+        f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {episodes} episodes per evaluation",
+        f"Mean over seeds [95 % interval: stratified bootstrap over seeds]; J: {config.score} of the "
+        f"{config.policy} policy; seen: as the server perceived it, else as it was; age in steps",
+        "J_norm: 0 random, 1 undelayed; recovery: 0 the stronger naive arm, 1 undelayed; not shown where "
+        "the delay costs less than a tenth of undelayed - random",
+    ]
+    if len(seeds) < SEEDS or episodes < EPISODES:
+        notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")
+    return notes + ([f"missing: {', '.join(missing)}"] if missing else [])
+
+
+@hydra.main(version_base=None, config_path=CONF, config_name="compare")
+@reported
+def main(written: DictConfig) -> None:
+    config = cast(CompareConfig, OmegaConf.to_object(written))
+    unknown = leftovers(written, config)
+    if unknown:
+        raise InputError(no_such_key(unknown[0], CompareConfig))
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    runs = plan(config, folder)
+    for run in runs:
+        check_stored(run)
+    failed: list[Run] = []
+    try:
+        if not config.report_only:
+            failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score))
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the same command goes on")
+    for run in failed:
+        print(f"failed: {run.name}; see {run.folder / LOG}", file=sys.stderr)
+    report(config, runs, folder)
+    print((folder / MARKDOWN).read_text())
+    if failed:
+        sys.exit(1)
+
+
+def start() -> None:
+    """Run the command line, whose overrides=[frames=1000,worlds=8] Hydra reads only with quotes."""
+    sys.argv = [_listed(word) for word in sys.argv]
+    launch(main)
+
+
+def _listed(word: str) -> str:
+    written = re.fullmatch(r"overrides=\[([^'\"]+)\]", word)
+    if not written:
+        return word
+    every = re.split(r",\s*(?=[+~]*[\w./]+=)", written[1])  # a comma before a key; others are within values
+    return f"overrides=[{','.join(repr(each) for each in every)}]"
+
+
+if __name__ == "__main__":
+    start()

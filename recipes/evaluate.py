@@ -1,0 +1,44 @@
+"""Fly a trained policy: as it was trained, or with more UAVs, other delays, another region.
+
+    python recipes/evaluate.py checkpoint=runs/2026-01-31_12-00-00 agents=10 delay=paper
+    python recipes/evaluate.py -m checkpoint=runs/2026-01-31_12-00-00 delay.obs=0,2,4,8
+
+Overrides of the training run hold where no others are given; what the actor sees must stay the same. The run
+folder gets config.yaml, result.csv and result.md.
+"""
+
+from pathlib import Path
+
+import hydra
+import torch
+from launch import CONF, TrainConfig, launch, load, prepare, reported, save_config
+from omegaconf import DictConfig
+from torchrl.checkpoint import Checkpoint
+from train import report
+
+from damian.delayed import make_env
+from damian.errors import InputError
+from damian.models import make_actor
+
+
+def fly(config: TrainConfig, folder: Path) -> None:
+    """Evaluate the policy of ``config.checkpoint``, and fill the folder."""
+    if not config.checkpoint:
+        raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
+    actor = make_actor(make_env(config, 1, config.seed, config.device), config.model)
+    load(Checkpoint(actor=actor), Path(config.checkpoint), "checkpoint")
+    save_config(config, folder)
+    report(config, folder, actor)
+
+
+@hydra.main(version_base=None, config_path=CONF, config_name="train")
+@reported
+def main(written: DictConfig) -> None:
+    config, folder = prepare(written)
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    fly(config, folder)
+
+
+if __name__ == "__main__":
+    launch(main)

@@ -1,0 +1,247 @@
+"""The comparison of arms as a person runs it: what runs and goes on, what is refused, what it adds up to."""
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compare import start
+
+from damian.comparison import MODE, RANDOM, SAMPLED, Arm, Comparison, lines
+from damian.comparison_report import markdown, plot_curves, plot_norms
+from damian.statistics import interquartile_mean
+
+SMALL = ["frames=16", "worlds=2", "algo.steps=4", "algo.epochs=1", "eval_episodes=3", "model.hidden=[4]"]
+TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,unaware]", f"overrides=[{','.join(SMALL)}]"]
+ARMS = {
+    "best": Arm(delayed=False),
+    "blind": Arm(naive=True),
+    "flown": Arm(naive=True, policy_of="best"),
+    "aware": Arm(),
+}
+
+
+@pytest.fixture
+def compare(tmp_path, monkeypatch):
+    """Run the recipe with overrides in an empty folder; returns where its results lie."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_recipe(*overrides: str) -> Path:
+        monkeypatch.setattr(sys, "argv", ["compare.py", *overrides])
+        start()
+        return tmp_path / "runs" / "usecase2"
+
+    return run_recipe
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in sorted(folder.rglob("seed_*/*")) if path.is_file()}
+
+
+def test_arms_and_seeds_are_run_once_and_go_on(compare, capsys):
+    folder = compare(*TWO)
+    told = capsys.readouterr().out
+    runs = [f"none/undelayed/seed_{n}" for n in (8, 9)] + [f"paper/unaware/seed_{n}" for n in (8, 9)]
+    found = sorted(path.parent.relative_to(folder / "usecase2") for path in folder.rglob("result.csv"))
+    assert [str(path) for path in found] == runs
+    assert "| random |" in (folder / "usecase2" / runs[0] / "log.txt").read_text()
+    assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
+    text = (folder / "table.md").read_text()
+    assert text.strip() in told
+    for part in ("**developing**", "2 seeds (8 to 9), 3 episodes", "Trained for 16 frames or 500", '"arms='):
+        assert part in text
+    rows = table(folder / "results.csv")
+    assert len(rows) == 4 * 3
+    mine = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("unaware", SAMPLED, "paper")]
+    assert [r["seed"] for r in mine] == ["8", "9"]
+    stored = [table(folder / "usecase2" / name / "result.csv")[0]["true_return"] for name in runs[2:]]
+    assert [float(r["true_return"]) for r in mine] == [float(number) for number in stored]
+
+    before = stamps(folder)
+    (folder / "usecase2" / runs[3] / "result.csv").unlink()  # as after Ctrl-C while it was evaluated
+    compare(*TWO[:2], "arms=[undelayed,unaware,deployed]", TWO[3])
+    after = stamps(folder)
+    again = {path for path in before if before[path] != after[path]}
+    assert again
+    assert all(runs[3] in path for path in again)
+    assert {Path(path).parent.parent.name for path in after.keys() - before.keys()} == {"deployed"}
+    went_on = [
+        "resume: null" not in (folder / "usecase2" / name / "config.yaml").read_text() for name in runs
+    ]
+    assert went_on == [False, False, False, True]
+
+    capsys.readouterr()
+    compare(*TWO[:1], "seeds=3", *TWO[2:], "report_only=true")
+    text = (folder / "table.md").read_text()
+    assert "missing: usecase2/none/undelayed/seed_10, usecase2/paper/unaware/seed_10" in text
+    assert stamps(folder) == after
+
+    with pytest.raises(SystemExit) as stopped:
+        compare(*TWO, "experiment.delays.paper=['delay=paper','delay.loss=0.5']")
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert f"{runs[2]}: delay.loss is 0.0 in this stored run, and 0.5 is asked for" in error
+    assert error.count("\n") == 1
+    assert stamps(folder) == after
+
+
+@pytest.mark.slow
+def test_several_processes_do_the_same_as_one_and_a_failed_run_is_named(compare, capsys):
+    words = [*TWO[:2], "arms=[undelayed,unaware,deployed]", TWO[3]]
+    folder = compare(*words)
+    alone = (folder / "results.csv").read_text()
+    compare(*words, "processes=2", "hydra.run.dir=runs/usecase2/other")
+    assert (folder / "other" / "results.csv").read_text() == alone
+    broken = folder / "other" / "usecase2" / "none" / "undelayed" / "seed_8"
+    (broken / "result.csv").unlink()
+    (broken / "metrics.csv").write_text("nonsense")
+    with pytest.raises(SystemExit) as stopped:
+        compare(*words, "processes=2", "hydra.run.dir=runs/usecase2/other")
+    assert stopped.value.code == 1
+    assert f"failed: usecase2/none/undelayed/seed_8; see {broken / 'log.txt'}" in capsys.readouterr().err
+    assert "missing: usecase2/none/undelayed/seed_8" in (folder / "other" / "table.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["overrides=[framess=3]"], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
+        (["overrides=[delay=papers]"], "'delay/papers'"),
+        (["overrides=[agents=two]"], "agents: Value 'two'"),
+        (["overrides=[delay.loss=0.1,source.position=[1,2,3]]"], "source.position: [1, 2, 3] is not"),
+        (["overrides=[seed=3]"], "overrides: seed=3 is not for all runs alike"),
+        (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not one of"),
+        (["arms=[undelayed,awake]"], "arms: awake is not one of undelayed, unaware, deployed, history"),
+        (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
+        (["seedz=3"], "seedz: no such key"),
+        (["+seedz=3"], "seedz: no such key"),
+        (["seeds=0"], "seeds: 0 is not between 1 and"),
+        (["processes=none"], "processes"),
+        (["score=age"], "score: age is not one of true_return, "),
+        (["policy=best"], "policy: best is not one of sampled, mode"),
+        (["experiment.arms.both.regime=R7"], "experiment.arms.both.regime: R7 is not one of R0, "),
+        (["experiment.arms.both.delayed=false"], "experiment.arms: ['undelayed', 'both'] are not delayed"),
+        (["+experiment.delays.none=[]"], "experiment.delays: none is no name for a folder"),
+        (["report_only=true"], "report_only: nothing is finished in"),
+    ],
+)
+def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(compare, capsys, tmp_path, overrides, told):
+    with pytest.raises(SystemExit) as stopped:
+        compare("experiment=usecase2", "seeds=2", *overrides)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert told in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = SAMPLED) -> dict:
+    """A row of which every measure is the value."""
+    where = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
+    names = ("true_return", "true_success_rate", "true_steps", "episode_return", "success_rate", "steps")
+    return where | dict.fromkeys((*names, "age", "late", "lost", "episodes"), value)
+
+
+def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
+    return [
+        row(task, "none" if arm == "best" else delay, arm, seed, x, policy)
+        for arm, values in scores.items()
+        for seed, value in enumerate(values)
+        for policy, x in ((SAMPLED, value), (MODE, value), (RANDOM, random))
+    ]
+
+
+SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware": [6.0, 9.0]}
+
+
+def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
+    compared = Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
+    norm, recovery = compared["aware"]
+    assert norm.value == 7.5 / 10
+    assert recovery.value == (7.5 - 4) / (10 - 4)
+    # of two seeds there are three resamples: each seed alone, and both
+    assert (recovery.low, recovery.high) == ((6 - 5) / (9 - 5), (9 - 5) / (11 - 5))
+    assert compared["blind"][0].value == 3 / 10
+    assert np.isnan(compared["blind"][1].value)
+    assert np.isnan(compared["flown"][1].value)
+
+
+def test_recovery_is_not_shown_if_the_delay_costs_nothing():
+    scores = SCORES | {"blind": [9.0, 9.5]}
+    norm, recovery = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
+    assert norm.value == 0.75
+    assert str(recovery) == "-"
+
+
+def test_fewer_steps_are_better():
+    steps = {arm: [20 - x for x in values] for arm, values in SCORES.items()}
+    by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "true_steps").compared("t", "late")
+    assert by_steps == Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
+
+
+def test_only_seeds_that_all_arms_have_are_compared():
+    rows = rows_of("t", "late", SCORES)
+    more = rows_of("t", "late", {"best": [0, 0, 99.0], "aware": [0, 0, -7.0]})
+    more = [row for row in more if row["seed"] == 2]
+    assert Comparison(rows + more, ARMS).compared("t", "late") == Comparison(rows, ARMS).compared("t", "late")
+
+
+def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
+    rows, norms = [], []
+    for task, best in (("t", [9.0, 11.0]), ("u", [3.0, 5.0])):
+        for delay, aware in (("late", [6.0, 1.0]), ("later", [2.0, 0.0])):
+            rows += rows_of(task, delay, {"blind": [0.0, 0.0], "aware": aware})
+            norms += [x / np.mean(best) for x in aware]
+        rows += rows_of(task, "none", {"best": best})
+    overall = Comparison(rows, ARMS).overall()
+    assert overall["aware"].value == pytest.approx(interquartile_mean(np.array(norms)), abs=1e-12)
+    assert overall["aware"].low < overall["aware"].value < overall["aware"].high
+    assert overall["blind"].value == 0
+    assert Comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")], ARMS).overall()
+    one = Comparison(rows_of("t", "late", SCORES), ARMS)
+    assert one.overall() == {}
+
+
+def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
+    found = list(lines(Comparison(rows_of("t", "late", SCORES), ARMS)))
+    told = [(line.delay, line.arm, line.policy) for line in found]
+    assert told == [
+        ("none", "best", SAMPLED),
+        ("none", "best", MODE),
+        ("none", RANDOM, RANDOM),
+        *[("late", arm, policy) for arm in ("blind", "flown", "aware") for policy in (SAMPLED, MODE)],
+        ("late", RANDOM, RANDOM),
+    ]
+    cells = found[7].cells()
+    assert [cells[name] for name in ("arm", "regime", "policy", "seeds")] == ["aware", "R0", SAMPLED, 2]
+    assert [cells[f"true_return{end}"] for end in ("", "_low", "_high")] == [7.5, 6.0, 9.0]
+    assert (cells["J_norm"], cells["recovery"]) == (0.75, 3.5 / 6)
+    assert (found[3].cells()["recovery"], found[8].cells()["J_norm"]) == ("", "")
+
+
+def test_a_task_without_success_shows_none_and_several_places_are_summed_up():
+    rows = rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES)
+    text = markdown(Comparison(rows, ARMS), ["a note"], {"t": "long", "u": "short"}, never={"u"})
+    first, second, overall = text.split("##")[1:]
+    aware = "| aware | R0 | trained, sampled | 7.500 [6.000, 9.000] |"
+    assert aware + " 7.500" in first
+    assert aware + " - |" in second
+    assert "| 0.750 [0.667, 0.818] | 0.583 [0.250, 0.667] |" in first
+    assert "| aware | 0.750 [" in overall
+
+
+def test_figures_take_arms_that_learn_nothing_and_runs_without_a_finished_episode(tmp_path):
+    comparison = Comparison(rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES), ARMS)
+    curve = [{"episodes": n, "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in range(5)]
+    none = [dict.fromkeys(curve[0], np.nan) | {"episodes": 0.0}]
+    curves = {("t", "none", "best"): [curve, curve[1:]], ("t", "late", "blind"): [none, none]}
+    plot_curves(comparison, curves, {"steps": 1.0}, {"u"}, tmp_path / "curves.png")
+    plot_norms(comparison, tmp_path / "norms.png")
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("curves.png", "norms.png"))
