@@ -1,6 +1,5 @@
 """A scenario's environment with its delays, losses and clocks: the one place that knows their order."""
 
-import math
 from collections.abc import Collection
 from typing import Any
 
@@ -137,8 +136,12 @@ def holding(actions: ActionConfig) -> int:
 
 
 def action_codes(actions: ActionConfig) -> Tensor | None:
-    """Discrete actions as an actor sees its past ones: distance and heading, each in [0, 1], [A, 2]."""
+    """Discrete actions as an actor sees its past ones: how far east and north, each in [0, 1], [A, 2].
+
+    Displacements, not distance and heading: where a UAV must be by now is then a sum over what it sees.
+    """
     if actions.kind == "continuous":
         return None  # they are just that
     distance, heading = actions.table().unbind(-1)
-    return torch.stack([distance / distance.max(), (heading / (2 * math.pi)) % 1], -1)
+    there = torch.stack([heading.sin(), heading.cos()], -1) * (distance / distance.max()).unsqueeze(-1)
+    return (there + 1) / 2

@@ -46,6 +46,10 @@ class ObservationConfig:
     """Centralised training, decentralised execution: the actor sees the local features only."""
     time_scale: float | None = None
     """Times are divided by this [s]; by the episode's time limit, or an hour, if not given."""
+    age: bool = False
+    """Show each UAV how old what the server holds of it is (age of information, SPEC 4)."""
+    age_scale: float = 10.0
+    """Ages are divided by this [s]."""
     window: int = 2
     """Positions over which the coverage area is counted."""
 
@@ -56,6 +60,7 @@ class ObservationConfig:
             checks.one_of("observation.global_features", name, GLOBAL)
         if self.time_scale is not None:
             checks.above("observation.time_scale", self.time_scale, 0.0, "s")
+        checks.above("observation.age_scale", self.age_scale, 0.0, "s")
         checks.in_range("observation.window", self.window, 1, 16)
         checks.require(
             bool(self.actor),
@@ -67,12 +72,16 @@ class ObservationConfig:
     @property
     def actor(self) -> list[str]:
         """Features of the actor's observation, in order."""
-        return list(self.local_features) if self.ctde else self.critic
+        return self._local if self.ctde else self.critic
 
     @property
     def critic(self) -> list[str]:
         """Features of the critic's observation, in order."""
-        return [*self.global_features, *self.local_features]
+        return [*self.global_features, *self._local]
+
+    @property
+    def _local(self) -> list[str]:
+        return [*self.local_features, "age"] if self.age else list(self.local_features)
 
 
 class Snapshot(NamedTuple):
@@ -143,6 +152,8 @@ class Knowledge(NamedTuple):
     """For the coverage; None if nobody asks for it."""
     points: Tensor
     """Landing points by flat id, [R*L, 2] metres."""
+    age_scale: float
+    """[s]."""
 
 
 def observe(snapshot: Snapshot, server: Knowledge, names: list[str]) -> dict[str, Tensor]:
@@ -290,4 +301,10 @@ def _spotted(v: _View) -> Tensor:
     return v.snapshot.spotted.to(v.scale.dtype)
 
 
-_FEATURES: dict[str, Callable[[_View], Tensor]] = {name: globals()[f"_{name}"] for name in (*GLOBAL, *LOCAL)}
+def _age(v: _View) -> Tensor:
+    return ((v.server.now.unsqueeze(-1) - v.snapshot.time) / v.server.age_scale).clamp(max=1)
+
+
+_FEATURES: dict[str, Callable[[_View], Tensor]] = {
+    name: globals()[f"_{name}"] for name in (*GLOBAL, *LOCAL, "age")
+}

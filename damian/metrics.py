@@ -21,7 +21,7 @@ class Evaluation:
     episodes: int
     success_rate: float
     steps: float
-    """Of an episode; one that nothing ends counts the horizon."""
+    """Of an episode; where success is possible, one without it counts the horizon."""
     episode_return: float
     """Sum of rewards of an episode, mean over the UAVs."""
     true_success_rate: float
@@ -62,15 +62,19 @@ def evaluation(flown: TensorDictBase, server: Server) -> Evaluation:
     truth = server.serve(Snapshot.unpack(message), elapsed, after.get("source_over", None))
     told = _until(after["done"].squeeze(-1))
     true = told & _until(truth.status.terminated)
-    success, won = (_ever(flag, told) for flag in (after["success"].squeeze(-1), truth.status.success))
-    won_at = torch.where(won, true.sum(-1), torch.where(success, horizon, told.sum(-1)))
+    success, won = _ever(after["success"].squeeze(-1), told), _ever(truth.status.success, true)
+    can_fail = server.config.episode.success_share is not None
+    steps, won_at = (
+        torch.where(ever | (not can_fail), until.sum(-1), horizon)
+        for ever, until in ((success, told), (won, true))
+    )
     held = Snapshot.unpack(after.get(("agents", "received"), message))
     age = elapsed.unsqueeze(-1) - held.time / server.dt
     late, lost = _late(cast(TensorDictBase, after["agents"]), told)
     return Evaluation(
         episodes=len(told),
         success_rate=_mean(success),
-        steps=_mean(told.sum(-1)),
+        steps=_mean(steps),
         episode_return=_mean((after["agents", "reward"].squeeze(-1).mean(-1) * told).sum(-1)),
         true_success_rate=_mean(won),
         true_steps=_mean(won_at),

@@ -94,6 +94,7 @@ class Server:
             battery=self.config.battery,
             footprints=self._footprints,
             points=self._points,
+            age_scale=self.config.observation.age_scale,
         )
         return observe(snapshot, knowledge, self._wanted)
 

@@ -1,10 +1,11 @@
-"""How fast the environment is beside VMAS, what delays cost, how it grows, and what memory it takes.
+"""How fast the environment and training are beside VMAS, what delays cost, growth, and memory.
 
     python recipes/bench.py            (a few minutes)
     python recipes/bench.py --quick    (seconds: does it run?)
 
-One thread, random actions through TorchRL's ``rollout``. Rivals take turns, so that a busy machine slows
-all of them, and medians are reported. The tables are also written to runs/bench.md.
+One thread, random actions through TorchRL's ``rollout``; training is measured in ``bench_training.py``.
+Rivals take turns, so that a busy machine slows all of them, and medians are reported. The tables are also
+written to runs/bench.md.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from bench_training import HEADER, training
 from hydra import compose, initialize_config_dir
 from launch import CONF, TrainConfig
 from omegaconf import OmegaConf
@@ -55,9 +57,14 @@ class Sizes:
     growth_steps: int = 15
     """Length of a rollout where only the growth is of interest."""
     modes: tuple[str, ...] = ("eager", "compiled")
+    training_worlds: int = 256
+    training_steps: int = 32
+    """Steps of every world in a batch."""
 
 
-QUICK = Sizes(16, 4, 2, many_worlds=(1, 8), many_uavs=(1, 3), growth_steps=4, modes=("eager",))
+QUICK = Sizes(
+    16, 4, 2, many_worlds=(1, 8), many_uavs=(1, 3), growth_steps=4, modes=("eager",), training_worlds=4
+)
 
 
 def scenarios() -> Scenarios:
@@ -222,6 +229,13 @@ def memory(presets: Scenarios) -> str:
     )
 
 
+def training_speed(sizes: Sizes) -> str:
+    """Steps of worlds per second of training, and where the time goes."""
+    worlds, steps = sizes.training_worlds, sizes.training_steps
+    title = f"Training: {worlds} worlds, 3 UAVs, {steps} steps; median of {sizes.repeats} iterations"
+    return table(title, HEADER, training(worlds, steps, sizes.repeats))
+
+
 def tensors(tree: Any) -> Iterator[Tensor]:
     """Every tensor in nested containers and objects."""
     if isinstance(tree, Tensor):
@@ -267,6 +281,7 @@ def main() -> None:
         growth_with_worlds(presets, sizes),
         growth_with_uavs(presets, sizes),
         memory(presets),
+        training_speed(sizes),
     ):
         print(part)
         report.append(part)

@@ -156,7 +156,8 @@ def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:
     elif (folder / CONFIG).exists():
         raise InputError(f"hydra.run.dir: {folder} holds a run already; resume={folder} goes on with it")
     config = checked(written)
-    config.overrides = list(HydraConfig.get().overrides.task)
+    if config.resume is None:
+        config.overrides = list(HydraConfig.get().overrides.task)
     return config, folder
 
 
@@ -230,10 +231,10 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
 
 def launch(main: Callable[[], Any]) -> None:
     """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
-    sys.argv[1:] = inherited(sys.argv[1:])
-    sys.argv[1:] = quoted(sys.argv[1:])
     _begun.clear()
     try:
+        words = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))  # flags first
+        sys.argv[1:] = quoted(inherited(words))
         main()
     except (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError) as error:
         if _begun:
@@ -242,17 +243,30 @@ def launch(main: Callable[[], Any]) -> None:
 
 
 def inherited(words: list[str]) -> list[str]:
-    """Overrides, with those of the run whose ``checkpoint`` they name in front, where they give no others."""
-    folder = next((word.partition("=")[2] for word in words if word.startswith("checkpoint=")), None)
-    if not folder or not (Path(folder) / CONFIG).is_file():
+    """Overrides, and those of the run whose ``checkpoint`` they name, where they give no others.
+
+    Raises:
+        InputError: the run's configuration cannot be read.
+    """
+    value = next((word.partition("=")[2] for word in words if word.startswith("checkpoint=")), "")
+    file = Path(value.strip("'\"")) / CONFIG
+    if not value or not file.is_file():
         return words  # whoever wants to load it will say so
-    saved = cast(DictConfig, OmegaConf.load(Path(folder) / CONFIG)).get("overrides", [])
-    given = {_key(word) for word in words}
-    return [word for word in saved if _key(word) not in given] + words
+    try:
+        saved = cast(list[str], OmegaConf.to_container(OmegaConf.load(file))["overrides"])  # type: ignore
+        given = [_key(word) for word in words]
+        return words + [word for word in saved if not any(_sets(key, _key(word)) for key in given)]
+    except Exception as error:  # whatever a spoilt file makes of itself
+        raise InputError(f"checkpoint: {file}: {one_line(error)}") from error
 
 
 def _key(override: str) -> str:
     return override.lstrip("+~").partition("=")[0]
+
+
+def _sets(given: str, key: str) -> bool:
+    """Does an override of the one, perhaps a group, also decide about the other?"""
+    return key == given or key.startswith(f"{given}.")
 
 
 def _give_up(error: Exception) -> NoReturn:

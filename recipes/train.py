@@ -108,11 +108,11 @@ def train(config: TrainConfig, folder: Path) -> None:
     progress, episodes = Progress(), EpisodeLog()
     state = {"progress": progress, "episodes": episodes, "clock": clock, "rng": GlobalRNGState()}
     checkpoint = Checkpoint(**learner.parts(), **state)
-    if config.checkpoint:
-        load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", "critic"])
     if config.resume:
         load(checkpoint, folder, "resume")
         env.set_seed(config.seed + progress.updates)  # not the first episodes once more
+    elif config.checkpoint:
+        load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", "critic"])
     save_config(config, folder)
     log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
     collector = Collector(

@@ -246,6 +246,7 @@ def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Snapshot, Knowle
         now=torch.tensor([now for now, _ in worlds]),
         scale=torch.full((len(worlds),), SCALE),
         time_scale=TIME_SCALE,
+        age_scale=10.0,
         battery=BatteryConfig(resolution=5.0),
         footprints=None,
         points=torch.zeros(1, 2),

@@ -349,18 +349,19 @@ def test_the_paper_s_law_makes_15_percent_late_and_its_ages_are_those_of_theory(
     check_mean(ages.mean(0), older.cumprod(0).sum().item())
 
 
-def test_uavs_remember_distance_and_heading_of_the_actions_that_they_chose():
+def test_uavs_remember_how_far_east_and_north_they_chose_to_go():
     scenario = square(delay=DelayConfig(act=2, history=2), episode=KEEPS_GOING)
     env, plain = delayed(scenario), UavEnv(square(), 4)
     actions = choices(env, 6)
     distance, heading = scenario.actions.table().unbind(-1)
-    table = torch.stack([distance / 200, (heading / (2 * math.pi)) % 1], -1)
+    there = torch.stack([distance * heading.sin(), distance * heading.cos()], -1)
+    table = (there / 200 + 1) / 2
     shown = play(env, actions)
     for t in range(2, 6):
         expected = torch.cat([table[actions[t - 1]], table[actions[t]]], -1)
         seen = shown[2 * t + 1][SEEN]
         assert seen.shape[-1] == plain.observation_spec[SEEN].shape[-1] + 4
-        assert seen[..., -4:].equal(expected)
+        torch.testing.assert_close(seen[..., -4:], expected, rtol=0, atol=1e-6)
 
 
 # Clocks.

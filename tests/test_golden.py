@@ -221,6 +221,7 @@ def scene(case: int, records: list[Move]) -> tuple[Snapshot, Knowledge, Counters
         now=number.float(),
         scale=torch.full((len(records),), golden["max_distance_normaliser_m"]),
         time_scale=golden["time_max_normaliser"],
+        age_scale=10.0,
         battery=BatteryConfig(),
         footprints=None,
         points=torch.zeros(1, 2),

@@ -1,23 +1,23 @@
-"""Models, losses and metrics: what is learnt from, by whom, and what is measured."""
-
-import math
+"""Models, losses and the learner: what is learnt from, by whom, and what it does to importance ratios."""
 
 import pytest
 import torch
-from damian.mappo import MappoConfig, add_advantages, losses_of, mappo_loss
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
+from helpers import both_kinds, everything
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.actions import ActionConfig
+from damian.delayed import make_env
+from damian.delays import DelayConfig
 from damian.env import UavEnv
-from damian.errors import InputError
-from damian.metrics import EpisodeLog, Evaluation, evaluate
+from damian.mappo import Mappo, MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.models import ModelConfig, make_actor, make_critic, random_policy
 from damian.rewards import EpisodeConfig, RewardConfig
-from damian.runs import MetricsLog, read_metrics, results_table
 from damian.scenario import RegionConfig, ScenarioConfig
+from damian.storage import BackupdateStorage, server_view
 from damian.world.motion import MotionConfig
 
 SMALL = ModelConfig(hidden=[16])
@@ -156,78 +156,74 @@ def test_the_critic_alone_sees_global_features_under_ctde():
     assert env.observation_spec["agents", "observation"].shape[-1] == 4
 
 
-def scripted(batch: int, done_at: list[int], success: list[bool], horizon: int) -> TensorDict:
-    """A batch in which world b ends at step done_at[b], again and again."""
-    done = torch.zeros(batch, horizon, 1, dtype=torch.bool)
-    for b, t in enumerate(done_at):
-        done[b, t - 1 :: t] = True
-    won = done & torch.tensor(success).view(-1, 1, 1)
-    reward = torch.arange(1.0, horizon + 1).view(1, -1, 1, 1).expand(batch, horizon, 2, 1)
-    return TensorDict(
-        {"next": {"done": done, "success": won, "agents": {"reward": reward}}}, [batch, horizon]
-    )
+# What hindsight does to the importance ratios of the first pass.
+
+ROUNDING = 1e-5
+"""Of log-probabilities that are computed step by step, and in one batch."""
 
 
-def test_an_evaluation_counts_the_first_episode_of_each_world_only():
-    class Script(UavEnv):
-        def rollout(self, *_, **__):
-            return scripted(3, [2, 5, 9], [True, False, True], 6)
-
-    row = evaluate(Script(scenario(), 3), TensorDictModule(lambda x: x, ["a"], ["b"]), 6)
-    assert row.episodes == 3
-    assert row.steps == pytest.approx((2 + 5 + 6) / 3)  # the third is cut at the horizon
-    assert row.success_rate == pytest.approx(1 / 3)
-    assert row.episode_return == pytest.approx((3 + 15 + 21) / 3)
-
-
-def test_the_episode_log_means_what_a_loop_over_episodes_means():
-    config = scenario(episode=EpisodeConfig(max_steps=7, success_share=0.3))
-    env = TransformedEnv(
-        UavEnv(config, 16),
-        Compose(RewardSum([("agents", "reward")], [("agents", "episode_reward")]), StepCounter()),
-    )
-    batch, log = env.rollout(40, break_when_any_done=False), EpisodeLog(window=10_000)
-    log.add(batch)
-    returns, wins, lengths = [], [], []
-    for world in batch:
-        total, steps = 0.0, 0
-        for step in world:
-            total += step["next", "agents", "reward"].mean().item()
-            steps += 1
-            if step["next", "done"].item():
-                returns.append(total)
-                wins.append(step["next", "success"].item())
-                lengths.append(steps)
-                total, steps = 0.0, 0
-    means = log.means()
-    assert log.finished == len(returns) > 0
-    assert 0 < means["success_rate"] < 1
-    assert means["episode_return"] == pytest.approx(sum(returns) / len(returns), abs=1e-5)
-    assert means["success_rate"] == pytest.approx(sum(wins) / len(wins))
-    assert means["steps"] == pytest.approx(sum(lengths) / len(lengths))
+def collected_late(kind: str, recompute_actor: bool) -> tuple[Mappo, TensorDictBase]:
+    """A learner with back-updating, and a batch that its actor has flown under delay, with episodes' ends."""
+    late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
+    scenario = everything(kind=kind, delay=late, episode=EpisodeConfig(max_steps=9))
+    env = make_env(scenario, 4, seed=1, extras=["message"])
+    env.append_transform(StepCounter())
+    view = server_view(env.worlds.server, actor=recompute_actor)
+    memory = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, view, longest=5))
+    torch.manual_seed(2)
+    learner = Mappo(env, SMALL, MappoConfig(minibatches=1, epochs=1), memory, recompute_actor)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        return learner, env.rollout(30, learner.actor, break_when_any_done=False)
 
 
-def test_an_episode_log_survives_a_checkpoint():
-    log, restored = EpisodeLog(), EpisodeLog()
-    assert math.isnan(log.means()["steps"])
-    log.finished = 1
-    log._recent.append((1.0, 0.0, 5.0))
-    restored.load_state_dict(log.state_dict())
-    assert restored.means() == log.means()
-    assert restored.finished == 1
+@torch.no_grad()
+def log_ratios(learner: Mappo, known: TensorDictBase, behaviour: Tensor) -> Tensor:
+    """Of the importance ratios of what is learnt from, [B, T, N]."""
+    return learner.actor.get_dist(known.clone()).log_prob(known["agents", "action"]) - behaviour
 
 
-def test_a_spoilt_metrics_file_is_one_clear_line(tmp_path):
-    log = MetricsLog(tmp_path, tensorboard=False, to_csv=True)
-    log.add(10, {"steps": 2.0})
-    assert read_metrics(tmp_path) == [{"frames": 10.0, "steps": 2.0}]
-    with (tmp_path / "metrics.csv").open("a") as file:
-        file.write("20,many\n")
-    with pytest.raises(InputError, match=r"metrics\.csv, line 3: not a row of numbers"):
-        read_metrics(tmp_path)
+@both_kinds
+def test_with_backupdating_the_first_importance_ratios_are_one_as_the_actor_saw_what_it_saw(kind):
+    learner, batch = collected_late(kind, recompute_actor=False)
+    known, behaviour = learner.known(batch), batch["agents", "action_log_prob"]
+    assert known["agents", "observation"].equal(batch["agents", "observation"])
+    assert known["agents", "action_log_prob"].equal(behaviour)
+    assert known["agents", "backupdated"].any()
+    assert log_ratios(learner, known, behaviour).abs().max() < ROUNDING
 
 
-def test_a_task_without_success_shows_none():
-    row = {"random": Evaluation(4, 0.0, 50.0, 1.5)}
-    assert "| random | - | 50.00 | 1.500 | 4 |" in results_table(row, can_succeed=False)
-    assert "| random | 0.00 | 50.00 | 1.500 | 4 |" in results_table(row, can_succeed=True)
+@both_kinds
+def test_recompute_actor_hides_that_corrected_observations_were_never_acted_on(kind):
+    learner, batch = collected_late(kind, recompute_actor=True)
+    known, behaviour = learner.known(batch), batch["agents", "action_log_prob"]
+    assert known["agents", "action"].equal(batch["agents", "action"])
+    corrected = (known["agents", "observation"] != batch["agents", "observation"]).any(-1)
+    assert 0.1 < corrected.float().mean() < 0.9
+    # What the loss is told: as if the actor had chosen with what came later.
+    assert log_ratios(learner, known, known["agents", "action_log_prob"]).abs().max() < ROUNDING
+    # What it did: another probability wherever something was corrected, and nowhere else.
+    true = log_ratios(learner, known, behaviour)
+    assert (true.abs() > ROUNDING).equal(corrected)
+    assert (true.exp() - 1).abs()[corrected].mean() > 0.01
+
+
+def test_an_observation_is_corrected_where_a_message_came_late_for_the_step_before():
+    learner, batch = collected_late("discrete", recompute_actor=True)
+    known = learner.known(batch)
+    corrected = (known["agents", "observation"] != batch["agents", "observation"]).any(-1).any(-1)
+    late = known["agents", "backupdated"].squeeze(-1).any(-1)
+    begins = batch["step_count"].squeeze(-1) == 0
+    assert begins[:, 1:].any()
+    assert not corrected[begins].any()
+    assert not (corrected[:, 1:] & ~late[:, :-1]).any()
+
+
+def test_what_was_corrected_is_reported_with_the_losses():
+    learner, batch = collected_late("discrete", recompute_actor=False)
+    share = learner.known(batch)["agents", "backupdated"].float().mean().item()
+    learner, batch = collected_late("discrete", recompute_actor=False)
+    losses = learner.learn(batch)
+    assert losses["backupdated"] == share
+    assert {"loss_objective", "loss_entropy", "loss_critic"} < set(losses)
+    learner.memory = None
+    assert "backupdated" not in learner.learn(batch)

@@ -8,7 +8,12 @@ from pathlib import Path
 import pytest
 from launch import TrainConfig, launch
 from omegaconf import OmegaConf
+from torch import Tensor
+from torchrl.checkpoint import Checkpoint
 from train import main
+
+from damian.delayed import make_env
+from damian.models import make_actor, make_critic
 
 TINY = ["frames=256", "worlds=8", "algo.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 GOLDEN = Path(__file__).parent / "data"
@@ -30,6 +35,17 @@ def run(tmp_path, monkeypatch):
 def metrics(folder: Path) -> list[dict[str, float]]:
     with (folder / "metrics.csv").open(newline="") as file:
         return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
+
+
+def weights(folder: Path) -> dict[str, Tensor]:
+    """What actor and critic of a run have learnt, by name."""
+    config = OmegaConf.to_object(
+        OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(folder / "config.yaml"))
+    )
+    env = make_env(config)
+    parts = {"actor": make_actor(env, config.model), "critic": make_critic(env, config.model)}
+    Checkpoint(**parts).load(folder / "checkpoint", components=list(parts))
+    return {f"{part}.{name}": w for part, net in parts.items() for name, w in net.state_dict().items()}
 
 
 @pytest.mark.parametrize(
@@ -150,6 +166,43 @@ def test_a_resumed_run_goes_on_below_its_own_rows(run):
     assert (folder / "metrics.csv").read_text().startswith(before)
     assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0, 384.0, 512.0]
     assert not (folder.parent / "second").exists()
+
+
+def test_a_resumed_run_with_a_triggered_clock_goes_on_with_its_period(run):
+    quiet = ["source.level_db=106", "algo.steps=4", "clock.trigger=2s", "clock.longest=10s"]
+    folder = run(*TINY, *quiet, "frames=80", "delay.obs=2", "backupdate=true", folder="first")
+    assert [row["frames"] / 8 for row in metrics(folder)] == [4, 4 + 6]
+    run(f"resume={folder}", "frames=300", folder="second")
+    frames = [row["frames"] / 8 for row in metrics(folder)]
+    assert frames == [4, 4 + 6, 4 + 6 + 8, 4 + 6 + 8 + 10, 4 + 6 + 8 + 10 + 10]
+
+
+def test_a_run_begins_with_the_policy_of_a_checkpoint_and_its_overrides(run):
+    first = run(*TINY, "agents=2", folder="first")
+    still = run(f"checkpoint={first}", "algo.lr=1e-30", "seed=1", folder="still")
+    fresh = run(*TINY, "agents=2", "algo.lr=1e-30", "seed=1", folder="fresh")
+    learnt, kept, other = (weights(folder) for folder in (first, still, fresh))
+    assert {name.partition(".")[0] for name in learnt} == {"actor", "critic"}
+    assert all(kept[name].equal(learnt[name]) for name in learnt)
+    assert not all(other[name].equal(learnt[name]) for name in learnt)
+    assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # it counts from the start
+    assert OmegaConf.load(still / "config.yaml").agents == 2
+
+
+def test_a_run_goes_on_without_the_folder_that_it_began_with(run):
+    first = run(*TINY, folder="first")
+    second = run(*TINY, f"checkpoint={first}", folder="second")
+    first.rename(first.with_name("moved"))
+    run(f"resume={second}", "frames=384", folder="third")
+    assert [row["frames"] for row in metrics(second)] == [128.0, 256.0, 384.0]
+
+
+def test_every_policy_is_evaluated_in_the_same_episodes(run):
+    only_hold = ["actions.distances=[100000]", "actions.headings=[0]", "actions.mask=false", "delay=paper"]
+    folder = run(*TINY, *only_hold, "frames=128", "source.level_db=150")
+    with (folder / "result.csv").open(newline="") as file:
+        _, one, *others = [row[1:] for row in csv.reader(file)]
+    assert others == [one, one]
 
 
 def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):

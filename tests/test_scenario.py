@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from damian.clocks import ClockConfig
 from damian.errors import InputError
 from damian.scenario import RegionConfig, ScenarioConfig, leftovers
 from damian.world.motion import MotionConfig
@@ -13,28 +12,6 @@ def test_the_library_needs_no_hydra_and_no_yaml():
     config = ScenarioConfig(agents=5)
     airspace = config.airspace(np.random.default_rng(0))
     assert airspace.n_points.min() >= 5
-
-
-@pytest.mark.parametrize(("clock", "seconds"), [("1s", 1.0), ("0.5m", 30.0), ("1h", 3600.0), ("0.2", 0.2)])
-def test_times_are_read_with_their_unit(clock, seconds):
-    assert ClockConfig(simulation=clock).dt == pytest.approx(seconds)
-
-
-@pytest.mark.parametrize(
-    ("clock", "told"),
-    [
-        ({"simulation": "1s", "agents": "1.5s"}, "clock.agents: 1.5s is not a multiple"),
-        ({"simulation": "2s", "server": "1s"}, "clock.server: 1s is not a multiple"),
-        ({"agents": "2s", "server": "3s"}, "clock.server: 3s is not a multiple of clock.agents=2s"),
-        ({"simulation": "0s"}, "clock.simulation: 0.0 s is not above 0 s"),
-        ({"simulation": "fast"}, "clock.simulation: fast is not a time such as 2s"),
-        ({"simulation": "nan"}, "clock.simulation: nan s is not above 0 s"),
-    ],
-)
-def test_clocks_that_do_not_fit_are_refused(clock, told):
-    with pytest.raises(InputError, match="clock") as refused:
-        ClockConfig(**clock)
-    assert told in str(refused.value)
 
 
 def test_more_uavs_than_landing_points_are_refused():

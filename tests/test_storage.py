@@ -102,9 +102,11 @@ def flight(scenario: ScenarioConfig, n_steps: int, n_worlds: int = 4) -> TensorD
     return torch.stack(steps, 1)
 
 
-def buffer(scenario: ScenarioConfig, capacity: int, n_worlds: int = 4, **options) -> TensorDictReplayBuffer:
+def buffer(
+    scenario: ScenarioConfig, capacity: int, n_worlds: int = 4, actor: bool = False, **options
+) -> TensorDictReplayBuffer:
     env = make_env(scenario, n_worlds)
-    view = server_view(env.base_env.server, terms=True)
+    view = server_view(env.base_env.server, terms=True, actor=actor)
     storage = BackupdateStorage(capacity * n_worlds, view, LONGEST)
     return TensorDictReplayBuffer(storage=storage, batch_size=8, **options)
 
@@ -144,6 +146,52 @@ def test_hindsight_is_truth_once_every_message_has_arrived(motion, parts):
     known, truth = (td[: 39 - LONGEST] for td in (in_order(stored, 39), undelayed.transpose(0, 1)))
     assert not known["next", "agents", "received"].equal(truth["next", "agents", "message"])
     check_truth(known, truth)
+
+
+@pytest.mark.parametrize("motion", ["instant", "polynomial"])
+@pytest.mark.parametrize("ctde", [False, True])
+def test_an_actor_may_be_shown_what_it_would_have_seen_without_delay_beside_what_it_remembers(motion, ctde):
+    scenario = everything(motion, episode=PERSISTENT)
+    scenario.observation.ctde = ctde
+    undelayed = flight(replace(scenario, delay=DelayConfig(history=2)), 39)
+    late = flight(replace(scenario, delay=DelayConfig(obs=LATE, history=2)), 39)
+    stored = buffer(scenario, 64, actor=True)
+    for part in late.split(13, 1):
+        stored.extend(part)
+    known, truth, perceived = (
+        td[: 39 - LONGEST] for td in (in_order(stored, 39), undelayed.transpose(0, 1), late.transpose(0, 1))
+    )
+    for key in (("agents", "observation"), ("next", "agents", "observation")):
+        assert not perceived[key].equal(truth[key])
+        assert known[key].equal(truth[key])
+    n_told = len(scenario.observation.actor)
+    remembered = late["agents", "observation"].transpose(0, 1)[..., -2 * 2 :]
+    assert remembered.any()
+    assert in_order(stored, 39)["agents", "observation"][..., -2 * 2 :].equal(remembered)
+    assert known["agents", "observation"].shape[-1] >= n_told + 2 * 2
+
+
+@pytest.mark.parametrize("order", ["generation", "arrival"])
+@pytest.mark.parametrize("motion", ["instant", "polynomial"])
+def test_backupdated_is_where_something_newer_than_what_was_held_came_late(motion, order):
+    scenario = everything(motion, episode=EpisodeConfig(max_steps=9))
+    late = flight(replace(scenario, delay=DelayConfig(obs=LATE, loss=0.2, order=order)), 40)
+    stored = buffer(scenario, 64)
+    for part in late.split(8, 1):
+        stored.extend(part)
+    flags = in_order(stored, 40)["agents", "backupdated"].squeeze(-1)
+    delay = late["next", "agents", "delay"].squeeze(-1)
+    held = Snapshot.unpack(late["next", "agents", "received"]).time
+    step_count, expected = late["step_count"].squeeze(-1), torch.zeros_like(flags)
+    for b in range(4):
+        for t in range(40):
+            start = t - int(step_count[b, t])
+            for i in range(flags.shape[-1]):
+                came = [g for g in range(start, t + 1) if 0 <= delay[b, g, i] <= 39 - g]
+                newest = max((g - start + 1 for g in came), default=0)
+                expected[t, b, i] = newest > held[b, t, i]
+    assert 0.05 < expected.float().mean() < 0.95
+    assert flags.equal(expected)
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])

@@ -1,0 +1,223 @@
+"""How fast training is: collecting, back-updating and optimising, beside TorchRL's MAPPO loop on VMAS.
+
+The second part of ``recipes/bench.py``. Every arm takes batches of as many worlds and steps, makes as many
+passes over them and has networks of the same widths; they take turns, iteration by iteration, so that a busy
+machine slows all of them.
+"""
+
+import importlib.util
+import statistics
+import time
+from collections.abc import Iterator
+from typing import NamedTuple, cast
+
+import torch
+from hydra import compose, initialize_config_dir
+from launch import CONF, TrainConfig, checked, quoted
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs.libs.vmas import VmasEnv
+from torchrl.modules import MultiAgentMLP, ProbabilisticActor, TanhNormal
+from torchrl.modules.distributions import NormalParamExtractor
+from torchrl.objectives.multiagent import MAPPOLoss
+from torchrl.objectives.utils import ValueEstimators
+from tqdm import tqdm
+from train import learning_env, make_memory, ticks
+
+from damian.clocks import SystemClock
+from damian.mappo import Mappo, MappoConfig, add_advantages
+
+RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
+RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
+"""Does one value stand for all agents? Then the critic has a third of our critic's work, else as much."""
+PAPER = "+usecase=2 delay=paper"
+ARMS = ("+usecase=2", PAPER, f"{PAPER} aware=backupdate", f"{PAPER} aware=both")
+"""What ``recipes/train.py`` is told."""
+HEADER = (
+    "training",
+    "frames/s",
+    "collecting [ms]",
+    "back-updating [ms]",
+    "optimising [ms]",
+    "back-updating's share",
+    "times TorchRL and VMAS",
+)
+WARM_UP = 2
+"""Iterations that do not count: the second is the first one that has a full memory to look back on."""
+
+
+class Seconds(NamedTuple):
+    """Of one training iteration."""
+
+    collecting: float
+    backupdating: float
+    optimising: float
+
+
+def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
+    """Rows under ``HEADER``: medians of so many iterations of each arm, on batches [worlds, steps]."""
+    arms = {words: damian(arm_config(words, worlds, steps)) for words in ARMS}
+    if importlib.util.find_spec("vmas"):
+        arms |= {
+            name: rival(arm_config(ARMS[0], worlds, steps), together) for name, together in RIVALS.items()
+        }
+    times: dict[str, list[Seconds]] = {name: [] for name in arms}
+    for _ in tqdm(range(WARM_UP + repeats), "training", leave=False):
+        for name, iterations in arms.items():
+            times[name].append(next(iterations))
+    medians = {name: median(measured[WARM_UP:]) for name, measured in times.items()}
+    return rows(medians, worlds * steps)
+
+
+def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
+    """What these overrides make, on larger batches."""
+    batch = [f"worlds={worlds}", f"algo.steps={steps}", "algo.epochs=4", "algo.minibatches=4"]
+    with initialize_config_dir(CONF, version_base=None):
+        return checked(compose("train", overrides=quoted([*words.split(), *batch])))
+
+
+def damian(config: TrainConfig) -> Iterator[Seconds]:
+    """Train as ``recipes/train.py`` does; yields what each iteration took."""
+    env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
+    learner = Mappo(env, config.model, config.algo, make_memory(config, env, clock))
+    collector = Collector(
+        env,
+        learner.actor,
+        frames_per_batch=config.worlds * clock.unit,
+        total_frames=-1,
+        auto_register_policy_transforms=True,
+    )
+    batches = ticks(collector, clock)
+    while True:
+        begin = time.perf_counter()
+        batch = next(batches)
+        collected = time.perf_counter()
+        known = learner.known(batch)
+        corrected = time.perf_counter()
+        add_advantages(known, learner.loss, learner.config)
+        learner.optimize(known.reshape(-1))
+        yield Seconds(collected - begin, corrected - collected, time.perf_counter() - corrected)
+
+
+def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
+    """Train as TorchRL's users do: its own networks and loss, and a replay buffer for the minibatches."""
+    worlds, steps = config.worlds, config.update_steps
+    env = vmas_env(worlds, config.agents)
+    actor, critic = vmas_actor(env, config), vmas_critic(env, config, together)
+    loss = vmas_loss(actor, critic, config.algo)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=config.algo.lr)
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=worlds * steps,
+        total_frames=-1,
+        auto_register_policy_transforms=True,
+    )
+    memory = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(worlds * steps),
+        sampler=SamplerWithoutReplacement(),
+        batch_size=worlds * steps // config.algo.minibatches,
+    )
+    batches = iter(collector)
+    while True:
+        begin = time.perf_counter()
+        batch = next(batches)
+        collected = time.perf_counter()
+        with torch.no_grad():
+            loss.value_estimator(batch)
+        memory.extend(batch.reshape(-1))
+        for _ in range(config.algo.epochs):
+            for steps_of_worlds in memory:
+                descend(loss, optimizer, steps_of_worlds, config.algo.max_grad_norm)
+        collector.update_policy_weights_()
+        yield Seconds(collected - begin, 0.0, time.perf_counter() - collected)
+
+
+def vmas_env(worlds: int, agents: int) -> TransformedEnv:
+    """Three agents that look for their goals with lidars."""
+    env = VmasEnv("navigation", num_envs=worlds, n_agents=agents, max_steps=100, continuous_actions=True)
+    return TransformedEnv(env, RewardSum([("agents", "reward")], [("agents", "episode_reward")]))
+
+
+def vmas_actor(env: TransformedEnv, config: TrainConfig) -> ProbabilisticActor:
+    """Tanh-normal actions of each agent, from what it sees."""
+    spec = env.full_action_spec_unbatched["agents", "action"]
+    network = vmas_network(env, config, n_out=2 * spec.shape[-1], centralised=False)
+    return ProbabilisticActor(
+        TensorDictModule(
+            nn.Sequential(network, NormalParamExtractor()),
+            in_keys=[("agents", "observation")],
+            out_keys=[("agents", "loc"), ("agents", "scale")],
+        ),
+        in_keys=[("agents", "loc"), ("agents", "scale")],
+        out_keys=[("agents", "action")],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -1.0, "high": 1.0},
+        return_log_prob=True,
+        log_prob_key=("agents", "action_log_prob"),
+    )
+
+
+def vmas_critic(env: TransformedEnv, config: TrainConfig, together: bool) -> TensorDictModule:
+    """A value for each agent from what it sees, or one for all of them from what they see together."""
+    network = vmas_network(env, config, n_out=1, centralised=together)
+    return TensorDictModule(
+        network, in_keys=[("agents", "observation")], out_keys=[("agents", "state_value")]
+    )
+
+
+def vmas_network(env: TransformedEnv, config: TrainConfig, n_out: int, centralised: bool) -> MultiAgentMLP:
+    """One network for all agents, as wide as ours."""
+    return MultiAgentMLP(
+        n_agent_inputs=env.observation_spec["agents", "observation"].shape[-1],
+        n_agent_outputs=n_out,
+        n_agents=config.agents,
+        centralized=centralised,
+        share_params=True,
+        num_cells=config.model.hidden,
+        activation_class=nn.Tanh,
+    )
+
+
+def vmas_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig) -> MAPPOLoss:
+    """TorchRL's loss under VMAS's names."""
+    loss = MAPPOLoss(actor, critic, clip_epsilon=config.clip, entropy_coeff=config.entropy)
+    loss.set_keys(reward=("agents", "reward"), value=("agents", "state_value"))
+    loss.make_value_estimator(ValueEstimators.MAGAE, gamma=config.gamma, lmbda=config.lmbda)
+    return loss
+
+
+def descend(
+    loss: MAPPOLoss, optimizer: torch.optim.Optimizer, steps: TensorDictBase, max_norm: float
+) -> None:
+    """One step of the optimiser on a minibatch [M]."""
+    losses = loss(steps)
+    total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+    optimizer.zero_grad()
+    cast(torch.Tensor, total).backward()
+    nn.utils.clip_grad_norm_(loss.parameters(), max_norm)
+    optimizer.step()
+
+
+def median(measured: list[Seconds]) -> Seconds:
+    """Of each part by itself."""
+    return Seconds(*map(statistics.median, zip(*measured, strict=True)))
+
+
+def rows(medians: dict[str, Seconds], frames: int) -> list[tuple[str, ...]]:
+    """What is shown of each arm, whose iterations take in so many steps of worlds."""
+    totals = {name: sum(parts) for name, parts in medians.items()}
+    return [
+        (
+            name,
+            f"{frames / totals[name]:,.0f}",
+            *(f"{1e3 * part:.0f}" for part in parts),
+            f"{parts.backupdating / totals[name]:.1%}",
+            f"{totals[RIVAL] / totals[name]:.2f}" if RIVAL in totals else "-",
+        )
+        for name, parts in medians.items()
+    ]
