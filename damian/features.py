@@ -47,7 +47,8 @@ class ObservationConfig:
     time_scale: float | None = None
     """Times are divided by this [s]; by the episode's time limit, or an hour, if not given."""
     age: bool = False
-    """Show each UAV how old what the server holds of it is (age of information, SPEC 4)."""
+    """Show each UAV how old what the server holds of it is (age of information, SPEC 4). Not the critic: to
+    the one that learns in hindsight it would say how far from its last batch's end a step was."""
     age_scale: float = 10.0
     """Ages are divided by this [s]."""
     window: int = 2
@@ -72,16 +73,13 @@ class ObservationConfig:
     @property
     def actor(self) -> list[str]:
         """Features of the actor's observation, in order."""
-        return self._local if self.ctde else self.critic
+        seen = self.local_features if self.ctde else self.critic
+        return [*seen, "age"] if self.age else list(seen)
 
     @property
     def critic(self) -> list[str]:
         """Features of the critic's observation, in order."""
-        return [*self.global_features, *self._local]
-
-    @property
-    def _local(self) -> list[str]:
-        return [*self.local_features, "age"] if self.age else list(self.local_features)
+        return [*self.global_features, *self.local_features]
 
 
 class Snapshot(NamedTuple):

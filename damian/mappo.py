@@ -68,6 +68,7 @@ class Mappo:
         config: how to learn.
         memory: buffer on a ``BackupdateStorage``; what is learnt from are the batches as it knows them.
             None: what was perceived.
+        settle: learn from steps only so many steps later, [0, those of a batch).
         recompute_actor: the original authors' variant, in which the corrected observations also stand for
             what the actor saw, as if it had chosen its action there.
     """
@@ -78,9 +79,11 @@ class Mappo:
         model: ModelConfig,
         config: MappoConfig,
         memory: TensorDictReplayBuffer | None = None,
+        settle: int = 0,
         recompute_actor: bool = False,
     ) -> None:
-        self.config, self.memory, self.recompute_actor = config, memory, recompute_actor
+        self.config, self.memory = config, memory
+        self.settle, self.recompute_actor = settle, recompute_actor
         self.actor, self.critic = make_actor(env, model), make_critic(env, model)
         self.loss = mappo_loss(self.actor, self.critic, config)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr)
@@ -99,7 +102,7 @@ class Mappo:
 
     @torch.no_grad()
     def known(self, batch: TensorDictBase) -> TensorDictBase:
-        """A batch [B, T] as the server knows it by now.
+        """A batch [B, T] as the server knows it by now, or an earlier one that has settled meanwhile.
 
         Steps after an end that the server learnt of late count too: until it does, a UAV must not undo it.
         """
@@ -107,7 +110,8 @@ class Mappo:
             return batch
         self.memory.extend(batch)
         storage = cast(BackupdateStorage, self.memory.storage)
-        batch = storage[storage.latest(batch.shape[1])].transpose(0, 1)
+        latest = storage.latest(batch.shape[1] + self.settle)
+        batch = storage[latest[: len(latest) - self.settle]].transpose(0, 1)
         if self.recompute_actor:
             chosen = self.actor.get_dist(batch).log_prob(batch["agents", "action"])
             batch["agents", "action_log_prob"] = chosen

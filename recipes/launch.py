@@ -27,7 +27,9 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import Checkpoint
 
 from damian import checks
+from damian.clocks import SystemClock
 from damian.delayed import is_late
+from damian.delays import law_of
 from damian.errors import InputError
 from damian.mappo import MappoConfig
 from damian.models import ModelConfig
@@ -70,6 +72,8 @@ class TrainConfig(ScenarioConfig):
     backupdate: bool = False
     """Put late messages in their place before learning from the steps that they belong to (SPEC 4): what the
     critic sees, rewards and ends of episodes; what the actor saw stays."""
+    settle: bool = False
+    """With ``backupdate``: learn from a step only when none of its messages can be under way any more."""
     recompute_actor: bool = False
     """The original authors' variant of ``backupdate``: late messages also rewrite what the actor saw and
     the probability of what it did, as if it had known."""
@@ -110,8 +114,19 @@ class TrainConfig(ScenarioConfig):
         for key, (value, set_) in others.items():
             should = "does not go with backupdate=true, which would undo it"
             checks.require(not (self.backupdate and set_), key, value, should)
-        should = "needs backupdate=true: there is nothing else to recompute"
-        checks.require(self.backupdate or not self.recompute_actor, "recompute_actor", True, should)
+        for key in ("settle", "recompute_actor"):
+            alone = getattr(self, key) and not self.backupdate
+            checks.require(not alone, key, True, "means nothing without backupdate=true")
+        shortest = SystemClock(self.clock, self.update_steps).shortest
+        should = (
+            f"needs more than {self.longest_delay} steps, the longest delay, between two updates: {shortest}"
+        )
+        checks.require(not self.settle or self.longest_delay < shortest, "settle", True, should)
+
+    @property
+    def longest_delay(self) -> int:
+        """Of a message [steps]."""
+        return law_of(self.delay.obs).sampler(self.clock.dt).longest
 
     @property
     def update_steps(self) -> int:

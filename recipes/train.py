@@ -30,7 +30,6 @@ from tqdm import tqdm
 from damian.chain import DelayedEnv
 from damian.clocks import SystemClock
 from damian.delayed import make_env, messages_are_late
-from damian.delays import law_of
 from damian.features import Snapshot
 from damian.mappo import Mappo
 from damian.metrics import EpisodeLog, Evaluation, evaluate
@@ -74,7 +73,7 @@ def make_memory(config: TrainConfig, env: DelayedEnv, clock: SystemClock) -> Ten
     """What keeps the latest steps until late messages have arrived; None if nothing is corrected."""
     if not looks_back(config):
         return None
-    longest = law_of(config.delay.obs).sampler(config.clock.dt).longest
+    longest = config.longest_delay
     view = server_view(env.worlds.server, terms=True, actor=config.recompute_actor)
     capacity = (clock.longest + 2 * longest) * config.worlds
     return TensorDictReplayBuffer(storage=BackupdateStorage(capacity, view, longest, device=config.device))
@@ -104,7 +103,8 @@ def train(config: TrainConfig, folder: Path) -> None:
     """Learn, then evaluate and fill the run folder."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     memory = make_memory(config, env, clock)
-    learner = Mappo(env, config.model, config.algo, memory, config.recompute_actor)
+    settle = config.longest_delay if config.settle else 0
+    learner = Mappo(env, config.model, config.algo, memory, settle, config.recompute_actor)
     progress, episodes = Progress(), EpisodeLog()
     state = {"progress": progress, "episodes": episodes, "clock": clock, "rng": GlobalRNGState()}
     checkpoint = Checkpoint(**learner.parts(), **state)

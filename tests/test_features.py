@@ -138,14 +138,15 @@ def test_with_ctde_the_actor_sees_its_local_features_and_the_critic_all():
     assert ObservationConfig(**shown, ctde=True).critic == ["source_time", "spotted"]
 
 
-def test_a_uav_sees_the_age_of_its_own_message_behind_its_local_features():
+def test_a_uav_sees_the_age_of_its_own_message_and_the_critic_does_not():
     snapshot, server = snapshot_of(random_worlds(0, 3, 1.0, 0.5))
     late = snapshot._replace(time=server.now.unsqueeze(-1) - torch.tensor([0.0, 4.0, 25.0]))
     age = observe(late, server, ["age"])["age"]
     torch.testing.assert_close(age, torch.tensor([0.0, 0.4, 1.0]).expand_as(age), rtol=0, atol=1e-5)
     config = ObservationConfig(["spotted"], ["source_time"], ctde=True, age=True)
     assert config.actor == ["spotted", "age"]
-    assert config.critic == ["source_time", "spotted", "age"]
+    assert config.critic == ["source_time", "spotted"]
+    assert ObservationConfig(["spotted"], ["source_time"], age=True).actor == [*config.critic, "age"]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from damian.actions import ActionConfig
 from damian.delayed import make_env
 from damian.delays import DelayConfig
 from damian.env import UavEnv
+from damian.features import Snapshot
 from damian.mappo import Mappo, MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.models import ModelConfig, make_actor, make_critic, random_policy
 from damian.rewards import EpisodeConfig, RewardConfig
@@ -171,7 +172,8 @@ def collected_late(kind: str, recompute_actor: bool) -> tuple[Mappo, TensorDictB
     view = server_view(env.worlds.server, actor=recompute_actor)
     memory = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, view, longest=5))
     torch.manual_seed(2)
-    learner = Mappo(env, SMALL, MappoConfig(minibatches=1, epochs=1), memory, recompute_actor)
+    config = MappoConfig(minibatches=1, epochs=1)
+    learner = Mappo(env, SMALL, config, memory, recompute_actor=recompute_actor)
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         return learner, env.rollout(30, learner.actor, break_when_any_done=False)
 
@@ -216,6 +218,22 @@ def test_an_observation_is_corrected_where_a_message_came_late_for_the_step_befo
     assert begins[:, 1:].any()
     assert not corrected[begins].any()
     assert not (corrected[:, 1:] & ~late[:, :-1]).any()
+
+
+def test_what_has_settled_is_learnt_from_later_and_then_as_it_truly_was():
+    learner, flight = collected_late("discrete", recompute_actor=False)
+    short = everything(episode=EpisodeConfig(max_steps=9))
+    learner.settle, server = 5, make_env(short, 4, seed=1).worlds.server
+    known = torch.cat([learner.known(flight[:, t : t + 10]) for t in (0, 10, 20)], 1)
+    assert known.shape[1] == len(flight[0]) - 5  # the first batch comes short
+    settled = flight[:, :25]
+    assert known["agents", "action"].equal(settled["agents", "action"])
+    sent, steps = settled["next", "agents", "message"], settled["next", "step_count"].squeeze(-1)
+    truth = server.serve(Snapshot.unpack(sent), steps)
+    assert known["next", "agents", "global_observation"].equal(truth.global_observation)
+    assert not known["next", "agents", "global_observation"].equal(
+        settled["next", "agents", "global_observation"]
+    )
 
 
 def test_what_was_corrected_is_reported_with_the_losses():
