@@ -87,7 +87,7 @@ def serving(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -
         order=delay.order,
         dt=scenario.clock.dt,
         sent_key="talks",
-        age_key="age" if "message" in extras else None,
+        age_key="age" if "message" in extras or remembers_unknown(scenario) else None,
         delay_key="delay" if "message" in extras else None,
     )
     unread = [] if "message" in extras else [("agents", k) for k in ("message", "received", "talks")]
@@ -119,9 +119,20 @@ def seeing(scenario: ScenarioConfig) -> list[Transform]:
             codes=action_codes(scenario.actions),
             default=holding(scenario.actions),
             recorded_key="ready",
+            age_key="age" if remembers_unknown(scenario) else None,
         )
         transforms.append(history)
     return transforms
+
+
+def remembers_unknown(scenario: ScenarioConfig) -> bool:
+    """Is a UAV's memory of its actions one of those that the server, as it answers, cannot know of?
+
+    With late actions or slow clocks nobody knows which these are, and it is one of all.
+    """
+    delay, clock = scenario.delay, scenario.clock
+    prompt = not is_late(delay.act, clock.dt) and clock.steps("server") == clock.steps("agents") == 1
+    return delay.history > 0 and prompt and messages_are_late(scenario)
 
 
 def is_late(law: Any, dt: float) -> bool:

@@ -241,6 +241,26 @@ def test_everyone_remembers_the_actions_that_a_list_of_them_holds(steps, recorde
             assert found[2 * t + 2, w, n].equal(torch.tensor(last_actions(taken, steps, default)) / 6)
 
 
+@pytest.mark.parametrize("recorded_key", [None, "ready"])
+def test_only_actions_that_what_is_shown_cannot_know_of_are_remembered(law, recorded_key):
+    default, chosen = 2, choices()
+    late = ObservationDelay(law, [OBSERVATION])
+    history = ActionHistory(3, ACTION, default=default, recorded_key=recorded_key, age_key="age")
+    shown = play(delayed(late, history), chosen)
+    found = torch.stack([td["agents", "action_history"] for td in shown])
+    ages = column(shown, "agents", "age")
+    ready, done = before(shown, "agents", "ready"), after(shown, "done")
+    for w, n in ROWS:
+        taken: list[tuple[int, int]] = []
+        for t in range(STEPS):
+            taken += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
+            latest = last_actions(taken, 3, (-STEPS, default))
+            since = t + 1 - ages[2 * t + 1][w][n][0]  # when the message that is shown was generated
+            unknown = [action if at >= since else default for at, action in latest]
+            assert found[2 * t + 1, w, n].equal(torch.tensor(unknown) / 6)
+            taken = [] if done[t][w][0] else taken
+
+
 def test_the_actions_that_are_remembered_are_the_chosen_ones_not_the_executed():
     late, history = ActionDelay(3, ACTION), ActionHistory(1, ACTION)
     shown = play(delayed(late, history, ends=0.0), choices())

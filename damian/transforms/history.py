@@ -30,6 +30,8 @@ class ActionHistory(OnActions):
             not given.
         recorded_key: flag that the policy sees: only where it is true is the action recorded, [...] bool;
             beside the action, if a bare name.
+        age_key: age of what the agent is shown [steps], [..., 1] (``ObservationDelay``): only actions chosen
+            since then are shown, in place of older ones, of which that knows already, the default.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class ActionHistory(OnActions):
         codes: Tensor | None = None,
         default: Any = None,
         recorded_key: NestedKey | None = None,
+        age_key: NestedKey | None = None,
     ) -> None:
         checks.whole("steps", steps, 1)
         super().__init__(action_key, default)
@@ -50,18 +53,21 @@ class ActionHistory(OnActions):
         self.steps, self.recorded_key = steps, beside(self.action_key, recorded_key)
         self.codes = codes
         self.act_keys = [self.action_key, *([self.recorded_key] if self.recorded_key else [])]
-        self.see_keys = self.in_keys
+        self.age_key = beside(self.action_key, age_key)
+        self._reads = [self.age_key] if self.age_key else []
+        self.see_keys = [*self.in_keys, *self._reads]
 
     @property
     def uses(self) -> Uses:
-        return Uses(appends=self.in_keys, records=[self.action_key])
+        return Uses(reads=self._reads, appends=self.in_keys, records=[self.action_key])
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
         actions = self.actions
         scale = {"low": actions.low, "width": actions.width}
         scale |= {} if self.codes is None else {"codes": self.codes.to(actions.initial.device)}
         first = self._encode(scale, actions.initial).repeat(1, self.steps)
-        return scale | {"first": first, "recent": first}
+        since = torch.zeros(len(first), self.steps, dtype=torch.long, device=first.device)
+        return scale | {"first": first, "recent": first, "since": since}
 
     def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         first = memory["first"]
@@ -72,12 +78,20 @@ class ActionHistory(OnActions):
         recent = memory["recent"]
         latest = self._encode(memory, as_rows(entries[self.action_key], self.rows))
         longer = torch.cat([recent[:, latest.shape[-1] :], latest], -1)
+        old, new = memory["since"], torch.ones_like(memory["since"][:, :1])
+        since = torch.cat([old[:, 1:] + 1, new], -1)
         if self.recorded_key in entries:
-            longer = torch.where(entries[self.recorded_key].reshape(-1, 1), longer, recent)
-        return memory | {"recent": longer}, {}
+            recorded = entries[self.recorded_key].reshape(-1, 1)
+            longer, since = torch.where(recorded, longer, recent), torch.where(recorded, since, old + 1)
+        return memory | {"recent": longer, "since": since}, {}
 
     def see(self, memory: Memory, entries: Entries) -> Change:
-        shown, key = from_rows(memory["recent"], self.rows), self.out_keys[0]
+        recent, key = memory["recent"], self.out_keys[0]
+        if self.age_key:
+            unknown = memory["since"] <= entries[self.age_key].reshape(-1, 1)
+            width = recent.shape[-1] // self.steps
+            recent = torch.where(unknown.repeat_interleave(width, -1), recent, memory["first"])
+        shown = from_rows(recent, self.rows)
         return memory, {key: torch.cat([entries[key], shown], -1) if key in entries else shown}
 
     def _encode(self, scale: Memory, action: Tensor) -> Tensor:
