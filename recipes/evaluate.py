@@ -14,6 +14,7 @@ import torch
 from launch import CONF, TrainConfig, launch, load, prepare, reported, save_config
 from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint
+from torchrl.modules import ProbabilisticActor
 from train import report
 
 from damian.delayed import make_env
@@ -23,12 +24,22 @@ from damian.models import make_actor
 
 def fly(config: TrainConfig, folder: Path) -> None:
     """Evaluate the policy of ``config.checkpoint``, and fill the folder."""
+    actor = stored_actor(config)
+    save_config(config, folder)
+    report(config, folder, actor)
+
+
+def stored_actor(config: TrainConfig) -> ProbabilisticActor:
+    """The policy of ``config.checkpoint``.
+
+    Raises:
+        InputError: there is none, or one that sees or does something else.
+    """
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
     actor = make_actor(make_env(config, 1, config.seed, config.device), config.model)
     load(Checkpoint(actor=actor), Path(config.checkpoint), "checkpoint")
-    save_config(config, folder)
-    report(config, folder, actor)
+    return actor
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
