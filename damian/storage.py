@@ -82,6 +82,28 @@ class BackupdateStorage(LazyTensorStorage):
         if longest > self.longest:
             raise ValueError(f"longest: a message takes {longest} steps, more than {self.longest}")
 
+    def receive(self, world: Tensor, agent: Tensor, steps_ago: Tensor, message: Tensor) -> None:
+        """Take messages from elsewhere, such as real UAVs, that have arrived after the latest step.
+
+        Args:
+            world: of the senders, [K].
+            agent: likewise, [K].
+            steps_ago: when each was generated, in steps before the latest, [K].
+            message: [K, F].
+
+        Raises:
+            ValueError: one is older than the storage looks back.
+        """
+        oldest, least = int(steps_ago.max()), int(steps_ago.min())
+        known = min(self.longest, cast(int, self._len_along_dim0) - 1)
+        if least < 0 or oldest > known:
+            raise ValueError(f"steps_ago: {least} to {oldest} is not between 0 and {known}")
+        place = self.latest(oldest + 1).flip(0)[steps_ago]
+        after = cast(TensorDictBase, self._storage["next", self.group])
+        after["message"][place, world, agent] = message
+        after["delay"][place, world, agent, 0] = steps_ago
+        self.look_back(oldest + 1)
+
     def look_back(self, n_steps: int) -> None:
         """Correct the latest steps with all that has arrived by the last one."""
         index = self.latest(n_steps + self.longest)  # what was sent before them may belong to them

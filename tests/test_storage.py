@@ -210,6 +210,27 @@ def test_in_pieces_and_around_the_ring_the_same_is_known_as_at_once(order):
             assert known[key].equal(again[key]), key
 
 
+def test_messages_from_elsewhere_count_as_if_they_had_arrived_just_now():
+    scenario = everything(delay=DelayConfig(obs=LATE, loss=0.4))
+    steps, stored, expected = flight(scenario, 30), buffer(scenario, 60), buffer(scenario, 60)
+    delay = steps["next", "agents", "delay"]
+    lost = (delay[:, -LONGEST:] < 0).squeeze(-1).nonzero()
+    world, agent, ago = lost[:, 0], lost[:, 2], LONGEST - 1 - lost[:, 1]
+    assert len(lost) > 10
+    came = steps.clone()
+    came["next", "agents", "delay"][world, 29 - ago, agent, 0] = ago
+    expected.extend(came)
+    message = steps["next", "agents", "message"][world, 29 - ago, agent]
+    steps["next", "agents", "message"][world, 29 - ago, agent] = 0.0  # nobody has heard them
+    stored.extend(steps)
+    with pytest.raises(AssertionError):
+        check_truth(in_order(stored, 30), in_order(expected, 30))
+    stored.storage.receive(world, agent, ago, message)
+    check_truth(in_order(stored, 30), in_order(expected, 30))
+    with pytest.raises(ValueError, match=f"steps_ago: 0 to {LONGEST + 1} is not between 0 and {LONGEST}"):
+        stored.storage.receive(world[:2], agent[:2], torch.tensor([0, LONGEST + 1]), message[:2])
+
+
 def test_what_the_actor_saw_and_did_stays():
     scenario = everything("instant", episode=EpisodeConfig(max_steps=9))
     late = flight(replace(scenario, delay=DelayConfig(obs=LATE, history=2)), 30)
