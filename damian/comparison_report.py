@@ -18,6 +18,7 @@ Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 """By task, delay and arm: for each seed the rows of its ``metrics.csv``."""
 
 LABELS = {"episode_return": "return", "success_rate": "success rate", "steps": "steps per episode"}
+"""Of measures while training, all as the server perceived them."""
 COLUMNS = (*TRUE, *SEEN, "age", "late", "lost")
 HEADS = ("return", "success", "steps", "seen return", "seen success", "seen steps", "age", "late", "lost")
 _STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
@@ -78,7 +79,9 @@ def plot_curves(
                     axis.axhline(
                         best[name], color="0.2", linestyle="--", linewidth=0.8, label="best possible"
                     )
-                axis.set(xlabel="episodes", ylabel=LABELS[name], title=f"{task}, delay {delay}")
+                axis.set(
+                    xlabel="episodes", ylabel=f"{LABELS[name]}, perceived", title=f"{task}, delay {delay}"
+                )
             row[-1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         figure.savefig(path, dpi=150)
 

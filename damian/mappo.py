@@ -120,8 +120,9 @@ class Mappo:
     def optimize(self, steps: TensorDictBase) -> dict[str, float]:
         """Some passes over steps [M] with advantages; returns the mean losses."""
         sums: dict[str, float] = {}
+        n_parts = min(self.config.minibatches, len(steps))
         for _ in range(self.config.epochs):
-            for index in torch.randperm(len(steps), device=steps.device).chunk(self.config.minibatches):
+            for index in torch.randperm(len(steps), device=steps.device).tensor_split(n_parts):
                 losses = losses_of(steps[index], self.loss)
                 self.optimizer.zero_grad()
                 torch.stack([*losses.values()]).sum().backward()
@@ -129,7 +130,7 @@ class Mappo:
                 self.optimizer.step()
                 for term, value in losses.items():
                     sums[term] = sums.get(term, 0.0) + value.item()
-        n_updates = self.config.epochs * self.config.minibatches
+        n_updates = self.config.epochs * n_parts
         return {term: total / n_updates for term, total in sums.items()}
 
 

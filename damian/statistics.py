@@ -40,10 +40,10 @@ def recovery(
         least: smallest ``(undelayed - naive) / (undelayed - random)`` to make sense of.
 
     Returns:
-        nan where the gap is not positive or smaller than that.
+        nan where the gap is not positive or smaller than that, or where random beats undelayed.
     """
     gap = np.asarray(undelayed - naive, dtype=float)
-    enough = (gap > 0) & (gap >= least * (undelayed - random))
+    enough = (gap > 0) & (undelayed > random) & (gap >= least * (undelayed - random))
     return (aware - naive) / np.where(enough, gap, np.nan)
 
 

@@ -23,14 +23,15 @@ from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from launch import CONF, checked, launch, no_such_key, one_line, quoted, reported
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from parallel import LOG, Run, check_stored, perform_all
 
 from damian import checks
-from damian.comparison import MODE, NOT_LATE, SAMPLED, SCORES, Arm, Comparison, lines
-from damian.comparison_report import markdown, plot_curves, plot_norms
+from damian.comparison import MODE, NOT_LATE, RANDOM, SAMPLED, SCORES, Arm, Comparison, lines
+from damian.comparison_report import LABELS, markdown, plot_curves, plot_norms
 from damian.errors import InputError
 from damian.runs import read_metrics
 from damian.scenario import leftovers
@@ -55,13 +56,15 @@ class Experiment:
     def __post_init__(self) -> None:
         for kind in ("tasks", "delays", "arms"):
             for name in getattr(self, kind):
-                good = re.fullmatch(r"[\w.-]+", name) and name != NOT_LATE
+                good = re.fullmatch(r"[\w.-]+", name) and name not in (NOT_LATE, RANDOM)
                 checks.require(bool(good), f"experiment.{kind}", name, "is no name for a folder")
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
         should = "are not delayed: it must be one"
         checks.require(len(undelayed) == 1, "experiment.arms", undelayed, should)
         for name, arm in self.arms.items():
             checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))
+        for name in self.best:
+            checks.one_of("experiment.best", name, LABELS)
 
 
 @dataclass
@@ -134,6 +137,8 @@ def _seeds(config: CompareConfig, folder: Path, words: list[str]) -> Iterator[Ru
     words = ["logger=csv", *words, *how.overrides, *config.overrides]
     try:
         first = checked(compose("train", quoted(words)))
+        if how.policy_of is None:
+            first.check_learning()
     except (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError) as error:
         raise InputError(f"{task}/{delay}/{arm}: {one_line(error)}") from error
     for seed in range(config.experiment.first_seed, config.experiment.first_seed + config.seeds):
@@ -150,7 +155,7 @@ def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
     """Write the tables and the figure of what is finished."""
     done = [run for run in runs if run.finished]
     if not done:
-        raise InputError(f"report_only: nothing is finished in {folder}")
+        raise InputError(f"experiment: nothing of it is finished in {folder}")
     arms = config.chosen("arms")
     rows = [
         {"task": run.task, "delay": run.delay, "arm": run.arm, "regime": arms[run.arm].regime, **seed, **row}
@@ -209,10 +214,12 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
 @hydra.main(version_base=None, config_path=CONF, config_name="compare")
 @reported
 def main(written: DictConfig) -> None:
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise InputError("-m: a comparison runs all its arms and seeds by itself; leave it out")
     config = cast(CompareConfig, OmegaConf.to_object(written))
     unknown = leftovers(written, config)
     if unknown:
-        raise InputError(no_such_key(unknown[0], CompareConfig))
+        raise InputError(no_such_key(unknown[0]))
     folder = Path(HydraConfig.get().runtime.output_dir)
     runs = plan(config, folder)
     for run in runs:
@@ -225,6 +232,8 @@ def main(written: DictConfig) -> None:
         sys.exit("interrupted; the same command goes on")
     for run in failed:
         print(f"failed: {run.name}; see {run.folder / LOG}", file=sys.stderr)
+    if failed and not any(run.finished for run in runs):
+        sys.exit(1)
     report(config, runs, folder)
     print((folder / MARKDOWN).read_text())
     if failed:
@@ -234,7 +243,7 @@ def main(written: DictConfig) -> None:
 def start() -> None:
     """Run the command line, whose overrides=[frames=1000,worlds=8] Hydra reads only with quotes."""
     sys.argv = [_listed(word) for word in sys.argv]
-    launch(main)
+    launch(main, CompareConfig)
 
 
 def _listed(word: str) -> str:

@@ -101,11 +101,15 @@ class TrainConfig(ScenarioConfig):
         if self.episodes is not None:
             checks.in_range("episodes", self.episodes, 1)
         checks.device("device", self.device)
-        self._check_backupdate()
-        checks.in_range("algo.minibatches", self.algo.minibatches, 1, self.worlds * self.update_steps)
 
-    def _check_backupdate(self) -> None:
-        """What is corrected are single rewards, and what the server knows at every step."""
+    def check_learning(self) -> None:
+        """Make sure that it can be learnt like this; what is only flown need not.
+
+        Raises:
+            InputError: names the key that does not fit.
+        """
+        checks.in_range("algo.minibatches", self.algo.minibatches, 1, self.worlds * self.update_steps)
+        # What is corrected are single rewards, and what the server knows at every step.
         others = {
             "delay.reward_window": (self.delay.reward_window, self.delay.reward_window > 1),
             "delay.rew": (self.delay.rew, is_late(self.delay.rew, self.clock.dt)),
@@ -244,8 +248,13 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
     return checked
 
 
-def launch(main: Callable[[], Any]) -> None:
+_schema: list[type] = [TrainConfig]
+"""Whose keys the program that runs knows."""
+
+
+def launch(main: Callable[[], Any], schema: type = TrainConfig) -> None:
     """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
+    _schema[0] = schema
     _begun.clear()
     try:
         words = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))  # flags first
@@ -265,6 +274,8 @@ def inherited(words: list[str]) -> list[str]:
     """
     value = next((word.partition("=")[2] for word in words if word.startswith("checkpoint=")), "")
     file = Path(value.strip("'\"")) / CONFIG
+    if "," in value and value[:1] not in "'\"":
+        raise InputError("checkpoint: one at a time, as each run brings its overrides along")
     if not value or not file.is_file():
         return words  # whoever wants to load it will say so
     try:
@@ -327,11 +338,11 @@ def one_line(error: BaseException) -> str:
     return f"{key[1]}: {told}" if key else told
 
 
-def no_such_key(key: str, schema: type = TrainConfig) -> str:
+def no_such_key(key: str) -> str:
     """The message for an unknown key, with the nearest known one."""
     if re.match(r"delay\.(obs|act|rew)\.", key):
         return f"{key}: no setting of the law that is there already; write another law over delay=none"
-    known = [str(name) for name in _keys(OmegaConf.structured(schema))]
+    known = [str(name) for name in _keys(OmegaConf.structured(_schema[0]))]
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.75)
     return f"{key}: no such key" + (f"; did you mean {near[0]}?" if near else "")
 
@@ -340,5 +351,6 @@ def _keys(config: DictConfig, path: str = "") -> Iterator[str]:
     """Every dotted key of a configuration."""
     for name in config:
         yield f"{path}{name}"
-        if isinstance(config._get_node(name), DictConfig):
+        node = config._get_node(name)
+        if isinstance(node, DictConfig) and not node._is_missing():
             yield from _keys(config[name], f"{path}{name}.")

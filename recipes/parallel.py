@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 from evaluate import fly
-from launch import TrainConfig
+from launch import TrainConfig, one_line
 from omegaconf import OmegaConf
 from tqdm import tqdm
 from train import train
@@ -58,18 +58,26 @@ class Run:
 
     def results(self) -> list[dict[str, Any]]:
         """A row for each policy."""
-        with (self.folder / RESULTS).open(newline="") as file:
-            return [
-                {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
-                for row in csv.DictReader(file)
-            ]
+        file = self.folder / RESULTS
+        try:
+            with file.open(newline="") as lines:
+                return [
+                    {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
+                    for row in csv.DictReader(lines)
+                ]
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{file}: no results of a run ({one_line(error)}); delete the folder") from error
 
 
 def check_stored(run: Run) -> None:
-    """Refuse a folder that holds a run of another configuration."""
+    """Refuse a folder that holds a run of another configuration; a setting that it lacks has its default."""
     if not (run.folder / CONFIG).exists():
         return
-    stored = OmegaConf.load(run.folder / CONFIG)
+    try:
+        stored = OmegaConf.load(run.folder / CONFIG)
+        stored = OmegaConf.merge(OmegaConf.to_container(OmegaConf.structured(TrainConfig)), stored)
+    except Exception as error:  # whatever a spoilt file makes of itself
+        raise InputError(f"{run.folder / CONFIG}: {one_line(error)}; delete the folder") from error
     asked = OmegaConf.create(OmegaConf.to_yaml(OmegaConf.structured(run.config)))
     known, wanted = (dict(_leaves(OmegaConf.to_container(config))) for config in (stored, asked))
     for key in wanted | known:
@@ -126,15 +134,21 @@ def _in_turn(runs: Sequence[Run]) -> Iterator[tuple[Run, BaseException | None]]:
 def _at_once(runs: Sequence[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
     """Carry runs out in so many other processes; yields each, when it is over, with what went wrong."""
     _stop.clear()
+    for trains in (True, False):  # a pool each: one whose worker was killed takes nothing more
+        now = [run for run in runs if run.trains == trains]
+        if now:
+            yield from _in_pool(now, processes)
+
+
+def _in_pool(runs: Sequence[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
     with ProcessPoolExecutor(processes, _SPAWN, _begin, (_stop,)) as pool:
         try:
-            for trains in (True, False):
-                futures = _submit(pool, [run for run in runs if run.trains == trains])
-                for future in as_completed(futures):
-                    error = future.exception()
-                    if isinstance(error, KeyboardInterrupt):  # it has heard it sooner
-                        raise error
-                    yield futures[future], error
+            futures = _submit(pool, runs)
+            for future in as_completed(futures):
+                error = future.exception()
+                if isinstance(error, KeyboardInterrupt):  # it has heard it sooner
+                    raise error
+                yield futures[future], error
         except KeyboardInterrupt:
             _stop.set()
             for worker in multiprocessing.active_children():  # a terminal has told them, ``kill`` has not
@@ -175,6 +189,9 @@ def _perform(run: Run) -> None:
                 train(run.config, run.folder)
         except SystemExit as interrupted:
             raise KeyboardInterrupt from interrupted
+        except InputError as error:
+            print(f"error: {error}")
+            raise
         except BaseException:
             traceback.print_exc()
             raise

@@ -74,7 +74,7 @@ def make_memory(config: TrainConfig, env: DelayedEnv, clock: SystemClock) -> Ten
     if not looks_back(config):
         return None
     longest = config.longest_delay
-    view = server_view(env.worlds.server, terms=True, actor=config.recompute_actor)
+    view = server_view(env.worlds.server, actor=config.recompute_actor)
     capacity = (clock.longest + 2 * longest) * config.worlds
     return TensorDictReplayBuffer(storage=BackupdateStorage(capacity, view, longest, device=config.device))
 
@@ -100,7 +100,12 @@ def spotting(batch: TensorDictBase) -> torch.Tensor:
 
 
 def train(config: TrainConfig, folder: Path) -> None:
-    """Learn, then evaluate and fill the run folder."""
+    """Learn, then evaluate and fill the run folder.
+
+    Raises:
+        InputError: it cannot be learnt like this, or what there is cannot be loaded.
+    """
+    config.check_learning()
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     memory = make_memory(config, env, clock)
     settle = config.longest_delay if config.settle else 0
@@ -110,7 +115,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     checkpoint = Checkpoint(**learner.parts(), **state)
     if config.resume:
         load(checkpoint, folder, "resume")
-        env.set_seed(config.seed + progress.updates)  # not the first episodes once more
+        env.set_seed(config.seed + 1_000_003 * progress.updates)  # not the first episodes once more
     elif config.checkpoint:
         load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", "critic"])
     save_config(config, folder)
