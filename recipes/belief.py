@@ -16,8 +16,9 @@ from typing import cast
 import hydra
 import numpy as np
 import torch
-from launch import CONF, TrainConfig, launch, prepare, reported, save_config
+from launch import launch, prepare, reported, save_config
 from omegaconf import DictConfig
+from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 

@@ -20,8 +20,8 @@ from typing import Any, cast
 import torch
 from bench_training import HEADER, training
 from hydra import compose, initialize_config_dir
-from launch import CONF, TrainConfig
 from omegaconf import OmegaConf
+from settings import CONF, TrainConfig
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv

@@ -24,10 +24,11 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from launch import CONF, checked, launch, no_such_key, one_line, quoted, reported
+from launch import checked, launch, no_such_key, one_line, quoted, reported
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from parallel import LOG, Run, check_stored, perform_all
+from settings import CONF
 
 from damian import checks
 from damian.comparison import MODE, NOT_LATE, RANDOM, SAMPLED, SCORES, Arm, Comparison, lines

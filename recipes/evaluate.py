@@ -11,8 +11,9 @@ from pathlib import Path
 
 import hydra
 import torch
-from launch import CONF, TrainConfig, launch, load, prepare, reported, save_config
+from launch import launch, load, prepare, reported, save_config
 from omegaconf import DictConfig
+from settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
 from torchrl.modules import ProbabilisticActor
 from train import report

@@ -11,8 +11,9 @@ from pathlib import Path
 import hydra
 import torch
 from evaluate import stored_actor
-from launch import CONF, TrainConfig, launch, prepare, reported, save_config
+from launch import launch, prepare, reported, save_config
 from omegaconf import DictConfig
+from settings import CONF, TrainConfig
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import StepCounter

@@ -18,8 +18,9 @@ from typing import Any
 
 import torch
 from evaluate import fly
-from launch import TrainConfig, one_line
+from launch import one_line
 from omegaconf import OmegaConf
+from settings import TrainConfig
 from tqdm import tqdm
 from train import train
 

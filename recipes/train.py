@@ -18,8 +18,9 @@ from typing import cast
 
 import hydra
 import torch
-from launch import CONF, TrainConfig, launch, load, prepare, reported, save_config
+from launch import launch, load, prepare, reported, save_config
 from omegaconf import DictConfig
+from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.collectors import Collector

@@ -6,8 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from launch import TrainConfig, launch
+from launch import launch
 from omegaconf import OmegaConf
+from settings import TrainConfig
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint
 from train import main

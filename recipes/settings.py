@@ -1,0 +1,141 @@
+"""Everything that the recipes can be told: a scenario (``damian.scenario``), and how to learn in it."""
+
+import os
+import re
+import zlib
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from damian import checks
+from damian.clocks import SystemClock
+from damian.delayed import is_late
+from damian.delays import law_of
+from damian.mappo import MappoConfig
+from damian.models import ModelConfig
+from damian.scenario import ScenarioConfig
+
+CONF = str(Path(__file__).parents[1] / "conf")
+"""Absolute, so that a recipe can be imported as well as run."""
+
+
+@dataclass
+class LoggerConfig:
+    """Where the curves go, inside the run folder."""
+
+    tensorboard: bool = True
+    """TensorBoard events."""
+    csv: bool = True
+    """``metrics.csv``."""
+
+
+@dataclass
+class TrainConfig(ScenarioConfig):
+    """Everything that ``recipes/train.py`` can be told."""
+
+    algo: MappoConfig = field(default_factory=MappoConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    seed: int = 0
+    """Of everything that is drawn."""
+    worlds: int = 64
+    """Worlds that are stepped together."""
+    frames: int = 300_000
+    """Steps to learn from, over all worlds."""
+    episodes: int | None = None
+    """Stop after so many episodes, if that comes first."""
+    eval_episodes: int = 200
+    """Episodes of each evaluation at the end."""
+    checkpoint_every: int = 20
+    """Updates between two checkpoints."""
+    backupdate: bool = False
+    """Put late messages in their place before learning from the steps that they belong to (SPEC 4): what the
+    critic sees, rewards and ends of episodes; what the actor saw stays."""
+    settle: bool = False
+    """With ``backupdate``: learn from a step only when none of its messages can be under way any more."""
+    recompute_actor: bool = False
+    """The original authors' variant of ``backupdate``: late messages also rewrite what the actor saw and
+    the probability of what it did, as if it had known."""
+    checkpoint: str | None = None
+    """Run folder whose policy to begin with; its overrides hold too, where no others are given."""
+    overrides: list[str] = field(default_factory=list)
+    """What was asked for on the command line; filled in by the recipe."""
+    resume: str | None = None
+    """Run folder to go on with."""
+    device: str = "cpu"
+    """cpu, cuda, cuda:1, ..."""
+    threads: int = 1
+    """Threads of torch; small tensors are slower with more."""
+    compile: bool = False
+    """Compile the environment's step: worth it from some hundred worlds on."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.in_range("seed", self.seed, 0, 2**31)
+        for name in ("worlds", "eval_episodes"):
+            checks.in_range(name, getattr(self, name), 1, 1e6)
+        for name in ("frames", "checkpoint_every"):
+            checks.in_range(name, getattr(self, name), 1, 1e12)
+        checks.in_range("threads", self.threads, 1, 1024)
+        if self.episodes is not None:
+            checks.in_range("episodes", self.episodes, 1)
+        checks.device("device", self.device)
+
+    def check_learning(self) -> None:
+        """Make sure that it can be learnt like this; what is only flown need not.
+
+        Raises:
+            InputError: names the key that does not fit.
+        """
+        checks.in_range("algo.minibatches", self.algo.minibatches, 1, self.worlds * self.update_steps)
+        # What is corrected are single rewards, and what the server knows at every step.
+        others = {
+            "delay.reward_window": (self.delay.reward_window, self.delay.reward_window > 1),
+            "delay.rew": (self.delay.rew, is_late(self.delay.rew, self.clock.dt)),
+            "clock.server": (self.clock.server, self.clock.steps("server") > 1),
+        }
+        for key, (value, set_) in others.items():
+            should = "does not go with backupdate=true, which would undo it"
+            checks.require(not (self.backupdate and set_), key, value, should)
+        for key in ("settle", "recompute_actor"):
+            alone = getattr(self, key) and not self.backupdate
+            checks.require(not alone, key, True, "means nothing without backupdate=true")
+        shortest = SystemClock(self.clock, self.update_steps).shortest
+        should = (
+            f"needs more than {self.longest_delay} steps, the longest delay, between two updates: {shortest}"
+        )
+        checks.require(not self.settle or self.longest_delay < shortest, "settle", True, should)
+
+    @property
+    def longest_delay(self) -> int:
+        """Of a message [steps]."""
+        return law_of(self.delay.obs).sampler(self.clock.dt).longest
+
+    @property
+    def update_steps(self) -> int:
+        """Steps of every world before the first update: the system clock's, or the algorithm's."""
+        return self.clock.steps("system") if self.clock.system else self.algo.steps
+
+    @property
+    def horizon(self) -> int:
+        """Steps after which an evaluated episode is cut, if nothing else ends it."""
+        limit = self.episode.max_steps or 200
+        return 4 * limit if self.episode.since_detection else limit
+
+
+ConfigStore.instance().store(name="schema", node=TrainConfig)
+OmegaConf.register_new_resolver("shipped", lambda name: str(files("damian") / "data" / name))
+
+
+def _plain(name: str) -> str:
+    """A folder's name without quotes and brackets, and not too long for a file system."""
+    plain = re.sub(r"[^\w.=,-]", "", name)
+    return plain if len(plain) <= 100 else f"{plain[:90]}_{zlib.crc32(plain.encode()):08x}"
+
+
+OmegaConf.register_new_resolver("plain", _plain)
