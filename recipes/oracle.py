@@ -1,4 +1,4 @@
-"""Fly a trained policy under delay, but with some of the messages on time: whose lateness costs what.
+"""Fly a trained policy under delay, but knowing some things on time: whose lateness costs what.
 
     python recipes/oracle.py checkpoint=runs/delaybench/tracking/none/undelayed/seed_8 delay=paper
 
@@ -6,6 +6,7 @@ What the policy acts on is more than it could know (regime R3 of a report). Over
 where no others are given. The run folder gets config.yaml, result.csv and result.md.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -25,9 +26,13 @@ from damian.metrics import evaluate
 from damian.runs import save_results
 from damian.server import Server
 
+ALL = Snapshot._fields
+PLACE = ("position", "target", "track", "trail")
+"""What a UAV can tell from its own past actions; what it has heard is not among it."""
+
 
 def foresee(config: TrainConfig, folder: Path) -> None:
-    """Evaluate with nobody's messages on time, a UAV's own, the others', everybody's; fill the folder."""
+    """Evaluate with more and more that is known on time, and fill the folder."""
     if not messages_are_late(config):
         raise InputError("delay.obs: nothing is late: there is nothing to know earlier")
     actor, seed = stored_actor(config), config.seed + 10_000
@@ -35,28 +40,49 @@ def foresee(config: TrainConfig, folder: Path) -> None:
     env = make_env(config, config.eval_episodes, seed, config.device, ["message"])
     env.append_transform(StepCounter())
     own = torch.eye(config.agents, dtype=torch.bool, device=env.device)
-    whose = {"nobody's": own & ~own, "its own": own, "the others'": ~own, "everybody's": own | ~own}
+    whose = {
+        "nothing": (own & ~own, ALL),
+        "where it is": (own, PLACE),
+        "its own messages": (own, ALL),
+        "the others' messages": (~own, ALL),
+        "everything": (own | ~own, ALL),
+    }
     rows = {}
-    for name, on_time in whose.items():
+    for name, known in whose.items():
         env.set_seed(seed)  # the same episodes for everyone
-        policy = TensorDictSequential([informed(env.worlds.server, on_time), actor])  # type: ignore[list-item]
+        policy = TensorDictSequential([informed(env.worlds.server, *known), actor])  # type: ignore[list-item]
         rows[name] = evaluate(env, policy, config.horizon)
     table = save_results(rows, folder, config.episode.success_share is not None, late=True)
-    print(f"\nmessages that are on time:\n\n{table}")
+    print(f"\nwhat a UAV knows on time:\n\n{table}")
 
 
-def informed(server: Server, on_time: Tensor) -> TensorDictModule:
-    """Shows each UAV what the server would tell it if messages had come, by viewer and sender [N, N]."""
+def informed(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDictModule:
+    """Shows each UAV what the server would tell it if it had known some things on time.
+
+    Args:
+        server: of the environment.
+        on_time: from whom, by who is told and who has sent, [N, N] bool.
+        fields: of their messages.
+    """
 
     def see(received: Tensor, message: Tensor, shown: Tensor, steps: Tensor) -> Tensor:
-        rows = torch.where(on_time.unsqueeze(-1), message.unsqueeze(1), received.unsqueeze(1))
-        told = server.serve(Snapshot.unpack(rows), steps.expand(rows.shape[:2])).observation  # [B, N, N, F]
+        n_agents = len(on_time)
+        held, sent = (
+            Snapshot.unpack(rows.unsqueeze(1).expand(-1, n_agents, -1, -1)) for rows in (received, message)
+        )
+        known = held._replace(**{name: _mixed(on_time, sent, held, name) for name in fields})
+        told = server.serve(known, steps.expand(-1, n_agents)).observation  # [B, N, N, F]
         own = told.diagonal(dim1=1, dim2=2).movedim(-1, 1)
         return torch.cat([own, shown[..., own.shape[-1] :]], -1)  # what it remembers by itself stays
 
     names = ("received", "message", "observation")
     keys = [*(("agents", name) for name in names), "step_count"]
     return TensorDictModule(see, in_keys=keys, out_keys=[("agents", "observation")])
+
+
+def _mixed(on_time: Tensor, sent: Snapshot, held: Snapshot, name: str) -> Tensor:
+    new, old = getattr(sent, name), getattr(held, name)
+    return torch.where(on_time.view(*on_time.shape, *[1] * (new.dim() - 3)), new, old)
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

@@ -26,11 +26,11 @@ def flown(motion):
     return env.rollout(15, break_when_any_done=False), env.worlds.server
 
 
-def told(flight, server, on_time):
+def told(flight, server, on_time, fields=oracle.ALL):
     """What ``informed`` shows at every step but the first, [B, T, N, F]."""
     steps = flight["next"].select(("agents", "received"), ("agents", "message"), ("agents", "observation"))
     steps["step_count"] = flight["next", "step_count"]
-    return oracle.informed(server, on_time)(steps.reshape(-1))["agents", "observation"]
+    return oracle.informed(server, on_time, fields)(steps.reshape(-1))["agents", "observation"]
 
 
 @both_motions
@@ -46,14 +46,16 @@ def test_nobodys_messages_on_time_change_nothing_and_everybodys_tell_all(motion)
 
 
 @both_motions
-def test_each_uav_is_told_with_its_own_message_on_time_what_a_loop_over_uavs_says(motion):
+@pytest.mark.parametrize("fields", [oracle.ALL, oracle.PLACE])
+def test_each_uav_is_told_with_its_own_message_on_time_what_a_loop_over_uavs_says(motion, fields):
     flight, server = flown(motion)
     after = flight["next"].flatten(0, 1)
-    shown = told(flight, server, torch.eye(3, dtype=torch.bool))
+    shown = told(flight, server, torch.eye(3, dtype=torch.bool), fields)
     for uav in range(3):
-        held = after["agents", "received"].clone()
-        held[:, uav] = after["agents", "message"][:, uav]
-        served = server.serve(Snapshot.unpack(held), after["step_count"].view(-1))
+        held, sent = (Snapshot.unpack(after["agents", key].clone()) for key in ("received", "message"))
+        for name in fields:
+            getattr(held, name)[:, uav] = getattr(sent, name)[:, uav]
+        served = server.serve(held, after["step_count"].view(-1))
         assert shown[:, uav, N_FEATURES].equal(served.observation[:, uav])
     assert shown[..., -4:].equal(after["agents", "observation"][..., -4:])
 
@@ -79,12 +81,13 @@ def foresee(tmp_path, monkeypatch):
 def test_a_person_reads_whose_lateness_costs_what(foresee, capsys):
     table = (foresee() / "result.md").read_text()
     assert [line.split(" | ")[0][2:] for line in table.splitlines()[2:]] == [
-        "nobody's",
-        "its own",
-        "the others'",
-        "everybody's",
+        "nothing",
+        "where it is",
+        "its own messages",
+        "the others' messages",
+        "everything",
     ]
-    assert "messages that are on time" in capsys.readouterr().out
+    assert "what a UAV knows on time" in capsys.readouterr().out
 
 
 def test_where_nothing_is_late_there_is_nothing_to_foresee(foresee, capsys, tmp_path):
