@@ -116,13 +116,13 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
     return checked
 
 
-_schema: list[type] = [TrainConfig]
-"""Whose keys the program that runs knows."""
+_schemas: list[type] = [TrainConfig]
+"""Whose keys the program that runs knows, its own first."""
 
 
 def launch(main: Callable[[], Any], schema: type = TrainConfig) -> None:
     """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
-    _schema[0] = schema
+    _schemas[:] = dict.fromkeys([schema, TrainConfig])
     _begun.clear()
     try:
         words = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))  # flags first
@@ -210,9 +210,12 @@ def no_such_key(key: str) -> str:
     """The message for an unknown key, with the nearest known one."""
     if re.match(r"delay\.(obs|act|rew)\.", key):
         return f"{key}: no setting of the law that is there already; write another law over delay=none"
-    known = [str(name) for name in _keys(OmegaConf.structured(_schema[0]))]
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.75)
-    return f"{key}: no such key" + (f"; did you mean {near[0]}?" if near else "")
+    near = (
+        difflib.get_close_matches(key, map(str, _keys(OmegaConf.structured(schema))), n=1, cutoff=0.75)
+        for schema in _schemas
+    )
+    nearest = next(filter(None, near), [])
+    return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in nearest)
 
 
 def _keys(config: DictConfig, path: str = "") -> Iterator[str]:
