@@ -18,7 +18,6 @@ from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.libs.vmas import VmasEnv
@@ -27,7 +26,7 @@ from torchrl.modules.distributions import NormalParamExtractor
 from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 from tqdm import tqdm
-from train import learning_env, make_memory, ticks
+from train import learning_env, make_collector, make_memory, ticks
 
 from damian.clocks import SystemClock
 from damian.mappo import Mappo, MappoConfig, add_advantages
@@ -85,13 +84,7 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
     """Train as ``recipes/train.py`` does; yields what each iteration took."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     learner = Mappo(env, config.model, config.algo, make_memory(config, env, clock))
-    collector = Collector(
-        env,
-        learner.actor,
-        frames_per_batch=config.worlds * clock.unit,
-        total_frames=-1,
-        auto_register_policy_transforms=True,
-    )
+    collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     batches = ticks(collector, clock)
     while True:
         begin = time.perf_counter()
@@ -111,13 +104,7 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
     actor, critic = vmas_actor(env, config), vmas_critic(env, config, together)
     loss = vmas_loss(actor, critic, config.algo)
     optimizer = torch.optim.Adam(loss.parameters(), lr=config.algo.lr)
-    collector = Collector(
-        env,
-        actor,
-        frames_per_batch=worlds * steps,
-        total_frames=-1,
-        auto_register_policy_transforms=True,
-    )
+    collector = make_collector(env, actor, worlds * steps)
     memory = TensorDictReplayBuffer(
         storage=LazyTensorStorage(worlds * steps),
         sampler=SamplerWithoutReplacement(),

@@ -10,8 +10,7 @@ folder gets config.yaml, result.csv and result.md.
 from pathlib import Path
 
 import hydra
-import torch
-from launch import launch, load, prepare, reported, save_config
+from launch import launch, load, perform, reported, save_config
 from omegaconf import DictConfig
 from settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
@@ -46,10 +45,7 @@ def stored_actor(config: TrainConfig) -> ProbabilisticActor:
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
 def main(written: DictConfig) -> None:
-    config, folder = prepare(written)
-    torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
-    fly(config, folder)
+    perform(written, fly)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import Any, NoReturn, cast
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises; ``launch`` prints
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -46,6 +47,14 @@ def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:
     if config.resume is None:
         config.overrides = list(HydraConfig.get().overrides.task)
     return config, folder
+
+
+def perform(written: DictConfig, program: Callable[[TrainConfig, Path], None]) -> None:
+    """Run a program on what Hydra composed, and its run folder; seeded."""
+    config, folder = prepare(written)
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    program(config, folder)
 
 
 def checked(written: DictConfig) -> TrainConfig:

@@ -12,7 +12,7 @@ from pathlib import Path
 import hydra
 import torch
 from evaluate import stored_actor
-from launch import launch, prepare, reported, save_config
+from launch import launch, perform, reported, save_config
 from omegaconf import DictConfig
 from settings import CONF, TrainConfig
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -88,10 +88,7 @@ def _mixed(on_time: Tensor, sent: Snapshot, held: Snapshot, name: str) -> Tensor
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
 def main(written: DictConfig) -> None:
-    config, folder = prepare(written)
-    torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
-    foresee(config, folder)
+    perform(written, foresee)
 
 
 if __name__ == "__main__":

@@ -18,14 +18,14 @@ from typing import cast
 
 import hydra
 import torch
-from launch import launch, load, prepare, reported, save_config
+from launch import launch, load, perform, reported, save_config
 from omegaconf import DictConfig
 from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import RewardSum, StepCounter
+from torchrl.envs import EnvBase, RewardSum, StepCounter
 from tqdm import tqdm
 
 from damian.chain import DelayedEnv
@@ -80,6 +80,13 @@ def make_memory(config: TrainConfig, env: DelayedEnv, clock: SystemClock) -> Ten
     return TensorDictReplayBuffer(storage=BackupdateStorage(capacity, view, longest, device=config.device))
 
 
+def make_collector(env: EnvBase, actor: torch.nn.Module, frames: int) -> Collector:
+    """Collects batches of so many steps, without end."""
+    return Collector(
+        env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
+    )
+
+
 def ticks(collector: Collector, clock: SystemClock) -> Iterator[TensorDictBase]:
     """What was collected between two ticks of the system clock, [B, T]."""
     parts: list[TensorDictBase] = []
@@ -121,13 +128,7 @@ def train(config: TrainConfig, folder: Path) -> None:
         load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", "critic"])
     save_config(config, folder)
     log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
-    collector = Collector(
-        env,
-        learner.actor,
-        frames_per_batch=config.worlds * clock.unit,
-        total_frames=-1,
-        auto_register_policy_transforms=True,
-    )
+    collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     bar = progress_bar(config, progress, episodes)
     with closing(log), closing(bar), Interrupt() as interrupt:
         for batch in ticks(collector, clock) if not enough(config, progress, episodes) else ():
@@ -193,10 +194,7 @@ def report(config: TrainConfig, folder: Path, actor: torch.nn.Module) -> Evaluat
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
 def main(written: DictConfig) -> None:
-    config, folder = prepare(written)
-    torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
-    train(config, folder)
+    perform(written, train)
 
 
 if __name__ == "__main__":
