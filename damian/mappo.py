@@ -96,9 +96,10 @@ class Mappo:
         """One update from a batch [B, T]; returns the mean losses, and what was corrected."""
         known = self.known(batch)
         add_advantages(known, self.loss, self.config)
-        replaced = {} if self.memory is None else {"backupdated": known["agents", "backupdated"]}
-        shares = {name: flag.float().mean().item() for name, flag in replaced.items()}
-        return {**shares, **self.optimize(known.reshape(-1))}
+        losses = self.optimize(known.reshape(-1))
+        if self.memory is None:
+            return losses
+        return {"backupdated": known["agents", "backupdated"].float().mean().item(), **losses}
 
     @torch.no_grad()
     def known(self, batch: TensorDictBase) -> TensorDictBase:

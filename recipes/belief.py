@@ -16,7 +16,7 @@ from typing import cast
 import hydra
 import numpy as np
 import torch
-from launch import launch, prepare, reported, save_config
+from launch import launch, perform, prepare, reported, save_config
 from omegaconf import DictConfig
 from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
@@ -87,17 +87,19 @@ def report(flight: Beliefs, folder: Path) -> None:
     print(f"lost messages: {flight.lost.sum() / n_sent:.1%}")
 
 
+def show(config: TrainConfig, folder: Path) -> None:
+    """Fly, and fill the run folder."""
+    flight = fly(config)
+    save_config(config, folder)
+    report(flight, folder)
+
+
 @hydra.main(version_base=None, config_path=CONF, config_name="belief")
 @reported
 def main(written: DictConfig) -> None:
     if written.resume is not None:
         raise InputError("resume: a flight of the random policy has nothing to go on with")
-    config, folder = prepare(written)
-    torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
-    flight = fly(config)
-    save_config(config, folder)
-    report(flight, folder)
+    perform(*prepare(written), show)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 from hydra import compose
@@ -24,8 +24,8 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from launch import checked, launch, no_such_key, one_line, quoted, reported
-from omegaconf import MISSING, DictConfig, OmegaConf
+from launch import checked, launch, one_line, quoted, reported
+from omegaconf import MISSING, DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from parallel import LOG, Run, check_stored, perform_all
 from settings import CONF
@@ -35,7 +35,6 @@ from damian.comparison import MODE, NOT_LATE, RANDOM, SAMPLED, SCORES, Arm, Comp
 from damian.comparison_report import LABELS, markdown, plot_curves, plot_norms
 from damian.errors import InputError
 from damian.runs import read_metrics
-from damian.scenario import leftovers
 
 ALL_RESULTS, TABLE, MARKDOWN, FIGURE = "results.csv", "table.csv", "table.md", "figure.png"
 SEEDS, EPISODES = 10, 100
@@ -159,9 +158,15 @@ def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
         raise InputError(f"experiment: nothing of it is finished in {folder}")
     arms = config.chosen("arms")
     rows = [
-        {"task": run.task, "delay": run.delay, "arm": run.arm, "regime": arms[run.arm].regime, **seed, **row}
+        {
+            "task": run.task,
+            "delay": run.delay,
+            "arm": run.arm,
+            "regime": arms[run.arm].regime,
+            "seed": run.config.seed,
+            **row,
+        }
         for run in done
-        for seed in [{"seed": run.config.seed}]
         for row in run.results()
     ]
     comparison = Comparison(rows, arms, config.score, POLICIES[config.policy])
@@ -217,10 +222,7 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
 def main(written: DictConfig) -> None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise InputError("-m: a comparison runs all its arms and seeds by itself; leave it out")
-    config = cast(CompareConfig, OmegaConf.to_object(written))
-    unknown = leftovers(written, config)
-    if unknown:
-        raise InputError(no_such_key(unknown[0]))
+    config: CompareConfig = checked(written)
     folder = Path(HydraConfig.get().runtime.output_dir)
     runs = plan(config, folder)
     for run in runs:

@@ -10,7 +10,7 @@ folder gets config.yaml, result.csv and result.md.
 from pathlib import Path
 
 import hydra
-from launch import launch, load, perform, reported, save_config
+from launch import launch, load, perform, prepare, reported, save_config
 from omegaconf import DictConfig
 from settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
@@ -45,7 +45,7 @@ def stored_actor(config: TrainConfig) -> ProbabilisticActor:
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
 def main(written: DictConfig) -> None:
-    perform(written, fly)
+    perform(*prepare(written), fly)
 
 
 if __name__ == "__main__":

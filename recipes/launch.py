@@ -49,16 +49,15 @@ def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:
     return config, folder
 
 
-def perform(written: DictConfig, program: Callable[[TrainConfig, Path], None]) -> None:
-    """Run a program on what Hydra composed, and its run folder; seeded."""
-    config, folder = prepare(written)
+def perform(config: TrainConfig, folder: Path, program: Callable[[TrainConfig, Path], None]) -> None:
+    """Run a program with its threads and its seed."""
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     program(config, folder)
 
 
-def checked(written: DictConfig) -> TrainConfig:
-    """The configuration of what was composed.
+def checked(written: DictConfig) -> Any:
+    """The configuration of what was composed, as its schema says: a ``TrainConfig``, or another one.
 
     Raises:
         InputError: a value is impossible, or a key means nothing.
@@ -67,7 +66,7 @@ def checked(written: DictConfig) -> TrainConfig:
     unknown = leftovers(written, config)
     if unknown:
         raise InputError(no_such_key(unknown[0]))
-    return cast(TrainConfig, config)
+    return config
 
 
 def save_config(config: TrainConfig, folder: Path) -> None:

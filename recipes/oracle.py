@@ -12,7 +12,7 @@ from pathlib import Path
 import hydra
 import torch
 from evaluate import stored_actor
-from launch import launch, perform, reported, save_config
+from launch import launch, perform, prepare, reported, save_config
 from omegaconf import DictConfig
 from settings import CONF, TrainConfig
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -25,6 +25,7 @@ from damian.features import Snapshot
 from damian.metrics import evaluate
 from damian.runs import save_results
 from damian.server import Server
+from damian.state import where
 
 ALL = Snapshot._fields
 PLACE = ("position", "target", "track", "trail")
@@ -70,7 +71,8 @@ def informed(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDi
         held, sent = (
             Snapshot.unpack(rows.unsqueeze(1).expand(-1, n_agents, -1, -1)) for rows in (received, message)
         )
-        known = held._replace(**{name: _mixed(on_time, sent, held, name) for name in fields})
+        timely = where(on_time.unsqueeze(0), sent, held)
+        known = held._replace(**{name: getattr(timely, name) for name in fields})
         told = server.serve(known, steps.expand(-1, n_agents)).observation  # [B, N, N, F]
         own = told.diagonal(dim1=1, dim2=2).movedim(-1, 1)
         return torch.cat([own, shown[..., own.shape[-1] :]], -1)  # what it remembers by itself stays
@@ -80,15 +82,10 @@ def informed(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDi
     return TensorDictModule(see, in_keys=keys, out_keys=[("agents", "observation")])
 
 
-def _mixed(on_time: Tensor, sent: Snapshot, held: Snapshot, name: str) -> Tensor:
-    new, old = getattr(sent, name), getattr(held, name)
-    return torch.where(on_time.view(*on_time.shape, *[1] * (new.dim() - 3)), new, old)
-
-
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
 def main(written: DictConfig) -> None:
-    perform(written, foresee)
+    perform(*prepare(written), foresee)
 
 
 if __name__ == "__main__":

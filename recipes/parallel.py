@@ -16,9 +16,8 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
-import torch
 from evaluate import fly
-from launch import one_line
+from launch import one_line, perform
 from omegaconf import OmegaConf
 from settings import TrainConfig
 from tqdm import tqdm
@@ -110,9 +109,9 @@ def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> l
         KeyboardInterrupt: after Ctrl-C, when every run has written a checkpoint.
     """
     todo, failed = [run for run in runs if not run.finished], []
-    perform = _in_turn(todo) if processes == 1 else _at_once(todo, processes)
+    ended = _in_turn(todo) if processes == 1 else _at_once(todo, processes)
     with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
-        for run, error in perform:
+        for run, error in ended:
             bar.update()
             if error:
                 failed.append(run)
@@ -180,14 +179,9 @@ def _perform(run: Run) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
-            torch.set_num_threads(run.config.threads)
-            torch.manual_seed(run.config.seed)
-            if not run.trains:
-                fly(run.config, run.folder)
-            elif (run.folder / CHECKPOINT).exists():
-                train(replace(run.config, resume=str(run.folder)), run.folder)
-            else:
-                train(run.config, run.folder)
+            begun = run.trains and (run.folder / CHECKPOINT).exists()
+            config = replace(run.config, resume=str(run.folder)) if begun else run.config
+            perform(config, run.folder, train if run.trains else fly)
         except SystemExit as interrupted:
             raise KeyboardInterrupt from interrupted
         except InputError as error:

@@ -18,7 +18,7 @@ from typing import cast
 
 import hydra
 import torch
-from launch import launch, load, perform, reported, save_config
+from launch import launch, load, perform, prepare, reported, save_config
 from omegaconf import DictConfig
 from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
@@ -30,6 +30,7 @@ from tqdm import tqdm
 
 from damian.chain import DelayedEnv
 from damian.clocks import SystemClock
+from damian.comparison import MODE, RANDOM, SAMPLED
 from damian.delayed import make_env, messages_are_late
 from damian.features import Snapshot
 from damian.mappo import Mappo
@@ -185,7 +186,7 @@ def report(config: TrainConfig, folder: Path, actor: torch.nn.Module) -> Evaluat
         return evaluate(env, policy, config.horizon, sample)
 
     random = fly(random_policy(env))
-    rows = {"trained, sampled": fly(actor), "trained, mode": fly(actor, False), "random": random}
+    rows = {SAMPLED: fly(actor), MODE: fly(actor, False), RANDOM: random}
     table = save_results(rows, folder, config.episode.success_share is not None, messages_are_late(config))
     print(f"\n{table}\n")
     return random
@@ -194,7 +195,7 @@ def report(config: TrainConfig, folder: Path, actor: torch.nn.Module) -> Evaluat
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
 def main(written: DictConfig) -> None:
-    perform(written, train)
+    perform(*prepare(written), train)
 
 
 if __name__ == "__main__":
