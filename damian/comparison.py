@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,6 +74,11 @@ class Comparison:
     score: str = "true_return"
     policy: str = SAMPLED
     """Whose score is compared."""
+
+    @cached_property
+    def lines(self) -> list["Line"]:
+        """The table: bootstrapped once, whoever reads it."""
+        return list(_lines(self))
 
     @property
     def undelayed(self) -> str:
@@ -197,7 +203,7 @@ class Line:
         return cells
 
 
-def lines(comparison: Comparison) -> Iterator[Line]:
+def _lines(comparison: Comparison) -> Iterator[Line]:
     """Every arm and policy, task by task and delay by delay; the undelayed arm first."""
     for task in comparison.tasks():
         for delay in (NOT_LATE, *comparison.delays(task)):

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from damian.comparison import NOT_LATE, RANDOM, SEEN, TRUE, Comparison, Line, lines
+from damian.comparison import NOT_LATE, RANDOM, SEEN, TRUE, Comparison, Line
 from damian.figures import COLOURS
 from damian.statistics import Floats, bootstrap
 
@@ -35,7 +35,7 @@ def markdown(comparison: Comparison, notes: Sequence[str], tasks: Mapping[str, s
         tasks: how each was trained, for below its heading.
         never: tasks in which there is no success.
     """
-    every, parts = list(lines(comparison)), ["\n".join(f"- {note}" for note in notes)]
+    every, parts = comparison.lines, ["\n".join(f"- {note}" for note in notes)]
     for task in comparison.tasks():
         for delay in comparison.delays(task) or [NOT_LATE]:
             told = [line for line in every if line.task == task and line.delay in (NOT_LATE, delay)]

@@ -31,7 +31,7 @@ from parallel import LOG, Run, check_stored, perform_all
 from settings import CONF
 
 from damian import checks
-from damian.comparison import MODE, NOT_LATE, RANDOM, SAMPLED, SCORES, Arm, Comparison, lines
+from damian.comparison import MODE, NOT_LATE, RANDOM, SAMPLED, SCORES, Arm, Comparison
 from damian.comparison_report import LABELS, markdown, plot_curves, plot_norms
 from damian.errors import InputError
 from damian.runs import read_metrics
@@ -171,7 +171,7 @@ def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
     ]
     comparison = Comparison(rows, arms, config.score, POLICIES[config.policy])
     _write(folder / ALL_RESULTS, rows)
-    _write(folder / TABLE, [line.cells() for line in lines(comparison)])
+    _write(folder / TABLE, [line.cells() for line in comparison.lines])
     never = {run.task for run in runs if run.config.episode.success_share is None}
     lasted = {run.task: _lasted(run) for run in done}
     (folder / MARKDOWN).write_text(markdown(comparison, _notes(config, runs, rows), lasted, never))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from compare import start
 
-from damian.comparison import MODE, RANDOM, SAMPLED, Arm, Comparison, lines
+from damian.comparison import MODE, RANDOM, SAMPLED, Arm, Comparison
 from damian.comparison_report import markdown, plot_curves, plot_norms
 from damian.statistics import interquartile_mean
 
@@ -210,7 +210,7 @@ def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
 
 
 def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
-    found = list(lines(Comparison(rows_of("t", "late", SCORES), ARMS)))
+    found = Comparison(rows_of("t", "late", SCORES), ARMS).lines
     told = [(line.delay, line.arm, line.policy) for line in found]
     assert told == [
         ("none", "best", SAMPLED),
