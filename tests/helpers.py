@@ -317,3 +317,15 @@ def fresh(scenario: ScenarioConfig, num_worlds: int = 1, **options) -> UavEnv:
 def flight(env: UavEnv) -> float:
     """Duration of the flight that has just begun [s]."""
     return (2 * env.state.vertical + env.state.cruise).item()
+
+
+def check_refused(recipe: Callable[[], Any], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """What a person got wrong is one line on stderr, and exit code 2."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        recipe()
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert told in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from belief import main
+from helpers import check_refused
 from launch import launch
 from matplotlib.image import imread
 from omegaconf import OmegaConf
@@ -143,11 +144,5 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
     ],
 )
 def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(run, capsys, tmp_path, overrides, message):
-    with pytest.raises(SystemExit) as stopped:
-        run(*overrides)
-    error = capsys.readouterr().err
-    assert stopped.value.code == 2
-    assert message in error
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1
+    check_refused(lambda: run(*overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []

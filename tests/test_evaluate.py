@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import train
 from evaluate import main
+from helpers import check_refused
 from launch import launch
 from omegaconf import OmegaConf
 
@@ -160,15 +161,3 @@ def test_a_spoilt_configuration_beside_a_checkpoint_is_refused(fly, learnt, caps
     spoilt = shutil.copytree(learnt, tmp_path / "spoilt")
     (spoilt / "config.yaml").write_text(text)
     check_refused(lambda: fly(of=spoilt), "config.yaml: ", capsys)
-
-
-def check_refused(fly: Callable[[], Path], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """One line on stderr, and exit code 2."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        fly()
-    error = capsys.readouterr().err
-    assert stopped.value.code == 2
-    assert told in error
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1
