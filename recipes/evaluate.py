@@ -15,31 +15,32 @@ from omegaconf import DictConfig
 from settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
 from torchrl.modules import ProbabilisticActor
-from train import report
+from train import report, unseen
 
-from damian.delayed import make_env
+from damian.chain import DelayedEnv
 from damian.errors import InputError
 from damian.models import make_actor
 
 
 def fly(config: TrainConfig, folder: Path) -> None:
     """Evaluate the policy of ``config.checkpoint``, and fill the folder."""
-    actor = stored_actor(config)
+    env, actor = stored(config)
     save_config(config, folder)
-    report(config, folder, actor)
+    report(config, folder, env, actor)
 
 
-def stored_actor(config: TrainConfig) -> ProbabilisticActor:
-    """The policy of ``config.checkpoint``.
+def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
+    """Where to fly, and the policy of ``config.checkpoint``.
 
     Raises:
         InputError: there is none, or one that sees or does something else.
     """
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
-    actor = make_actor(make_env(config, 1, config.seed, config.device), config.model)
+    env = unseen(config)
+    actor = make_actor(env, config.model)
     load(Checkpoint(actor=actor), Path(config.checkpoint), "checkpoint")
-    return actor
+    return env, actor
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import hydra
 import torch
-from evaluate import stored_actor
+from evaluate import stored
 from launch import launch, perform, prepare, reported, save_config
 from omegaconf import DictConfig
 from settings import CONF, TrainConfig
@@ -19,7 +19,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import StepCounter
 
-from damian.delayed import make_env, messages_are_late
+from damian.delayed import messages_are_late
 from damian.errors import InputError
 from damian.features import Snapshot
 from damian.metrics import evaluate
@@ -36,9 +36,8 @@ def foresee(config: TrainConfig, folder: Path) -> None:
     """Evaluate with more and more that is known on time, and fill the folder."""
     if not messages_are_late(config):
         raise InputError("delay.obs: nothing is late: there is nothing to know earlier")
-    actor, seed = stored_actor(config), config.seed + 10_000
+    env, actor = stored(config)
     save_config(config, folder)
-    env = make_env(config, config.eval_episodes, seed, config.device, ["message"])
     env.append_transform(StepCounter())
     own = torch.eye(config.agents, dtype=torch.bool, device=env.device)
     whose = {
@@ -50,7 +49,7 @@ def foresee(config: TrainConfig, folder: Path) -> None:
     }
     rows = {}
     for name, known in whose.items():
-        env.set_seed(seed)  # the same episodes for everyone
+        env.set_seed(config.unseen_seed)  # the same episodes for everyone
         policy = TensorDictSequential([informed(env.worlds.server, *known), actor])  # type: ignore[list-item]
         rows[name] = evaluate(env, policy, config.horizon)
     table = save_results(rows, folder, config.episode.success_share is not None, late=True)

@@ -122,6 +122,11 @@ class TrainConfig(ScenarioConfig):
         return self.clock.steps("system") if self.clock.system else self.algo.steps
 
     @property
+    def unseen_seed(self) -> int:
+        """Of the situations that a policy is evaluated in, and not trained."""
+        return self.seed + 10_000
+
+    @property
     def horizon(self) -> int:
         """Steps after which an evaluated episode is cut, if nothing else ends it."""
         limit = self.episode.max_steps or 200

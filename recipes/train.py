@@ -149,7 +149,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     collector.shutdown()
     if interrupt.asked:
         sys.exit(f"interrupted; go on with resume={folder}")
-    random = report(config, folder, learner.actor)
+    random = report(config, folder, unseen(config), learner.actor)
     plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, MAPPO")
     print(f"learning curve: {folder / FIGURE}")
 
@@ -172,17 +172,20 @@ def mean_terms(batch: TensorDictBase) -> dict[str, float]:
     return {f"reward/{name}": term.mean().item() for name, term in terms.items()}
 
 
-def report(config: TrainConfig, folder: Path, actor: torch.nn.Module) -> Evaluation:
-    """Evaluate in situations that were not trained on; results into the folder, and a table to read.
+def unseen(config: TrainConfig) -> DelayedEnv:
+    """An environment of situations that were not trained on, a world for each episode of an evaluation."""
+    return make_env(config, config.eval_episodes, config.unseen_seed, config.device, ["message"])
+
+
+def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module) -> Evaluation:
+    """Evaluate an actor; results into the folder, and a table to read.
 
     Returns:
         what a random policy comes to.
     """
-    seed = config.seed + 10_000
-    env = make_env(config, config.eval_episodes, seed, config.device, ["message"])
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
-        env.set_seed(seed)  # the same episodes for every policy
+        env.set_seed(config.unseen_seed)  # the same episodes for every policy
         return evaluate(env, policy, config.horizon, sample)
 
     random = fly(random_policy(env))
