@@ -21,7 +21,7 @@ class ClockConfig:
     server: str | None = None
     """How often the server node broadcasts; as the simulation if not given."""
     system: str | None = None
-    """How often the learner takes what has been collected; every ``algo.steps`` steps if not given."""
+    """How often the learner takes what has been collected; every ``steps`` of the algorithm if not given."""
     trigger: str | None = None
     """By how much the system clock's period shrinks at a tick while a UAV spots the source (in half of the
     worlds or more), and grows otherwise; it is fixed if not given."""

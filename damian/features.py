@@ -51,6 +51,9 @@ class ObservationConfig:
     the one that learns in hindsight it would say how far from its last batch's end a step was."""
     age_scale: float = 10.0
     """Ages are divided by this [s]."""
+    own: bool = False
+    """A UAV knows its own latest message at once, with no need to hear of it from the server; else, as in the
+    paper, all that it sees comes from there."""
     window: int = 2
     """Positions over which the coverage area is counted."""
 

@@ -4,26 +4,30 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.multiagent import MAPPOLoss
-from torchrl.objectives.utils import ValueEstimators
+from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from damian import checks
 from damian.models import ModelConfig, make_actor, make_critic
 from damian.storage import BackupdateStorage
+
+LEARNT: list[NestedKey] = [
+    *(("agents", key) for key in ("observation", "action_mask", "action", "action_log_prob", "advantage")),
+    *(("agents", key) for key in ("global_observation", "state_value", "value_target", "ready")),
+]
+"""What the loss reads of a step."""
 
 
 @dataclass
 class MappoConfig:
     """Multi-agent PPO (Yu et al. 2022) with one shared policy."""
 
-    name: str = "mappo"
-    """The algorithm."""
     lr: float = 3e-4
     """Learning rate of Adam."""
     gamma: float = 0.95
@@ -48,15 +52,14 @@ class MappoConfig:
     """Scale the advantages of a batch to mean 0 and deviation 1."""
 
     def __post_init__(self) -> None:
-        checks.one_of("algo.name", self.name, ["mappo"])
         for name in ("lr", "max_grad_norm"):
-            checks.above(f"algo.{name}", getattr(self, name), 0.0)
+            checks.above(f"mappo.{name}", getattr(self, name), 0.0)
         for name in ("gamma", "lmbda"):
-            checks.in_range(f"algo.{name}", getattr(self, name), 0.0, 1.0)
+            checks.in_range(f"mappo.{name}", getattr(self, name), 0.0, 1.0)
         for name in ("clip", "entropy", "value"):
-            checks.in_range(f"algo.{name}", getattr(self, name), 0.0)
+            checks.in_range(f"mappo.{name}", getattr(self, name), 0.0)
         for name in ("steps", "epochs", "minibatches"):
-            checks.in_range(f"algo.{name}", getattr(self, name), 1)
+            checks.in_range(f"mappo.{name}", getattr(self, name), 1)
 
 
 class Mappo:
@@ -95,7 +98,7 @@ class Mappo:
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """One update from a batch [B, T]; returns the mean losses, and what was corrected."""
         known = self.known(batch)
-        add_advantages(known, self.loss, self.config)
+        add_advantages(known, self.critic, self.config)
         losses = self.optimize(known.reshape(-1))
         if self.memory is None:
             return losses
@@ -120,6 +123,7 @@ class Mappo:
 
     def optimize(self, steps: TensorDictBase) -> dict[str, float]:
         """Some passes over steps [M] with advantages; returns the mean losses."""
+        steps = steps.select(*LEARNT, strict=False)  # each entry costs time at every minibatch
         sums: dict[str, float] = {}
         n_parts = min(self.config.minibatches, len(steps))
         for _ in range(self.config.epochs):
@@ -154,20 +158,27 @@ def mappo_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: Mapp
         value_target=("agents", "value_target"),
         sample_log_prob=("agents", "action_log_prob"),
     )
-    loss.make_value_estimator(ValueEstimators.MAGAE, gamma=config.gamma, lmbda=config.lmbda)
     return loss
 
 
 @torch.no_grad()
-def add_advantages(batch: TensorDictBase, loss: MAPPOLoss, config: MappoConfig) -> None:
-    """Write advantages and value targets into a batch [B, T], in place.
+def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: MappoConfig) -> None:
+    """Write values, advantages and value targets into a batch [B, T], in place.
 
-    An entry at which the UAV was not ready is no decision: its advantage is 0, so nothing is learnt from
-    what the policy "chose" there.
+    What a decision earns is all that comes until the next one, k steps later, discounted by gamma^k (a
+    semi-Markov decision process; Sutton, Precup and Singh 1999): in between, nothing is estimated, so that
+    there the lambda of the generalised advantage estimate (Schulman et al. 2016) is 1. An entry at which
+    the UAV was not ready is no decision: its advantage is 0.
     """
-    loss.value_estimator(batch)
-    advantage = batch["agents", "advantage"]
-    ready = batch["agents", "ready"].unsqueeze(-1)
+    critic(batch)
+    critic(batch["next"])
+    value, after, ready = batch["agents", "state_value"], batch["next", "agents"], batch["agents", "ready"]
+    done, terminated = (batch["next", k].unsqueeze(-2).expand_as(value) for k in ("done", "terminated"))
+    lmbda = torch.where(after["ready"].unsqueeze(-1), config.lmbda, 1.0)
+    advantage, batch["agents", "value_target"] = vec_generalized_advantage_estimate(
+        config.gamma, lmbda, value, after["state_value"], after["reward"], done, terminated, time_dim=-3
+    )
+    ready = ready.unsqueeze(-1)
     if config.normalize_advantage:
         chosen = advantage[ready] if ready.any() else torch.zeros(1, device=advantage.device)
         advantage = (advantage - chosen.mean()) / chosen.std(correction=0).clamp(min=1e-6)

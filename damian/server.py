@@ -4,6 +4,7 @@ Asked by the environment (nothing delayed), by the ``ServerNode`` transform (wha
 learner's storage (what has arrived by the time of learning): one copy of every formula.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -80,12 +81,13 @@ class Server:
             self._footprints = self._footprints.to(device)
         return self
 
-    def features(self, snapshot: Snapshot, steps: Tensor) -> Features:
+    def features(self, snapshot: Snapshot, steps: Tensor, names: list[str] | None = None) -> Features:
         """What the observations and the rewards are made of (Table 2).
 
         Args:
             snapshot: the messages held, [*, N].
             steps: elapsed in the episode, [*].
+            names: only these; everything that somebody wants, if not given.
         """
         knowledge = Knowledge(
             now=steps * self.dt,
@@ -96,12 +98,39 @@ class Server:
             points=self._points,
             age_scale=self.config.observation.age_scale,
         )
-        return observe(snapshot, knowledge, self._wanted)
+        return observe(snapshot, knowledge, names or self._wanted)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
         """What the actors see [*, N, F], and the critic [*, N, G]."""
         wanted = self.config.observation
         return stack(features, wanted.actor), stack(features, wanted.critic)
+
+    def informed(
+        self,
+        received: Tensor,
+        message: Tensor,
+        steps: Tensor,
+        on_time: Tensor | None = None,
+        fields: Sequence[str] = Snapshot._fields,
+    ) -> Tensor:
+        """What each actor sees if it knows some messages at once, [*, N, F].
+
+        Args:
+            received: what the server holds, [*, N, M].
+            message: what the UAVs sent last, [*, N, M].
+            steps: elapsed in the episode, [*].
+            on_time: whose messages, by who is told and who has sent, [N, N]; one's own, if not given.
+            fields: what of them.
+        """
+        n_agents, names = received.shape[-2], self.config.observation.actor
+        if on_time is None:
+            on_time = torch.eye(n_agents, dtype=torch.bool, device=received.device)
+        timely = torch.where(on_time.unsqueeze(-1), message.unsqueeze(-3), received.unsqueeze(-3))
+        known = Snapshot.unpack(received.unsqueeze(-3).expand_as(timely))  # [*, N, N], by who is told
+        timely = Snapshot.unpack(timely)._asdict()
+        known = known._replace(**{name: timely[name] for name in fields})
+        told = stack(self.features(known, steps.unsqueeze(-1).expand(received.shape[:-1]), names), names)
+        return told.diagonal(dim1=-3, dim2=-2).movedim(-1, -2)
 
     def judge(self, features: Features, snapshot: Snapshot, steps: Tensor, source_over: Tensor) -> Judgement:
         """Rewards and status (eq. 5-8, SPEC 5).

@@ -170,7 +170,10 @@ def server_view(server: Server, terms: bool = False, actor: bool = False) -> Rec
             ("next", "agents", "reward"): served.reward.unsqueeze(-1),
         }
         if actor:
-            told, seen = served.observation, steps["next", "agents", "observation"]
+            message = steps["next", "agents", "message"]
+            own = server.config.observation.own
+            told = server.informed(beliefs, message, elapsed) if own else served.observation
+            seen = steps["next", "agents", "observation"]
             entries["next", "agents", "observation"] = torch.cat([told, seen[..., told.shape[-1] :]], -1)
         if terms:
             entries |= {("next", "agents", "reward_terms", k): v for k, v in served.terms.items()}

@@ -75,7 +75,7 @@ def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
 
 def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
     """What these overrides make, on larger batches."""
-    batch = [f"worlds={worlds}", f"algo.steps={steps}", "algo.epochs=4", "algo.minibatches=4"]
+    batch = [f"worlds={worlds}", f"mappo.steps={steps}", "mappo.epochs=4", "mappo.minibatches=4"]
     with initialize_config_dir(CONF, version_base=None):
         return checked(compose("train", overrides=quoted([*words.split(), *batch])))
 
@@ -83,7 +83,7 @@ def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
 def damian(config: TrainConfig) -> Iterator[Seconds]:
     """Train as ``recipes/train.py`` does; yields what each iteration took."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    learner = Mappo(env, config.model, config.algo, make_memory(config, env, clock))
+    learner = Mappo(env, config.model, config.mappo, make_memory(config, env, clock))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     batches = ticks(collector, clock)
     while True:
@@ -92,7 +92,7 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
         collected = time.perf_counter()
         known = learner.known(batch)
         corrected = time.perf_counter()
-        add_advantages(known, learner.loss, learner.config)
+        add_advantages(known, learner.critic, learner.config)
         learner.optimize(known.reshape(-1))
         yield Seconds(collected - begin, corrected - collected, time.perf_counter() - corrected)
 
@@ -102,13 +102,13 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
     worlds, steps = config.worlds, config.update_steps
     env = vmas_env(worlds, config.agents)
     actor, critic = vmas_actor(env, config), vmas_critic(env, config, together)
-    loss = vmas_loss(actor, critic, config.algo)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=config.algo.lr)
+    loss = vmas_loss(actor, critic, config.mappo)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=config.mappo.lr)
     collector = make_collector(env, actor, worlds * steps)
     memory = TensorDictReplayBuffer(
         storage=LazyTensorStorage(worlds * steps),
         sampler=SamplerWithoutReplacement(),
-        batch_size=worlds * steps // config.algo.minibatches,
+        batch_size=worlds * steps // config.mappo.minibatches,
     )
     batches = iter(collector)
     while True:
@@ -118,9 +118,9 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
         with torch.no_grad():
             loss.value_estimator(batch)
         memory.extend(batch.reshape(-1))
-        for _ in range(config.algo.epochs):
+        for _ in range(config.mappo.epochs):
             for steps_of_worlds in memory:
-                descend(loss, optimizer, steps_of_worlds, config.algo.max_grad_norm)
+                descend(loss, optimizer, steps_of_worlds, config.mappo.max_grad_norm)
         collector.update_policy_weights_()
         yield Seconds(collected - begin, 0.0, time.perf_counter() - collected)
 

@@ -25,7 +25,6 @@ from damian.features import Snapshot
 from damian.metrics import evaluate
 from damian.runs import save_results
 from damian.server import Server
-from damian.state import where
 
 ALL = Snapshot._fields
 PLACE = ("position", "target", "track", "trail")
@@ -66,15 +65,8 @@ def informed(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDi
     """
 
     def see(received: Tensor, message: Tensor, shown: Tensor, steps: Tensor) -> Tensor:
-        n_agents = len(on_time)
-        held, sent = (
-            Snapshot.unpack(rows.unsqueeze(1).expand(-1, n_agents, -1, -1)) for rows in (received, message)
-        )
-        timely = where(on_time.unsqueeze(0), sent, held)
-        known = held._replace(**{name: getattr(timely, name) for name in fields})
-        told = server.serve(known, steps.expand(-1, n_agents)).observation  # [B, N, N, F]
-        own = told.diagonal(dim1=1, dim2=2).movedim(-1, 1)
-        return torch.cat([own, shown[..., own.shape[-1] :]], -1)  # what it remembers by itself stays
+        known = server.informed(received, message, steps.squeeze(-1), on_time, fields)
+        return torch.cat([known, shown[..., known.shape[-1] :]], -1)  # what it remembers by itself stays
 
     names = ("received", "message", "observation")
     keys = [*(("agents", name) for name in names), "step_count"]

@@ -38,7 +38,9 @@ class LoggerConfig:
 class TrainConfig(ScenarioConfig):
     """Everything that ``recipes/train.py`` can be told."""
 
-    algo: MappoConfig = field(default_factory=MappoConfig)
+    algo: str = "mappo"
+    """mappo or sac."""
+    mappo: MappoConfig = field(default_factory=MappoConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = 0
@@ -92,7 +94,7 @@ class TrainConfig(ScenarioConfig):
         Raises:
             InputError: names the key that does not fit.
         """
-        checks.in_range("algo.minibatches", self.algo.minibatches, 1, self.worlds * self.update_steps)
+        checks.in_range("mappo.minibatches", self.mappo.minibatches, 1, self.worlds * self.update_steps)
         # What is corrected are single rewards, and what the server knows at every step.
         others = {
             "delay.reward_window": (self.delay.reward_window, self.delay.reward_window > 1),
@@ -119,7 +121,7 @@ class TrainConfig(ScenarioConfig):
     @property
     def update_steps(self) -> int:
         """Steps of every world before the first update: the system clock's, or the algorithm's."""
-        return self.clock.steps("system") if self.clock.system else self.algo.steps
+        return self.clock.steps("system") if self.clock.system else self.mappo.steps
 
     @property
     def unseen_seed(self) -> int:

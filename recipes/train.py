@@ -118,7 +118,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     memory = make_memory(config, env, clock)
     settle = config.longest_delay if config.settle else 0
-    learner = Mappo(env, config.model, config.algo, memory, settle, config.recompute_actor)
+    learner = Mappo(env, config.model, config.mappo, memory, settle, config.recompute_actor)
     progress, episodes = Progress(), EpisodeLog()
     state = {"progress": progress, "episodes": episodes, "clock": clock, "rng": GlobalRNGState()}
     checkpoint = Checkpoint(**learner.parts(), **state)

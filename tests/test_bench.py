@@ -15,7 +15,7 @@ def test_arms_differ_in_delay_and_awareness_only():
     assert [config.delay.history > 0 for config in configs] == [False, False, False, True]
     for config in configs:
         assert (config.agents, config.worlds, config.update_steps) == (3, 8, 16)
-        assert (config.algo, config.model) == (configs[0].algo, configs[0].model)
+        assert (config.mappo, config.model) == (configs[0].mappo, configs[0].model)
 
 
 def test_each_part_has_its_own_median():

@@ -13,7 +13,7 @@ from damian.comparison import MODE, RANDOM, SAMPLED, Arm, Comparison
 from damian.comparison_report import markdown, plot_curves, plot_norms
 from damian.statistics import interquartile_mean
 
-SMALL = ["frames=16", "worlds=2", "algo.steps=4", "algo.epochs=1", "eval_episodes=3", "model.hidden=[4]"]
+SMALL = ["frames=16", "worlds=2", "mappo.steps=4", "mappo.epochs=1", "eval_episodes=3", "model.hidden=[4]"]
 TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,unaware]", f"overrides=[{','.join(SMALL)}]"]
 ARMS = {
     "best": Arm(delayed=False),

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 TRAINED = [
     "frames=64",
     "worlds=4",
-    "algo.steps=8",
+    "mappo.steps=8",
     "model.hidden=[16]",
     "eval_episodes=8",
     "episode.max_steps=10",

@@ -1,9 +1,12 @@
 """Models, losses and the learner: what is learnt from, by whom, and what it does to importance ratios."""
 
+import itertools
+
 import pytest
 import torch
-from helpers import both_kinds, everything
-from tensordict import TensorDictBase
+from helpers import both_kinds, both_motions, everything
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
@@ -22,6 +25,7 @@ from damian.storage import BackupdateStorage, server_view
 from damian.world.motion import MotionConfig
 
 SMALL = ModelConfig(hidden=[16])
+REWARD = ("next", "agents", "reward")
 
 
 def scenario(**changes) -> ScenarioConfig:
@@ -83,13 +87,13 @@ def collected(motion: str, kind: str):
     env = UavEnv(config, 8)
     actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
     batch = env.rollout(24, actor, break_when_any_done=False)
-    return batch, mappo_loss(actor, critic, MappoConfig())
+    return batch, critic
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 def test_nothing_is_learnt_from_actions_that_were_none(kind):
-    batch, loss = collected("polynomial", kind)
-    add_advantages(batch, loss, MappoConfig())
+    batch, critic = collected("polynomial", kind)
+    add_advantages(batch, critic, MappoConfig())
     ready = batch["agents", "ready"]
     assert 0 < ready.float().mean() < 1
     assert (batch["agents", "advantage"][~ready] == 0).all()
@@ -107,7 +111,7 @@ def test_entries_without_a_decision_move_the_critic_only(kind, mask):
 
     def gradients(ready: bool) -> tuple[float, float]:
         batch["agents", "ready"] = torch.full_like(batch["agents", "ready"], ready)
-        add_advantages(batch, loss, MappoConfig())
+        add_advantages(batch, critic, MappoConfig())
         loss.zero_grad()
         sum(losses_of(batch.reshape(-1), loss).values()).backward()
         grads = {n: p.grad.abs().sum().item() for n, p in loss.named_parameters() if p.grad is not None}
@@ -122,28 +126,63 @@ def test_entries_without_a_decision_move_the_critic_only(kind, mask):
 
 
 def test_advantages_are_scaled_over_decisions_only():
-    batch, loss = collected("polynomial", "discrete")
-    add_advantages(batch, loss, MappoConfig())
+    batch, critic = collected("polynomial", "discrete")
+    add_advantages(batch, critic, MappoConfig())
     advantage = batch["agents", "advantage"][batch["agents", "ready"]]
     assert advantage.mean().item() == pytest.approx(0, abs=1e-5)
     assert advantage.std(correction=0).item() == pytest.approx(1, abs=1e-4)
 
 
-def test_advantages_are_the_generalised_estimate_of_each_uav():
+@both_motions
+def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(motion):
     config = MappoConfig(gamma=0.9, lmbda=0.8, normalize_advantage=False)
-    batch, loss = collected("instant", "discrete")
-    loss.make_value_estimator(loss.value_type, gamma=0.9, lmbda=0.8)
-    add_advantages(batch, loss, config)
-    value = batch["agents", "state_value"].squeeze(-1)
+    batch, critic = collected(motion, "discrete")
+    add_advantages(batch, critic, config)
+    value, reward = (batch[key].squeeze(-1) for key in (("agents", "state_value"), REWARD))
     after = batch["next", "agents", "state_value"].squeeze(-1)
-    reward = batch["next", "agents", "reward"].squeeze(-1)
-    ends, dones = batch["next", "terminated"].float(), batch["next", "done"].float()
-    estimate, expected = torch.zeros(8, 3), torch.zeros_like(value)
-    for t in reversed(range(24)):
-        delta = reward[:, t] + 0.9 * after[:, t] * (1 - ends[:, t]) - value[:, t]
-        estimate = delta + 0.9 * 0.8 * (1 - dones[:, t]) * estimate
-        expected[:, t] = estimate
-    assert torch.allclose(batch["agents", "advantage"].squeeze(-1), expected, atol=1e-5)
+    ready, then = batch["agents", "ready"], batch["next", "agents", "ready"]
+    compared = 0
+    for world, uav in itertools.product(range(8), range(3)):
+        estimate = 0.0  # of the decision after this one
+        for t in reversed(range(24)):
+            if not ready[world, t, uav]:
+                continue
+            earned, discount, last = 0.0, 1.0, t
+            while True:  # until the next decision, an end, or the end of what is known
+                earned += discount * reward[world, last, uav].item()
+                discount *= 0.9
+                over = batch["next", "done"][world, last].item()
+                if over or then[world, last, uav] or last == 23:
+                    break
+                last += 1
+            alive = not batch["next", "terminated"][world, last].item()
+            delta = earned + alive * discount * after[world, last, uav].item() - value[world, t, uav].item()
+            follows = 0.0 if over or last == 23 else discount * 0.8 * estimate
+            estimate = delta + follows
+            got = batch["agents", "advantage"][world, t, uav].item()
+            assert got == pytest.approx(estimate, abs=1e-5)
+            compared += 1
+    assert compared > 100
+
+
+def test_a_flight_of_three_steps_earns_what_comes_meanwhile_and_the_value_where_it_lands():
+    """By hand: gamma 1/2, rewards 1, 2, 4, and values 8 before the flight, 16 after it."""
+    agents = {
+        "ready": torch.tensor([True, False, False]).view(1, 3, 1),
+        "global_observation": torch.tensor([8.0, 100.0, -100.0]).view(1, 3, 1, 1),
+    }
+    after = {
+        "ready": torch.tensor([False, False, True]).view(1, 3, 1),
+        "global_observation": torch.tensor([100.0, -100.0, 16.0]).view(1, 3, 1, 1),
+        "reward": torch.tensor([1.0, 2.0, 4.0]).view(1, 3, 1, 1),
+    }
+    no = torch.zeros(1, 3, 1, dtype=torch.bool)
+    flight = TensorDict({"agents": agents, "next": {"agents": after, "done": no, "terminated": no}}, [1, 3])
+    critic = TensorDictModule(
+        torch.nn.Identity(), [("agents", "global_observation")], [("agents", "state_value")]
+    )
+    add_advantages(flight, critic, MappoConfig(gamma=0.5, lmbda=0.7, normalize_advantage=False))
+    assert flight["agents", "advantage"].flatten().tolist() == [1 + 2 / 2 + 4 / 4 + 16 / 8 - 8, 0.0, 0.0]
 
 
 def test_the_critic_alone_sees_global_features_under_ctde():

@@ -14,15 +14,18 @@ from damian.delayed import make_env
 from damian.delays import DelayConfig
 from damian.features import Snapshot
 
-TINY = ["frames=64", "worlds=4", "algo.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]
+TINY = ["frames=64", "worlds=4", "mappo.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]
 N_FEATURES = slice(None, -4)  # two past actions stand behind
 
 
-def flown(motion):
+def flown(motion, own=False):
     """A flight under delay [B, T] with two past actions behind what is seen, and its server."""
     late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, history=2)
-    env = make_env(everything(motion, delay=late), 4, seed=3, extras=["message"])
+    scenario = everything(motion, delay=late)
+    scenario.observation.own = own
+    env = make_env(scenario, 4, seed=3, extras=["message"])
     env.append_transform(StepCounter())
+    torch.manual_seed(1)
     return env.rollout(15, break_when_any_done=False), env.worlds.server
 
 
@@ -58,6 +61,17 @@ def test_each_uav_is_told_with_its_own_message_on_time_what_a_loop_over_uavs_say
         served = server.serve(held, after["step_count"].view(-1))
         assert shown[:, uav, N_FEATURES].equal(served.observation[:, uav])
     assert shown[..., -4:].equal(after["agents", "observation"][..., -4:])
+
+
+@both_motions
+def test_a_uav_that_knows_its_own_messages_sees_them_at_once_and_all_else_as_late_as_before(motion):
+    late, server = flown(motion)
+    prompt, _ = flown(motion, own=True)
+    assert prompt["agents", "action"].equal(late["agents", "action"])
+    own = torch.eye(3, dtype=torch.bool)
+    assert prompt["next", "agents", "observation"].flatten(0, 1).equal(told(late, server, own))
+    for key in ("global_observation", "reward"):  # the server knows no more than before
+        assert prompt["next", "agents", key].equal(late["next", "agents", key])
 
 
 @pytest.fixture

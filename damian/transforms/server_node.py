@@ -40,7 +40,8 @@ class ServerNode(Stateful):
         made = [("agents", name) for name in _AGENTS] + [("agents", "reward_terms", name) for name in named]
         super().__init__([message_key], [*made, *_TASK])
         self.server, self.drop, self.terms = server, list(drop), terms
-        self.see_keys = [*self.in_keys, "source_over"]
+        self.own_key = ("agents", "message") if server.config.observation.own else None
+        self.see_keys = [*self.in_keys, "source_over", *([self.own_key] if self.own_key else [])]
 
     @property
     def row_key(self) -> NestedKey:
@@ -58,8 +59,12 @@ class ServerNode(Stateful):
         return {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, {}
 
     def see(self, memory: Memory, entries: Entries) -> Change:
-        elapsed, snapshot = memory["elapsed"] + 1, Snapshot.unpack(entries[self.in_keys[0]])
-        served = self.server.serve(snapshot, elapsed.view(self.rows), entries.get("source_over"))
+        elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
+        steps = elapsed.view(self.rows)
+        served = self.server.serve(Snapshot.unpack(received), steps, entries.get("source_over"))
+        if self.own_key:
+            known = self.server.informed(received, entries[self.own_key], steps)
+            served = served._replace(observation=known)
         seen = [served.observation, served.global_observation, served.reward.unsqueeze(-1)]
         made: Entries = {("agents", name): value for name, value in zip(_AGENTS, seen, strict=True)}
         if self.terms:
