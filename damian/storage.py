@@ -20,8 +20,34 @@ SEEN = ("observation", "global_observation")
 """Entries of the agents that are shown after a step and before the next."""
 
 
-class BackupdateStorage(LazyTensorStorage):
-    """Keeps steps in order of time, [T, B], and corrects them as late messages arrive.
+class TimeStorage(LazyTensorStorage):
+    """Keeps steps in order of time, [T, B].
+
+    The writer must be a round robin (TorchRL's default) over steps of the same B worlds.
+
+    Args:
+        max_size: steps of worlds, T times B.
+        options: of ``LazyTensorStorage``.
+    """
+
+    def __init__(self, max_size: int, **options: Any) -> None:
+        super().__init__(max_size, ndim=2, **options)
+
+    @property
+    def steps(self) -> TensorDictBase:
+        """All there is room for, [T, B], not in order: see ``latest``."""
+        return cast(TensorDictBase, self._storage)
+
+    def latest(self, n_steps: int | None = None) -> Tensor:
+        """Places of the latest steps, or of all, in order of time, [min(n_steps, T)]."""
+        stored = cast(int, self._len_along_dim0)
+        n_steps = stored if n_steps is None else min(n_steps, stored)
+        last = int(torch.as_tensor(self._last_cursor).view(-1)[-1])
+        return torch.arange(last - n_steps + 1, last + 1) % stored
+
+
+class BackupdateStorage(TimeStorage):
+    """Keeps steps in order of time, and corrects them as late messages arrive.
 
     Whenever steps are written, the latest of them and those before to which a message may still have
     belonged are seen again with all that has arrived by the last one: what follows from the messages (the
@@ -33,8 +59,6 @@ class BackupdateStorage(LazyTensorStorage):
     ``cut`` [T, B, 1], true where the environment was really reset (where it was, but the task had not ended
     after all, the step is truncated); ``(group, "backupdated")`` [T, B, N, 1], true where a message that
     came late took the place of what was held.
-
-    The writer must be a round robin (TorchRL's default) over steps of the same B worlds.
 
     Args:
         max_size: steps of worlds, T times B; T must be at least a batch's steps and twice ``longest``.
@@ -56,7 +80,7 @@ class BackupdateStorage(LazyTensorStorage):
         begins_key: NestedKey = "step_count",
         **options: Any,
     ) -> None:
-        super().__init__(max_size, ndim=2, **options)
+        super().__init__(max_size, **options)
         self.recompute, self.longest, self.group, self.begins_key = recompute, longest, group, begins_key
 
     def set(  # type: ignore[override]
@@ -112,12 +136,6 @@ class BackupdateStorage(LazyTensorStorage):
         for key, value in corrected.items():
             self._storage.get(key)[rows] = value[-len(rows) :]
         self._bump_mutation_revision()
-
-    def latest(self, n_steps: int) -> Tensor:
-        """Places of the latest steps, in order of time, [min(n_steps, T)]."""
-        stored = cast(int, self._len_along_dim0)
-        last = int(torch.as_tensor(self._last_cursor).view(-1)[-1])
-        return torch.arange(last - min(n_steps, stored) + 1, last + 1) % stored
 
     def corrected(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
         """The entries of consecutive steps [T, B] as they are known after the last of them."""

@@ -26,7 +26,7 @@ from torchrl.modules.distributions import NormalParamExtractor
 from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 from tqdm import tqdm
-from train import learning_env, make_collector, make_memory, ticks
+from train import learning_env, make_collector, make_learner, ticks
 
 from damian.clocks import SystemClock
 from damian.mappo import Mappo, MappoConfig, add_advantages
@@ -83,7 +83,7 @@ def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
 def damian(config: TrainConfig) -> Iterator[Seconds]:
     """Train as ``recipes/train.py`` does; yields what each iteration took."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    learner = Mappo(env, config.model, config.mappo, make_memory(config, env, clock))
+    learner = cast(Mappo, make_learner(config, env, clock))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     batches = ticks(collector, clock)
     while True:

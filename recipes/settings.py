@@ -15,9 +15,10 @@ from omegaconf import OmegaConf
 from damian import checks
 from damian.clocks import SystemClock
 from damian.delayed import is_late
-from damian.delays import law_of
+from damian.env import PRIVILEGED
 from damian.mappo import MappoConfig
 from damian.models import ModelConfig
+from damian.sac import SacConfig
 from damian.scenario import ScenarioConfig
 
 CONF = str(Path(__file__).parents[1] / "conf")
@@ -41,7 +42,10 @@ class TrainConfig(ScenarioConfig):
     algo: str = "mappo"
     """mappo or sac."""
     mappo: MappoConfig = field(default_factory=MappoConfig)
+    sac: SacConfig = field(default_factory=SacConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
+    critic: str = "server"
+    """What the critic sees: what the ``server`` holds, or ``privileged``, what is true (regime R1)."""
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = 0
     """Of everything that is drawn."""
@@ -78,6 +82,8 @@ class TrainConfig(ScenarioConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        checks.one_of("algo", self.algo, ("mappo", "sac"))
+        checks.one_of("critic", self.critic, ("server", "privileged"))
         checks.in_range("seed", self.seed, 0, 2**31)
         for name in ("worlds", "eval_episodes"):
             checks.in_range(name, getattr(self, name), 1, 1e6)
@@ -94,7 +100,14 @@ class TrainConfig(ScenarioConfig):
         Raises:
             InputError: names the key that does not fit.
         """
-        checks.in_range("mappo.minibatches", self.mappo.minibatches, 1, self.worlds * self.update_steps)
+        if self.algo == "mappo":
+            most = self.worlds if self.model.recurrent else self.worlds * self.update_steps
+            checks.in_range("mappo.minibatches", self.mappo.minibatches, 1, most)
+        else:
+            self._check_memory()
+        self._check_recurrent()
+        held = self.delay.hold == "max" and self.longest_delay == 0
+        checks.require(not held, "delay.hold", "max", "means nothing without late messages (delay.obs)")
         # What is corrected are single rewards, and what the server knows at every step.
         others = {
             "delay.reward_window": (self.delay.reward_window, self.delay.reward_window > 1),
@@ -111,17 +124,36 @@ class TrainConfig(ScenarioConfig):
         should = (
             f"needs more than {self.longest_delay} steps, the longest delay, between two updates: {shortest}"
         )
-        checks.require(not self.settle or self.longest_delay < shortest, "settle", True, should)
+        fits = self.algo == "sac" or self.longest_delay < shortest
+        checks.require(not self.settle or fits, "settle", True, should)
+
+    def _check_recurrent(self) -> None:
+        should = "is for algo=mappo only: SAC learns from single decisions, without what came before them"
+        fits = self.algo == "mappo" or not self.model.recurrent
+        checks.require(fits, "model.rnn", self.model.rnn, should)
+        should = "does not go with model.rnn: what a UAV remembers is not corrected"
+        checks.require(not (self.model.recurrent and self.recompute_actor), "recompute_actor", True, should)
+
+    def _check_memory(self) -> None:
+        least = self.worlds * (self.update_steps + 2 * self.longest_delay)
+        checks.in_range("sac.memory", self.sac.memory, least, unit="steps")
+        should = "is for algo=mappo only: SAC has no importance ratios"
+        checks.require(not self.recompute_actor, "recompute_actor", True, should)
 
     @property
     def longest_delay(self) -> int:
         """Of a message [steps]."""
-        return law_of(self.delay.obs).sampler(self.clock.dt).longest
+        return self.delay.uplink.sampler(self.clock.dt).longest
+
+    @property
+    def critic_sees(self) -> str:
+        """Name of the entry that the critic reads."""
+        return PRIVILEGED if self.critic == "privileged" else "global_observation"
 
     @property
     def update_steps(self) -> int:
         """Steps of every world before the first update: the system clock's, or the algorithm's."""
-        return self.clock.steps("system") if self.clock.system else self.mappo.steps
+        return self.clock.steps("system") if self.clock.system else getattr(self, self.algo).steps
 
     @property
     def unseen_seed(self) -> int:

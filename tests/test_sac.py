@@ -1,0 +1,167 @@
+"""SAC: its targets, its temperature, and what it learns from once late messages have arrived."""
+
+import pytest
+import torch
+from helpers import both_kinds, both_motions, everything
+from tensordict import TensorDict
+from torchrl.data import ReplayBuffer
+from torchrl.envs import StepCounter
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from damian.actions import ActionConfig
+from damian.decisions import find_decisions, transitions
+from damian.delayed import make_env
+from damian.delays import DelayConfig
+from damian.env import UavEnv
+from damian.features import Snapshot
+from damian.models import ModelConfig
+from damian.rewards import EpisodeConfig
+from damian.sac import LOSSES, Sac, SacConfig
+from damian.storage import BackupdateStorage, TimeStorage, server_view
+
+SMALL = ModelConfig(hidden=[16])
+FAST = SacConfig(updates=2, batch=64, warm_up=0)
+
+
+def learner_of(env, config=FAST, settle=0, steps=200) -> Sac:
+    torch.manual_seed(0)
+    memory = ReplayBuffer(storage=TimeStorage(steps * env.batch_size[0]))
+    return Sac(env, SMALL, config, memory, settle)
+
+
+def flown(env, actor, steps=24):
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        return env.rollout(steps, actor, break_when_any_done=False)
+
+
+@both_kinds
+@both_motions
+def test_a_round_of_learning_moves_actor_critics_and_temperature(kind, motion):
+    env = UavEnv(everything(motion, kind=kind), 8)
+    learner = learner_of(env)
+    before = {name: value.clone() for name, value in learner.loss.state_dict().items()}
+    losses = learner.learn(flown(env, learner.actor))
+    assert set(losses) == set(LOSSES)
+    assert all(torch.tensor([*losses.values()]).isfinite())
+    moved = {name for name, value in learner.loss.state_dict().items() if not value.equal(before[name])}
+    for part in ("actor_network_params", "target_qvalue_network_params", "qvalue_network_params", "log_alpha"):
+        assert any(name.startswith(part) for name in moved), part
+
+
+def test_nothing_is_learnt_before_the_warm_up():
+    env = UavEnv(everything(), 8)
+    learner = learner_of(env, SacConfig(warm_up=300))
+    assert learner.learn(flown(env, learner.actor))["loss_actor"] != 0  # nan
+    before = learner.loss.log_alpha.item()
+    learner.learn(flown(env, learner.actor, 13))  # 37 steps of 8 worlds: 296
+    assert learner.loss.log_alpha.item() == before
+    learner.learn(flown(env, learner.actor, 1))
+    assert learner.loss.log_alpha.item() != before
+
+
+def test_the_target_of_a_decision_discounts_the_next_value_by_its_duration():
+    env = UavEnv(everything("polynomial", kind="discrete"), 8)
+    learner = learner_of(env, SacConfig(gamma=0.5, warm_up=0))
+    batch = flown(env, learner.actor, 60)
+    learner.memory.extend(batch)
+    storage = learner.memory.storage
+    steps, order = storage.steps, storage.latest()
+    ready, after, done = (
+        steps[key][order] for key in (("agents", "ready"), ("next", "agents", "ready"), ("next", "done"))
+    )
+    found = find_decisions(ready, after, done.squeeze(-1))
+    made = transitions(steps, order, found, 0.5, learner.seen)
+    duration = made["steps_to_next_obs"]
+    assert duration.max() > 5
+    target = learner.loss._compute_target(made)
+    zero = made.clone()
+    zero["next", "agents", "reward"].zero_()
+    at_once = zero.clone()
+    at_once["steps_to_next_obs"] = torch.ones_like(duration)
+    value = learner.loss._compute_target(at_once) / 0.5  # of the state after it
+    expected = made["next", "agents", "reward"].squeeze(-1) + 0.5 ** duration.squeeze(-1) * value
+    assert torch.allclose(target, expected, atol=1e-5)
+
+
+def test_the_temperature_rests_where_the_entropy_is_its_share_of_that_of_the_legal_actions():
+    env = UavEnv(everything(kind="discrete"), 8)
+    learner = learner_of(env, SacConfig(entropy=0.5))
+    n_actions = env.full_action_spec_unbatched["agents", "action"].n
+    mask = torch.zeros(2, n_actions, dtype=torch.bool)
+    mask[0, :4], mask[1, :16] = True, True
+    seen = torch.rand(2, env.observation_spec["agents", "observation"].shape[-1])
+    glob = torch.rand(2, env.observation_spec["agents", "global_observation"].shape[-1])
+    for parameter in learner.actor.parameters():
+        parameter.data.zero_()  # a uniform choice among the legal actions
+    entries = {"observation": seen, "global_observation": glob, "action_mask": mask}
+    _, told = learner.loss.actor_loss(TensorDict({"agents": TensorDict(entries, [2])}, [2]))
+    # log pi = -log n where log n / 2 is asked for.
+    legal = torch.tensor([4.0, 16.0]).log()
+    assert torch.allclose(told["log_prob"], -legal / 2, atol=1e-5)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 1.0)])
+def test_continuous_actions_aim_at_the_entropy_of_one_uav_within_its_bounds(low, high):
+    env = UavEnv(everything(kind="continuous"), 4)
+    bounds = env.full_action_spec["agents", "action"].space
+    bounds.low, bounds.high = torch.full_like(bounds.low, low), torch.full_like(bounds.high, high)
+    target = learner_of(env).loss.target_entropy.item()
+    assert target == pytest.approx(2 * (torch.tensor((high - low) / 2).log().item() - 1), abs=1e-6)
+
+
+def late_env():
+    late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
+    env = make_env(everything(delay=late, episode=EpisodeConfig(max_steps=9)), 4, 1, extras=["message"])
+    env.append_transform(StepCounter())
+    return env
+
+
+def test_a_late_message_corrects_transitions_that_are_stored_already():
+    env = late_env()
+    view = server_view(env.worlds.server)
+    memory = ReplayBuffer(storage=BackupdateStorage(60 * 4, view, longest=5))
+    learner = Sac(env, SMALL, FAST, memory, settle=5)
+    batch = flown(env, learner.actor, 40)
+    for part in batch.split(8, 1):
+        learner.learn(part)
+    storage = memory.storage
+    held = storage.steps[storage.latest()[:-5]].transpose(0, 1)
+    settled = batch[:, :-5]
+    sent, elapsed = settled["next", "agents", "message"], settled["next", "step_count"].squeeze(-1)
+    truth = env.worlds.server.serve(Snapshot.unpack(sent), elapsed)
+    assert held["next", "agents", "reward"].squeeze(-1).equal(truth.reward)
+    assert held["next", "agents", "global_observation"].equal(truth.global_observation)
+    assert not held["next", "agents", "reward"].equal(settled["next", "agents", "reward"])
+    assert held["agents", "observation"].equal(settled["agents", "observation"])  # what the actor saw stays
+
+
+def test_steps_that_have_not_settled_are_not_learnt_from(monkeypatch):
+    env = late_env()
+    learner = learner_of(env, FAST, settle=5)
+    latest = []
+    original = Sac.improve
+
+    def improve(self, drawn):
+        latest.append(drawn["agents", "observation"])
+        return original(self, drawn)
+
+    monkeypatch.setattr(Sac, "improve", improve)
+    batch = flown(env, learner.actor, 12)
+    learner.learn(batch)
+    allowed = {tuple(row) for row in batch["agents", "observation"][:, :7].flatten(0, 2).tolist()}
+    assert latest
+    assert all(tuple(row) in allowed for drawn in latest for row in drawn.tolist())
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_it_learns_which_action_pays(kind):
+    """Reward for choosing to the east, at once and with no future: a contextless bandit."""
+    env = UavEnv(everything(kind=kind, actions=ActionConfig(kind=kind, mask=False)), 16)
+    learner = learner_of(env, SacConfig(updates=60, batch=128, gamma=0.0, warm_up=0, alpha=0.01))
+    for _ in range(4):
+        batch = flown(env, learner.actor, 16)
+        action = batch["agents", "action"]
+        good = action % 8 == 4 if kind == "discrete" else action[..., 1] < 0.25
+        batch["next", "agents", "reward"] = good.float().unsqueeze(-1)
+        learner.learn(batch)
+    assert good.float().mean() > 0.6
