@@ -10,8 +10,9 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian.compiling import compiled
 from damian.env import Shown, UavEnv
-from damian.state import Rows
-from damian.transforms.stateful import Entries, Memory, Stateful, taken
+from damian.fast_forward import FastForward
+from damian.state import Rows, where
+from damian.transforms.stateful import Entries, Memory, Stateful, taken, wide
 from damian.world import draws
 
 ACTION, ACTS = ("agents", "action"), ("agents", "acts")
@@ -99,25 +100,52 @@ class DelayedEnv(TransformedEnv):
             entries |= taken(tensordict, transform.act_keys)
             memories.append(transform.memory)
         step = self._function("_whole_step", *chain, *entries)
-        env.worlds, memories, shown = step(env.worlds, memories, entries)
+        worlds, memories, shown = step(env.worlds, memories, entries)
+        skip = next((transform for transform in chain if isinstance(transform, FastForward)), None)
+        if skip is not None:
+            further, seen = self._function("_further_step", *chain, *entries), flat(shown)
+            while (moves := skip.idle(seen)).any():
+                worlds, memories, seen = further(skip, worlds, memories, entries, seen, moves)
+            shown = nested(seen)
+        env.worlds = worlds
         for transform, memory in zip(chain, memories, strict=True):
             transform.remember(memory)
         return env.tensordict(shown)
 
     def _whole_step(
-        self, worlds: Rows, memories: list[Memory], entries: Entries
+        self, worlds: Rows, memories: list[Memory], entries: Entries, moves: Tensor | None = None
     ) -> tuple[Rows, list[Memory], Shown]:
-        """A step of the worlds and of every transform in front of TorchRL's own; pure, as they are."""
+        """A step of the worlds and of every transform in front of TorchRL's own; pure, as they are.
+
+        Only the worlds of the mask [B] show that they send anything, if there is one: the others will make
+        this step once more, and what they send now, which is written in place, they may not send then.
+        """
         (chain, _), memories = self._split(), list(memories)
         for i, transform in reversed(list(enumerate(chain))):
             memories[i], changed = transform.act(memories[i], entries)
             entries = entries | changed
         worlds, shown = self.worlds.play(worlds, entries[ACTION], entries.get(ACTS))
-        entries = flat(shown)
+        entries = flat(shown) if moves is None else sent_by(moves, chain, flat(shown))
         for i, transform in enumerate(chain):
             memories[i], changed = transform.see(memories[i], entries)
             entries = without(entries | changed, transform.drop)
         return worlds, memories, nested(entries)
+
+    def _further_step(
+        self,
+        skip: FastForward,
+        worlds: Rows,
+        memories: list[Memory],
+        entries: Entries,
+        seen: Entries,
+        moves: Tensor,
+    ) -> tuple[Rows, list[Memory], Entries]:
+        """One more step of the worlds of the mask [B], in which nobody is ready; the others stand still."""
+        chain, _ = self._split()
+        entries = entries | {key: seen[key] for key in entries if key in seen}  # nobody is ready any more
+        later, changed, shown = self._whole_step(worlds, memories, entries, moves)
+        memories = [t.only(old, new, moves) for t, old, new in zip(chain, memories, changed, strict=True)]
+        return where(moves, later, worlds), memories, skip.longer(seen, flat(shown), moves)
 
     @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
@@ -144,8 +172,7 @@ class DelayedEnv(TransformedEnv):
         worlds, shown = self.worlds.begin(worlds, mask.view(-1))
         entries = flat(shown)
         for i, transform in enumerate(chain):
-            rows = mask.expand(-1, transform.rows.numel() // len(mask)).reshape(-1)
-            memories[i], changed = transform.begin(memories[i], entries, rows)
+            memories[i], changed = transform.begin(memories[i], entries, transform.rows_of(mask))
             entries = without(entries | changed, transform.drop)
         return worlds, memories, nested(entries)
 
@@ -160,6 +187,12 @@ class DelayedEnv(TransformedEnv):
         for module in self.transform.modules():
             if isinstance(module, Stateful):
                 yield module
+
+
+def sent_by(moves: Tensor, chain: Sequence[Stateful], entries: Entries) -> Entries:
+    """The entries, but only the worlds of the mask [B] send anything."""
+    flags = [transform.sent_key for transform in chain if transform.sent_key in entries]
+    return entries | {key: entries[key] & wide(moves, entries[key]) for key in flags}
 
 
 def without(entries: Entries, keys: Sequence[NestedKey]) -> Entries:

@@ -29,6 +29,11 @@ class ClockConfig:
     """Least period of a triggered system clock; ``trigger``, if not given."""
     longest: str | None = None
     """Largest period of a triggered system clock; twice its first, if not given."""
+    skip: bool = False
+    """A step of the environment lasts until some UAV of its world can choose again, or the episode ends;
+    ``duration`` says how many ``simulation`` steps that took (``damian.fast_forward``)."""
+    skip_discount: float = 1.0
+    """Discount of the rewards within such a step, for each ``simulation`` step of it."""
 
     def __post_init__(self) -> None:
         fast, slow = ("simulation", "agents", "server"), ("trigger", "shortest", "longest")
@@ -39,6 +44,9 @@ class ClockConfig:
         for one, other in itertools.product(given, fast):
             checks.seconds(f"clock.{one}", getattr(self, one))
             self._check_multiple(one, other)
+        checks.in_range("clock.skip_discount", self.skip_discount, 0.0, 1.0)
+        told = "means nothing without clock.skip=true"
+        checks.require(self.skip or self.skip_discount == 1, "clock.skip_discount", self.skip_discount, told)
         should = "means nothing without clock.trigger: the system clock is fixed"
         alone = given[0] if given and self.trigger is None else None
         checks.require(alone is None, f"clock.{alone}", getattr(self, alone or "trigger"), should)

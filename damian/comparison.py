@@ -9,7 +9,9 @@ import numpy as np
 
 from damian.statistics import LEAST_GAP, Floats, bootstrap, interquartile_mean, normalised, recovery
 
-SAMPLED, MODE, RANDOM = "trained, sampled", "trained, mode", "random"
+SAMPLED, MODE, RANDOM, GREEDY = "trained, sampled", "trained, mode", "random", "greedy"
+SCRIPTED = (RANDOM, GREEDY)
+"""Fly the same episodes beside each arm, and learn nothing."""
 NOT_LATE = "none"
 """The delay of what is not delayed."""
 TRUE = ("true_return", "true_success_rate", "true_steps")
@@ -214,8 +216,10 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
                     line = _line(comparison, task, delay, arm, policy)
                     told = compared.get(arm) if policy == comparison.policy else None
                     yield replace(line, j_norm=told[0], recovery=told[1]) if told else line
-            for arm in arms[:1]:  # flies the same episodes beside each arm
-                yield replace(_line(comparison, task, delay, arm, RANDOM), arm=RANDOM, regime="")
+            for arm in arms[:1]:
+                for policy in SCRIPTED:
+                    if comparison.values(task, delay, arm, policy, comparison.score):  # older runs lack some
+                        yield replace(_line(comparison, task, delay, arm, policy), arm=policy, regime="")
 
 
 def _line(comparison: Comparison, task: str, delay: str, arm: str, policy: str) -> Line:

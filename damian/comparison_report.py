@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from damian.comparison import NOT_LATE, RANDOM, SEEN, TRUE, Comparison, Line
+from damian.comparison import NOT_LATE, RANDOM, SCRIPTED, SEEN, TRUE, Comparison, Line
 from damian.figures import COLOURS
 from damian.statistics import Floats, bootstrap
 
@@ -52,7 +52,7 @@ def _table(told: Sequence[Line], never: bool) -> str:
     left, right = ("arm", "regime", "policy"), (*HEADS, "J_norm", "recovery")
     rows = [[*left, *right], [":--"] * len(left) + ["--:"] * len(right)]
     for line in told:
-        name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm == RANDOM else line.arm
+        name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
         numbers = ["-" if never and "success" in key else str(line.measures[key]) for key in COLUMNS]
         rows.append([name, line.regime, line.policy, *numbers, str(line.j_norm), str(line.recovery)])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)

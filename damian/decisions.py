@@ -67,18 +67,21 @@ def transitions(
     before, last = (order[begin], world, agent), (order[end], world, agent)
     agents, after = (cast(TensorDictBase, steps[key]) for key in ("agents", ("next", "agents")))
     chosen = {"action": agents["action"][before], **{key: agents[key][before] for key in seen}}
-    passed = torch.arange(int((end - begin).max()) + 1, device=begin.device).unsqueeze(-1)  # [H, 1]
-    meanwhile = order[torch.minimum(begin + passed, end)], world, agent
-    rewards = torch.where(begin + passed <= end, after["reward"].squeeze(-1)[meanwhile], 0.0)
-    earned = (gamma**passed * rewards).sum(0).unsqueeze(-1)
-    following = {"reward": earned, **{key: after[key][last] for key in seen}}
+    step = begin + torch.arange(int((end - begin).max()) + 1, device=begin.device).unsqueeze(-1)  # [H, K]
+    meanwhile = order[torch.minimum(step, end)], world
+    lasts = (step <= end).long()
+    if ("next", "duration") in steps:
+        lasts = lasts * steps["next", "duration"].squeeze(-1)[meanwhile]  # longer with ``clock.skip``
+    rewards = after["reward"].squeeze(-1)[*meanwhile, agent] * (step <= end)
+    earned = (gamma ** (lasts.cumsum(0) - lasts) * rewards).sum(0)
+    following = {"reward": earned.unsqueeze(-1), **{key: after[key][last] for key in seen}}
     ends = {key: steps["next", key][last[:2]] for key in ("done", "terminated")}
     n = len(begin)
     return TensorDict(
         {
             "agents": TensorDict(chosen, [n]),
             "next": TensorDict({"agents": TensorDict(following, [n]), **ends}, [n]),
-            "steps_to_next_obs": (end - begin + 1).unsqueeze(-1),
+            "steps_to_next_obs": lasts.sum(0).unsqueeze(-1),
         },
         [n],
     )

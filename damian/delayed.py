@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
+from damian import checks
 from damian.actions import ActionConfig
 from damian.chain import ACTION, DelayedEnv
 from damian.delays import law_of
 from damian.env import UavEnv
+from damian.fast_forward import FastForward
 from damian.scenario import ScenarioConfig
 from damian.server import Server
 from damian.transforms import (
@@ -44,8 +46,10 @@ def make_env(
             server holds), its ``age`` [steps], and the ``delay`` of what is sent, under ``"agents"``.
 
     Raises:
-        InputError: the scenario asks for something impossible.
+        InputError: the scenario asks for something impossible, or for messages between skipped steps.
     """
+    should = "skips steps, but back-updating and evaluation need the messages of every one"
+    checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, should)
     late = messages_are_late(scenario)
     shown = {*extras, "message"} if late else extras
     env = UavEnv(scenario, num_worlds, seed, device, shown, serves=not late)
@@ -58,6 +62,7 @@ def chain(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> 
     """The transforms of a scenario in their order; what the policy chooses passes them backwards."""
     served = serving(scenario, server, extras) if messages_are_late(scenario) else []
     parts = [*deciding(scenario), *served, *paying(scenario), *seeing(scenario)]
+    parts += skipping(scenario, extras)
     return Compose(*parts)  # type: ignore[arg-type]
 
 
@@ -73,14 +78,14 @@ def deciding(scenario: ScenarioConfig) -> list[Transform]:
 
 def messages_are_late(scenario: ScenarioConfig) -> bool:
     """Does the server hold anything else than what was just sent."""
-    return scenario.delay.loss > 0 or is_late(scenario.delay.obs, scenario.clock.dt)
+    return scenario.delay.loss > 0 or is_late(scenario.delay.uplink, scenario.clock.dt)
 
 
 def serving(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
     """Messages on their way to the server node, and what it makes of those that have arrived."""
     delay = scenario.delay
     uplink = ObservationDelay(
-        law_of(delay.obs, "delay.obs"),
+        delay.uplink,
         [("agents", "message")],
         [("agents", "received")],
         loss=delay.loss,
@@ -123,6 +128,15 @@ def seeing(scenario: ScenarioConfig) -> list[Transform]:
         )
         transforms.append(history)
     return transforms
+
+
+def skipping(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
+    """Steps in which nobody can choose."""
+    if not scenario.clock.skip:
+        return []
+    named = scenario.task.terms if "reward_terms" in extras else []
+    terms = [("agents", "reward_terms", name) for name in named]
+    return [FastForward(scenario.clock.skip_discount, [REWARD, *terms])]
 
 
 def remembers_unknown(scenario: ScenarioConfig) -> bool:

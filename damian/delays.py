@@ -13,6 +13,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from damian import checks
 from damian.errors import InputError
 from damian.sampling import Recorded, Sampler
@@ -167,6 +170,36 @@ class Trace(Law):
         return -1 if written == LOST else in_steps(key, _number(written), dt)
 
 
+@dataclass(frozen=True)
+class Held(Law):
+    """Every message is held until the longest delay of another law has passed, so that all take as long.
+
+    That is how methods for constant delays are used with random ones. The same messages are lost.
+    """
+
+    law: Law
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        return HeldSampler(self.law.sampler(dt, loss, key))
+
+
+class HeldSampler(Sampler):
+    """Draws what another sampler draws, and lets it take the longest."""
+
+    def __init__(self, drawn: Sampler) -> None:
+        arrive = (1 - drawn.chances[:, -1]).tolist()
+        super().__init__([[0.0] * drawn.longest + [chance] for chance in arrive])
+        self.drawn = drawn
+        self.certain = None if self.loses else self.longest
+
+    def begin(self, streams: Tensor) -> Tensor:
+        return self.drawn.begin(streams)
+
+    def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        delay, memory = self.drawn(streams, clock, memory)
+        return torch.where(delay < self.lost, self.longest, self.lost), memory
+
+
 LAWS: dict[str, type[Law]] = {
     "constant": Constant,
     "uniform": Uniform,
@@ -257,6 +290,9 @@ class DelayConfig:
     """Delay of the rewards."""
     loss: float = 0.0
     """Probability that a message is lost."""
+    hold: str = "none"
+    """``max``: the server keeps every message back until the longest delay that ``obs`` allows has passed, so
+    that the delay is constant."""
     order: str = "generation"
     """The server believes the message that was generated last (``generation``, the age of what it knows
     grows by at most a step each step) or that arrived last (``arrival``)."""
@@ -269,11 +305,18 @@ class DelayConfig:
 
     def __post_init__(self) -> None:
         checks.in_range("delay.loss", self.loss, 0.0, 1.0)
+        checks.one_of("delay.hold", self.hold, ("none", "max"))
         checks.one_of("delay.order", self.order, ORDERS)
         checks.whole("delay.history", self.history, 0, 1000, "actions")
         checks.whole("delay.reward_window", self.reward_window, 1, LONGEST, "steps")
         checks.above("delay.reward_discount", self.reward_discount, 0.0)
         checks.in_range("delay.reward_discount", self.reward_discount, 0.0, 1.0)
+
+    @property
+    def uplink(self) -> Law:
+        """The law that the messages to the server really follow."""
+        law = law_of(self.obs, "delay.obs")
+        return Held(law) if self.hold == "max" else law
 
     def check(self, dt: float) -> None:
         """Make sure that the laws mean something at this length of a step [s].

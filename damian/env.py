@@ -19,11 +19,13 @@ from damian.server import Features, Server
 from damian.simulation import Simulation
 from damian.state import SITUATION, Rows, State, tree_map
 from damian.world import draws
+from damian.world.airspace import rows
 
 Shown = dict[str, Any]
 """What a step shows, as nested dictionaries of tensors."""
 
 EXTRAS = ("message", "state", "reward_terms")
+PRIVILEGED = "privileged_observation"
 
 
 class UavEnv(EnvBase):
@@ -40,6 +42,8 @@ class UavEnv(EnvBase):
     - ``observation``, ``global_observation``: features of the actor [B, N, F], of the critic [B, N, G];
     - ``message``: the latest message of each UAV, [B, N, M] (``Snapshot.unpack`` names its numbers), and
       ``talks``: sent just now, [B, N];
+    - ``privileged_observation``: ``global_observation`` as if nothing were late or lost, and how far east and
+      north of the UAV the source really is, over the region's size, in [-1, 1] each; [B, N, G + 2];
     - ``reward``: eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
     At the root stand ``state`` (simulator truth: for drawing and reference arms, never for an actor),
@@ -52,8 +56,8 @@ class UavEnv(EnvBase):
         num_worlds: B.
         seed: of the regions and situations drawn at construction, and of the worlds' streams.
         device: where everything lives.
-        extras: which of ``message``, ``state`` and ``reward_terms`` are shown; each costs time, so leave
-            out what nobody reads (delays read the messages).
+        extras: which of ``message``, ``state``, ``reward_terms`` and (reference arms only) ``privileged``
+            are shown; each costs time, so leave out what nobody reads (delays read the messages).
         serves: False leaves it to a ``ServerNode`` transform to make something of the messages: what it
             writes is empty after a step.
 
@@ -192,6 +196,8 @@ class UavEnv(EnvBase):
             agents["action_mask"] = self.simulation.action_mask(state)
         if "message" in self.extras:
             agents |= {"message": state.sent.pack(), "talks": state.talks}
+        if "privileged" in self.extras:
+            agents[PRIVILEGED] = self._truth(state, features)
         shown: Shown = {"agents": agents}
         if self.scenario.episode.end_with_source:
             shown["source_over"] = state.source_over.unsqueeze(-1)
@@ -199,6 +205,13 @@ class UavEnv(EnvBase):
             truth = [state.position.flatten(1), state.battery, state.source]
             shown["state"] = torch.cat(truth, -1)
         return shown
+
+    def _truth(self, state: State, features: Features | None) -> Tensor:
+        """What a privileged critic sees, [B, N, G + 2]."""
+        _, seen = self.server.observations(features or self.server.features(state.sent, state.steps))
+        scale = rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
+        toward = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
+        return torch.cat([seen, toward.clamp(-1, 1)], -1)
 
     def _empty(self) -> Shown:
         """In place of what a ``ServerNode`` will make of the messages."""
@@ -272,8 +285,9 @@ def _spec_of(shown: Shown, worlds: torch.Size, device: torch.device, n_agents: i
         shape = torch.Size((*worlds, *example.shape[1:]))
         if example.dtype == torch.bool:
             return Binary(shape[-1], shape=shape, dtype=torch.bool, device=device)
-        if name in ("observation", "global_observation"):
-            return Bounded(0.0, 1.0, shape=shape, dtype=example.dtype, device=device)
+        if name in ("observation", "global_observation", PRIVILEGED):
+            low = -1.0 if name == PRIVILEGED else 0.0
+            return Bounded(low, 1.0, shape=shape, dtype=example.dtype, device=device)
         return Unbounded(shape, dtype=example.dtype, device=device)
 
     def branch(level: Shown, shape: torch.Size) -> Composite:

@@ -7,7 +7,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.multiagent import MAPPOLoss
@@ -15,13 +15,14 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 
 from damian import checks
 from damian.models import ModelConfig, make_actor, make_critic
+from damian.recurrent import CARRIED
 from damian.storage import BackupdateStorage
 
 LEARNT: list[NestedKey] = [
     *(("agents", key) for key in ("observation", "action_mask", "action", "action_log_prob", "advantage")),
-    *(("agents", key) for key in ("global_observation", "state_value", "value_target", "ready")),
+    *(("agents", key) for key in ("state_value", "value_target", "ready")),
 ]
-"""What the loss reads of a step."""
+"""What the loss reads of a step, beside what the critic sees."""
 
 
 @dataclass
@@ -74,6 +75,7 @@ class Mappo:
         settle: learn from steps only so many steps later, [0, those of a batch).
         recompute_actor: the original authors' variant, in which the corrected observations also stand for
             what the actor saw, as if it had chosen its action there.
+        critic_sees: what the critic sees of each UAV.
     """
 
     def __init__(
@@ -81,13 +83,14 @@ class Mappo:
         env: EnvBase,
         model: ModelConfig,
         config: MappoConfig,
-        memory: TensorDictReplayBuffer | None = None,
+        memory: ReplayBuffer | None = None,
         settle: int = 0,
         recompute_actor: bool = False,
+        critic_sees: str = "global_observation",
     ) -> None:
-        self.config, self.memory = config, memory
+        self.config, self.memory, self.recurrent = config, memory, model.recurrent
         self.settle, self.recompute_actor = settle, recompute_actor
-        self.actor, self.critic = make_actor(env, model), make_critic(env, model)
+        self.actor, self.critic = make_actor(env, model), make_critic(env, model, critic_sees)
         self.loss = mappo_loss(self.actor, self.critic, config)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr)
 
@@ -99,7 +102,7 @@ class Mappo:
         """One update from a batch [B, T]; returns the mean losses, and what was corrected."""
         known = self.known(batch)
         add_advantages(known, self.critic, self.config)
-        losses = self.optimize(known.reshape(-1))
+        losses = self.optimize(known)
         if self.memory is None:
             return losses
         return {"backupdated": known["agents", "backupdated"].float().mean().item(), **losses}
@@ -121,9 +124,14 @@ class Mappo:
             batch["agents", "action_log_prob"] = chosen
         return batch
 
-    def optimize(self, steps: TensorDictBase) -> dict[str, float]:
-        """Some passes over steps [M] with advantages; returns the mean losses."""
-        steps = steps.select(*LEARNT, strict=False)  # each entry costs time at every minibatch
+    def optimize(self, batch: TensorDictBase) -> dict[str, float]:
+        """Some passes over a batch [B, T] with advantages; returns the mean losses.
+
+        Minibatches are drawn over steps; for an actor that remembers, over worlds with whole sequences.
+        """
+        keys = [*LEARNT, *self.critic.in_keys, *(CARRIED if self.recurrent else [])]
+        batch = batch.select(*keys, strict=False)  # each entry costs time at every minibatch
+        steps = batch if self.recurrent else batch.reshape(-1)
         sums: dict[str, float] = {}
         n_parts = min(self.config.minibatches, len(steps))
         for _ in range(self.config.epochs):
@@ -171,14 +179,16 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     the UAV was not ready is no decision: its advantage is 0.
     """
     critic(batch)
-    critic(batch["next"])
-    value, after, ready = batch["agents", "state_value"], batch["next", "agents"], batch["agents", "ready"]
-    done, terminated = (batch["next", k].unsqueeze(-2).expand_as(value) for k in ("done", "terminated"))
+    following = critic(batch["next"])
+    value, after = batch["agents", "state_value"], cast(TensorDictBase, following["agents"])
+    ends = [following[key] for key in ("done", "terminated")]
+    lasts = following.get("duration", torch.ones_like(ends[0], dtype=torch.long))  # more with ``clock.skip``
+    gamma, done, terminated = (x.unsqueeze(-2).expand_as(value) for x in (config.gamma**lasts, *ends))
     lmbda = torch.where(after["ready"].unsqueeze(-1), config.lmbda, 1.0)
     advantage, batch["agents", "value_target"] = vec_generalized_advantage_estimate(
-        config.gamma, lmbda, value, after["state_value"], after["reward"], done, terminated, time_dim=-3
+        gamma, lmbda, value, after["state_value"], after["reward"], done, terminated, time_dim=-3
     )
-    ready = ready.unsqueeze(-1)
+    ready = batch["agents", "ready"].unsqueeze(-1)
     if config.normalize_advantage:
         chosen = advantage[ready] if ready.any() else torch.zeros(1, device=advantage.device)
         advantage = (advantage - chosen.mean()) / chosen.std(correction=0).clamp(min=1e-6)
@@ -186,7 +196,7 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
 
 
 def losses_of(batch: TensorDictBase, loss: MAPPOLoss) -> dict[str, Tensor]:
-    """The parts of the loss on a batch [M]; actor and entropy over decisions only, the critic over all.
+    """The parts of the loss on a batch [*]; actor and entropy over decisions only, the critic over all.
 
     In flight a policy "chooses" too, but nothing follows from it (SPEC 1).
     """

@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.chain import DelayedEnv
 from damian.features import Snapshot
+from damian.recurrent import prime
 from damian.server import Server
 
 
@@ -48,6 +49,7 @@ def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = Tr
         horizon: steps after which an episode without an end is cut.
         sample: draw from the policy; else take its mode.
     """
+    prime(env, policy)
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     with set_exploration_type(mode):
         flown = env.rollout(horizon, policy, break_when_any_done=False)

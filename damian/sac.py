@@ -166,7 +166,12 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
         self, actor: ProbabilisticActor, action_value: TensorDictModule, n: int, share: float, **options: Any
     ) -> None:
         super().__init__(
-            actor, action_value, action_space="categorical", num_actions=n, target_entropy=0, **options  # type: ignore
+            actor,
+            action_value,
+            action_space="categorical",
+            num_actions=n,
+            target_entropy=0,
+            **options,  # type: ignore
         )
         self.share, self.n_actions = share, n
 

@@ -31,7 +31,7 @@ from parallel import LOG, Run, check_stored, perform_all
 from settings import CONF
 
 from damian import checks
-from damian.comparison import MODE, NOT_LATE, RANDOM, SAMPLED, SCORES, Arm, Comparison
+from damian.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison
 from damian.comparison_report import LABELS, markdown, plot_curves, plot_norms
 from damian.errors import InputError
 from damian.runs import read_metrics
@@ -56,7 +56,7 @@ class Experiment:
     def __post_init__(self) -> None:
         for kind in ("tasks", "delays", "arms"):
             for name in getattr(self, kind):
-                good = re.fullmatch(r"[\w.-]+", name) and name not in (NOT_LATE, RANDOM)
+                good = re.fullmatch(r"[\w.-]+", name) and name not in (NOT_LATE, *SCRIPTED)
                 checks.require(bool(good), f"experiment.{kind}", name, "is no name for a folder")
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
         should = "are not delayed: it must be one"

@@ -16,24 +16,31 @@ import os
 import statistics
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple, NoReturn, cast
+from typing import NamedTuple, NoReturn
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import torch
-from tensordict.nn import InteractionType, NormalParamExtractor, TensorDictModule
 from torch import nn
-from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, EnvBase, GymEnv, RewardSum, SerialEnv, Transform, TransformedEnv
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    GymEnv,
+    RenameTransform,
+    RewardSum,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import SACLoss, SoftUpdate
 from tqdm import tqdm
 
 from damian import checks
 from damian.errors import InputError
+from damian.models import ModelConfig
+from damian.sac import Sac, SacConfig
 from damian.transforms import ActionHistory, ObservationDelay
 
 ARMS = ("undelayed", "naive", "history")
@@ -44,8 +51,12 @@ REFERENCE = {("undelayed", d): r for d, r in DEPLOYED.items()} | {("naive", 6): 
 HORIZON = 200  # steps of an episode
 RANDOM_STEPS = 1000  # before learning begins
 EVALUATION_SEED = 1000  # of the first positions in every evaluation
-BATCH, LR, GAMMA, TAU, TARGET_ENTROPY = 256, 1e-3, 0.99, 0.005, -1.0
-STORED = ("observation", "action", *(("next", k) for k in ("observation", "reward", "done", "terminated")))
+BATCH, LR, GAMMA, TAU = 256, 1e-3, 0.99, 0.005
+STORED = [
+    *(("agents", key) for key in ("observation", "action")),
+    *(("next", "agents", key) for key in ("observation", "reward")),
+    *(("next", key) for key in ("done", "terminated")),
+]
 
 
 class Run(NamedTuple):
@@ -72,47 +83,30 @@ def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
     transforms: list[Transform] = [RewardSum(), ObservationDelay(delay, age_key=None)]
     if history:
         transforms.append(ActionHistory(history, append_to="observation"))
+    # The names that our learner knows; the only agent needs no dimension of its own.
+    shown, done = ["observation", "reward"], ["action"]
+    transforms.append(RenameTransform(shown, [("agents", k) for k in shown], done, [("agents", "action")]))
     return TransformedEnv(SerialEnv(worlds, one) if worlds else one(), Compose(transforms))
 
 
-def make_sac(env: EnvBase, hidden: int) -> tuple[ProbabilisticActor, SACLoss]:
-    """Soft actor-critic (Haarnoja et al. 2018): two critics, learnt temperature."""
-    action, n_seen = cast(Bounded, env.action_spec), env.observation_spec["observation"].shape[-1]
-    mlp = partial(MLP, num_cells=[hidden, hidden], activation_class=nn.ReLU)
-    net = nn.Sequential(mlp(in_features=n_seen, out_features=2 * action.shape[-1]), NormalParamExtractor())
-    actor = ProbabilisticActor(
-        TensorDictModule(net, ["observation"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        spec=action,
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": action.low, "high": action.high},
-        default_interaction_type=InteractionType.RANDOM,
-    )
-    value = mlp(in_features=n_seen + action.shape[-1], out_features=1)
-    critic = ValueOperator(value, in_keys=["observation", "action"])
-    # Without vmap: a loop over two critics is faster on a CPU.
-    loss = SACLoss(actor, critic, loss_function="l2", target_entropy=TARGET_ENTROPY, deactivate_vmap=True)
-    loss.make_value_estimator(gamma=GAMMA)
-    return actor, loss
+def make_learner(env: EnvBase, run: Run) -> Sac:
+    """The learner of our UAVs, on a memory that takes single steps."""
+    config = SacConfig(lr=LR, gamma=GAMMA, tau=TAU, alpha=1.0)
+    memory = ReplayBuffer(storage=LazyTensorStorage(run.steps), batch_size=BATCH)
+    model = ModelConfig(hidden=[run.hidden, run.hidden], activation="relu")
+    return Sac(env, model, config, memory, critic_sees="observation")
 
 
-def train(env: EnvBase, actor: nn.Module, loss: SACLoss, steps: int, bar: tqdm) -> None:
+def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
     """Learn for so many steps, with one update after each."""
-    memory = TensorDictReplayBuffer(storage=LazyTensorStorage(steps), batch_size=BATCH)
-    optimizer = torch.optim.Adam(loss.parameters(), LR, fused=True)
-    targets = SoftUpdate(loss, tau=TAU)
     seen = env.reset()
     for step in range(steps):
         with torch.no_grad():
-            chosen = env.rand_action(seen) if step < RANDOM_STEPS else actor(seen)
+            chosen = env.rand_action(seen) if step < RANDOM_STEPS else learner.actor(seen)
             after, seen = env.step_and_maybe_reset(chosen)
-        memory.add(after.select(*STORED))
+        learner.memory.add(after.select(*STORED))
         if step >= RANDOM_STEPS:
-            parts = loss(memory.sample())
-            optimizer.zero_grad()
-            (parts["loss_actor"] + parts["loss_qvalue"] + parts["loss_alpha"]).backward()
-            optimizer.step()
-            targets.step()
+            learner.improve(learner.memory.sample())
         bar.update()
         if after["next", "done"].item():
             bar.set_postfix({"return": f"{after['next', 'episode_reward'].item():.0f}"})
@@ -126,7 +120,7 @@ def evaluate_under(delay: int, history: int, actor: nn.Module, episodes: int) ->
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         flown = env.rollout(HORIZON, actor, break_when_any_done=False)
     env.close()
-    return flown["next", "reward"].sum(1).mean().item()
+    return flown["next", "agents", "reward"].sum(1).mean().item()
 
 
 def run_arm(run: Run, folder: Path, place: int) -> None:
@@ -137,11 +131,11 @@ def run_arm(run: Run, folder: Path, place: int) -> None:
     history = run.delay if run.arm == "history" else 0
     env = make_env(delay, history)
     env.set_seed(run.seed)
-    actor, loss = make_sac(env, run.hidden)
+    learner = make_learner(env, run)
     with tqdm(total=run.steps, desc=f"seed {run.seed} {run.arm}", position=place) as bar:
-        train(env, actor, loss, run.steps, bar)
+        train(env, learner, run.steps, bar)
     delays = sorted({*DEPLOYED, run.delay}) if run.arm == "undelayed" else [delay]
-    returns = {d: evaluate_under(d, history, actor, run.episodes) for d in delays}
+    returns = {d: evaluate_under(d, history, learner.actor, run.episodes) for d in delays}
     partly = run.file(folder).with_suffix(".part")  # all of it or nothing
     partly.write_text(json.dumps({**run._asdict(), "returns": returns}))
     partly.replace(run.file(folder))

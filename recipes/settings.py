@@ -3,7 +3,7 @@
 import os
 import re
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -154,6 +154,17 @@ class TrainConfig(ScenarioConfig):
     def update_steps(self) -> int:
         """Steps of every world before the first update: the system clock's, or the algorithm's."""
         return self.clock.steps("system") if self.clock.system else getattr(self, self.algo).steps
+
+    @property
+    def flown(self) -> ScenarioConfig:
+        """What an evaluation flies: every step, for its measures."""
+        return replace(self, clock=replace(self.clock, skip=False, skip_discount=1.0))
+
+    @property
+    def learnt(self) -> ScenarioConfig:
+        """What is trained in: rewards of skipped steps are discounted as the learner does."""
+        discount = getattr(self, self.algo).gamma if self.clock.skip else 1.0
+        return replace(self, clock=replace(self.clock, skip_discount=discount))
 
     @property
     def unseen_seed(self) -> int:

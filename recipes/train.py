@@ -1,7 +1,8 @@
-"""Train UAVs with MAPPO, and show what they have learnt beside a random policy.
+"""Train UAVs with MAPPO or SAC, and show what they have learnt beside a random policy.
 
     python recipes/train.py agents=3 scenario=spotting motion=polynomial seed=1
     python recipes/train.py +usecase=2 delay=paper aware=both
+    python recipes/train.py algo=sac scenario=tracking actions=continuous
     python recipes/train.py -m seed=0,1,2 agents=3,5
     python recipes/train.py resume=runs/2026-01-31_12-00-00
 
@@ -24,20 +25,23 @@ from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.collectors import Collector
-from torchrl.data import TensorDictReplayBuffer
-from torchrl.envs import EnvBase, RewardSum, StepCounter
+from torchrl.data import ReplayBuffer
+from torchrl.envs import RewardSum, StepCounter, TransformedEnv
 from tqdm import tqdm
 
 from damian.chain import DelayedEnv
 from damian.clocks import SystemClock
-from damian.comparison import MODE, RANDOM, SAMPLED
+from damian.comparison import GREEDY, MODE, RANDOM, SAMPLED
 from damian.delayed import make_env, messages_are_late
 from damian.features import Snapshot
+from damian.greedy import greedy_policy
 from damian.mappo import Mappo
 from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.models import random_policy
+from damian.recurrent import prime
 from damian.runs import CHECKPOINT, FIGURE, Interrupt, MetricsLog, plot_learning_curve, save_results
-from damian.storage import BackupdateStorage, server_view
+from damian.sac import Sac
+from damian.storage import BackupdateStorage, TimeStorage, server_view
 
 
 @dataclass
@@ -57,7 +61,8 @@ class Progress:
 def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment that policies are trained in."""
     read = looks_back(config) or config.clock.trigger is not None
-    env = make_env(config, config.worlds, config.seed, config.device, ["reward_terms", *["message"] * read])
+    extras = ["reward_terms", *["message"] * read, *["privileged"] * (config.critic == "privileged")]
+    env = make_env(config.learnt, config.worlds, config.seed, config.device, extras)
     if config.compile:
         env.compile()
     episode_reward = RewardSum(in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")])
@@ -71,18 +76,30 @@ def looks_back(config: TrainConfig) -> bool:
     return config.backupdate and messages_are_late(config)
 
 
-def make_memory(config: TrainConfig, env: DelayedEnv, clock: SystemClock) -> TensorDictReplayBuffer | None:
-    """What keeps the latest steps until late messages have arrived; None if nothing is corrected."""
+def make_learner(config: TrainConfig, env: DelayedEnv, clock: SystemClock) -> Mappo | Sac:
+    """The algorithm, on a memory in which late messages correct what is learnt from if they should."""
+    settle = config.longest_delay if config.settle else 0
+    if config.algo == "mappo":
+        shortest = (clock.longest + 2 * config.longest_delay) * config.worlds
+        memory = make_memory(config, env, shortest) if looks_back(config) else None
+        seen, recompute = config.critic_sees, config.recompute_actor
+        return Mappo(env, config.model, config.mappo, memory, settle, recompute, seen)
+    memory = make_memory(config, env, config.sac.memory // config.worlds * config.worlds)
+    return Sac(env, config.model, config.sac, memory, settle, config.critic_sees)
+
+
+def make_memory(config: TrainConfig, env: DelayedEnv, capacity: int) -> ReplayBuffer:
+    """What keeps the latest steps of the worlds, so many in all."""
     if not looks_back(config):
-        return None
-    longest = config.longest_delay
+        return ReplayBuffer(storage=TimeStorage(capacity, device=config.device))
     view = server_view(env.worlds.server, actor=config.recompute_actor)
-    capacity = (clock.longest + 2 * longest) * config.worlds
-    return TensorDictReplayBuffer(storage=BackupdateStorage(capacity, view, longest, device=config.device))
+    storage = BackupdateStorage(capacity, view, config.longest_delay, device=config.device)
+    return ReplayBuffer(storage=storage)
 
 
-def make_collector(env: EnvBase, actor: torch.nn.Module, frames: int) -> Collector:
+def make_collector(env: TransformedEnv, actor: torch.nn.Module, frames: int) -> Collector:
     """Collects batches of so many steps, without end."""
+    prime(env, actor)
     return Collector(
         env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
     )
@@ -116,9 +133,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     """
     config.check_learning()
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    memory = make_memory(config, env, clock)
-    settle = config.longest_delay if config.settle else 0
-    learner = Mappo(env, config.model, config.mappo, memory, settle, config.recompute_actor)
+    learner = make_learner(config, env, clock)
     progress, episodes = Progress(), EpisodeLog()
     state = {"progress": progress, "episodes": episodes, "clock": clock, "rng": GlobalRNGState()}
     checkpoint = Checkpoint(**learner.parts(), **state)
@@ -150,7 +165,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     if interrupt.asked:
         sys.exit(f"interrupted; go on with resume={folder}")
     random = report(config, folder, unseen(config), learner.actor)
-    plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, MAPPO")
+    plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {config.algo.upper()}")
     print(f"learning curve: {folder / FIGURE}")
 
 
@@ -174,7 +189,7 @@ def mean_terms(batch: TensorDictBase) -> dict[str, float]:
 
 def unseen(config: TrainConfig) -> DelayedEnv:
     """An environment of situations that were not trained on, a world for each episode of an evaluation."""
-    return make_env(config, config.eval_episodes, config.unseen_seed, config.device, ["message"])
+    return make_env(config.flown, config.eval_episodes, config.unseen_seed, config.device, ["message"])
 
 
 def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module) -> Evaluation:
@@ -189,7 +204,7 @@ def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.M
         return evaluate(env, policy, config.horizon, sample)
 
     random = fly(random_policy(env))
-    rows = {SAMPLED: fly(actor), MODE: fly(actor, False), RANDOM: random}
+    rows = {SAMPLED: fly(actor), MODE: fly(actor, False), RANDOM: random, GREEDY: fly(greedy_policy(env))}
     table = save_results(rows, folder, config.episode.success_share is not None, messages_are_late(config))
     print(f"\n{table}\n")
     return random

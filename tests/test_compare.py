@@ -9,7 +9,7 @@ import pytest
 from compare import start
 from helpers import check_refused
 
-from damian.comparison import MODE, RANDOM, SAMPLED, Arm, Comparison
+from damian.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison
 from damian.comparison_report import markdown, plot_curves, plot_norms
 from damian.statistics import interquartile_mean
 
@@ -58,7 +58,7 @@ def test_arms_and_seeds_are_run_once_and_go_on(compare, capsys):
     for part in ("**developing**", "2 seeds (8 to 9), 3 episodes", "Trained for 16 frames or 500", '"arms='):
         assert part in text
     rows = table(folder / "results.csv")
-    assert len(rows) == 4 * 3
+    assert len(rows) == 4 * 4
     mine = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("unaware", SAMPLED, "paper")]
     assert [r["seed"] for r in mine] == ["8", "9"]
     stored = [table(folder / "usecase2" / name / "result.csv")[0]["true_return"] for name in runs[2:]]
@@ -219,6 +219,16 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert [cells[f"true_return{end}"] for end in ("", "_low", "_high")] == [7.5, 6.0, 9.0]
     assert (cells["J_norm"], cells["recovery"]) == (0.75, 3.5 / 6)
     assert (found[3].cells()["recovery"], found[8].cells()["J_norm"]) == ("", "")
+
+
+def test_the_greedy_policy_stands_beside_the_random_one_where_it_was_flown():
+    rows = rows_of("t", "late", SCORES)
+    greedy = [row("t", delay, arm, 0, 7.0, GREEDY) for delay, arm in (("none", "best"), ("late", "blind"))]
+    table = markdown(Comparison(rows + greedy, ARMS), [], {"t": "long"}, never=set())
+    told = [line.split(" |")[:4] for line in table.splitlines() if "greedy" in line]
+    assert told == [
+        [f"| {name}", " ", " greedy", " 7.000 [7.000, 7.000]"] for name in ("greedy (undelayed)", "greedy")
+    ]
 
 
 def test_a_task_without_success_shows_none_and_several_places_are_summed_up():

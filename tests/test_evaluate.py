@@ -63,7 +63,7 @@ def test_it_is_flown_as_it_was_trained_if_nothing_else_is_asked_for(fly, learnt,
     assert {path.name for path in folder.iterdir()} == {"config.yaml", "result.csv", "result.md"}
     assert (folder / "result.md").read_text().strip() in capsys.readouterr().out
     again, before = results(folder), results(learnt)
-    assert again.keys() == before.keys() == {"trained, sampled", "trained, mode", "random"}
+    assert again.keys() == before.keys() == {"trained, sampled", "trained, mode", "random", "greedy"}
     assert again["trained, mode"] == before["trained, mode"]
     config, trained = (OmegaConf.load(path / "config.yaml") for path in (folder, learnt))
     differ = {name for name in trained if config[name] != trained[name]}
@@ -74,6 +74,12 @@ def test_a_policy_trained_with_three_is_flown_with_ten(fly):
     folder = fly("agents=10", "eval_episodes=5")
     assert OmegaConf.load(folder / "config.yaml").agents == 10
     assert results(folder)["trained, mode"]["episodes"] == 5
+
+
+def test_a_policy_of_sac_flies_as_one_of_mappo_does(fly, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["train.py", "algo=sac", *TRAINED, "hydra.run.dir=soft"])
+    launch(train.main)
+    assert results(fly("agents=5", of="soft")).keys() == {*results(tmp_path / "soft")}
 
 
 def test_new_overrides_win_and_the_others_of_the_run_hold(fly):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pendulum
 import pytest
 import torch
-from pendulum import ARMS, evaluate_under, main, make_env, make_sac, train
+from pendulum import ARMS, Run, evaluate_under, main, make_env, make_learner, train
 from torch import nn
 from tqdm import tqdm
 
@@ -19,9 +19,9 @@ def learn(delay: int, history: int, steps: int) -> nn.Module:
     torch.manual_seed(0)
     env = make_env(delay, history)
     env.set_seed(0)
-    actor, loss = make_sac(env, 128)
-    train(env, actor, loss, steps, tqdm(disable=True))
-    return actor
+    learner = make_learner(env, Run("history", 0, steps, delay, 20, 128))
+    train(env, learner, steps, tqdm(disable=True))
+    return learner.actor
 
 
 @pytest.fixture(scope="module")

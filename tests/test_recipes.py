@@ -18,6 +18,8 @@ from damian.delayed import make_env
 from damian.models import make_actor, make_critic
 
 TINY = ["frames=256", "worlds=8", "mappo.steps=16", "eval_episodes=4", "model.hidden=[16]"]
+TINY += ["sac.steps=16", "sac.updates=2", "sac.batch=32", "sac.warm_up=100"]
+both_algorithms = pytest.mark.parametrize("algo", ["algo=mappo", "algo=sac"])
 GOLDEN = Path(__file__).parent / "data"
 
 
@@ -73,6 +75,7 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
     assert {"config.yaml", "metrics.csv", "checkpoint", "learning_curve.png"} <= written
     assert (folder / "result.md").read_text().strip() in told
     assert "| random |" in told
+    assert "| greedy |" in told
     assert str(Path(folder.name) / "learning_curve.png") in told
     assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0]
     config = OmegaConf.load(folder / "config.yaml")
@@ -86,6 +89,10 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
     ("overrides", "told"),
     [
         (["agent=3"], "agent: no such key; did you mean agents?"),
+        (["algo=ppo"], "algo: ppo is not one of mappo, sac"),
+        (["algo=sac", "recompute_actor=true", "backupdate=true"], "recompute_actor: True is for algo=mappo"),
+        (["algo=sac", "sac.memory=1000"], "sac.memory: 1000 steps is not at least"),
+        (["sac.warm_up=300000"], "sac.warm_up: 300000 is not between 0 and 200000"),
         (["mappo.lrr=1"], "mappo.lrr: no such key; did you mean mappo.lr?"),
         (["+motion.foo=1"], "motion.foo: no such key"),
         (["+delay.foo=3"], "delay.foo: no such key"),
@@ -152,15 +159,17 @@ def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(run, capsys, tm
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_same_seed_gives_the_same_curve_and_another_one_another(run):
-    one, same = run(*TINY, folder="one"), run(*TINY, folder="same")
-    other = run(*TINY, "seed=1", folder="other")
+@both_algorithms
+def test_the_same_seed_gives_the_same_curve_and_another_one_another(run, algo):
+    one, same = run(*TINY, algo, folder="one"), run(*TINY, algo, folder="same")
+    other = run(*TINY, algo, "seed=1", folder="other")
     assert (one / "metrics.csv").read_text() == (same / "metrics.csv").read_text()
     assert (one / "metrics.csv").read_text() != (other / "metrics.csv").read_text()
 
 
-def test_a_resumed_run_goes_on_below_its_own_rows(run):
-    folder = run(*TINY, folder="first")
+@both_algorithms
+def test_a_resumed_run_goes_on_below_its_own_rows(run, algo):
+    folder = run(*TINY, algo, folder="first")
     before = (folder / "metrics.csv").read_text()
     run(f"resume={folder}", "frames=512", folder="second")
     assert (folder / "metrics.csv").read_text().startswith(before)
@@ -213,8 +222,9 @@ def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):
     assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0, 384.0]
 
 
-def test_a_finished_run_that_is_resumed_learns_nothing_more(run):
-    folder = run(*TINY, folder="first")
+@both_algorithms
+def test_a_finished_run_that_is_resumed_learns_nothing_more(run, algo):
+    folder = run(*TINY, algo, folder="first")
     before = (folder / "metrics.csv").read_text()
     run(f"resume={folder}", folder="second")
     assert (folder / "metrics.csv").read_text() == before

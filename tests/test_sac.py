@@ -44,7 +44,7 @@ def test_a_round_of_learning_moves_actor_critics_and_temperature(kind, motion):
     assert set(losses) == set(LOSSES)
     assert all(torch.tensor([*losses.values()]).isfinite())
     moved = {name for name, value in learner.loss.state_dict().items() if not value.equal(before[name])}
-    for part in ("actor_network_params", "target_qvalue_network_params", "qvalue_network_params", "log_alpha"):
+    for part in ("actor_network", "target_qvalue_network", "qvalue_network", "log_alpha"):
         assert any(name.startswith(part) for name in moved), part
 
 

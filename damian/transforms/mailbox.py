@@ -28,7 +28,7 @@ class Mailbox:
     A message is written at once into the slot of the step at which it will arrive, where a later one that
     arrives at the same time replaces it. Pure but for the slots, which are written in place. It remembers
 
-    - ``clock``: steps so far, [], and ``today``: the slot of this step, [];
+    - ``clock``: steps so far, and ``today``: the slot of this step, [M] each;
     - ``streams``: random stream of each sender, [M], and ``channel``: state of its channel, [M];
     - ``began``: clock at its latest reset, [M], and ``since``: when what is held was generated, [M];
     - ``senders``: 0, 1, ..., M - 1;
@@ -49,11 +49,11 @@ class Mailbox:
         """The memory for messages of these values [M, ...] and senders of these random streams [M]."""
         n_slots, zero = self.sampler.lost + 1, torch.zeros_like(streams)
         memory = {
-            "clock": zero.new_zeros(()),
-            "today": zero.new_zeros(()),
+            "clock": zero,
+            "today": zero.clone(),
             "streams": streams,
             "channel": self.sampler.begin(streams),
-            "began": zero,
+            "began": zero.clone(),
             "since": zero.clone(),
             "senders": torch.arange(len(streams), device=streams.device),
             "stamps": zero.new_full((n_slots, len(streams)), -1),
@@ -87,9 +87,9 @@ class Mailbox:
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
         arrives = torch.where(delay < n_slots, after(today, delay, n_slots), n_slots)
-        row = arrives * n_senders + memory["senders"]
-        memory["stamps"].view(-1).index_copy_(0, row, clock.expand(n_senders))
-        stamp = memory["stamps"].index_select(0, today.view(1)).squeeze(0)
+        row, here = (slot * n_senders + memory["senders"] for slot in (arrives, today))
+        stamps = memory["stamps"].view(-1)
+        stamp = stamps.index_copy_(0, row, clock).index_select(0, here)
         older = since if self._newest else torch.maximum(memory["began"], clock - n_slots)
         fresh = stamp > older
         since = torch.where(fresh, stamp, since)
@@ -97,8 +97,7 @@ class Mailbox:
         held = []
         for i, value in enumerate(values):
             slots, old = memory[f"slots_{i}"], memory[f"held_{i}"]
-            slots.flatten(0, 1).index_copy_(0, row, value)
-            new = slots.index_select(0, today.view(1)).squeeze(0)
+            new = slots.flatten(0, 1).index_copy_(0, row, value).index_select(0, here)
             held.append(torch.where(wide(fresh, old), new, old))
             memory[f"held_{i}"] = held[i]
         return memory, Delivery(held, clock - since, fresh, delay)

@@ -50,6 +50,11 @@ class OnRewards(Stateful):
         past = memory["past"]
         return memory | {"past": past.masked_fill(wide(mask, past[0]), 0)}, {}
 
+    def only(self, before: Memory, after: Memory, moves: Tensor) -> Memory:
+        old, new = before["past"], after["past"]
+        past = torch.where(wide(self.rows_of(moves), old[0]), new, old)
+        return super().only(before, after | {"past": old}, moves) | {"past": past}
+
 
 class RewardDelay(OnRewards):
     """Pays each reward some steps later; what is still owed when an episode ends is paid with its last step.
@@ -81,8 +86,8 @@ class RewardDelay(OnRewards):
         memory = super().allocate(tensordict)
         streams = self.streams(tensordict.batch_size, memory["past"].device)
         channel = self.sampler.begin(streams)
-        zero = streams.new_zeros(())
-        return memory | {"clock": zero, "today": zero, "streams": streams, "channel": channel}
+        zero = torch.zeros_like(streams)
+        return memory | {"clock": zero, "today": zero.clone(), "streams": streams, "channel": channel}
 
     def see(self, memory: Memory, entries: Entries) -> Change:
         clock, owed = memory["clock"] + 1, memory["past"]
@@ -90,10 +95,11 @@ class RewardDelay(OnRewards):
         delay, channel = self.sampler(memory["streams"], clock, memory["channel"])
         today = after(memory["today"], 1, self.n_past)
         due = after(today, delay, self.n_past)
-        row = due * len(reward) + torch.arange(len(reward), device=delay.device)
-        owed = owed.flatten(0, 1).index_add(0, row, reward).view_as(owed)
-        paid = owed.index_select(0, today.view(1)).squeeze(0)
-        owed = owed.index_fill(0, today.view(1), 0)
+        rows = torch.arange(len(reward), device=delay.device)
+        row, here = (slot * len(reward) + rows for slot in (due, today))
+        flat = owed.flatten(0, 1).index_add(0, row, reward)
+        paid = flat.index_select(0, here)
+        owed = flat.index_fill(0, here, 0).view_as(owed)
         done = flag_rows(entries, "done", self.reward_key, self.rows)
         if done is not None:
             over = wide(done, paid)

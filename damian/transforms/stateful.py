@@ -62,6 +62,8 @@ class Stateful(Transform):
     """Entries that ``begin`` and ``see`` are given, if they are there."""
     drop: Sequence[NestedKey] = ()
     """Entries that are not passed on."""
+    sent_key: NestedKey | None = None
+    """Flag that says which rows send something now, if not all do."""
 
     def __init__(
         self,
@@ -91,6 +93,14 @@ class Stateful(Transform):
     def see(self, memory: Memory, entries: Entries) -> Change:
         """What is shown, of what the environment shows after a step."""
         return memory, {}
+
+    def only(self, before: Memory, after: Memory, moves: Tensor) -> Memory:
+        """The memory after a step of the worlds of the mask [B] alone, in which no others sent anything."""
+        rows = self.rows_of(moves)
+        return {
+            name: new if new is before[name] else torch.where(wide(rows, new), new, before[name])
+            for name, new in after.items()
+        }
 
     # Once, for subclasses.
 
@@ -172,6 +182,10 @@ class Stateful(Transform):
         """The shape of the rows, M in all."""
         assert self._rows is not None
         return self._rows
+
+    def rows_of(self, worlds: Tensor) -> Tensor:
+        """A mask of worlds [B] as one of rows [M]."""
+        return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
     @property
     def memory(self) -> Memory:

@@ -1,0 +1,184 @@
+"""The scripted policy: what it makes of the server's messages, and how far that gets it."""
+
+import pytest
+import torch
+from helpers import everything, told, walking
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from damian.actions import ActionConfig, displacement
+from damian.chain import DelayedEnv
+from damian.delayed import make_env
+from damian.delays import DelayConfig
+from damian.features import ObservationConfig
+from damian.greedy import Greedy, greedy_policy
+from damian.metrics import evaluate
+from damian.models import random_policy
+from damian.rewards import RewardConfig
+from damian.scenario import RegionConfig, ScenarioConfig
+from damian.world.source import SourceConfig
+
+FIELD = [[0.0, 0.0], [400.0, 0.0], [400.0, 400.0], [0.0, 400.0]]
+STARTS = [[50.0, 50.0], [200.0, 200.0], [360.0, 260.0]]
+FINE = ActionConfig(distances=[50.0 * n for n in range(7)], headings=[22.5 * n for n in range(16)])
+CONTINUOUS = ActionConfig(kind="continuous", distances=[300.0])
+COVER = RewardConfig(spotted=0.0, coverage=1.0)
+SEARCH = RewardConfig(spotted=0.0, spotting_agents=1.0)
+
+
+def field(**changed) -> DelayedEnv:
+    """Three UAVs across a large square; a source in a corner that none of them hears."""
+    region = RegionConfig(
+        kind="vertices", vertices=FIELD, lattice_step=32.0, situations=4, start_positions=STARTS
+    )
+    sections = {
+        "region": region,
+        "source": SourceConfig(level_db=135.0, position=[390.0, 10.0]),
+        "actions": FINE,
+        "task": SEARCH,
+    }
+    return make_env(ScenarioConfig(**(sections | changed)), 2, extras=["message"])
+
+
+def landing(env: DelayedEnv, shown: TensorDictBase) -> Tensor:
+    """Where the policy sends the UAVs of the first world, if alone there, [N, 2]."""
+    action = greedy_policy(env)(shown)["agents", "action"][0]
+    worlds = env.worlds
+    if worlds.scenario.actions.kind == "discrete":
+        distance, heading = worlds.scenario.actions.table()[action].unbind(-1)
+    else:
+        distance, heading = action[:, 0] * 300.0, action[:, 1] * 2 * torch.pi
+    target = told(shown).position[0] + displacement(distance, heading)
+    points = worlds.simulation.airspace.points[0]
+    return points[torch.cdist(target, points).argmin(-1)]
+
+
+def heard(env: DelayedEnv, place: list[float], ago: float = 0.0, now: float = 9.0) -> TensorDictBase:
+    """What is shown at a time if the second UAV has heard the source so long ago at a place."""
+    shown = env.reset()
+    held = told(shown)
+    second = torch.tensor([False, True, False])
+    detected = torch.where(second.unsqueeze(-1), torch.tensor(place), 0.0).expand_as(held.position)
+    times = torch.where(second, now - ago, -1.0).expand_as(held.time)
+    held = held._replace(
+        time=torch.full_like(held.time, now), detected_time=times, detected_position=detected
+    )
+    held = held._replace(spotted=(second & (ago == 0)).expand_as(held.spotted))
+    return shown.set(("agents", "message"), held.pack())
+
+
+@pytest.mark.parametrize("actions", [FINE, CONTINUOUS], ids=["discrete", "continuous"])
+def test_all_fly_to_where_one_has_heard_the_source_and_that_one_stays(actions):
+    env = field(actions=actions)
+    shown = heard(env, [200.0, 200.0])
+    there = told(shown).position[0, 1]
+    apart = torch.linalg.vector_norm(landing(env, shown) - there, dim=-1)
+    assert (apart <= env.worlds.simulation.radius).all()
+    assert apart[1] == 0
+
+
+def test_what_was_heard_long_ago_of_a_source_at_rest_still_counts_but_of_one_that_moves_does_not():
+    moving = SourceConfig(level_db=135.0, motion="dynamic", speed=20.0)
+    ends = [landing(env, heard(env, [200.0, 200.0], 8)) for env in (field(), field(source=moving))]
+    apart = [torch.cdist(end[::2], torch.tensor([[200.0, 200.0]])) for end in ends]
+    radius = field().worlds.simulation.radius
+    assert (apart[0] <= 2 * radius).all()
+    assert (apart[1] > 2 * radius).all()
+
+
+def test_a_source_just_lost_is_looked_for_around_the_silent_footprint_and_not_in_it():
+    env = field(source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
+    shown = heard(env, [200.0, 200.0], ago=2.0)
+    away = torch.linalg.vector_norm(landing(env, shown)[1] - told(shown).position[0, 1])
+    assert env.worlds.simulation.radius < away < 3 * env.worlds.simulation.radius
+
+
+@pytest.mark.parametrize("task", [SEARCH, COVER], ids=["search", "coverage"])
+def test_before_anything_is_heard_the_uavs_leave_for_fresh_ground_of_their_own(task):
+    env = field(task=task)
+    shown = env.reset()
+    start, end = told(shown).position[0], landing(env, shown)
+    apart = torch.cdist(end, start)
+    assert (apart.diagonal() > env.worlds.simulation.radius).all()
+    assert torch.equal(apart.argmin(-1), torch.arange(3))
+
+
+def test_without_a_reward_for_the_source_nobody_flies_to_it():
+    env = field(task=COVER, observation=ObservationConfig(global_features=["coverage"], local_features=[]))
+    assert torch.equal(landing(env, heard(env, [200.0, 200.0])), landing(env, heard(env, [50.0, 350.0])))
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("motion", ["instant", "polynomial"])
+@pytest.mark.parametrize("obs", [0, 2])
+def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_other_worlds(kind, motion, obs):
+    env = make_env(everything(motion, kind, delay=DelayConfig(obs=obs)), 16, extras=["message"])
+    policy = greedy_policy(env)
+    flown = env.rollout(8, policy, break_when_any_done=False)
+    action = flown["agents", "action"]
+    if kind == "discrete":
+        mask = flown["agents", "action_mask"]
+        assert not mask.all()
+        assert mask.gather(-1, action.unsqueeze(-1)).all()
+    else:
+        assert env.action_spec.contains(flown[:, 0].select(*env.action_keys))
+    seen = flown[3:5, 5].exclude(("agents", "action"))
+    assert torch.equal(policy(seen)["agents", "action"], action[3:5, 5])
+
+
+def test_regions_of_different_sizes_have_their_own_ground_only():
+    env = make_env(everything(), 2, extras=["message"])
+    seen = Greedy(env.worlds).near.sum(1)
+    for region, points in enumerate(env.worlds.simulation.airspace.points):
+        real = points[points[:, 0].isfinite()]
+        apart = torch.linalg.vector_norm(real.unsqueeze(0) - real.unsqueeze(1), dim=-1)
+        near = (apart <= env.worlds.simulation.radius).sum(0)
+        assert torch.equal(seen[region, : len(real)], near.float())
+    assert not env.worlds.simulation.airspace.points.isfinite().all()
+
+
+def test_of_equally_good_places_the_nearest_is_flown_to():
+    for actions in (FINE, CONTINUOUS):
+        env = make_env(everything(actions=actions), 4, extras=["message"])
+        policy, held = Greedy(env.worlds), told(env.reset())
+        region = held.trail[:, 0, 0] // policy.points.shape[1]
+        real = policy.real[region]
+        assert not real.all()
+        if actions is FINE:
+            action = policy.best_action(held, torch.zeros(4, 3, real.shape[-1]), None)
+            distance = actions.table()[action, 0]
+        else:  # what only fills the table of a smaller region is no place
+            gain = (~real).float().unsqueeze(1).expand(-1, 3, -1)
+            distance = policy.best_move(held, gain, policy.points[region], real)[..., 0]
+        assert (distance == 0).all()
+
+
+def test_it_knows_what_has_arrived_and_not_what_was_sent():
+    env = field(delay=DelayConfig(obs=3))
+    shown, policy = heard(env, [200.0, 200.0]), greedy_policy(env)
+    blind = policy(env.reset())["agents", "action"]
+    assert torch.equal(policy(shown.clone())["agents", "action"], blind)
+    shown["agents", "received"] = shown["agents", "message"]
+    assert not torch.equal(policy(shown)["agents", "action"], blind)
+
+
+def test_late_messages_make_what_was_heard_old():
+    env = field(delay=DelayConfig(obs=9), source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
+    shown, policy = heard(env, [200.0, 200.0]), greedy_policy(env)
+    shown["agents", "received"] = shown["agents", "message"]
+    fresh = policy(shown.clone())["agents", "action"]
+    shown["agents", "age"] += 9
+    assert not torch.equal(policy(shown)["agents", "action"], fresh)
+
+
+def test_any_number_of_uavs_is_flown_and_clearly_better_than_by_chance():
+    torch.manual_seed(0)
+    region = RegionConfig(min_area=60_000, max_area=90_000, pool=2, situations=16)
+    for agents in (1, 3, 7):
+        scenario = ScenarioConfig(agents=agents, region=region, source=walking(), task=SEARCH)
+        env = make_env(scenario, 32, 5, extras=["message"])
+        scores = []
+        for policy in (greedy_policy(env), random_policy(env)):
+            env.set_seed(5)
+            scores.append(evaluate(env, policy, 50).true_return)
+        assert scores[0] > 2 * scores[1]

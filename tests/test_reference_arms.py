@@ -1,0 +1,282 @@
+"""Arms that others are compared with: messages held to a constant delay, and a critic that sees the truth."""
+
+import math
+import sys
+from typing import Any
+
+import pytest
+import torch
+from delay_twin import drawn
+from helpers import (
+    HERE,
+    KEEPS_GOING,
+    MOTIONS,
+    all_same,
+    both_kinds,
+    both_motions,
+    check_refused,
+    everything,
+    go,
+    one_uav,
+    play,
+    random_actions,
+    same,
+    square,
+)
+from launch import launch
+from settings import TrainConfig
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+from train import learning_env, main, make_learner
+
+from damian.actions import ActionConfig
+from damian.chain import DelayedEnv
+from damian.clocks import ClockConfig, SystemClock
+from damian.delayed import make_env, messages_are_late
+from damian.delays import DelayConfig, Held, law_of
+from damian.env import EXTRAS, PRIVILEGED
+from damian.mappo import Mappo, MappoConfig
+from damian.models import ModelConfig, make_critic
+from damian.sac import Sac
+from damian.scenario import ScenarioConfig
+from damian.world.source import SourceConfig
+
+PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
+BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}
+LAWS: dict[str, Any] = {
+    "uniform": (PAPER, 7),
+    "geometric": ({"law": "geometric", "mean": 2, "longest": 6}, 6),
+    "burst": (BURST | {"bad_loss": 0.0}, 4),
+}
+"""Laws that lose nothing, and the longest delay [steps] of each."""
+
+TRUTH = ("agents", PRIVILEGED)
+
+
+def actions_for(env: DelayedEnv, n_steps: int) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    return [random_actions(env.worlds, generator) for _ in range(n_steps)]
+
+
+def flown(
+    scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS, n_steps: int = 20
+) -> list[TensorDictBase]:
+    """What a rollout of random actions shows, the same ones at each call."""
+    env = make_env(scenario, 4, extras=extras)
+    return play(env, actions_for(env, n_steps))
+
+
+# Held messages.
+
+
+@both_motions
+@pytest.mark.parametrize("law", LAWS)
+def test_held_messages_arrive_as_with_a_constant_delay(law, motion):
+    obs, longest = LAWS[law]
+    held = flown(everything(motion, delay=DelayConfig(obs=obs, hold="max", history=2)))
+    assert all_same(held, flown(everything(motion, delay=DelayConfig(obs=longest, history=2))))
+
+
+def test_what_the_server_knows_is_as_old_as_the_longest_delay_once_that_has_passed():
+    shown = flown(everything(delay=DelayConfig(obs=PAPER, hold="max"), episode=KEEPS_GOING))
+    ages = torch.stack([td["agents", "age"] for td in shown[1::2]])
+    expected = torch.arange(1, len(ages) + 1).clamp(max=7)
+    assert ages.equal(expected.view(-1, 1, 1, 1).expand_as(ages).float())
+
+
+@pytest.mark.parametrize("law", ["uniform", "burst", "trace"])
+def test_held_messages_are_lost_as_often_as_before(law, tmp_path):
+    (tmp_path / "delays.csv").write_text("delay\n0\n5\nlost\n2\n")
+    trace = {"law": "trace", "path": str(tmp_path / "delays.csv")}
+    late, longest = {"uniform": (PAPER, 7), "burst": (BURST, 4), "trace": (trace, 5)}[law]
+    free, held = (each.sampler(loss=0.2) for each in (law_of(late), Held(law_of(late))))
+    before, after = (drawn(sampler, torch.arange(500), 20) for sampler in (free, held))
+    assert (held.longest, held.lost) == (longest, free.lost)
+    assert after.equal(torch.where(before == free.lost, held.lost, longest))
+    assert 0.1 < (after == held.lost).float().mean() < 0.5
+    assert held.loses
+    assert held.certain is None
+
+
+def test_where_no_message_can_be_late_there_is_nothing_to_hold():
+    nothing = everything(delay=DelayConfig(hold="max"))
+    assert not messages_are_late(nothing)
+    assert all_same(flown(nothing), flown(everything()))
+
+
+# The privileged observation.
+
+
+@both_motions
+@pytest.mark.parametrize("delay", [{}, {"obs": PAPER, "act": 1, "history": 2}], ids=["prompt", "late"])
+def test_an_environment_that_shows_the_truth_keeps_its_specs(motion, delay):
+    env = make_env(everything(motion, delay=DelayConfig(**delay)), 2, extras=["privileged"])
+    assert TRUTH in env.observation_spec.keys(True, True)
+    check_env_specs(env, seed=0, break_when_any_done="both")
+    assert env.observation_spec[TRUTH].is_in(env.rollout(3)[TRUTH][:, -1])
+
+
+@both_motions
+@pytest.mark.parametrize("order", ["generation", "arrival"])
+def test_no_delay_and_no_loss_changes_what_is_true(motion, order):
+    late = {
+        "delay": DelayConfig(obs=BURST, loss=0.3, order=order, history=2, rew=1),
+        "clock": ClockConfig(server="2s"),
+    }
+    prompt, delayed = (
+        flown(everything(motion, episode=KEEPS_GOING, **sections), ("privileged",)) for sections in ({}, late)
+    )
+    seen = ("agents", "global_observation")
+    assert not all(one[seen].equal(other[seen]) for one, other in zip(prompt, delayed, strict=True))
+    for one, other in zip(prompt, delayed, strict=True):
+        assert one[TRUTH].equal(other[TRUTH])
+        assert one[TRUTH][..., :-2].equal(one[seen])
+
+
+@both_motions
+def test_the_truth_ends_with_how_far_east_and_north_the_source_is(motion):
+    place = [20.0, 150.0]
+    shown = flown(
+        square(motion=MOTIONS[motion], source=SourceConfig(position=place)), ("privileged", "state")
+    )
+    for td in shown:
+        here = td["state"][:, :9].unflatten(-1, (3, 3))[..., :2]
+        toward = (torch.tensor(place) - here) / (200 * math.sqrt(2))
+        torch.testing.assert_close(td[TRUTH][..., -2:], toward, atol=1e-6, rtol=0)
+
+
+def test_the_truth_of_a_source_beyond_the_region_is_its_direction():
+    assert moved([9000.0, -9000.0])[TRUTH][0, 0, -2:].tolist() == [1.0, -1.0]
+
+
+@pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs=PAPER)], ids=["prompt", "late"])
+def test_showing_the_truth_changes_nothing_else(delay):
+    scenario = everything(delay=delay)
+    with_it, without = flown(scenario, (*EXTRAS, "privileged")), flown(scenario)
+    assert all(TRUTH in td.keys(True, True) for td in with_it)
+    assert all_same([td.exclude(TRUTH) for td in with_it], without)
+
+
+def test_both_compile():
+    scenario = square(delay=DelayConfig(obs=BURST, hold="max"))
+    env = make_env(scenario, 4, extras=["message", "privileged"]).compile(backend="eager")
+    assert all_same(play(env, actions_for(env, 15)), flown(scenario, ("message", "privileged"), 15))
+
+
+# Who sees it.
+
+
+def moved(place: list[float]) -> TensorDictBase:
+    """After a step in which no message arrived, with the source put somewhere that no UAV hears."""
+    scenario = one_uav(delay=DelayConfig(loss=1.0))
+    env = make_env(scenario, extras=["privileged"])
+    env.reset()
+    env.worlds.state = env.worlds.state._replace(source=torch.tensor([place]))
+    return go(env, HERE)
+
+
+def test_only_a_privileged_critic_learns_of_a_source_that_moved_before_any_message_arrives():
+    env = make_env(one_uav(), extras=["privileged"])
+    here, there = moved([390.0, 100.0]), moved([390.0, 160.0])
+    assert same(here.exclude(TRUTH), there.exclude(TRUTH))
+    for seen, differs in ((PRIVILEGED, True), ("global_observation", False)):
+        critic = make_critic(env, ModelConfig([16]), seen)
+        one, other = (critic(td.clone())["agents", "state_value"] for td in (here, there))
+        assert one.equal(other) is not differs
+
+
+def settings(**changed: Any) -> TrainConfig:
+    """A tiny run, a message in three late."""
+    obs = PAPER | {"low": 1, "high": 3, "probability": 0.3}
+    sections = vars(everything(delay=DelayConfig(obs=obs, history=2)))
+    tiny = {"worlds": 4, "mappo": MappoConfig(steps=12, minibatches=2), "model": ModelConfig([16])}
+    return TrainConfig(**(sections | tiny | {"critic": "privileged"} | changed))
+
+
+def learner_of(config: TrainConfig) -> tuple[Mappo | Sac, DelayedEnv]:
+    env = learning_env(config)
+    return make_learner(config, env, SystemClock(config.clock, config.update_steps)), env
+
+
+@both_kinds
+@pytest.mark.parametrize("algo", ["mappo", "sac"])
+def test_the_actor_of_a_privileged_critic_sees_no_truth(algo, kind):
+    learner, env = learner_of(settings(algo=algo, actions=ActionConfig(kind=kind)))
+    assert TRUTH not in learner.actor.in_keys
+    td = env.reset()
+    other = td.clone()
+    other[TRUTH] = -td[TRUTH]
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        chosen = [learner.actor(shown)["agents", "action"] for shown in (td, other)]
+    assert chosen[0].equal(chosen[1])
+
+
+@pytest.mark.parametrize("critic", ["server", "privileged"])
+def test_the_critic_reads_what_was_asked_for(critic):
+    learner, env = learner_of(settings(critic=critic))
+    seen = {"server": "global_observation", "privileged": PRIVILEGED}[critic]
+    assert learner.critic.in_keys == [("agents", seen)]
+    soft, _ = learner_of(settings(critic=critic, algo="sac"))
+    assert ("agents", seen) in soft.loss.qvalue_network.in_keys
+    assert (TRUTH in env.observation_spec.keys(True, True)) == (critic == "privileged")
+
+
+def test_back_updating_leaves_the_truth_as_it_was():
+    learner, env = learner_of(settings(backupdate=True))
+    batch = env.rollout(12, learner.actor, break_when_any_done=False)
+    known = learner.known(batch)
+    assert known["agents", "backupdated"].any()
+    assert not known["next", "agents", "global_observation"].equal(
+        batch["next", "agents", "global_observation"]
+    )
+    for key in (TRUTH, ("next", *TRUTH)):
+        assert known[key].equal(batch[key])
+    losses = learner.learn(env.rollout(12, learner.actor, break_when_any_done=False))
+    assert all(math.isfinite(loss) for loss in losses.values())
+
+
+# On the command line.
+
+TINY = ["frames=200", "worlds=4", "mappo.steps=16", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
+SAC = ["algo=sac", "sac.warm_up=100", "sac.memory=1000", "sac.updates=1"]
+
+
+@pytest.fixture
+def train(tmp_path, monkeypatch):
+    """Run the recipe in an empty folder; returns its run folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*overrides: str):
+        monkeypatch.setattr(sys, "argv", ["train.py", *TINY, *overrides, "hydra.run.dir=run"])
+        launch(main)
+        return tmp_path / "run"
+
+    return run
+
+
+HELD = ["delay.hold=max", "aware=both", "settle=true"]
+ARMS = [
+    ["critic=privileged"],
+    *(pytest.param(arm, marks=pytest.mark.slow) for arm in (["critic=privileged", *SAC], HELD)),
+]
+
+
+@pytest.mark.parametrize("overrides", ARMS, ids=["privileged", "privileged sac", "held"])
+def test_a_reference_arm_is_trained_and_flown(train, overrides):
+    folder = train("+delaybench=tracking", "delay=paper", *overrides)
+    assert (folder / "result.csv").is_file()
+    assert (folder / "learning_curve.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("delay.hold=longest", "delay.hold: longest is not one of none, max"),
+        ("delay.hold=max", "delay.hold: max means nothing without late messages (delay.obs)"),
+        ("critic=oracle", "critic: oracle is not one of server, privileged"),
+    ],
+)
+def test_a_reference_arm_that_means_nothing_is_refused(train, override, told, capsys, tmp_path):
+    check_refused(lambda: train(override), told, capsys)
+    assert not (tmp_path / "run").exists()
