@@ -31,7 +31,8 @@ class ClockConfig:
     """Largest period of a triggered system clock; twice its first, if not given."""
     skip: bool = False
     """A step of the environment lasts until some UAV of its world can choose again, or the episode ends;
-    ``duration`` says how many ``simulation`` steps that took (``damian.fast_forward``)."""
+    ``duration`` says how many ``simulation`` steps that took (``damian.fast_forward``). The steps and frames
+    of a training log are such steps then, and its returns are discounted within them."""
     skip_discount: float = 1.0
     """Discount of the rewards within such a step, for each ``simulation`` step of it."""
 

@@ -25,13 +25,18 @@ class Decisions(NamedTuple):
         return Decisions(*(part[drawn] for part in self))
 
 
-def find_decisions(ready: Tensor, ready_next: Tensor, done: Tensor, n_decisions: int = 1) -> Decisions:
+def find_decisions(
+    ready: Tensor, ready_next: Tensor, done: Tensor, terminated: Tensor, n_decisions: int = 1
+) -> Decisions:
     """All decisions in consecutive steps that had come to an end by the last of them.
+
+    Those that a time limit cuts in flight are none: of what would have come of them, nothing is learnt.
 
     Args:
         ready: could the UAV choose before each step, [T, B, N].
         ready_next: could it after the step, [T, B, N].
         done: did the episode end with it, [T, B].
+        terminated: and for good, not by a time limit, [T, B].
         n_decisions: take so many in a row as one, as far as the episode goes (n-step returns).
     """
     n_steps = len(ready)
@@ -44,7 +49,8 @@ def find_decisions(ready: Tensor, ready_next: Tensor, done: Tensor, n_decisions:
     for _ in range(n_decisions - 1):
         over = ended.gather(0, end.clamp(max=n_steps - 1))
         end = torch.where(over, end, first.gather(0, (end + 1).clamp(max=n_steps)))
-    begin, world, agent = (ready & (end < n_steps)).nonzero().unbind(-1)
+    told = (ready_next | terminated.unsqueeze(-1)).gather(0, end.clamp(max=n_steps - 1))
+    begin, world, agent = (ready & told & (end < n_steps)).nonzero().unbind(-1)
     return Decisions(begin, world, agent, end[begin, world, agent])
 
 

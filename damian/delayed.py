@@ -142,11 +142,13 @@ def skipping(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transfor
 def remembers_unknown(scenario: ScenarioConfig) -> bool:
     """Is a UAV's memory of its actions one of those that the server, as it answers, cannot know of?
 
-    With late actions or slow clocks nobody knows which these are, and it is one of all.
+    With late actions or slow clocks nobody knows which these are, and it is one of all; so it is if the UAV
+    knows where it is without them.
     """
     delay, clock = scenario.delay, scenario.clock
     prompt = not is_late(delay.act, clock.dt) and clock.steps("server") == clock.steps("agents") == 1
-    return delay.history > 0 and prompt and messages_are_late(scenario)
+    blind = not scenario.observation.own
+    return delay.history > 0 and blind and prompt and messages_are_late(scenario)
 
 
 def is_late(law: Any, dt: float) -> bool:

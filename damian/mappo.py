@@ -157,6 +157,7 @@ def mappo_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: Mapp
         critic_coeff=config.value,
         normalize_advantage=False,  # done in ``add_advantages``, over decisions only
         reduction="none",  # likewise, in ``losses_of``
+        log_explained_variance=False,  # which costs time
     )
     loss.set_keys(
         reward=("agents", "reward"),

@@ -86,6 +86,10 @@ class Sac:
         self.config, self.memory, self.settle = config, memory, settle
         self.actor = make_actor(env, model)
         self.loss = sac_loss(self.actor, make_action_value(env, model, critic_sees), env, config)
+        # A checkpoint brings what was learnt, not with which discount.
+        self.loss.register_load_state_dict_post_hook(
+            lambda loss, _: loss.make_value_estimator(gamma=config.gamma)
+        )
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr, fused=True)
         self.targets = SoftUpdate(self.loss, tau=config.tau)
         masked = ("agents", "action_mask") in self.actor.in_keys
@@ -104,9 +108,10 @@ class Sac:
         self.memory.extend(batch.exclude(*_UNREAD))
         storage = cast(TimeStorage, self.memory.storage)
         steps, order = storage.steps, storage.latest()
-        known = order[: len(order) - self.settle]
-        agents, after, done = (steps.get(key)[known] for key in (_READY, ("next", *_READY), ("next", "done")))
-        decisions = find_decisions(agents, after, done.squeeze(-1), self.config.n_steps)
+        known = order[: max(len(order) - self.settle, 0)]
+        ready, then = (cast(Tensor, steps[key])[known] for key in (_READY, ("next", *_READY)))
+        done, terminated = (steps["next", key][known].squeeze(-1) for key in ("done", "terminated"))
+        decisions = find_decisions(ready, then, done, terminated, self.config.n_steps)
         if len(order) * batch.shape[0] < self.config.warm_up or not len(decisions.begin):
             return dict.fromkeys(LOSSES, math.nan)
         sums = dict.fromkeys(LOSSES, 0.0)
@@ -165,13 +170,9 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
     def __init__(
         self, actor: ProbabilisticActor, action_value: TensorDictModule, n: int, share: float, **options: Any
     ) -> None:
+        zero: Any = 0.0  # of what ``actor_loss`` reports
         super().__init__(
-            actor,
-            action_value,
-            action_space="categorical",
-            num_actions=n,
-            target_entropy=0,
-            **options,  # type: ignore
+            actor, action_value, action_space="categorical", num_actions=n, target_entropy=zero, **options
         )
         self.share, self.n_actions = share, n
 

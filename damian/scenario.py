@@ -122,6 +122,9 @@ class ScenarioConfig:
         self.delay.check(self.clock.dt)
         flight_levels(self.motion, self.agents)
         self._check_ends()
+        held = self.observation.own and self.clock.steps("server") > 1
+        should = "does not go with clock.server: between two broadcasts nothing that is seen changes"
+        checks.require(not held, "observation.own", True, should)
         alone = self.agents == 1 and self.observation.actor == ["agent_distances"]
         checks.require(not alone, "observation", "agent_distances", "is all that a single UAV sees")
         starts = self.region.start_positions

@@ -43,7 +43,7 @@ class TimeStorage(LazyTensorStorage):
         stored = cast(int, self._len_along_dim0)
         n_steps = stored if n_steps is None else min(n_steps, stored)
         last = int(torch.as_tensor(self._last_cursor).view(-1)[-1])
-        return torch.arange(last - n_steps + 1, last + 1) % stored
+        return torch.arange(last - n_steps + 1, last + 1, device=self.device) % stored
 
 
 class BackupdateStorage(TimeStorage):

@@ -36,7 +36,7 @@ COLUMNS = ("time_s", "uav", *POSITIONS, "age_s", "arrived", "lost")
 
 def fly(config: TrainConfig) -> Beliefs:
     """One episode of the random policy."""
-    env = make_env(config, 1, config.seed, config.device, extras=["message", "state", "reward_terms"])
+    env = make_env(config.flown, 1, config.seed, config.device, extras=["message", "state", "reward_terms"])
     flight = env.rollout(config.horizon, random_policy(env))[0].cpu()
     keys = ["state", *(("agents", name) for name in ("message", "talks", "received", "delay"))]
     parts = [part.select(*keys, strict=False) for part in (flight[:1], flight["next"])]

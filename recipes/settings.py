@@ -100,12 +100,9 @@ class TrainConfig(ScenarioConfig):
         Raises:
             InputError: names the key that does not fit.
         """
-        if self.algo == "mappo":
-            most = self.worlds if self.model.recurrent else self.worlds * self.update_steps
-            checks.in_range("mappo.minibatches", self.mappo.minibatches, 1, most)
-        else:
-            self._check_memory()
-        self._check_recurrent()
+        checked = {"mappo": self._check_mappo, "sac": self._check_sac}
+        checked[self.algo]()
+        self._check_skip()
         held = self.delay.hold == "max" and self.longest_delay == 0
         checks.require(not held, "delay.hold", "max", "means nothing without late messages (delay.obs)")
         # What is corrected are single rewards, and what the server knows at every step.
@@ -120,25 +117,32 @@ class TrainConfig(ScenarioConfig):
         for key in ("settle", "recompute_actor"):
             alone = getattr(self, key) and not self.backupdate
             checks.require(not alone, key, True, "means nothing without backupdate=true")
-        shortest = SystemClock(self.clock, self.update_steps).shortest
-        should = (
-            f"needs more than {self.longest_delay} steps, the longest delay, between two updates: {shortest}"
-        )
-        fits = self.algo == "sac" or self.longest_delay < shortest
-        checks.require(not self.settle or fits, "settle", True, should)
 
-    def _check_recurrent(self) -> None:
-        should = "is for algo=mappo only: SAC learns from single decisions, without what came before them"
-        fits = self.algo == "mappo" or not self.model.recurrent
-        checks.require(fits, "model.rnn", self.model.rnn, should)
+    def _check_mappo(self) -> None:
+        shortest, recurrent = SystemClock(self.clock, self.update_steps).shortest, self.model.recurrent
+        most = self.worlds if recurrent else self.worlds * shortest
+        checks.in_range("mappo.minibatches", self.mappo.minibatches, 1, most)
+        longest = self.longest_delay
+        should = f"needs more than {longest} steps, the longest delay, between two updates: {shortest}"
+        checks.require(not self.settle or longest < shortest, "settle", True, should)
         should = "does not go with model.rnn: what a UAV remembers is not corrected"
-        checks.require(not (self.model.recurrent and self.recompute_actor), "recompute_actor", True, should)
+        checks.require(not (recurrent and self.recompute_actor), "recompute_actor", True, should)
 
-    def _check_memory(self) -> None:
-        least = self.worlds * (self.update_steps + 2 * self.longest_delay)
-        checks.in_range("sac.memory", self.sac.memory, least, unit="steps")
+    def _check_sac(self) -> None:
+        should = "is for algo=mappo only: SAC learns from single decisions, without what came before them"
+        checks.require(not self.model.recurrent, "model.rnn", self.model.rnn, should)
         should = "is for algo=mappo only: SAC has no importance ratios"
         checks.require(not self.recompute_actor, "recompute_actor", True, should)
+        least = SystemClock(self.clock, self.update_steps).longest + 2 * self.longest_delay
+        checks.in_range("sac.memory", self.sac.memory, self.worlds * least, unit="steps")
+        room = self.sac.memory // self.worlds * self.worlds
+        checks.in_range("sac.warm_up", self.sac.warm_up, 0, room, unit="steps")
+
+    def _check_skip(self) -> None:
+        should = "does not go with model.rnn: a flight is remembered at every step, not only at decisions"
+        checks.require(not (self.model.recurrent and self.clock.skip), "clock.skip", True, should)
+        discount, should = self.clock.skip_discount, "is that of the algorithm while it learns; leave it out"
+        checks.require(discount == 1, "clock.skip_discount", discount, should)
 
     @property
     def longest_delay(self) -> int:

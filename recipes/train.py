@@ -20,7 +20,7 @@ from typing import cast
 import hydra
 import torch
 from launch import launch, load, perform, prepare, reported, save_config
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
@@ -39,7 +39,7 @@ from damian.mappo import Mappo
 from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.models import random_policy
 from damian.recurrent import prime
-from damian.runs import CHECKPOINT, FIGURE, Interrupt, MetricsLog, plot_learning_curve, save_results
+from damian.runs import CHECKPOINT, CONFIG, FIGURE, Interrupt, MetricsLog, plot_learning_curve, save_results
 from damian.sac import Sac
 from damian.storage import BackupdateStorage, TimeStorage, server_view
 
@@ -141,7 +141,9 @@ def train(config: TrainConfig, folder: Path) -> None:
         load(checkpoint, folder, "resume")
         env.set_seed(config.seed + 1_000_003 * progress.updates)  # not the first episodes once more
     elif config.checkpoint:
-        load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", "critic"])
+        load(
+            checkpoint, Path(config.checkpoint), "checkpoint", ["actor", *["critic"] * same_algorithm(config)]
+        )
     save_config(config, folder)
     log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
@@ -167,6 +169,12 @@ def train(config: TrainConfig, folder: Path) -> None:
     random = report(config, folder, unseen(config), learner.actor)
     plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {config.algo.upper()}")
     print(f"learning curve: {folder / FIGURE}")
+
+
+def same_algorithm(config: TrainConfig) -> bool:
+    """Has the policy to begin with been learnt by the same algorithm, so that its critic fits?"""
+    saved = Path(str(config.checkpoint)) / CONFIG
+    return not saved.is_file() or OmegaConf.load(saved).get("algo", "mappo") == config.algo
 
 
 def progress_bar(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> tqdm:

@@ -65,7 +65,8 @@ def test_transitions_are_the_same(flights):
     for flight in (steps, jumps):
         by_time = flight.transpose(0, 1)
         ready, then = by_time["agents", "ready"], by_time["next", "agents", "ready"]
-        found = find_decisions(ready, then, by_time["next", "done"].squeeze(-1), 2)
+        ends = (by_time["next", key].squeeze(-1) for key in ("done", "terminated"))
+        found = find_decisions(ready, then, *ends, 2)
         order = torch.arange(len(by_time))
         learnt = transitions(by_time, order, found, GAMMA, ["observation", "global_observation"])
         of_world = [learnt[found.world == world] for world in range(16)]

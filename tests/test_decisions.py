@@ -17,11 +17,11 @@ def flags(seed: int):
     after, done = torch.rand(T, B, N) < 0.4, torch.rand(T, B) < 0.1
     ready = torch.cat([torch.ones(1, B, N, dtype=torch.bool), after[:-1]])
     ready[1:] |= done[:-1].unsqueeze(-1)  # a reset begins with everybody ready
-    return ready, after, done
+    return ready, after, done, done & (torch.rand(T, B) < 0.5)
 
 
-def loop(ready, after, done, n_decisions):
-    """Every decision that ends in time, step by step."""
+def loop(ready, after, done, terminated, n_decisions):
+    """Every decision that ends in time, and not in flight at a time limit, step by step."""
     found = set()
     for begin, world, agent in itertools.product(range(T), range(B), range(N)):
         if not ready[begin, world, agent]:
@@ -31,7 +31,8 @@ def loop(ready, after, done, n_decisions):
             over = done[end, world]
             left -= int(over or after[end, world, agent])
             if over or left == 0:
-                found.add((begin, world, agent, end))
+                if after[end, world, agent] or terminated[end, world]:
+                    found.add((begin, world, agent, end))
                 break
             end += 1
     return found
@@ -40,16 +41,16 @@ def loop(ready, after, done, n_decisions):
 @pytest.mark.parametrize("n_decisions", [1, 2, 4])
 @pytest.mark.parametrize("seed", range(5))
 def test_each_decision_lasts_until_the_next_or_the_end_as_a_loop_finds(n_decisions, seed):
-    ready, after, done = flags(seed)
-    found = torch.stack(find_decisions(ready, after, done, n_decisions), -1)
-    expected = loop(ready, after, done, n_decisions)
+    found = torch.stack(find_decisions(*flags(seed), n_decisions), -1)
+    expected = loop(*flags(seed), n_decisions)
     assert {tuple(row) for row in found.tolist()} == expected
     assert len(found) == len(expected) > 20
 
 
 def test_without_flights_every_step_but_the_last_ones_is_a_decision():
     yes = torch.ones(T, B, N, dtype=torch.bool)
-    found = find_decisions(yes, yes, torch.zeros(T, B, dtype=torch.bool), 3)
+    no = torch.zeros(T, B, dtype=torch.bool)
+    found = find_decisions(yes, yes, no, no, 3)
     assert (found.end - found.begin == 2).all()
     assert len(found.begin) == (T - 2) * B * N
 

@@ -49,7 +49,8 @@ class ServerNode(Stateful):
 
     @property
     def uses(self) -> Uses:
-        return Uses(reads=self.in_keys, makes=self.out_keys)
+        own = [self.own_key] if self.own_key else []
+        return Uses(reads=[*self.in_keys, *own], makes=self.out_keys)
 
     def allocate(self, tensordict: TensorDictBase) -> Memory:
         messages = tensordict.get(self.in_keys[0])
