@@ -13,12 +13,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from damian import checks
 from damian.errors import InputError
-from damian.sampling import Recorded, Sampler
+from damian.sampling import HeldSampler, Recorded, Sampler
 from damian.world.reading import named, near, read_text, show
 
 Delay = int | str
@@ -181,23 +178,6 @@ class Held(Law):
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         return HeldSampler(self.law.sampler(dt, loss, key))
-
-
-class HeldSampler(Sampler):
-    """Draws what another sampler draws, and lets it take the longest."""
-
-    def __init__(self, drawn: Sampler) -> None:
-        arrive = (1 - drawn.chances[:, -1]).tolist()
-        super().__init__([[0.0] * drawn.longest + [chance] for chance in arrive])
-        self.drawn = drawn
-        self.certain = None if self.loses else self.longest
-
-    def begin(self, streams: Tensor) -> Tensor:
-        return self.drawn.begin(streams)
-
-    def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        delay, memory = self.drawn(streams, clock, memory)
-        return torch.where(delay < self.lost, self.longest, self.lost), memory
 
 
 LAWS: dict[str, type[Law]] = {

@@ -87,3 +87,20 @@ class Recorded(Sampler):
         if self._loss:
             delay = torch.where(draws.uniform(streams, clock) < self._loss, self.lost, delay)
         return delay, (memory + 1) % len(self._delays)
+
+
+class HeldSampler(Sampler):
+    """Draws what another sampler draws, and lets it take the longest."""
+
+    def __init__(self, drawn: Sampler) -> None:
+        arrive = (1 - drawn.chances[:, -1]).tolist()
+        super().__init__([[0.0] * drawn.longest + [chance] for chance in arrive])
+        self.drawn = drawn
+        self.certain = None if self.loses else self.longest
+
+    def begin(self, streams: Tensor) -> Tensor:
+        return self.drawn.begin(streams)
+
+    def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        delay, memory = self.drawn(streams, clock, memory)
+        return torch.where(delay < self.lost, self.longest, self.lost), memory
