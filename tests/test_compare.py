@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from compare import start
 from helpers import check_refused
+from settings import CONF
 
 from damian.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison
 from damian.comparison_report import markdown, plot_curves, plot_norms
@@ -250,3 +251,10 @@ def test_figures_take_arms_that_learn_nothing_and_runs_without_a_finished_episod
     plot_curves(comparison, curves, {"steps": 1.0}, {"u"}, tmp_path / "curves.png")
     plot_norms(comparison, tmp_path / "norms.png")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("curves.png", "norms.png"))
+
+
+@pytest.mark.parametrize("name", [path.stem for path in sorted((Path(CONF) / "experiment").iterdir())])
+def test_every_experiment_that_there_is_makes_runs_that_can_be_learnt(compare, capsys, name):
+    only = ["delays=[paper]", "tasks=[flights]"] if name == "delaybench" else []
+    words = [f"experiment={name}", "seeds=1", "report_only=true", *only]
+    check_refused(lambda: compare(*words), "experiment: nothing of it is finished in", capsys)
