@@ -69,7 +69,11 @@ def test_a_uav_that_knows_its_own_messages_sees_them_at_once_and_all_else_as_lat
     prompt, _ = flown(motion, own=True)
     assert prompt["agents", "action"].equal(late["agents", "action"])
     own = torch.eye(3, dtype=torch.bool)
-    assert prompt["next", "agents", "observation"].flatten(0, 1).equal(told(late, server, own))
+    seen = prompt["next", "agents", "observation"].flatten(0, 1)
+    assert seen[..., N_FEATURES].equal(told(late, server, own)[..., N_FEATURES])
+    assert not seen[..., N_FEATURES].equal(
+        late["next", "agents", "observation"].flatten(0, 1)[..., N_FEATURES]
+    )
     for key in ("global_observation", "reward"):  # the server knows no more than before
         assert prompt["next", "agents", key].equal(late["next", "agents", key])
 
