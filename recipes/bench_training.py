@@ -93,7 +93,7 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
         known = learner.known(batch)
         corrected = time.perf_counter()
         add_advantages(known, learner.critic, learner.config)
-        learner.optimize(known.reshape(-1))
+        learner.optimize(known)
         yield Seconds(collected - begin, corrected - collected, time.perf_counter() - corrected)
 
 

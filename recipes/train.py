@@ -174,7 +174,8 @@ def train(config: TrainConfig, folder: Path) -> None:
 def same_algorithm(config: TrainConfig) -> bool:
     """Has the policy to begin with been learnt by the same algorithm, so that its critic fits?"""
     saved = Path(str(config.checkpoint)) / CONFIG
-    return not saved.is_file() or OmegaConf.load(saved).get("algo", "mappo") == config.algo
+    stored = cast(DictConfig, OmegaConf.load(saved)) if saved.is_file() else {}
+    return stored.get("algo", config.algo) == config.algo
 
 
 def progress_bar(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> tqdm:

@@ -41,24 +41,15 @@ def metrics(folder: Path) -> list[dict[str, float]]:
         return [{name: float(x) for name, x in row.items()} for row in csv.DictReader(file)]
 
 
-def policy(folder: Path) -> dict[str, Tensor]:
-    """What the actor of a run has learnt, by name."""
-    config = OmegaConf.to_object(
-        OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(folder / "config.yaml"))
-    )
-    actor = make_actor(make_env(config), config.model)
-    Checkpoint(actor=actor).load(folder / "checkpoint", components=["actor"])
-    return actor.state_dict()
-
-
-def weights(folder: Path) -> dict[str, Tensor]:
-    """What actor and critic of a run have learnt, by name."""
+def weights(folder: Path, *names: str) -> dict[str, Tensor]:
+    """What the named parts of a run, actor or critic, have learnt."""
     config = OmegaConf.to_object(
         OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(folder / "config.yaml"))
     )
     env = make_env(config)
-    parts = {"actor": make_actor(env, config.model), "critic": make_critic(env, config.model)}
-    Checkpoint(**parts).load(folder / "checkpoint", components=list(parts))
+    make = {"actor": make_actor, "critic": make_critic}
+    parts = {name: make[name](env, config.model) for name in names}
+    Checkpoint(**parts).load(folder / "checkpoint", components=names)
     return {f"{part}.{name}": w for part, net in parts.items() for name, w in net.state_dict().items()}
 
 
@@ -204,7 +195,7 @@ def test_a_run_begins_with_the_policy_of_a_checkpoint_and_its_overrides(run):
     first = run(*TINY, "agents=2", folder="first")
     still = run(f"checkpoint={first}", "mappo.lr=1e-30", "seed=1", folder="still")
     fresh = run(*TINY, "agents=2", "mappo.lr=1e-30", "seed=1", folder="fresh")
-    learnt, kept, other = (weights(folder) for folder in (first, still, fresh))
+    learnt, kept, other = (weights(folder, "actor", "critic") for folder in (first, still, fresh))
     assert {name.partition(".")[0] for name in learnt} == {"actor", "critic"}
     assert all(kept[name].equal(learnt[name]) for name in learnt)
     assert not all(other[name].equal(learnt[name]) for name in learnt)
@@ -215,7 +206,7 @@ def test_a_run_begins_with_the_policy_of_a_checkpoint_and_its_overrides(run):
 def test_one_algorithm_begins_with_the_policy_of_the_other(run):
     first = run(*TINY, folder="first")
     second = run(*TINY, f"checkpoint={first}", "algo=sac", "sac.lr=1e-30", folder="second")
-    one, other = (policy(folder) for folder in (first, second))
+    one, other = (weights(folder, "actor") for folder in (first, second))
     assert all(other[name].equal(one[name]) for name in one)
 
 
