@@ -54,6 +54,9 @@ class ObservationConfig:
     own: bool = False
     """A UAV knows its own latest message at once, with no need to hear of it from the server; else, as in the
     paper, all that it sees comes from there."""
+    estimate: str = "mean"
+    """Where the server believes the source: at the ``mean`` of the places of all UAVs' latest detections, or
+    only of the ``newest`` of these: a source that moves has left the older ones."""
     window: int = 2
     """Positions over which the coverage area is counted."""
 
@@ -65,6 +68,7 @@ class ObservationConfig:
         if self.time_scale is not None:
             checks.above("observation.time_scale", self.time_scale, 0.0, "s")
         checks.above("observation.age_scale", self.age_scale, 0.0, "s")
+        checks.one_of("observation.estimate", self.estimate, ("mean", "newest"))
         checks.in_range("observation.window", self.window, 1, 16)
         checks.require(
             bool(self.actor),
@@ -155,6 +159,8 @@ class Knowledge(NamedTuple):
     """Landing points by flat id, [R*L, 2] metres."""
     age_scale: float
     """[s]."""
+    newest: bool = False
+    """Do only the newest detections tell where the source is?"""
 
 
 def observe(snapshot: Snapshot, server: Knowledge, names: list[str]) -> dict[str, Tensor]:
@@ -206,8 +212,11 @@ def _ever(v: _View) -> Tensor:
 
 
 def _to_source(v: _View) -> Tensor:
-    """From each UAV to the mean place of the latest detections, [*, N, 2] metres."""
-    known = v(_known).to(v.snapshot.position.dtype)
+    """From each UAV to where the source is believed, [*, N, 2] metres."""
+    told, when = v(_known), v.snapshot.detected_time
+    if v.server.newest:
+        told = told & (when == when.amax(-1, keepdim=True))
+    known = told.to(v.snapshot.position.dtype)
     places = (v.snapshot.detected_position * known.unsqueeze(-1)).sum(-2, keepdim=True)
     estimate = places / known.sum(-1).clamp(min=1)[..., None, None]
     return estimate - v.snapshot.position

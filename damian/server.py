@@ -97,6 +97,7 @@ class Server:
             footprints=self._footprints,
             points=self._points,
             age_scale=self.config.observation.age_scale,
+            newest=self.config.observation.estimate == "newest",
         )
         return observe(snapshot, knowledge, names or self._wanted)
 

@@ -18,11 +18,11 @@ fleets = st.integers(1, 6)
 shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])
 
 
-def check(worlds):
+def check(worlds, newest=False):
     snapshot, server = snapshot_of(worlds)
-    ours = observe(snapshot, server, NAMES)
+    ours = observe(snapshot, server._replace(newest=newest), NAMES)
     for b, (now, uavs) in enumerate(worlds):
-        for name, values in twin.features(uavs, now, SCALE, TIME_SCALE).items():
+        for name, values in twin.features(uavs, now, SCALE, TIME_SCALE, newest=newest).items():
             apart = ours[name][b].double() - torch.tensor(values, dtype=torch.float64)
             if name in ("source_bearing", "source_drift"):  # 0 and 1 are the same angle.
                 apart = apart - apart.round()
@@ -31,9 +31,9 @@ def check(worlds):
 
 
 @settings(max_examples=200, deadline=None)
-@given(seed=seeds, n_agents=fleets, heard=shares, spots=shares)
-def test_every_feature_equals_its_loop_and_lies_between_0_and_1(seed, n_agents, heard, spots):
-    check(random_worlds(seed, n_agents, heard, spots))
+@given(seed=seeds, n_agents=fleets, heard=shares, spots=shares, newest=st.booleans())
+def test_every_feature_equals_its_loop_and_lies_between_0_and_1(seed, n_agents, heard, spots, newest):
+    check(random_worlds(seed, n_agents, heard, spots), newest)
 
 
 @pytest.mark.parametrize("n_agents", [1, 2, 5])

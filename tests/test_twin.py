@@ -31,7 +31,7 @@ TWIN_FEATURES = [name for name in GLOBAL if name != "coverage"]
 SHOWN = [*TWIN_FEATURES, *LOCAL]
 
 
-def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
+def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> ScenarioConfig:
     """Every term and feature but the coverage; odd distances, so that no two points tie."""
     task = dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5) | {"coverage": 0.0}
     return ScenarioConfig(
@@ -44,7 +44,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool) -> ScenarioConfig:
             headings=[-131.0, -77.7, -20.1, 11.3, 59.0, 123.4],
         ),
         observation=ObservationConfig(
-            local_features=list(LOCAL), global_features=TWIN_FEATURES, time_scale=9.0
+            local_features=list(LOCAL), global_features=TWIN_FEATURES, time_scale=9.0, estimate=estimate
         ),
         task=RewardConfig(**task, bonus=2.0, bonus_over_steps=True, penalty=0.5),
         episode=EpisodeConfig(5, since_detection=since, success_share=None if since else 0.5),
@@ -69,6 +69,7 @@ def twins(env: UavEnv) -> list[twin.World]:
             task=env.scenario.task,
             episode=env.scenario.episode,
             uavs=[twin.Uav(tuple(points[p]), p) for p in first.tolist()],
+            newest=env.scenario.observation.estimate == "newest",
         )
         world.begin()
         worlds.append(world)
@@ -89,11 +90,11 @@ def check_shown(world: twin.World, seen: torch.Tensor):
     assert apart.max() < 1e-4
 
 
-@pytest.mark.parametrize("since", [False, True])
+@pytest.mark.parametrize(("since", "estimate"), [(False, "mean"), (True, "newest")])
 @both_kinds
 @pytest.mark.parametrize("n_agents", [1, 2, 4])
-def test_rollouts_equal_those_of_a_slow_twin(n_agents, kind, since):
-    env = UavEnv(twin_scenario(n_agents, kind, since), num_worlds=12, seed=n_agents)
+def test_rollouts_equal_those_of_a_slow_twin(n_agents, kind, since, estimate):
+    env = UavEnv(twin_scenario(n_agents, kind, since, estimate), num_worlds=12, seed=n_agents)
     table = env.scenario.actions.table()
     generator = torch.Generator().manual_seed(n_agents)
     compared = ended = spotted = 0

@@ -27,13 +27,20 @@ class Uav:
 
 
 def features(
-    uavs: Sequence[Uav], now: float, scale: float, time_scale: float, resolution: float = 5.0
+    uavs: Sequence[Uav],
+    now: float,
+    scale: float,
+    time_scale: float,
+    resolution: float = 5.0,
+    newest: bool = False,
 ) -> dict[str, list]:
     """Table 2 but for the coverage, a value for each UAV."""
     heard = [uav for uav in uavs if uav.heard_at is not None]
     source = None
     if heard:
-        source = tuple(sum(uav.heard_from[axis] for uav in heard) / len(heard) for axis in (0, 1))
+        last = max(uav.heard_at for uav in heard)
+        told = [uav for uav in heard if uav.heard_at == last or not newest]
+        source = tuple(sum(uav.heard_from[axis] for uav in told) / len(told) for axis in (0, 1))
     found: dict[str, list] = {}
     for uav in uavs:
         others = [other for other in uavs if other is not uav]
@@ -54,7 +61,7 @@ def features(
             row["source_distance"] = near(uav.place, source, scale)
             row["source_bearing"] = bearing % (2 * math.pi) / (2 * math.pi)
             row["source_drift"] = (bearing - uav.track + math.pi) % (2 * math.pi) / (2 * math.pi)
-            row["source_time"] = min((now - max(u.heard_at for u in heard)) / time_scale, 1.0)
+            row["source_time"] = min((now - last) / time_scale, 1.0)
         row["mean_distance"] = mean([math.dist(uav.place, u.place) / scale for u in others])
         silent = [u for u in others if not u.spots and not uav.spots]
         row["mean_distance_not_spotting"] = mean([math.dist(uav.place, u.place) / scale for u in silent])
@@ -162,6 +169,7 @@ class World:
     task: RewardConfig
     episode: EpisodeConfig
     uavs: list[Uav]
+    newest: bool = False
     steps: int = 0
     ended: tuple[bool, bool, bool] = field(default=(False, False, False))
 
@@ -189,7 +197,7 @@ class World:
         return rewards
 
     def observe(self) -> dict[str, list]:
-        return features(self.uavs, self.steps * self.dt, self.scale, self.time_scale)
+        return features(self.uavs, self.steps * self.dt, self.scale, self.time_scale, newest=self.newest)
 
     def _preferences(self, uav: Uav, move: tuple[float, float]) -> list[int]:
         """Landing points, nearest the target first; only the own one if the target is outside."""
