@@ -29,20 +29,20 @@ class SacConfig:
     """Learning rate of Adam."""
     gamma: float = 0.95
     """Discount factor of a step."""
-    tau: float = 0.005
+    tau: float = 0.01
     """How far the target networks move to the learnt ones at each update."""
     alpha: float = 0.1
     """Temperature to begin with: weight of the entropy."""
-    entropy: float = 0.3
+    entropy: float = 0.1
     """Entropy that the temperature aims at (discrete actions): share of that of a uniform choice among the
     legal actions of each UAV. Continuous actions aim at minus their dimensions, on [-1, 1]."""
     n_steps: int = 1
     """Decisions whose rewards are summed before a value is estimated (n-step returns)."""
     steps: int = 4
     """Steps of every world between two rounds of learning."""
-    updates: int = 8
+    updates: int = 4
     """Updates in a round."""
-    batch: int = 256
+    batch: int = 512
     """Decisions in an update."""
     memory: int = 200_000
     """Latest steps, over all worlds, that are learnt from."""
