@@ -27,13 +27,15 @@ class SacConfig:
 
     lr: float = 1e-3
     """Learning rate of Adam."""
+    alpha_lr: float = 1e-2
+    """That of the temperature's logarithm, which must come from ``alpha`` to the scale of the rewards first."""
     gamma: float = 0.95
     """Discount factor of a step."""
     tau: float = 0.01
     """How far the target networks move to the learnt ones at each update."""
-    alpha: float = 0.1
+    alpha: float = 0.01
     """Temperature to begin with: weight of the entropy."""
-    entropy: float = 0.1
+    entropy: float = 0.5
     """Entropy that the temperature aims at (discrete actions): share of that of a uniform choice among the
     legal actions of each UAV. Continuous actions aim at minus their dimensions, on [-1, 1]."""
     n_steps: int = 1
@@ -50,7 +52,7 @@ class SacConfig:
     """Steps, over all worlds, before learning begins."""
 
     def __post_init__(self) -> None:
-        for name in ("lr", "tau", "alpha"):
+        for name in ("lr", "alpha_lr", "tau", "alpha"):
             checks.above(f"sac.{name}", getattr(self, name), 0.0)
         for name in ("gamma", "tau", "entropy"):
             checks.in_range(f"sac.{name}", getattr(self, name), 0.0, 1.0)
@@ -90,7 +92,9 @@ class Sac:
         self.loss.register_load_state_dict_post_hook(
             lambda loss, _: loss.make_value_estimator(gamma=config.gamma)
         )
-        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr, fused=True)
+        networks = [weights for name, weights in self.loss.named_parameters() if name != "log_alpha"]
+        temperature = {"params": [self.loss.log_alpha], "lr": config.alpha_lr}
+        self.optimizer = torch.optim.Adam([{"params": networks}, temperature], lr=config.lr, fused=True)
         self.targets = SoftUpdate(self.loss, tau=config.tau)
         masked = ("agents", "action_mask") in self.actor.in_keys
         self.seen = ["observation", critic_sees, *["action_mask"] * masked]

@@ -91,7 +91,7 @@ def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
 
 def make_learner(env: EnvBase, run: Run) -> Sac:
     """The learner of our UAVs, on a memory that takes single steps."""
-    config = SacConfig(lr=LR, gamma=GAMMA, tau=TAU, alpha=1.0)
+    config = SacConfig(lr=LR, alpha_lr=LR, gamma=GAMMA, tau=TAU, alpha=1.0)
     memory = ReplayBuffer(storage=LazyTensorStorage(run.steps), batch_size=BATCH)
     model = ModelConfig(hidden=[run.hidden, run.hidden], activation="relu")
     return Sac(env, model, config, memory, critic_sees="observation")
