@@ -2,16 +2,20 @@
 
 import csv
 import math
+from dataclasses import replace
 
 import pytest
 from helpers import everything
 from settings import LoggerConfig, TrainConfig
-from train import train
+from train import learning_env, make_learner, train
 
+from damian.chain import DelayedEnv
+from damian.clocks import ClockConfig, SystemClock
 from damian.delays import DelayConfig
-from damian.mappo import MappoConfig
+from damian.mappo import Mappo, MappoConfig
 from damian.models import ModelConfig
-from damian.sac import SacConfig
+from damian.sac import Sac, SacConfig
+from damian.storage import BackupdateStorage
 
 AWARE = {
     "none": {},
@@ -53,3 +57,49 @@ def test_every_combination_learns_and_is_evaluated(tmp_path, algo, rnn, kind, mo
     assert float(last["frames"]) == 96
     with (tmp_path / "result.csv").open(newline="") as file:
         assert all(math.isfinite(float(row["episode_return"])) for row in csv.DictReader(file))
+
+
+# What a learner is made of.
+
+both_algorithms = pytest.mark.parametrize("algo", ["mappo", "sac"])
+
+
+def made(algo: str, aware: str = "backupdate", **changed) -> tuple[Mappo | Sac, DelayedEnv]:
+    """A learner and its environment, for messages up to 3 steps late."""
+    asked = replace(config(algo, "none", "discrete", "instant", aware), **changed)
+    env = learning_env(asked)
+    return make_learner(asked, env, SystemClock(asked.clock, asked.update_steps)), env
+
+
+@both_algorithms
+@pytest.mark.parametrize("settle", [False, True])
+def test_a_learner_waits_for_the_longest_delay_if_it_is_to_settle(algo, settle):
+    learner, _ = made(algo, settle=settle)
+    assert learner.settle == (3 if settle else 0)
+
+
+@both_algorithms
+def test_a_memory_corrects_if_it_should(algo):
+    corrects = {aware: made(algo, aware)[0].memory for aware in ("backupdate", "history")}
+    assert isinstance(corrects["backupdate"].storage, BackupdateStorage)
+    assert corrects["backupdate"].storage.longest == 3
+    plain = corrects["history"]
+    assert plain is None if algo == "mappo" else not isinstance(plain.storage, BackupdateStorage)
+
+
+@both_algorithms
+def test_a_memory_has_room_for_whole_steps_of_the_longest_batch_and_all_that_is_late(algo):
+    clock = ClockConfig(trigger="4s", longest="24s")
+    learner, env = made(algo, clock=clock, sac=SacConfig(steps=12, memory=123, warm_up=0))
+    assert learner.memory.storage.max_size == 4 * (24 + 2 * 3)
+    learner.learn(env.rollout(24, learner.actor, break_when_any_done=False))
+
+
+@pytest.mark.parametrize("recompute", [False, True])
+def test_late_messages_correct_what_the_actor_saw_only_if_that_is_recomputed(recompute):
+    learner, env = made("mappo", recompute_actor=recompute)
+    batch = env.rollout(12, learner.actor, break_when_any_done=False)
+    known = learner.known(batch)
+    assert known["agents", "backupdated"].any()
+    for key in ("observation", "action_log_prob"):
+        assert known["agents", key].equal(batch["agents", key]) is not recompute

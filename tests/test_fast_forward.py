@@ -228,6 +228,12 @@ def test_an_impossible_discount_is_refused(clock, told):
         ClockConfig(**clock)
 
 
+@pytest.mark.parametrize("gamma", [-0.1, 1.1])
+def test_a_transform_with_an_impossible_discount_is_refused(gamma):
+    with pytest.raises(InputError, match=f"gamma: {gamma}"):
+        FastForward(gamma)
+
+
 def test_where_nothing_can_stand_still_there_is_no_skipping():
     env = TransformedEnv(UavEnv(square(), 2), FastForward())
     with pytest.raises(RuntimeError, match="FastForward works only in a DelayedEnv"):

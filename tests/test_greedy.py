@@ -1,8 +1,12 @@
 """The scripted policy: what it makes of the server's messages, and how far that gets it."""
 
+import itertools
+import math
+from dataclasses import replace
+
 import pytest
 import torch
-from helpers import everything, told, walking
+from helpers import clock, everything, told, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -11,10 +15,10 @@ from damian.chain import DelayedEnv
 from damian.delayed import make_env
 from damian.delays import DelayConfig
 from damian.features import ObservationConfig
-from damian.greedy import Greedy, greedy_policy
+from damian.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.metrics import evaluate
 from damian.models import random_policy
-from damian.rewards import RewardConfig
+from damian.rewards import EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
 from damian.world.source import SourceConfig
 
@@ -103,9 +107,128 @@ def test_before_anything_is_heard_the_uavs_leave_for_fresh_ground_of_their_own(t
     assert torch.equal(apart.argmin(-1), torch.arange(3))
 
 
-def test_without_a_reward_for_the_source_nobody_flies_to_it():
-    env = field(task=COVER, observation=ObservationConfig(global_features=["coverage"], local_features=[]))
-    assert torch.equal(landing(env, heard(env, [200.0, 200.0])), landing(env, heard(env, [50.0, 350.0])))
+@pytest.mark.parametrize(
+    ("sections", "seeks"),
+    [
+        ({}, False),
+        ({"task": replace(COVER, mean_distance=1.0)}, False),
+        ({"episode": EpisodeConfig(success_share=0.5)}, True),
+    ],
+)
+def test_without_a_reward_for_the_source_nobody_flies_to_it(sections, seeks):
+    seen = ObservationConfig(global_features=["coverage"], local_features=[])
+    env = field(**{"task": COVER, "observation": seen} | sections)
+    ends = [landing(env, heard(env, place)) for place in ([200.0, 200.0], [50.0, 350.0])]
+    assert torch.equal(*ends) is not seeks
+
+
+def test_fresh_ground_is_ones_own_and_under_none_of_ones_latest_footprints():
+    env = make_env(everything(), 4, extras=["message"])
+    policy, held = Greedy(env.worlds), told(env.rollout(4, random_policy(env))["next"][:, -1])
+    assert (held.trail[..., 0] != held.trail[..., 1]).any()
+    points, been = policy.points.flatten(0, 1).tolist(), held.trail.tolist()
+    ground = policy.points[held.trail[:, 0, 0] // policy.points.shape[1]]
+    fresh = policy.fresh(held, ground).tolist()
+    for world, targets in enumerate(held.target.tolist()):
+        for place, *found in zip(ground[world].tolist(), *fresh[world], strict=True):
+            apart = [math.dist(target, place) for target in targets]
+            for uav, trail in enumerate(been[world]):
+                covered = any(math.dist(points[flat], place) <= policy.radius for flat in trail)
+                assert found[uav] == (apart[uav] == min(apart) and not covered)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_believed_of_a_place_is_what_one_uav_after_the_other_says_of_it(seed):
+    env = field(source=walking(emission="per_step", emission_probability=0.7))
+    policy, radius = Greedy(env.worlds), env.worlds.simulation.radius
+    torch.manual_seed(seed)
+    places, times = 400 * torch.rand(2, 2, 3, 2), 8.0 + torch.randint(2, (2, 3))
+    detected = torch.minimum(torch.tensor([-1.0, 0.0, 5.0, 9.0])[torch.randint(4, (2, 3))], times)
+    held = told(env.reset())._replace(time=times, position=places[0], spotted=detected == times)
+    held = held._replace(detected_time=detected, detected_position=places[1])
+    ground = policy.points[[0, 0]]
+    likely, recent = policy.believe(held, ground, torch.full((2, 1), 9.0))
+    for world, spots in enumerate(held.spotted.tolist()):
+        ages = [9 - time if time >= 0 else math.inf for time in detected[world].tolist()]
+        sure = TRUST * (1.0 if min(ages) == 0 else 0.7)
+        silent = [
+            p for p, t, spot in zip(places[0, world], times[world], spots, strict=True) if t == 9 and not spot
+        ]
+        expected = []
+        for place in ground[world].tolist():
+            log = math.log(1 - sure) if any(math.dist(p, place) <= radius for p in silent) else 0.0
+            for age, there in zip(ages, places[1, world].tolist(), strict=True):
+                outside = max(math.dist(there, place) - radius, 0.0)
+                if age < math.inf:
+                    log -= (outside / (BLUR_M + policy.speed * age / 2)) ** 2 / 2
+            expected.append(log)
+        most = max(expected)
+        assert likely[world, 0].tolist() == pytest.approx(
+            [math.exp(log - most) for log in expected], abs=1e-4
+        )
+        assert recent[world].item() == (min(ages) * policy.speed <= RECENT * radius)
+
+
+def test_the_uavs_fly_where_most_fresh_ground_is_seen_and_there_the_shortest_way():
+    scenario = everything(task=COVER, episode=EpisodeConfig(max_steps=9))
+    env = make_env(scenario, 8, extras=["message"])
+    policy, radius = Greedy(env.worlds), env.worlds.simulation.radius
+    shown = env.rollout(4, random_policy(env))["next"][:, -1]
+    held, legal = told(shown), shown["agents", "action_mask"]
+    region = held.trail[:, 0, 0] // policy.points.shape[1]
+    assert len(region.unique()) == 3
+    fresh, chosen = policy.fresh(held, policy.points[region]), greedy_policy(env)(shown)["agents", "action"]
+    moves = displacement(*scenario.actions.table().unbind(-1))
+    for world, uav in itertools.product(range(8), range(3)):
+        points, start = policy.points[region[world]][policy.real[region[world]]], held.position[world, uav]
+        ends = points[apart(start + moves, points).argmin(-1)]
+        seen = (apart(ends, points) <= radius).float() @ fresh[world, uav, : len(points)]
+        far = apart(start.unsqueeze(0), ends)[0]
+        most = seen[legal[world, uav]].max()
+        best = legal[world, uav] & (seen == most)
+        action = chosen[world, uav]
+        assert best[action]
+        assert far[action] == pytest.approx(far[best].min().item(), abs=1e-3)
+
+
+def apart(some: Tensor, others: Tensor) -> Tensor:
+    """Distances [P, Q], exact."""
+    return torch.linalg.vector_norm(some.unsqueeze(1) - others, dim=-1)
+
+
+def test_nobody_flies_further_than_a_continuous_action_reaches():
+    env = field(actions=ActionConfig(kind="continuous", distances=[100.0]))
+    action = greedy_policy(env)(heard(env, [200.0, 45.0]))["agents", "action"]
+    assert 0 < action[..., 0].max() <= 1
+
+
+def test_it_is_as_late_as_the_newest_message_says():
+    env = field(source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
+    shown = heard(env, [200.0, 200.0], 8)
+    held, flying = told(shown), torch.tensor([True, False, False])
+    older = held._replace(time=torch.where(flying, 1.0, held.time)).pack()
+    ends = [landing(env, td) for td in (shown, shown.clone().set(("agents", "message"), older))]
+    assert torch.equal(ends[0][1:], ends[1][1:])
+
+
+def test_lateness_counts_in_seconds():
+    moving = SourceConfig(level_db=135.0, motion="dynamic", speed=20.0)
+    actions = []
+    for period, age in (("1s", 9), ("3s", 3), ("1s", 3)):
+        env = field(delay=DelayConfig(obs=9), source=moving, clock=clock(period))
+        shown = heard(env, [200.0, 200.0])
+        shown["agents", "received"] = shown["agents", "message"]
+        shown["agents", "age"].fill_(age)
+        actions.append(greedy_policy(env)(shown)["agents", "action"])
+    assert torch.equal(actions[0], actions[1])
+    assert not torch.equal(actions[0], actions[2])
+
+
+def test_long_after_a_detection_fresh_ground_near_it_is_searched_first():
+    moving = SourceConfig(level_db=135.0, motion="dynamic", speed=20.0)
+    env = field(source=moving)
+    ends = [landing(env, heard(env, place, 8)) for place in ([100.0, 350.0], [350.0, 100.0])]
+    assert not torch.equal(*ends)
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])

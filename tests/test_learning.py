@@ -79,7 +79,9 @@ def test_continuous_actions_lie_in_the_unit_square():
 
 
 def collected(motion: str, kind: str):
+    """Episodes of 9 steps; every other world ends for good, the others by the time limit."""
     config = scenario(
+        episode=EpisodeConfig(max_steps=9),
         motion=MotionConfig(kind=motion),
         actions=ActionConfig(kind=kind),
         task=RewardConfig(spotted=1.0, source_distance=1.0),
@@ -87,6 +89,7 @@ def collected(motion: str, kind: str):
     env = UavEnv(config, 8)
     actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
     batch = env.rollout(24, actor, break_when_any_done=False)
+    batch["next", "terminated"][::2] = batch["next", "done"][::2]
     return batch, critic
 
 
@@ -123,6 +126,21 @@ def test_entries_without_a_decision_move_the_critic_only(kind, mask):
     assert critic_moves > 0
     assert gradients(ready=False)[0] == 0
     assert gradients(ready=False)[1] > 0
+
+
+def test_objective_and_entropy_are_means_over_decisions():
+    env = UavEnv(scenario(motion=MotionConfig(kind="polynomial")), 8)
+    actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        batch = env.rollout(12, actor, break_when_any_done=False)
+    add_advantages(batch, critic, MappoConfig())
+    ready = batch["agents", "ready"]
+    batch["agents", "advantage"] = torch.where(ready, 2.0, 5.0).unsqueeze(-1)
+    assert not ready.all()
+    losses = losses_of(batch.reshape(-1), mappo_loss(actor, critic, MappoConfig(entropy=0.1)))
+    assert losses["loss_objective"].item() == pytest.approx(-2, abs=1e-5)  # ratios of 1
+    entropy = actor.get_dist(batch).entropy()[ready].mean().item()
+    assert losses["loss_entropy"].item() == pytest.approx(-0.1 * entropy, rel=1e-5)
 
 
 def test_advantages_are_scaled_over_decisions_only():
@@ -183,6 +201,11 @@ def test_a_flight_of_three_steps_earns_what_comes_meanwhile_and_the_value_where_
     )
     add_advantages(flight, critic, MappoConfig(gamma=0.5, lmbda=0.7, normalize_advantage=False))
     assert flight["agents", "advantage"].flatten().tolist() == [1 + 2 / 2 + 4 / 4 + 16 / 8 - 8, 0.0, 0.0]
+    targets = [1 + 2 / 2 + 4 / 4 + 16 / 8, 2 + 4 / 2 + 16 / 4, 4 + 16 / 2]
+    assert flight["agents", "value_target"].flatten().tolist() == targets
+    add_advantages(flight, critic, MappoConfig(gamma=0.5, lmbda=0.7))
+    assert flight["agents", "advantage"].flatten().tolist() == [0.0, 0.0, 0.0]  # one decision is the mean
+    assert flight["agents", "value_target"].flatten().tolist() == targets
 
 
 def test_the_critic_alone_sees_global_features_under_ctde():

@@ -1,11 +1,13 @@
 """SAC: its targets, its temperature, and what it learns from once late messages have arrived."""
 
+import itertools
 import math
 
 import pytest
 import torch
 from helpers import both_kinds, both_motions, everything
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -14,7 +16,7 @@ from damian.actions import ActionConfig
 from damian.decisions import find_decisions, transitions
 from damian.delayed import make_env
 from damian.delays import DelayConfig
-from damian.env import UavEnv
+from damian.env import PRIVILEGED, UavEnv
 from damian.features import Snapshot
 from damian.models import ModelConfig
 from damian.rewards import EpisodeConfig
@@ -45,6 +47,7 @@ def test_a_round_of_learning_moves_actor_critics_and_temperature(kind, motion):
     losses = learner.learn(flown(env, learner.actor))
     assert set(losses) == set(LOSSES)
     assert all(torch.tensor([*losses.values()]).isfinite())
+    assert losses["alpha"] == pytest.approx(FAST.alpha, rel=0.01)  # a mean; in the first update as it began
     moved = {name for name, value in learner.loss.state_dict().items() if not value.equal(before[name])}
     for part in ("actor_network", "target_qvalue_network", "qvalue_network", "log_alpha"):
         assert any(name.startswith(part) for name in moved), part
@@ -52,8 +55,8 @@ def test_a_round_of_learning_moves_actor_critics_and_temperature(kind, motion):
 
 def test_nothing_is_learnt_before_the_warm_up():
     env = UavEnv(everything(), 8)
-    learner = learner_of(env, SacConfig(warm_up=300))
-    assert learner.learn(flown(env, learner.actor))["loss_actor"] != 0  # nan
+    learner = learner_of(env, SacConfig(warm_up=304))
+    assert math.isnan(learner.learn(flown(env, learner.actor))["loss_actor"])
     before = learner.loss.log_alpha.item()
     learner.learn(flown(env, learner.actor, 13))  # 37 steps of 8 worlds: 296
     assert learner.loss.log_alpha.item() == before
@@ -136,6 +139,102 @@ def test_a_late_message_corrects_transitions_that_are_stored_already():
     assert held["agents", "observation"].equal(settled["agents", "observation"])  # what the actor saw stays
 
 
+class Watched(Sac):
+    """Keeps what it learns from."""
+
+    drawn: tuple[TensorDictBase, ...] = ()
+
+    def improve(self, drawn: TensorDictBase) -> TensorDictBase:
+        self.drawn = (*self.drawn, drawn.clone())
+        return super().improve(drawn)
+
+
+def two_decisions(flight: TensorDictBase, world: int, begin: int, agent: int, last: int) -> Tensor | None:
+    """What a UAV chose and what came of it until it had chosen once more, as a row of numbers.
+
+    None: it could not choose, or what came of it is not known by the last step.
+    """
+    seen, after, ends = flight["agents"], flight["next", "agents"], flight["next"]
+    if not seen["ready"][world, begin, agent]:
+        return None
+    earned, left = 0.0, 2
+    for t in range(begin, last + 1):
+        earned += 0.8 ** (t - begin) * after["reward"][world, t, agent]
+        then, over = after["ready"][world, t, agent], ends["done"][world, t]
+        left -= int(then | over)
+        if over or left == 0:
+            break
+    else:
+        return None
+    terminated = ends["terminated"][world, t]
+    if not (then | terminated):
+        return None
+    shown = [
+        entries[key][world, when, agent]
+        for entries, when in ((seen, begin), (after, t))
+        for key in ("observation", PRIVILEGED)
+    ]
+    chosen = seen["action"][world, begin, agent].view(1)
+    return torch.cat([*shown, chosen, earned, over, terminated, torch.tensor([t - begin + 1])])
+
+
+SHOWN = [("agents", name) for name in ("observation", PRIVILEGED)]
+ROW = [*SHOWN, *(("next", *key) for key in SHOWN), ("agents", "action"), ("next", "agents", "reward")]
+ROW += [("next", "done"), ("next", "terminated"), "steps_to_next_obs"]
+
+
+def test_what_is_learnt_from_are_the_settled_decisions_that_the_memory_still_holds():
+    scenario = everything("polynomial", episode=EpisodeConfig(max_steps=9))
+    env = make_env(scenario, 4, seed=1, extras=["privileged"])
+    config = SacConfig(gamma=0.8, n_steps=2, updates=2, batch=600, warm_up=0)
+    memory = ReplayBuffer(storage=TimeStorage(24 * 4))
+    learner = Watched(env, SMALL, config, memory, settle=3, critic_sees=PRIVILEGED)
+    flight = flown(env, learner.actor, 40)
+    flight["next", "terminated"][::2] = flight["next", "done"][::2]  # every other world ends for good
+    for part in flight.split(8, 1):  # the ring goes round
+        learner.drawn = ()
+        learner.learn(part)
+    assert [len(drawn) for drawn in learner.drawn] == [600, 600]
+    places = itertools.product(range(4), range(16, 37), range(3))
+    made = (two_decisions(flight, *place, last=36) for place in places)
+    expected = torch.stack([row for row in made if row is not None])
+    assert 0 < expected[:, -2].sum() < expected[:, -3].sum() < len(expected)  # terminated, done
+    drawn = torch.cat(learner.drawn)
+    found = torch.cat([drawn[key].view(len(drawn), -1) for key in ROW], -1)
+    apart = (found.unsqueeze(1) - expected).abs().amax(-1)
+    assert apart.amin(1).max() < 1e-5
+    assert apart.amin(0).max() < 1e-5
+
+
+def watched(**changed) -> Watched:
+    """A learner that has made one update."""
+    env = UavEnv(everything(kind="discrete"), 4)
+    config = SacConfig(**({"updates": 1, "batch": 64, "warm_up": 0} | changed))
+    learner = Watched(env, SMALL, config, ReplayBuffer(storage=TimeStorage(100)))
+    learner.learn(flown(env, learner.actor, 8))
+    return learner
+
+
+def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_a_share_of_that():
+    learner = watched(lr=1e-2, tau=0.25)
+    loss = learner.loss
+    learnt, target = (
+        torch.cat([weight.flatten() for weight in getattr(loss, name).data.values(True, True)])
+        for name in ("qvalue_network_params", "target_qvalue_network_params")
+    )
+    # Both have begun at the same place.
+    begun = (target - 0.25 * learnt) / 0.75
+    assert (learnt - begun).abs().max().item() == pytest.approx(1e-2, rel=1e-2)  # of Adam's first step
+
+
+def test_an_update_forgets_the_gradients_of_the_one_before():
+    learner = watched(lr=1e-12, alpha_lr=1e-12)
+    first = [weight.grad.clone() for weight in learner.loss.parameters()]
+    learner.improve(learner.drawn[0])
+    for weight, before in zip(learner.loss.parameters(), first, strict=True):
+        torch.testing.assert_close(weight.grad, before)
+
+
 def test_before_anything_has_settled_nothing_is_learnt():
     env = late_env()
     learner = learner_of(env, settle=10)
@@ -146,8 +245,11 @@ def test_before_anything_has_settled_nothing_is_learnt():
 def test_a_checkpoint_brings_what_was_learnt_and_not_the_discount():
     env = UavEnv(everything(), 4)
     far, near = (learner_of(env, SacConfig(gamma=gamma)) for gamma in (0.99, 0.5))
+    learnt = far.loss.state_dict()
     far.loss.load_state_dict(near.loss.state_dict())
+    near.loss.load_state_dict(learnt)
     assert far.loss.value_estimator.gamma.item() == pytest.approx(0.99)
+    assert near.loss.value_estimator.gamma.item() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
