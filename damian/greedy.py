@@ -1,7 +1,8 @@
 """A scripted policy that learns nothing: fly to where the source is believed, else over fresh ground.
 
 Every UAV flies where its footprint holds most of what it wants: while a detection is recent, ground on which
-the source is likely to be; else its own ground (nearer to it than to the others), not just covered.
+the source is likely to be; else its own ground (nearer to it than to the others), not just covered. If there
+is none of it within reach, it flies as near as it can.
 """
 
 import math
@@ -24,6 +25,8 @@ RECENT = 3.0
 """Footprint radii that the source may go before it must be searched for anew."""
 _NEARER = 1e-6
 """Landing points that a metre less to fly is worth: of equally good places the nearest."""
+_NOTHING = 1e-3
+"""Landing points: if no choice gains more, what is wanted lies further away."""
 
 
 def greedy_policy(env: DelayedEnv) -> TensorDictModule:
@@ -66,9 +69,13 @@ class Greedy:
             likely, recent = self.believe(held, ground, time.amax(-1, keepdim=True))
             wanted = torch.where(recent, likely, wanted * likely)
         gain = wanted @ (self.near if len(self.near) == 1 else self.near[region])
+        gain = gain.where(self.real[region].unsqueeze(1), -torch.inf)
+        flown = _apart(held.target, ground)
+        goal = (gain - _NEARER * flown).argmax(-1)
+        left = _apart(_pick(ground, goal), ground)
         if self.actions.kind == "discrete":
-            return self.best_action(held, gain, mask)
-        return self.best_move(held, gain, ground, self.real[region])
+            return self.best_action(held, gain, left, mask)
+        return self.best_move(held, gain, left, ground)
 
     def fresh(self, held: Snapshot, ground: Tensor) -> Tensor:
         """1 where ground [B, L, 2] is the UAV's own and not in its latest footprints, else 0, [B, N, L]."""
@@ -80,8 +87,8 @@ class Greedy:
     def believe(self, held: Snapshot, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
         """How likely the source is on ground [B, L, 2], up to 1, [B, 1, L]; is that recent, [B, 1, 1].
 
-        Heard within a footprint, the source has gone on since: two deviations at its full speed. A silent
-        footprint speaks against it, less so if the source may just not have emitted.
+        Heard within a footprint, the source has gone on since: two deviations at its full speed. A footprint
+        that is silent now speaks against it, less so if the source may just not have emitted.
         """
         known = held.detected_time >= 0
         since = torch.where(known, now - held.detected_time, torch.inf).unsqueeze(-1)
@@ -96,23 +103,39 @@ class Greedy:
         gone = torch.where(latest.isfinite(), latest * self.speed, torch.inf)
         return (log - log.amax(-1, keepdim=True)).exp(), gone <= RECENT * self.radius
 
-    def best_action(self, held: Snapshot, gain: Tensor, mask: Tensor | None) -> Tensor:
-        """The legal action that leads to the landing point [B, N, L] with most gain, [B, N]."""
+    def best_action(self, held: Snapshot, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
+        """The best legal action, [B, N]; by landing point: its gain, and how far the goal is, [B, N, L]."""
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = held.trail[..., :1] * len(action) + action
-        point, distance = (rows(table[:, 0], row) for table in self.candidates.ranking)
-        gain = gain.gather(-1, point.long()) - _NEARER * distance
-        return (gain if mask is None else gain.where(mask, -torch.inf)).argmax(-1)
+        point, flown = (rows(table[:, 0], row) for table in self.candidates.ranking)
+        gain, left = (numbers.gather(-1, point.long()) for numbers in (gain, left))
+        return _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)
 
-    def best_move(self, held: Snapshot, gain: Tensor, ground: Tensor, real: Tensor) -> Tensor:
-        """Distance and heading in [0, 1] to the landing point [B, N, L] with most gain, [B, N, 2]."""
-        distance = _apart(held.target, ground)
-        reached = (distance <= self.candidates.max_distance) & real.unsqueeze(1)
-        best = (gain - _NEARER * distance).where(reached, -torch.inf).argmax(-1, keepdim=True)
-        east, north = (ground.gather(1, best.expand(*best.shape[:2], 2)) - held.target).unbind(-1)
+    def best_move(self, held: Snapshot, gain: Tensor, left: Tensor, ground: Tensor) -> Tensor:
+        """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2]."""
+        flown = _apart(held.target, ground)
+        best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
+        east, north = (_pick(ground, best) - held.target).unbind(-1)
         turn = torch.remainder(torch.atan2(east, north) / (2 * math.pi), 1.0)
-        far = distance.gather(-1, best).squeeze(-1) / self.candidates.max_distance
+        far = flown.gather(-1, best.unsqueeze(-1)).squeeze(-1) / self.candidates.max_distance
         return torch.stack([far, turn], -1)
+
+
+def _best(gain: Tensor, flown: Tensor, left: Tensor) -> Tensor:
+    """Where most is gained, of equals the nearest; if nothing is, where least is left to the goal, [B, N].
+
+    Args:
+        gain: of each choice, -inf if it must not be made, [B, N, C].
+        flown: to get there [m], [B, N, C].
+        left: from there to where most is gained of all [m], [B, N, C].
+    """
+    some = gain.amax(-1, keepdim=True) > _NOTHING
+    return torch.where(some, gain - _NEARER * flown, -left.where(gain.isfinite(), torch.inf)).argmax(-1)
+
+
+def _pick(ground: Tensor, chosen: Tensor) -> Tensor:
+    """Places [B, N, 2] by index [B, N] among [B, L, 2]."""
+    return ground.gather(1, chosen.unsqueeze(-1).expand(*chosen.shape, 2))
 
 
 def _apart(places: Tensor, others: Tensor) -> Tensor:

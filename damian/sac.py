@@ -28,7 +28,7 @@ class SacConfig:
     lr: float = 1e-3
     """Learning rate of Adam."""
     alpha_lr: float = 1e-2
-    """That of the temperature's logarithm, which must come from ``alpha`` to the scale of the rewards first."""
+    """That of the temperature's logarithm, which has to find the scale of the rewards first."""
     gamma: float = 0.95
     """Discount factor of a step."""
     tau: float = 0.01

@@ -107,6 +107,15 @@ def test_before_anything_is_heard_the_uavs_leave_for_fresh_ground_of_their_own(t
     assert torch.equal(apart.argmin(-1), torch.arange(3))
 
 
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_a_source_beyond_reach_is_flown_to_as_far_as_can_be(kind):
+    env = field(actions=replace(FINE, kind=kind))
+    shown, there = heard(env, [380.0, 380.0]), torch.tensor([380.0, 380.0])
+    start, end = told(shown).position[0, 0], landing(env, shown)[0]
+    assert (start - there).norm() > 300 + env.worlds.simulation.radius
+    assert (start - there).norm() - (end - there).norm() > 250
+
+
 @pytest.mark.parametrize(
     ("sections", "seeks"),
     [
@@ -260,20 +269,16 @@ def test_regions_of_different_sizes_have_their_own_ground_only():
     assert not env.worlds.simulation.airspace.points.isfinite().all()
 
 
-def test_of_equally_good_places_the_nearest_is_flown_to():
-    for actions in (FINE, CONTINUOUS):
-        env = make_env(everything(actions=actions), 4, extras=["message"])
-        policy, held = Greedy(env.worlds), told(env.reset())
-        region = held.trail[:, 0, 0] // policy.points.shape[1]
-        real = policy.real[region]
-        assert not real.all()
-        if actions is FINE:
-            action = policy.best_action(held, torch.zeros(4, 3, real.shape[-1]), None)
-            distance = actions.table()[action, 0]
-        else:  # what only fills the table of a smaller region is no place
-            gain = (~real).float().unsqueeze(1).expand(-1, 3, -1)
-            distance = policy.best_move(held, gain, policy.points[region], real)[..., 0]
-        assert (distance == 0).all()
+@pytest.mark.parametrize("actions", [FINE, CONTINUOUS], ids=["discrete", "continuous"])
+def test_of_equally_good_places_the_nearest_is_flown_to(actions):
+    env = make_env(everything(actions=actions), 4, extras=["message"])
+    policy = Greedy(env.worlds)
+    assert not policy.real.all()
+    # What only fills the table of a smaller region is no place, however much it promises.
+    policy.near = (~policy.real).float().unsqueeze(1).expand_as(policy.near)
+    action = policy(env.reset()["agents", "message"])
+    distance = actions.table()[action, 0] if actions is FINE else action[..., 0]
+    assert (distance == 0).all()
 
 
 def test_it_knows_what_has_arrived_and_not_what_was_sent():
