@@ -2,7 +2,7 @@
 
     python recipes/belief.py
     python recipes/belief.py delay=paper scenario=tracking agents=2 seed=1
-    python recipes/belief.py delay.obs=3 delay.loss=0.2 motion=polynomial motion.max_speed=20
+    python recipes/belief.py delay.obs=3 delay.loss=0.2 motion=polynomial
 
 Takes what recipes/train.py takes; a flight lasts as long as an episode. The run folder explains itself:
 config.yaml, belief.png, and belief.csv with a row for each instant and UAV.

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from omegaconf import OmegaConf
 
 UNDELAYED = ["delay.obs=0", "delay.loss=0"]
-FLYING = ["motion=polynomial", "motion.max_speed=20"]
+FLYING = ["motion=polynomial", "clock.simulation=1s"]
 BADLY = ["delay=none", "delay.obs={law: uniform, low: 0, high: 5}", "delay.loss=0.3"]
 """Messages that overtake each other or are lost: every case in a short flight."""
 

@@ -285,6 +285,8 @@ def test_a_run_without_a_single_decision_in_a_batch_goes_on(run):
         "mappo.steps=4",
         "mappo.minibatches=1",
         "motion=polynomial",
+        "motion.max_speed=5",
+        "clock.simulation=1s",
         "eval_episodes=2",
         "model.hidden=[8]",
     )
