@@ -75,7 +75,7 @@ class Greedy:
         left = _apart(_pick(ground, goal), ground)
         if self.actions.kind == "discrete":
             return self.best_action(held, gain, left, mask)
-        return self.best_move(held, gain, left, ground)
+        return self.best_move(held, gain, flown, left, ground)
 
     def fresh(self, held: Snapshot, ground: Tensor) -> Tensor:
         """1 where ground [B, L, 2] is the UAV's own and not in its latest footprints, else 0, [B, N, L]."""
@@ -111,9 +111,8 @@ class Greedy:
         gain, left = (numbers.gather(-1, point.long()) for numbers in (gain, left))
         return _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)
 
-    def best_move(self, held: Snapshot, gain: Tensor, left: Tensor, ground: Tensor) -> Tensor:
+    def best_move(self, held: Snapshot, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor) -> Tensor:
         """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2]."""
-        flown = _apart(held.target, ground)
         best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
         east, north = (_pick(ground, best) - held.target).unbind(-1)
         turn = torch.remainder(torch.atan2(east, north) / (2 * math.pi), 1.0)
