@@ -216,7 +216,7 @@ def watched(**changed) -> Watched:
 
 
 def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_a_share_of_that():
-    learner = watched(lr=1e-2, tau=0.25)
+    learner = watched(lr=1e-2, alpha_lr=0.3, tau=0.25)
     loss = learner.loss
     learnt, target = (
         torch.cat([weight.flatten() for weight in getattr(loss, name).data.values(True, True)])
@@ -225,6 +225,8 @@ def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_a_share_
     # Both have begun at the same place.
     begun = (target - 0.25 * learnt) / 0.75
     assert (learnt - begun).abs().max().item() == pytest.approx(1e-2, rel=1e-2)  # of Adam's first step
+    moved = loss.log_alpha.item() - math.log(learner.config.alpha)
+    assert abs(moved) == pytest.approx(0.3, rel=1e-2)  # at a rate of its own
 
 
 def test_an_update_forgets_the_gradients_of_the_one_before():
