@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 from damian.world.airspace import Airspace, inside, nearest_points, rows
 
 MAX_PAIRS = 2_000_000_000

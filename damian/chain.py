@@ -8,12 +8,12 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, Transform, TransformedEnv
 
-from damian.compiling import compiled
+from damian.common import counter_rng
+from damian.common.compiling import compiled
 from damian.env import Shown, UavEnv
 from damian.fast_forward import FastForward
 from damian.state import Rows, where
 from damian.transforms.stateful import Entries, Memory, Stateful, taken, wide
-from damian.world import draws
 
 ACTION, ACTS = ("agents", "action"), ("agents", "acts")
 
@@ -49,7 +49,7 @@ class DelayedEnv(TransformedEnv):
         """Give every world its own streams, [B] integers: alone it does what it does among others."""
         self.worlds.seed_worlds(seeds)
         for number, transform in enumerate(self._stateful()):
-            transform.seed_worlds(draws.bits(seeds, torch.full_like(seeds, number)))
+            transform.seed_worlds(counter_rng.bits(seeds, torch.full_like(seeds, number)))
 
     def compile(self, **options: Any) -> "DelayedEnv":
         """Compile a step of ``UavEnv`` with its delays, as one graph, in place of TorchRL's bookkeeping.

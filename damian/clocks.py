@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 
 
 @dataclass

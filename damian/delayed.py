@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
-from damian import checks
 from damian.actions import ActionConfig
 from damian.chain import ACTION, DelayedEnv
+from damian.common import checks
 from damian.delays import law_of
 from damian.env import UavEnv
 from damian.fast_forward import FastForward

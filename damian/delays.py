@@ -13,10 +13,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from damian import checks
-from damian.errors import InputError
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.common.text_files import named, near, read_text, show
 from damian.sampling import HeldSampler, Recorded, Sampler
-from damian.world.reading import named, near, read_text, show
 
 Delay = int | str
 """Whole steps, or a time with its unit."""

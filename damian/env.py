@@ -13,12 +13,12 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Un
 from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
-from damian.compiling import compiled
+from damian.common import counter_rng
+from damian.common.compiling import compiled
 from damian.scenario import ScenarioConfig
 from damian.server import Features, Server
 from damian.simulation import Simulation
 from damian.state import SITUATION, Rows, State, tree_map
-from damian.world import draws
 from damian.world.airspace import rows
 
 Shown = dict[str, Any]
@@ -139,7 +139,7 @@ class UavEnv(EnvBase):
         self.state = first._replace(seed=seeds)
 
     def _set_seed(self, seed: int | None) -> None:
-        self.seed_worlds(draws.world_seeds(seed or 0, self.batch_size[0], self.device))
+        self.seed_worlds(counter_rng.world_seeds(seed or 0, self.batch_size[0], self.device))
 
     # TorchRL's hooks.
 

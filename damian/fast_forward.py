@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
-from damian import checks
+from damian.common import checks
 from damian.transforms.stateful import Change, Entries, Memory, Stateful, wide
 
 

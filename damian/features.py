@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 from damian.world.airspace import rows
 from damian.world.battery import BatteryConfig, observed
 from damian.world.coverage import FootprintTables, covered_share

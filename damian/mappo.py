@@ -13,7 +13,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from damian import checks
+from damian.common import checks
 from damian.models import ModelConfig, make_actor, make_critic
 from damian.recurrent import CARRIED
 from damian.storage import BackupdateStorage

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, TanhNormal
 from torchrl.modules.distributions import NormalParamExtractor
 
-from damian import checks
+from damian.common import checks
 from damian.recurrent import AgentGRU
 
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 from damian.features import Snapshot
 
 INDIVIDUAL = ("coverage", "spotted", "battery")

@@ -9,7 +9,7 @@ from pathlib import Path
 import matplotlib
 from torch.utils.tensorboard import SummaryWriter
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.metrics import Evaluation
 
 matplotlib.use("Agg")

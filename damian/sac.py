@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 
-from damian import checks
+from damian.common import checks
 from damian.decisions import find_decisions, transitions
 from damian.models import ModelConfig, make_action_value, make_actor
 from damian.storage import TimeStorage

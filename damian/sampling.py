@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from damian import checks
-from damian.world import draws
+from damian.common import checks, counter_rng
 
 
 class Sampler(nn.Module):
@@ -52,13 +51,13 @@ class Sampler(nn.Module):
 
     def begin(self, streams: Tensor) -> Tensor:
         """State of each channel at first, from its stream of random numbers [M]."""
-        return (draws.uniform(streams) < self._bad).long()
+        return (counter_rng.uniform(streams) < self._bad).long()
 
     def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Delays [M] of the messages sent at ``clock``, and the channels' next states [M]."""
         if self.certain is not None:
             return torch.full_like(streams, self.certain), memory
-        chance = draws.bits(streams, clock)
+        chance = counter_rng.bits(streams, clock)
         if len(self.chances) == 1:
             return torch.bucketize(chance, self._boundaries[0], right=True), memory
         outcome = (chance.unsqueeze(-1) >= self._boundaries[memory]).sum(-1)
@@ -80,12 +79,12 @@ class Recorded(Sampler):
         self.register_buffer("_delays", torch.tensor(code), persistent=False)
 
     def begin(self, streams: Tensor) -> Tensor:
-        return draws.bits(streams) % len(self._delays)
+        return counter_rng.bits(streams) % len(self._delays)
 
     def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         delay = self._delays[memory]
         if self._loss:
-            delay = torch.where(draws.uniform(streams, clock) < self._loss, self.lost, delay)
+            delay = torch.where(counter_rng.uniform(streams, clock) < self._loss, self.lost, delay)
         return delay, (memory + 1) % len(self._delays)
 
 

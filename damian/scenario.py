@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from damian import checks
 from damian.actions import ActionConfig
 from damian.clocks import ClockConfig
+from damian.common import checks
 from damian.delays import DelayConfig
 from damian.features import ObservationConfig
 from damian.rewards import EpisodeConfig, RewardConfig

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.features import EXACT, Knowledge, Snapshot, observe, stack
 from damian.rewards import Counters, Status, final_reward, reward, status
 from damian.scenario import ScenarioConfig

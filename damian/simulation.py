@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from damian.actions import Candidates, book
-from damian.errors import InputError
+from damian.common import counter_rng
+from damian.common.errors import InputError
 from damian.features import Snapshot
 from damian.scenario import ScenarioConfig
 from damian.state import EPISODE, SEED, Layout, Rows, State, tree_map, where
-from damian.world import draws
 from damian.world.airspace import Airspace, inside, nearest_points, rows
 from damian.world.battery import (
     charge_gain,
@@ -83,7 +83,7 @@ class Simulation:
     def next_episode(self, worlds: Rows) -> Rows:
         """A new episode in each of these worlds."""
         seed, episode = worlds.integers[:, SEED], worlds.integers[:, EPISODE] + 1
-        situation = draws.bits(seed, episode) % self.n_situations
+        situation = counter_rng.bits(seed, episode) % self.n_situations
         fresh = tree_map(lambda table: table.index_select(0, situation), self.beginnings)
         kept = torch.stack([seed, episode], 1)  # the first two columns
         return fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
@@ -244,7 +244,7 @@ class Simulation:
             if config.emission == "per_stop":
                 emits = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
         if config.emission == "per_step":
-            chance = draws.uniform(state.seed, state.episode, state.steps)
+            chance = counter_rng.uniform(state.seed, state.episode, state.steps)
             emits = chance < config.emission_probability
         return place, emits & ~over, over
 
@@ -288,7 +288,7 @@ class Simulation:
             trail=goal.unsqueeze(-1).repeat(1, 1, self.config.observation.window),
         )
         state = State(
-            seed=draws.world_seeds(seed, n),
+            seed=counter_rng.world_seeds(seed, n),
             episode=torch.zeros_like(number),
             situation=number,
             region=region,

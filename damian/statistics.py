@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from damian import checks
+from damian.common import checks
 
 Floats = NDArray[np.floating]
 

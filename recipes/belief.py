@@ -22,9 +22,9 @@ from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from damian.common.errors import InputError
 from damian.delayed import make_env
 from damian.env import UavEnv
-from damian.errors import InputError
 from damian.features import Snapshot
 from damian.figures import Beliefs, plot_beliefs
 from damian.models import random_policy

@@ -30,10 +30,10 @@ from omegaconf.errors import OmegaConfBaseException
 from parallel import LOG, Run, check_stored, perform_all
 from settings import CONF
 
-from damian import checks
+from damian.common import checks
+from damian.common.errors import InputError
 from damian.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison
 from damian.comparison_report import LABELS, markdown, plot_curves, plot_norms
-from damian.errors import InputError
 from damian.runs import read_metrics
 
 ALL_RESULTS, TABLE, MARKDOWN, FIGURE = "results.csv", "table.csv", "table.md", "figure.png"

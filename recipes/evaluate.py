@@ -18,7 +18,7 @@ from torchrl.modules import ProbabilisticActor
 from train import report, unseen
 
 from damian.chain import DelayedEnv
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.models import make_actor
 
 

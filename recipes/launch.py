@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.runs import CHECKPOINT, CONFIG
 from damian.scenario import leftovers
 

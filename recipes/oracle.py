@@ -19,8 +19,8 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import StepCounter
 
+from damian.common.errors import InputError
 from damian.delayed import messages_are_late
-from damian.errors import InputError
 from damian.features import Snapshot
 from damian.metrics import evaluate
 from damian.runs import save_results

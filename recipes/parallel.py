@@ -23,7 +23,7 @@ from settings import TrainConfig
 from tqdm import tqdm
 from train import train
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.runs import CHECKPOINT, CONFIG, RESULTS
 
 LOG = "log.txt"

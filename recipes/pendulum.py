@@ -37,8 +37,8 @@ from torchrl.envs import (
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from damian import checks
-from damian.errors import InputError
+from damian.common import checks
+from damian.common.errors import InputError
 from damian.models import ModelConfig
 from damian.sac import Sac, SacConfig
 from damian.transforms import ActionHistory, ObservationDelay

@@ -12,8 +12,8 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from damian import checks
 from damian.clocks import SystemClock
+from damian.common import checks
 from damian.delayed import is_late
 from damian.env import PRIVILEGED
 from damian.mappo import MappoConfig

@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from damian.common import counter_rng
 from damian.sampling import Sampler
-from damian.world import draws
 
 
 def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
@@ -145,7 +145,9 @@ class Counting(EnvBase):
     def _flag(self, salt: int) -> Tensor:
         """A flag that is true two times out of three, [B, N]."""
         agents = torch.arange(self.n_agents)
-        return draws.bits(self.names.unsqueeze(-1), agents, torch.tensor([2 * self.total + salt])) % 3 > 0
+        return (
+            counter_rng.bits(self.names.unsqueeze(-1), agents, torch.tensor([2 * self.total + salt])) % 3 > 0
+        )
 
     def _show(self) -> TensorDict:
         shape = (*self.batch_size, self.n_agents)
@@ -178,7 +180,7 @@ class Counting(EnvBase):
         shown = self._show()
         reward = (self.x + 100 * self.names.unsqueeze(-1) - 1000 * self.lies).float()
         shown["agents"].set("reward", reward.unsqueeze(-1))
-        over = draws.uniform(self.names, torch.tensor(self.total)) < self.ends
+        over = counter_rng.uniform(self.names, torch.tensor(self.total)) < self.ends
         return shown.set("done", over.unsqueeze(-1)).set("terminated", over.unsqueeze(-1))
 
     def _set_seed(self, seed: int | None) -> None:

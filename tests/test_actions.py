@@ -14,7 +14,7 @@ from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from damian.actions import ActionConfig, Candidates, Ranking, book, displacement
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.world.airspace import build_airspace, inside, nearest_points
 from damian.world.regions import Region
 

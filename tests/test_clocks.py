@@ -12,8 +12,8 @@ from torchrl.collectors import Collector
 from train import learning_env, spotting, ticks
 
 from damian.clocks import ClockConfig, SystemClock
+from damian.common.errors import InputError
 from damian.delays import DelayConfig
-from damian.errors import InputError
 from damian.features import Snapshot
 from damian.models import random_policy
 from damian.rewards import EpisodeConfig

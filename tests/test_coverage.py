@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Point, Polygon
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.world import coverage
 from damian.world.coverage import build_tables, covered_share
 

@@ -7,6 +7,8 @@ import torch
 from delay_twin import drawn
 from torch import Tensor
 
+from damian.common import counter_rng
+from damian.common.errors import InputError
 from damian.delays import (
     LONGEST,
     Burst,
@@ -19,11 +21,9 @@ from damian.delays import (
     in_steps,
     law_of,
 )
-from damian.errors import InputError
 from damian.sampling import Sampler
 from damian.scenario import ScenarioConfig
 from damian.transforms import RewardDelay
-from damian.world import draws
 
 STREAMS, STEPS = 1000, 100
 """10^5 messages."""
@@ -31,7 +31,7 @@ STREAMS, STEPS = 1000, 100
 
 def sample(sampler: Sampler, n_streams: int = STREAMS, n_steps: int = STEPS) -> Tensor:
     """Delays of messages, [T, M]."""
-    return drawn(sampler, draws.world_seeds(5, n_streams), n_steps)
+    return drawn(sampler, counter_rng.world_seeds(5, n_streams), n_steps)
 
 
 def check_chances(sampler: Sampler, chances: dict[int, float], delays: Tensor) -> None:
@@ -118,7 +118,7 @@ def test_each_delay_is_independent_of_the_one_before(name):
 
 def test_a_sender_draws_the_same_delays_among_others_as_alone():
     sampler = Burst(bad=PAPER).sampler()
-    streams = draws.world_seeds(5, 8)
+    streams = counter_rng.world_seeds(5, 8)
     alone = [sampler(one, torch.tensor(9), torch.ones(1, dtype=torch.long))[0] for one in streams.split(1)]
     together, _ = sampler(streams, torch.tensor(9), torch.ones(8, dtype=torch.long))
     assert together.equal(torch.cat(alone))

@@ -14,10 +14,10 @@ from torchrl.envs.utils import check_env_specs
 
 from damian.actions import ActionConfig
 from damian.clocks import ClockConfig
+from damian.common.errors import InputError
 from damian.delayed import ACTION, REWARD, DelayedEnv, make_env
 from damian.delays import DelayConfig
 from damian.env import UavEnv
-from damian.errors import InputError
 from damian.fast_forward import FastForward
 from damian.rewards import EpisodeConfig
 from damian.scenario import ScenarioConfig

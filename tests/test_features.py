@@ -9,7 +9,7 @@ from helpers import SCALE, TIME_SCALE, random_worlds, snapshot_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.features import GLOBAL, LOCAL, ObservationConfig, Snapshot, observe, stack
 
 NAMES = [name for name in (*LOCAL, *GLOBAL) if name != "coverage"]

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.world.motion import (
     MotionConfig,
     flight_levels,

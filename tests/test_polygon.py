@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.world.polygon import (
     landing_lattice,
     largest_vertex_distance,

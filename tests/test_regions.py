@@ -10,12 +10,12 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
 import damian
-from damian.errors import InputError
+from damian.common.errors import InputError
+from damian.common.text_files import MAX_BYTES
 from damian.world.fir import read_fir
 from damian.world.geodesy import EARTH_RADIUS_M, to_latlon
 from damian.world.geojson import read_geojson
 from damian.world.polygon import landing_lattice
-from damian.world.reading import MAX_BYTES
 from damian.world.regions import Region
 
 DATA = Path(__file__).parent / "data" / "regions"

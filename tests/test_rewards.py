@@ -10,7 +10,7 @@ from helpers import random_worlds, snapshot_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.rewards import (
     INDIVIDUAL,
     SYSTEM,

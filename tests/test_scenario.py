@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.scenario import RegionConfig, ScenarioConfig, leftovers
 from damian.world.motion import MotionConfig
 

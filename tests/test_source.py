@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.world.source import (
     SourceConfig,
     Walk,

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.statistics import bootstrap, interquartile_mean, interval, normalised, recovery, resampled
 
 

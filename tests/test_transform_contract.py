@@ -31,9 +31,9 @@ from torchrl.envs import Compose, ParallelEnv, RewardSum, SerialEnv, Transform, 
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
+from damian.common.errors import InputError
 from damian.delayed import make_env
 from damian.delays import DelayConfig
-from damian.errors import InputError
 from damian.transforms import (
     ActionDelay,
     ActionHistory,

@@ -24,6 +24,7 @@ from torchrl.data import (
 from torchrl.envs import Compose, EnvBase, GymEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from damian.common import counter_rng
 from damian.delays import Burst, Geometric, Trace, Uniform
 from damian.transforms import (
     ActionDelay,
@@ -34,7 +35,6 @@ from damian.transforms import (
     RewardDelay,
     Stateful,
 )
-from damian.world import draws
 
 ACTION, REWARD, OBSERVATION = ("agents", "action"), ("agents", "reward"), ("agents", "observation")
 WORLDS, N_AGENTS, STEPS = [3, 5, 8, 13], 2, 40
@@ -73,13 +73,13 @@ def delayed(*transforms: Stateful, worlds: Sequence[int] = WORLDS, **options: An
 
 def streams_of(worlds: Sequence[int]) -> Tensor:
     """Random streams that the transforms of ``delayed`` draw from, [M]."""
-    return draws.bits(torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)).flatten()
+    return counter_rng.bits(torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)).flatten()
 
 
 def choices(worlds: Sequence[int] = WORLDS, n_steps: int = STEPS) -> list[Tensor]:
     """What each world's agents do, whoever is stepped beside them, [B, N] for each step."""
     names, agents = torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)
-    return [draws.bits(names, agents, torch.tensor([t])) % Counting.N_ACTIONS for t in range(n_steps)]
+    return [counter_rng.bits(names, agents, torch.tensor([t])) % Counting.N_ACTIONS for t in range(n_steps)]
 
 
 def column(shown: Sequence[TensorDictBase], *key: str) -> list:

@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 from damian.delays import Delay, in_steps
 from damian.transforms.stateful import (
     Change,

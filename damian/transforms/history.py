@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
-from damian import checks
+from damian.common import checks
 from damian.transforms.action import OnActions
 from damian.transforms.stateful import Change, Entries, Memory, Uses, as_rows, beside, from_rows, wide
 from damian.world.airspace import rows

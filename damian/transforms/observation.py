@@ -8,7 +8,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
-from damian import checks
+from damian.common import checks
 from damian.delays import ORDERS, law_of
 from damian.transforms.mailbox import Delivery, Mailbox
 from damian.transforms.stateful import (

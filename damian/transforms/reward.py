@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 from damian.delays import LOSES, law_of
 from damian.transforms.mailbox import after
 from damian.transforms.stateful import (

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Compose, EnvBase, Transform
 
-from damian.errors import InputError
-from damian.world import draws
+from damian.common import counter_rng
+from damian.common.errors import InputError
 
 Memory = dict[str, Tensor]
 """What a transform remembers, by the name of its buffer."""
@@ -245,11 +245,11 @@ class Stateful(Transform):
         if self._world_seeds is not None:
             worlds = self._world_seeds.to(device)
         elif self._seed is not None:
-            worlds = draws.world_seeds(self._seed, n_worlds, device)
+            worlds = counter_rng.world_seeds(self._seed, n_worlds, device)
         else:
             worlds = torch.randint(2**32, (n_worlds,)).to(device)
         each = torch.arange(self.rows.numel() // n_worlds, device=device)
-        return draws.bits(worlds.view(-1, 1), each).flatten()
+        return counter_rng.bits(worlds.view(-1, 1), each).flatten()
 
     # Where it may stand.
 

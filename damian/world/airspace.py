@@ -7,7 +7,7 @@ import shapely
 import torch
 from torch import Tensor
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 from damian.world.polygon import landing_lattice, largest_vertex_distance
 from damian.world.regions import Region
 

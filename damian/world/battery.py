@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 
 _VERTICAL_FACTOR = 0.9
 """Takeoff and landing: the base that the engine's power is divided by shrinks by 10 %."""

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 
 # Offsets from -2R to 2R along each axis; odd, so that "the same place" (offset 0) is exact.
 _GRID = 321

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from damian.errors import InputError
-from damian.world.reading import listed, named, near, read_text, show
+from damian.common.errors import InputError
+from damian.common.text_files import listed, named, near, read_text, show
 from damian.world.regions import Region, local_region
 
 _ID, _SEQUENCE = "Airspace ID", "Sequence Number"

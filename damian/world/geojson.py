@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from damian.errors import InputError
+from damian.common.errors import InputError
+from damian.common.text_files import listed, named, near, read_text, show
 from damian.world.geodesy import Floats
-from damian.world.reading import listed, named, near, read_text, show
 from damian.world.regions import Region, local_region
 
 _SHAPES = ("Polygon", "MultiPolygon")

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 
 _TINY = 1e-9
 

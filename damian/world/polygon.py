@@ -13,8 +13,8 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 from shapely.geometry import MultiPoint, MultiPolygon, Polygon
 
-from damian import checks
-from damian.errors import InputError
+from damian.common import checks
+from damian.common.errors import InputError
 
 Floats = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
-from damian.errors import InputError
+from damian.common.errors import InputError
+from damian.common.text_files import one_line
 from damian.world.geodesy import Floats, to_local, wrap_longitude
 from damian.world.polygon import polygon_from_rings
-from damian.world.reading import one_line
 
 
 @dataclass(frozen=True)

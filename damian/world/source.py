@@ -15,7 +15,7 @@ import shapely
 import torch
 from torch import Tensor
 
-from damian import checks
+from damian.common import checks
 from damian.world.polygon import sample_interior
 
 _Polygon = shapely.Polygon | shapely.MultiPolygon

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 
 MAX_BYTES = 50_000_000
 """Larger files are refused unread."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from damian.errors import InputError
+from damian.common.errors import InputError
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 

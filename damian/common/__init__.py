@@ -1,0 +1,1 @@
+"""Checks, errors, random numbers and other helpers that know nothing of UAVs or of learning."""
