@@ -12,8 +12,8 @@ from damian.common import counter_rng
 from damian.common.compiling import compiled
 from damian.env import Shown, UavEnv
 from damian.fast_forward import FastForward
-from damian.state import Rows, where
 from damian.transforms.stateful import Entries, Memory, Stateful, taken, wide
+from damian.world.state import Rows, where
 
 ACTION, ACTS = ("agents", "action"), ("agents", "acts")
 

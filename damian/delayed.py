@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
-from damian.actions import ActionConfig
 from damian.chain import ACTION, DelayedEnv
 from damian.common import checks
 from damian.delays import law_of
@@ -24,6 +23,7 @@ from damian.transforms import (
     RewardDelay,
     ServerNode,
 )
+from damian.world.landing import ActionConfig
 
 REWARD, SEEN = ("agents", "reward"), ("agents", "observation")
 

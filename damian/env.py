@@ -17,9 +17,9 @@ from damian.common import counter_rng
 from damian.common.compiling import compiled
 from damian.scenario import ScenarioConfig
 from damian.server import Features, Server
-from damian.simulation import Simulation
-from damian.state import SITUATION, Rows, State, tree_map
 from damian.world.airspace import rows
+from damian.world.simulation import Simulation
+from damian.world.state import SITUATION, Rows, State, tree_map
 
 Shown = dict[str, Any]
 """What a step shows, as nested dictionaries of tensors."""

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from damian.actions import ActionConfig
 from damian.clocks import ClockConfig
 from damian.common import checks
 from damian.delays import DelayConfig
@@ -13,12 +12,13 @@ from damian.features import ObservationConfig
 from damian.rewards import EpisodeConfig, RewardConfig
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import BatteryConfig
-from damian.world.fir import read_fir
-from damian.world.geojson import read_geojson
+from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig, flight_levels
-from damian.world.polygon import polygon_from_vertices, random_polygon
-from damian.world.regions import Region
-from damian.world.source import SourceConfig
+from damian.world.regions.fir import read_fir
+from damian.world.regions.geojson import read_geojson
+from damian.world.regions.polygon import polygon_from_vertices, random_polygon
+from damian.world.regions.region import Region
+from damian.world.signal_source import SourceConfig
 
 FLIGHT_LEVEL_M = 30.48
 """A flight level is a hundred feet."""

@@ -13,16 +13,16 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from twin import Uav
 
-from damian.actions import ActionConfig
 from damian.clocks import ClockConfig
 from damian.env import UavEnv
 from damian.features import GLOBAL, LOCAL, Knowledge, ObservationConfig, Snapshot
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
-from damian.state import State
 from damian.world.battery import BatteryConfig
+from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
-from damian.world.source import SourceConfig
+from damian.world.signal_source import SourceConfig
+from damian.world.state import State
 
 DATA = Path(__file__).parent / "data"
 

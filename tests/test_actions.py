@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Polygon
 
-from damian.actions import ActionConfig, Candidates, Ranking, book, displacement
 from damian.common.errors import InputError
 from damian.world.airspace import build_airspace, inside, nearest_points
-from damian.world.regions import Region
+from damian.world.landing import ActionConfig, Candidates, Ranking, book, displacement
+from damian.world.regions.region import Region
 
 
 def fleets(seed, n_worlds, n_agents, n_points, together):

@@ -32,7 +32,7 @@ from damian.features import Snapshot
 from damian.rewards import EpisodeConfig
 from damian.scenario import ScenarioConfig
 from damian.transforms import ActionDelay, Clock, CumulativeReward, RewardDelay
-from damian.world.source import SourceConfig
+from damian.world.signal_source import SourceConfig
 
 READY, BROADCAST = ("agents", "ready"), ("agents", "global_observation")
 RECEIVED, MESSAGE, AGE = ("agents", "received"), ("agents", "message"), ("agents", "age")

@@ -25,10 +25,10 @@ from helpers import (
 from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
-from damian.actions import ActionConfig
 from damian.env import UavEnv
 from damian.rewards import INDIVIDUAL, SYSTEM
 from damian.scenario import ScenarioConfig
+from damian.world.landing import ActionConfig
 
 # TorchRL's contract.
 

@@ -30,7 +30,7 @@ from helpers import (
 from damian.rewards import EpisodeConfig, RewardConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
 from damian.world.motion import MotionConfig
-from damian.world.source import SourceConfig
+from damian.world.signal_source import SourceConfig
 
 # Ends.
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from damian.actions import ActionConfig
 from damian.clocks import ClockConfig
 from damian.common.errors import InputError
 from damian.delayed import ACTION, REWARD, DelayedEnv, make_env
@@ -21,6 +20,7 @@ from damian.env import UavEnv
 from damian.fast_forward import FastForward
 from damian.rewards import EpisodeConfig
 from damian.scenario import ScenarioConfig
+from damian.world.landing import ActionConfig
 
 LATE = {"law": "uniform", "low": 1, "high": 5, "probability": 0.6}
 BURST = {"law": "burst", "enter": 0.3, "leave": 0.3, "bad": 4}

@@ -30,14 +30,14 @@ from helpers import (
     usecase,
 )
 
-from damian.actions import ActionConfig
 from damian.env import UavEnv
 from damian.rewards import EpisodeConfig
 from damian.scenario import RegionConfig, ScenarioConfig
-from damian.state import State
 from damian.world.battery import BatteryConfig, flight_drain
+from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
-from damian.world.source import SourceConfig
+from damian.world.signal_source import SourceConfig
+from damian.world.state import State
 
 # Where UAVs stand.
 

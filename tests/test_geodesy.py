@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.world.geodesy import EARTH_RADIUS_M, to_latlon, to_local, wrap_longitude
+from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon, to_local, wrap_longitude
 
 ONE_DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 reproducible = settings(derandomize=True, deadline=None)

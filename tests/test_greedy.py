@@ -10,7 +10,6 @@ from helpers import clock, everything, told, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from damian.actions import ActionConfig, displacement
 from damian.chain import DelayedEnv
 from damian.delayed import make_env
 from damian.delays import DelayConfig
@@ -20,7 +19,8 @@ from damian.metrics import evaluate
 from damian.models import random_policy
 from damian.rewards import EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
-from damian.world.source import SourceConfig
+from damian.world.landing import ActionConfig, displacement
+from damian.world.signal_source import SourceConfig
 
 FIELD = [[0.0, 0.0], [400.0, 0.0], [400.0, 400.0], [0.0, 400.0]]
 STARTS = [[50.0, 50.0], [200.0, 200.0], [360.0, 260.0]]

@@ -12,7 +12,6 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.actions import ActionConfig
 from damian.delayed import make_env
 from damian.delays import DelayConfig
 from damian.env import UavEnv
@@ -22,6 +21,7 @@ from damian.models import ModelConfig, make_actor, make_critic, random_policy
 from damian.rewards import EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
 from damian.storage import BackupdateStorage, server_view
+from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
 
 SMALL = ModelConfig(hidden=[16])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon
 
 from damian.common.errors import InputError
-from damian.world.polygon import (
+from damian.world.regions.polygon import (
     landing_lattice,
     largest_vertex_distance,
     polygon_from_vertices,

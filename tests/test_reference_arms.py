@@ -30,7 +30,6 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from train import learning_env, main, make_learner
 
-from damian.actions import ActionConfig
 from damian.chain import DelayedEnv
 from damian.clocks import ClockConfig, SystemClock
 from damian.delayed import make_env, messages_are_late
@@ -40,7 +39,8 @@ from damian.mappo import Mappo, MappoConfig
 from damian.models import ModelConfig, make_critic
 from damian.sac import Sac
 from damian.scenario import ScenarioConfig
-from damian.world.source import SourceConfig
+from damian.world.landing import ActionConfig
+from damian.world.signal_source import SourceConfig
 
 PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
 BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}

@@ -12,11 +12,11 @@ from shapely.geometry import MultiPolygon, Polygon
 import damian
 from damian.common.errors import InputError
 from damian.common.text_files import MAX_BYTES
-from damian.world.fir import read_fir
-from damian.world.geodesy import EARTH_RADIUS_M, to_latlon
-from damian.world.geojson import read_geojson
-from damian.world.polygon import landing_lattice
-from damian.world.regions import Region
+from damian.world.regions.fir import read_fir
+from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon
+from damian.world.regions.geojson import read_geojson
+from damian.world.regions.polygon import landing_lattice
+from damian.world.regions.region import Region
 
 DATA = Path(__file__).parent / "data" / "regions"
 FIR, ZONES = DATA / "fir.csv", DATA / "zones.geojson"

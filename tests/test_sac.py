@@ -12,7 +12,6 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.actions import ActionConfig
 from damian.decisions import find_decisions, transitions
 from damian.delayed import make_env
 from damian.delays import DelayConfig
@@ -22,6 +21,7 @@ from damian.models import ModelConfig
 from damian.rewards import EpisodeConfig
 from damian.sac import LOSSES, Sac, SacConfig
 from damian.storage import BackupdateStorage, TimeStorage, server_view
+from damian.world.landing import ActionConfig
 
 SMALL = ModelConfig(hidden=[16])
 FAST = SacConfig(updates=2, batch=64, warm_up=0)

@@ -12,14 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
-from damian.world.source import (
-    SourceConfig,
-    Walk,
-    draw_walks,
-    footprint_radius,
-    leg_duration,
-    locate,
-)
+from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, leg_duration, locate
 
 DATA = Path(__file__).parent / "data"
 SCENARIO = json.loads((DATA / "usecase1.json").read_text())["scenario"]

@@ -18,12 +18,12 @@ from helpers import (
     told,
 )
 
-from damian.actions import ActionConfig
 from damian.env import UavEnv
 from damian.features import GLOBAL, LOCAL, ObservationConfig
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
-from damian.world.source import SourceConfig
+from damian.world.landing import ActionConfig
+from damian.world.signal_source import SourceConfig
 
 # The slow twin.
 

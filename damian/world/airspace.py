@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from damian.common.errors import InputError
-from damian.world.polygon import landing_lattice, largest_vertex_distance
-from damian.world.regions import Region
+from damian.world.regions.polygon import landing_lattice, largest_vertex_distance
+from damian.world.regions.region import Region
 
 
 @dataclass(frozen=True)

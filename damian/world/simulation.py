@@ -10,12 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from damian.actions import Candidates, book
 from damian.common import counter_rng
 from damian.common.errors import InputError
 from damian.features import Snapshot
 from damian.scenario import ScenarioConfig
-from damian.state import EPISODE, SEED, Layout, Rows, State, tree_map, where
 from damian.world.airspace import Airspace, inside, nearest_points, rows
 from damian.world.battery import (
     charge_gain,
@@ -24,9 +22,11 @@ from damian.world.battery import (
     used_so_far,
     vertical_drain,
 )
+from damian.world.landing import Candidates, book
 from damian.world.motion import flight_levels, fly, minimum_time
-from damian.world.polygon import MAX_COORDINATE_M
-from damian.world.source import Walk, draw_walks, footprint_radius, locate
+from damian.world.regions.polygon import MAX_COORDINATE_M
+from damian.world.signal_source import Walk, draw_walks, footprint_radius, locate
+from damian.world.state import EPISODE, SEED, Layout, Rows, State, tree_map, where
 
 _TIME_EPS = 1e-4
 """Seconds; far below any step, far above float32 error within an episode."""

@@ -2,6 +2,8 @@
 
 import torch
 
+from damian.common import counter_rng
+
 
 def test_the_hash_agrees_with_a_plain_one():
     def lowbias32(x: int) -> int:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.world.polygon import sample_interior
+from damian.world.regions.polygon import sample_interior
 
 _Polygon = shapely.Polygon | shapely.MultiPolygon
 

@@ -10,8 +10,8 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
-from damian.world.geodesy import Floats, to_local, wrap_longitude
-from damian.world.polygon import polygon_from_rings
+from damian.world.regions.geodesy import Floats, to_local, wrap_longitude
+from damian.world.regions.polygon import polygon_from_rings
 
 
 @dataclass(frozen=True)

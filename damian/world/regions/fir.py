@@ -10,7 +10,7 @@ import numpy as np
 
 from damian.common.errors import InputError
 from damian.common.text_files import listed, named, near, read_text, show
-from damian.world.regions import Region, local_region
+from damian.world.regions.region import Region, local_region
 
 _ID, _SEQUENCE = "Airspace ID", "Sequence Number"
 _LOWEST, _HIGHEST = "Min Flight Level", "Max Flight Level"

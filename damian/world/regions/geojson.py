@@ -9,8 +9,8 @@ import numpy as np
 
 from damian.common.errors import InputError
 from damian.common.text_files import listed, named, near, read_text, show
-from damian.world.geodesy import Floats
-from damian.world.regions import Region, local_region
+from damian.world.regions.geodesy import Floats
+from damian.world.regions.region import Region, local_region
 
 _SHAPES = ("Polygon", "MultiPolygon")
 _BOUNDS = (("longitude", -180.0, 180.0), ("latitude", -90.0, 90.0))
