@@ -9,7 +9,7 @@ from torchrl.envs import Compose, Transform
 
 from damian.chain import ACTION, DelayedEnv
 from damian.common import checks
-from damian.delays import law_of
+from damian.delays.laws import law_of
 from damian.env import UavEnv
 from damian.fast_forward import FastForward
 from damian.scenario import ScenarioConfig

@@ -7,7 +7,7 @@ import numpy as np
 
 from damian.clocks import ClockConfig
 from damian.common import checks
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.features import ObservationConfig
 from damian.rewards import EpisodeConfig, RewardConfig
 from damian.world.airspace import Airspace, build_airspace

@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from damian.clocks import ClockConfig
 from damian.delayed import make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.env import EXTRAS, UavEnv
 from damian.features import GLOBAL, LOCAL, ObservationConfig
 from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig

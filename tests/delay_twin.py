@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from damian.common import counter_rng
-from damian.sampling import Sampler
+from damian.delays.samplers import Sampler
 
 
 def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:

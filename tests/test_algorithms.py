@@ -11,7 +11,7 @@ from train import learning_env, make_learner, train
 
 from damian.chain import DelayedEnv
 from damian.clocks import ClockConfig, SystemClock
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.mappo import Mappo, MappoConfig
 from damian.models import ModelConfig
 from damian.sac import Sac, SacConfig

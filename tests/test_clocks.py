@@ -13,7 +13,7 @@ from train import learning_env, spotting, ticks
 
 from damian.clocks import ClockConfig, SystemClock
 from damian.common.errors import InputError
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.features import Snapshot
 from damian.models import random_policy
 from damian.rewards import EpisodeConfig

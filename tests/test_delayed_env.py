@@ -26,7 +26,7 @@ from torchrl.envs.utils import check_env_specs
 
 from damian.clocks import ClockConfig
 from damian.delayed import ACTION, REWARD, SEEN, DelayedEnv, chain, holding, make_env, serving
-from damian.delays import DelayConfig, law_of
+from damian.delays.laws import DelayConfig, law_of
 from damian.env import EXTRAS, UavEnv
 from damian.features import Snapshot
 from damian.rewards import EpisodeConfig

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from damian.common import counter_rng
 from damian.common.errors import InputError
-from damian.delays import (
+from damian.delays.laws import (
     LONGEST,
     Burst,
     Constant,
@@ -21,7 +21,7 @@ from damian.delays import (
     in_steps,
     law_of,
 )
-from damian.sampling import Sampler
+from damian.delays.samplers import Sampler
 from damian.scenario import ScenarioConfig
 from damian.transforms import RewardDelay
 

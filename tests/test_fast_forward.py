@@ -15,7 +15,7 @@ from torchrl.envs.utils import check_env_specs
 from damian.clocks import ClockConfig
 from damian.common.errors import InputError
 from damian.delayed import ACTION, REWARD, DelayedEnv, make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.env import UavEnv
 from damian.fast_forward import FastForward
 from damian.rewards import EpisodeConfig

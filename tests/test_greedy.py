@@ -12,7 +12,7 @@ from torch import Tensor
 
 from damian.chain import DelayedEnv
 from damian.delayed import make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.features import ObservationConfig
 from damian.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.metrics import evaluate

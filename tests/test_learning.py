@@ -13,7 +13,7 @@ from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.delayed import make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.env import UavEnv
 from damian.features import Snapshot
 from damian.mappo import Mappo, MappoConfig, add_advantages, losses_of, mappo_loss

@@ -14,7 +14,7 @@ from torchrl.envs import RewardSum, StepCounter
 from damian.chain import DelayedEnv
 from damian.common.errors import InputError
 from damian.delayed import make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.features import Snapshot
 from damian.metrics import EpisodeLog, Evaluation, evaluate, evaluation
 from damian.models import random_policy

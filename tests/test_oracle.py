@@ -11,7 +11,7 @@ from launch import launch
 from torchrl.envs import StepCounter
 
 from damian.delayed import make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.features import Snapshot
 
 TINY = ["frames=64", "worlds=4", "mappo.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]

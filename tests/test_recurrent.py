@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.chain import DelayedEnv
 from damian.delayed import make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.mappo import Mappo, MappoConfig, mappo_loss
 from damian.metrics import evaluate
 from damian.models import ModelConfig, make_actor

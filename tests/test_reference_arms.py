@@ -33,7 +33,7 @@ from train import learning_env, main, make_learner
 from damian.chain import DelayedEnv
 from damian.clocks import ClockConfig, SystemClock
 from damian.delayed import make_env, messages_are_late
-from damian.delays import DelayConfig, Held, law_of
+from damian.delays.laws import DelayConfig, Held, law_of
 from damian.env import EXTRAS, PRIVILEGED
 from damian.mappo import Mappo, MappoConfig
 from damian.models import ModelConfig, make_critic

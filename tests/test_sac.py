@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.decisions import find_decisions, transitions
 from damian.delayed import make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.env import PRIVILEGED, UavEnv
 from damian.features import Snapshot
 from damian.models import ModelConfig

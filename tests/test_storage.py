@@ -11,7 +11,7 @@ from torchrl.data import SamplerWithoutReplacement, SliceSampler, TensorDictRepl
 from torchrl.envs import StepCounter
 
 from damian.delayed import make_env
-from damian.delays import DelayConfig
+from damian.delays.laws import DelayConfig
 from damian.env import EXTRAS
 from damian.features import Snapshot
 from damian.hindsight import Mail, hindsight, over_before

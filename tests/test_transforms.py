@@ -25,7 +25,7 @@ from torchrl.envs import Compose, EnvBase, GymEnv, SerialEnv, Transform, Transfo
 from torchrl.envs.utils import check_env_specs
 
 from damian.common import counter_rng
-from damian.delays import Burst, Geometric, Trace, Uniform
+from damian.delays.laws import Burst, Geometric, Trace, Uniform
 from damian.transforms import (
     ActionDelay,
     ActionHistory,

@@ -8,8 +8,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
-from damian.delays import law_of
-from damian.transforms.mailbox import Mailbox
+from damian.delays.delay_line import Mailbox
+from damian.delays.laws import law_of
 from damian.transforms.stateful import (
     Change,
     Entries,

@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian.common import checks
-from damian.delays import Delay, in_steps
+from damian.delays.laws import Delay, in_steps
 from damian.transforms.stateful import (
     Change,
     Entries,

@@ -9,8 +9,8 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
 from damian.common import checks
-from damian.delays import ORDERS, law_of
-from damian.transforms.mailbox import Delivery, Mailbox
+from damian.delays.delay_line import Delivery, Mailbox
+from damian.delays.laws import ORDERS, law_of
 from damian.transforms.stateful import (
     Change,
     Entries,

@@ -7,8 +7,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian.common import checks
-from damian.delays import LOSES, law_of
-from damian.transforms.mailbox import after
+from damian.delays.delay_line import after
+from damian.delays.laws import LOSES, law_of
 from damian.transforms.stateful import (
     Change,
     Entries,

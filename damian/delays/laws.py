@@ -16,7 +16,7 @@ from typing import Any
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.text_files import named, near, read_text, show
-from damian.sampling import HeldSampler, Recorded, Sampler
+from damian.delays.samplers import HeldSampler, Recorded, Sampler
 
 Delay = int | str
 """Whole steps, or a time with its unit."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.sampling import Sampler
+from damian.delays.samplers import Sampler
 from damian.transforms.stateful import Memory, wide
 
 
