@@ -13,7 +13,7 @@ from damian.delays.laws import law_of
 from damian.env import UavEnv
 from damian.fast_forward import FastForward
 from damian.scenario import ScenarioConfig
-from damian.server import Server
+from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,
     ActionHistory,

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from damian.common import counter_rng
 from damian.common.compiling import compiled
 from damian.scenario import ScenarioConfig
-from damian.server import Features, Server
+from damian.server.server import Features, Server
 from damian.world.airspace import rows
 from damian.world.simulation import Simulation
 from damian.world.state import SITUATION, Rows, State, tree_map

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from damian.chain import DelayedEnv
 from damian.env import UavEnv
-from damian.features import Snapshot
+from damian.server.features import Snapshot
 from damian.world.airspace import rows
 
 BLUR_M = 5.0

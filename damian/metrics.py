@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.chain import DelayedEnv
-from damian.features import Snapshot
 from damian.recurrent import prime
-from damian.server import Server
+from damian.server.features import Snapshot
+from damian.server.server import Server
 
 
 @dataclass(frozen=True)

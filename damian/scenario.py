@@ -8,8 +8,8 @@ import numpy as np
 from damian.clocks import ClockConfig
 from damian.common import checks
 from damian.delays.laws import DelayConfig
-from damian.features import ObservationConfig
-from damian.rewards import EpisodeConfig, RewardConfig
+from damian.server.features import ObservationConfig
+from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.world.airspace import Airspace, build_airspace
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig

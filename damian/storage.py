@@ -8,9 +8,9 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
-from damian.features import Snapshot
 from damian.hindsight import Mail, hindsight, over_before
-from damian.server import Server
+from damian.server.features import Snapshot
+from damian.server.server import Server
 
 Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
 """From steps [T, B] and what was known after each, [T, B, N, F]: the entries after the step, corrected."""

@@ -25,9 +25,9 @@ from torch import Tensor
 from damian.common.errors import InputError
 from damian.delayed import make_env
 from damian.env import UavEnv
-from damian.features import Snapshot
 from damian.figures import Beliefs, plot_beliefs
 from damian.models import random_policy
+from damian.server.features import Snapshot
 
 TABLE, FIGURE = "belief.csv", "belief.png"
 POSITIONS = ("true_east_m", "true_north_m", "believed_east_m", "believed_north_m")

@@ -31,9 +31,9 @@ from damian.clocks import ClockConfig
 from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
 from damian.env import EXTRAS, UavEnv
-from damian.features import GLOBAL, LOCAL, ObservationConfig
-from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.scenario import BatteryConfig, MotionConfig, ScenarioConfig
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig
+from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 
 RIVAL, BARE = "VMAS discovery", "bare"
 COMPILED_TOO = (BARE, "whole chain", "every transform")

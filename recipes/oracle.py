@@ -21,10 +21,10 @@ from torchrl.envs import StepCounter
 
 from damian.common.errors import InputError
 from damian.delayed import messages_are_late
-from damian.features import Snapshot
 from damian.metrics import evaluate
 from damian.runs import save_results
-from damian.server import Server
+from damian.server.features import Snapshot
+from damian.server.server import Server
 
 ALL = Snapshot._fields
 PLACE = ("position", "target", "track", "trail")

@@ -33,7 +33,6 @@ from damian.chain import DelayedEnv
 from damian.clocks import SystemClock
 from damian.comparison import GREEDY, MODE, RANDOM, SAMPLED
 from damian.delayed import make_env, messages_are_late
-from damian.features import Snapshot
 from damian.greedy import greedy_policy
 from damian.mappo import Mappo
 from damian.metrics import EpisodeLog, Evaluation, evaluate
@@ -41,6 +40,7 @@ from damian.models import random_policy
 from damian.recurrent import prime
 from damian.runs import CHECKPOINT, CONFIG, FIGURE, Interrupt, MetricsLog, plot_learning_curve, save_results
 from damian.sac import Sac
+from damian.server.features import Snapshot
 from damian.storage import BackupdateStorage, TimeStorage, server_view
 
 

@@ -15,9 +15,9 @@ from twin import Uav
 
 from damian.clocks import ClockConfig
 from damian.env import UavEnv
-from damian.features import GLOBAL, LOCAL, Knowledge, ObservationConfig, Snapshot
-from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
+from damian.server.features import GLOBAL, LOCAL, Knowledge, ObservationConfig, Snapshot
+from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig

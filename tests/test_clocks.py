@@ -14,9 +14,9 @@ from train import learning_env, spotting, ticks
 from damian.clocks import ClockConfig, SystemClock
 from damian.common.errors import InputError
 from damian.delays.laws import DelayConfig
-from damian.features import Snapshot
 from damian.models import random_policy
-from damian.rewards import EpisodeConfig
+from damian.server.features import Snapshot
+from damian.server.rewards import EpisodeConfig
 
 SPOTTED, QUIET = torch.tensor([[False, True]]), torch.tensor([[False, False]])
 WORLDS = 4

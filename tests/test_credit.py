@@ -13,7 +13,7 @@ from damian.decisions import find_decisions, transitions
 from damian.delayed import make_env
 from damian.mappo import MappoConfig, add_advantages
 from damian.models import ModelConfig, make_actor, make_critic
-from damian.rewards import EpisodeConfig
+from damian.server.rewards import EpisodeConfig
 
 GAMMA = 0.9
 

@@ -28,9 +28,9 @@ from damian.clocks import ClockConfig
 from damian.delayed import ACTION, REWARD, SEEN, DelayedEnv, chain, holding, make_env, serving
 from damian.delays.laws import DelayConfig, law_of
 from damian.env import EXTRAS, UavEnv
-from damian.features import Snapshot
-from damian.rewards import EpisodeConfig
 from damian.scenario import ScenarioConfig
+from damian.server.features import Snapshot
+from damian.server.rewards import EpisodeConfig
 from damian.transforms import ActionDelay, Clock, CumulativeReward, RewardDelay
 from damian.world.signal_source import SourceConfig
 

@@ -26,8 +26,8 @@ from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
 from damian.env import UavEnv
-from damian.rewards import INDIVIDUAL, SYSTEM
 from damian.scenario import ScenarioConfig
+from damian.server.rewards import INDIVIDUAL, SYSTEM
 from damian.world.landing import ActionConfig
 
 # TorchRL's contract.

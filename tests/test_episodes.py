@@ -27,7 +27,7 @@ from helpers import (
     walking,
 )
 
-from damian.rewards import EpisodeConfig, RewardConfig
+from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
 from damian.world.motion import MotionConfig
 from damian.world.signal_source import SourceConfig

@@ -18,8 +18,8 @@ from damian.delayed import ACTION, REWARD, DelayedEnv, make_env
 from damian.delays.laws import DelayConfig
 from damian.env import UavEnv
 from damian.fast_forward import FastForward
-from damian.rewards import EpisodeConfig
 from damian.scenario import ScenarioConfig
+from damian.server.rewards import EpisodeConfig
 from damian.world.landing import ActionConfig
 
 LATE = {"law": "uniform", "low": 1, "high": 5, "probability": 0.6}

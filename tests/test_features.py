@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
-from damian.features import GLOBAL, LOCAL, ObservationConfig, Snapshot, observe, stack
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig, Snapshot, observe, stack
 
 NAMES = [name for name in (*LOCAL, *GLOBAL) if name != "coverage"]
 seeds = st.integers(0, 2**32 - 1)

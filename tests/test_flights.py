@@ -31,8 +31,8 @@ from helpers import (
 )
 
 from damian.env import UavEnv
-from damian.rewards import EpisodeConfig
 from damian.scenario import RegionConfig, ScenarioConfig
+from damian.server.rewards import EpisodeConfig
 from damian.world.battery import BatteryConfig, flight_drain
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig

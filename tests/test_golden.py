@@ -17,9 +17,9 @@ import torch
 from helpers import DATA, GOLDEN, act, nearest, told, usecase
 
 from damian.env import UavEnv
-from damian.features import Knowledge, Snapshot, observe
-from damian.rewards import Counters, RewardConfig, final_reward, reward, status
 from damian.scenario import ScenarioConfig
+from damian.server.features import Knowledge, Snapshot, observe
+from damian.server.rewards import Counters, RewardConfig, final_reward, reward, status
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 

@@ -13,12 +13,12 @@ from torch import Tensor
 from damian.chain import DelayedEnv
 from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
-from damian.features import ObservationConfig
 from damian.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.metrics import evaluate
 from damian.models import random_policy
-from damian.rewards import EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
+from damian.server.features import ObservationConfig
+from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.world.landing import ActionConfig, displacement
 from damian.world.signal_source import SourceConfig
 

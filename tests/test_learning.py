@@ -15,11 +15,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
 from damian.env import UavEnv
-from damian.features import Snapshot
 from damian.mappo import Mappo, MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.models import ModelConfig, make_actor, make_critic, random_policy
-from damian.rewards import EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
+from damian.server.features import Snapshot
+from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.storage import BackupdateStorage, server_view
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig

@@ -15,13 +15,13 @@ from damian.chain import DelayedEnv
 from damian.common.errors import InputError
 from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
-from damian.features import Snapshot
 from damian.metrics import EpisodeLog, Evaluation, evaluate, evaluation
 from damian.models import random_policy
-from damian.rewards import EpisodeConfig, RewardConfig
 from damian.runs import MetricsLog, read_metrics, results_table, save_results
 from damian.scenario import ScenarioConfig
-from damian.server import Server
+from damian.server.features import Snapshot
+from damian.server.rewards import EpisodeConfig, RewardConfig
+from damian.server.server import Server
 
 HORIZON = 24
 BURSTS = {"law": "burst", "enter": 0.3, "leave": 0.3, "good": 0, "bad": 5, "bad_loss": 0.2}

@@ -12,7 +12,7 @@ from torchrl.envs import StepCounter
 
 from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
-from damian.features import Snapshot
+from damian.server.features import Snapshot
 
 TINY = ["frames=64", "worlds=4", "mappo.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]
 N_FEATURES = slice(None, -4)  # two past actions stand behind

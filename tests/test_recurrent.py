@@ -24,8 +24,8 @@ from damian.mappo import Mappo, MappoConfig, mappo_loss
 from damian.metrics import evaluate
 from damian.models import ModelConfig, make_actor
 from damian.recurrent import BEFORE, HIDDEN, prime
-from damian.rewards import EpisodeConfig
 from damian.runs import CHECKPOINT
+from damian.server.rewards import EpisodeConfig
 from damian.storage import BackupdateStorage, server_view
 
 GRU = ModelConfig(hidden=[16, 8], rnn="gru")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
-from damian.rewards import (
+from damian.server.rewards import (
     INDIVIDUAL,
     SYSTEM,
     Counters,

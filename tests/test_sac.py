@@ -16,10 +16,10 @@ from damian.decisions import find_decisions, transitions
 from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
 from damian.env import PRIVILEGED, UavEnv
-from damian.features import Snapshot
 from damian.models import ModelConfig
-from damian.rewards import EpisodeConfig
 from damian.sac import LOSSES, Sac, SacConfig
+from damian.server.features import Snapshot
+from damian.server.rewards import EpisodeConfig
 from damian.storage import BackupdateStorage, TimeStorage, server_view
 from damian.world.landing import ActionConfig
 

@@ -13,10 +13,10 @@ from torchrl.envs import StepCounter
 from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
 from damian.env import EXTRAS
-from damian.features import Snapshot
 from damian.hindsight import Mail, hindsight, over_before
-from damian.rewards import EpisodeConfig
 from damian.scenario import ScenarioConfig
+from damian.server.features import Snapshot
+from damian.server.rewards import EpisodeConfig
 from damian.storage import BackupdateStorage, server_view
 
 LONGEST = 5

@@ -19,9 +19,9 @@ from helpers import (
 )
 
 from damian.env import UavEnv
-from damian.features import GLOBAL, LOCAL, ObservationConfig
-from damian.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.scenario import RegionConfig, ScenarioConfig
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig
+from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import shapely
 
-from damian.rewards import INDIVIDUAL, EpisodeConfig, RewardConfig
+from damian.server.rewards import INDIVIDUAL, EpisodeConfig, RewardConfig
 
 
 @dataclass

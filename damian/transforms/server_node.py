@@ -7,8 +7,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from damian.features import Snapshot
-from damian.server import Server
+from damian.server.features import Snapshot
+from damian.server.server import Server
 from damian.transforms.stateful import Change, Entries, Memory, Stateful, Uses
 
 _AGENTS = ("observation", "global_observation", "reward")

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from damian.features import Snapshot
+from damian.server.features import Snapshot
 
 Tree = TypeVar("Tree", bound=NamedTuple)
 

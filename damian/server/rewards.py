@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.features import Snapshot
+from damian.server.features import Snapshot
 
 INDIVIDUAL = ("coverage", "spotted", "battery")
 SYSTEM = (

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from damian.common.errors import InputError
-from damian.features import EXACT, Knowledge, Snapshot, observe, stack
-from damian.rewards import Counters, Status, final_reward, reward, status
 from damian.scenario import ScenarioConfig
+from damian.server.features import EXACT, Knowledge, Snapshot, observe, stack
+from damian.server.rewards import Counters, Status, final_reward, reward, status
 from damian.world.airspace import Airspace, rows
 from damian.world.coverage import FootprintTables, build_tables
 
