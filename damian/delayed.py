@@ -11,7 +11,6 @@ from damian.chain import ACTION, DelayedEnv
 from damian.common import checks
 from damian.delays.laws import law_of
 from damian.env import UavEnv
-from damian.fast_forward import FastForward
 from damian.scenario import ScenarioConfig
 from damian.server.server import Server
 from damian.transforms import (
@@ -23,6 +22,7 @@ from damian.transforms import (
     RewardDelay,
     ServerNode,
 )
+from damian.transforms.skip_until_ready import FastForward
 from damian.world.landing import ActionConfig
 
 REWARD, SEEN = ("agents", "reward"), ("agents", "observation")

@@ -17,9 +17,9 @@ from damian.common.errors import InputError
 from damian.delayed import ACTION, REWARD, DelayedEnv, make_env
 from damian.delays.laws import DelayConfig
 from damian.env import UavEnv
-from damian.fast_forward import FastForward
 from damian.scenario import ScenarioConfig
 from damian.server.rewards import EpisodeConfig
+from damian.transforms.skip_until_ready import FastForward
 from damian.world.landing import ActionConfig
 
 LATE = {"law": "uniform", "low": 1, "high": 5, "probability": 0.6}

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from damian.delays.samplers import Sampler
-from damian.transforms.stateful import Memory, wide
+from damian.transforms.base import Memory, wide
 
 
 class Delivery(NamedTuple):

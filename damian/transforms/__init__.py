@@ -1,12 +1,12 @@
 """Delays, memories and clocks as TorchRL transforms; all but ``ServerNode`` work on any environment."""
 
-from damian.transforms.action import ActionDelay
-from damian.transforms.clock import Clock
-from damian.transforms.history import ActionHistory
-from damian.transforms.observation import ObservationDelay
-from damian.transforms.reward import CumulativeReward, RewardDelay
+from damian.transforms.action_delay import ActionDelay
+from damian.transforms.action_history import ActionHistory
+from damian.transforms.base import Stateful, check_order
+from damian.transforms.observation_delay import ObservationDelay
+from damian.transforms.reward_delay import CumulativeReward, RewardDelay
+from damian.transforms.sample_and_hold import Clock
 from damian.transforms.server_node import ServerNode
-from damian.transforms.stateful import Stateful, check_order
 
 __all__ = [
     "ActionDelay",

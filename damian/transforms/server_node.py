@@ -9,7 +9,7 @@ from torchrl.data import Composite
 
 from damian.server.features import Snapshot
 from damian.server.server import Server
-from damian.transforms.stateful import Change, Entries, Memory, Stateful, Uses
+from damian.transforms.base import Change, Entries, Memory, Stateful, Uses
 
 _AGENTS = ("observation", "global_observation", "reward")
 _TASK = ("success", "done", "terminated", "truncated")

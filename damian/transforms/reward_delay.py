@@ -9,7 +9,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.delays.delay_line import after
 from damian.delays.laws import LOSES, law_of
-from damian.transforms.stateful import (
+from damian.transforms.base import (
     Change,
     Entries,
     Memory,

@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from damian.delays.delay_line import Mailbox
 from damian.delays.laws import law_of
-from damian.transforms.stateful import (
+from damian.transforms.base import (
     Change,
     Entries,
     Memory,

@@ -8,8 +8,8 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from damian.common import checks
-from damian.transforms.action import OnActions
-from damian.transforms.stateful import Change, Entries, Memory, Uses, as_rows, beside, from_rows, wide
+from damian.transforms.action_delay import OnActions
+from damian.transforms.base import Change, Entries, Memory, Uses, as_rows, beside, from_rows, wide
 from damian.world.airspace import rows
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from damian.common import checks
-from damian.transforms.stateful import Change, Entries, Memory, Stateful, wide
+from damian.transforms.base import Change, Entries, Memory, Stateful, wide
 
 
 class FastForward(Stateful):

@@ -8,17 +8,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.delays.laws import Delay, in_steps
-from damian.transforms.stateful import (
-    Change,
-    Entries,
-    Memory,
-    Stateful,
-    Uses,
-    as_rows,
-    from_rows,
-    taken,
-    wide,
-)
+from damian.transforms.base import Change, Entries, Memory, Stateful, Uses, as_rows, from_rows, taken, wide
 
 
 class Clock(Stateful):

@@ -11,7 +11,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from damian.common import checks
 from damian.delays.delay_line import Delivery, Mailbox
 from damian.delays.laws import ORDERS, law_of
-from damian.transforms.stateful import (
+from damian.transforms.base import (
     Change,
     Entries,
     Memory,
