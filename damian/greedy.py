@@ -12,8 +12,8 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from damian.chain import DelayedEnv
-from damian.env import UavEnv
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.uav_env import UavEnv
 from damian.server.features import Snapshot
 from damian.world.airspace import rows
 

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.chain import DelayedEnv
+from damian.envs.delayed_env import DelayedEnv
 from damian.recurrent import prime
 from damian.server.features import Snapshot
 from damian.server.server import Server

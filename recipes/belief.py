@@ -23,8 +23,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from damian.common.errors import InputError
-from damian.delayed import make_env
-from damian.env import UavEnv
+from damian.envs.pipeline import make_env
+from damian.envs.uav_env import UavEnv
 from damian.figures import Beliefs, plot_beliefs
 from damian.models import random_policy
 from damian.server.features import Snapshot

@@ -27,11 +27,11 @@ from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
 from tqdm import tqdm
 
-from damian.clocks import ClockConfig
-from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
-from damian.env import EXTRAS, UavEnv
-from damian.scenario import BatteryConfig, MotionConfig, ScenarioConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import BatteryConfig, MotionConfig, ScenarioConfig
+from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 

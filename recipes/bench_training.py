@@ -28,7 +28,7 @@ from torchrl.objectives.utils import ValueEstimators
 from tqdm import tqdm
 from train import learning_env, make_collector, make_learner, ticks
 
-from damian.clocks import SystemClock
+from damian.envs.clocks import SystemClock
 from damian.mappo import Mappo, MappoConfig, add_advantages
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"

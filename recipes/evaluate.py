@@ -17,8 +17,8 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.modules import ProbabilisticActor
 from train import report, unseen
 
-from damian.chain import DelayedEnv
 from damian.common.errors import InputError
+from damian.envs.delayed_env import DelayedEnv
 from damian.models import make_actor
 
 

@@ -22,8 +22,8 @@ from settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
+from damian.envs.scenario import leftovers
 from damian.runs import CHECKPOINT, CONFIG
-from damian.scenario import leftovers
 
 
 def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:

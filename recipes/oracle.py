@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl.envs import StepCounter
 
 from damian.common.errors import InputError
-from damian.delayed import messages_are_late
+from damian.envs.pipeline import messages_are_late
 from damian.metrics import evaluate
 from damian.runs import save_results
 from damian.server.features import Snapshot

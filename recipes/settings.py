@@ -12,14 +12,14 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from damian.clocks import SystemClock
 from damian.common import checks
-from damian.delayed import is_late
-from damian.env import PRIVILEGED
+from damian.envs.clocks import SystemClock
+from damian.envs.pipeline import is_late
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import PRIVILEGED
 from damian.mappo import MappoConfig
 from damian.models import ModelConfig
 from damian.sac import SacConfig
-from damian.scenario import ScenarioConfig
 
 CONF = str(Path(__file__).parents[1] / "conf")
 """Absolute, so that a recipe can be imported as well as run."""

@@ -29,10 +29,10 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import RewardSum, StepCounter, TransformedEnv
 from tqdm import tqdm
 
-from damian.chain import DelayedEnv
-from damian.clocks import SystemClock
 from damian.comparison import GREEDY, MODE, RANDOM, SAMPLED
-from damian.delayed import make_env, messages_are_late
+from damian.envs.clocks import SystemClock
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env, messages_are_late
 from damian.greedy import greedy_policy
 from damian.mappo import Mappo
 from damian.metrics import EpisodeLog, Evaluation, evaluate

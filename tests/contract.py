@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
 
-from damian.env import UavEnv
+from damian.envs.uav_env import UavEnv
 from damian.transforms import (
     ActionDelay,
     ActionHistory,

@@ -13,9 +13,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from twin import Uav
 
-from damian.clocks import ClockConfig
-from damian.env import UavEnv
-from damian.scenario import RegionConfig, ScenarioConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.uav_env import UavEnv
 from damian.server.features import GLOBAL, LOCAL, Knowledge, ObservationConfig, Snapshot
 from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.world.battery import BatteryConfig

@@ -9,9 +9,9 @@ from helpers import everything
 from settings import LoggerConfig, TrainConfig
 from train import learning_env, make_learner, train
 
-from damian.chain import DelayedEnv
-from damian.clocks import ClockConfig, SystemClock
 from damian.delays.laws import DelayConfig
+from damian.envs.clocks import ClockConfig, SystemClock
+from damian.envs.delayed_env import DelayedEnv
 from damian.mappo import Mappo, MappoConfig
 from damian.models import ModelConfig
 from damian.sac import Sac, SacConfig

@@ -5,7 +5,7 @@ import importlib.util
 from bench_training import ARMS, HEADER, RIVAL, RIVALS, Seconds, arm_config, median, rows, training
 from train import looks_back
 
-from damian.delayed import messages_are_late
+from damian.envs.pipeline import messages_are_late
 
 
 def test_arms_differ_in_delay_and_awareness_only():

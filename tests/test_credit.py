@@ -8,9 +8,9 @@ from helpers import everything
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.clocks import ClockConfig
 from damian.decisions import find_decisions, transitions
-from damian.delayed import make_env
+from damian.envs.clocks import ClockConfig
+from damian.envs.pipeline import make_env
 from damian.mappo import MappoConfig, add_advantages
 from damian.models import ModelConfig, make_actor, make_critic
 from damian.server.rewards import EpisodeConfig

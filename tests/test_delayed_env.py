@@ -24,11 +24,11 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from damian.clocks import ClockConfig
-from damian.delayed import ACTION, REWARD, SEEN, DelayedEnv, chain, holding, make_env, serving
 from damian.delays.laws import DelayConfig, law_of
-from damian.env import EXTRAS, UavEnv
-from damian.scenario import ScenarioConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.pipeline import ACTION, REWARD, SEEN, DelayedEnv, chain, holding, make_env, serving
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig
 from damian.transforms import ActionDelay, Clock, CumulativeReward, RewardDelay

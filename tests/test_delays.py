@@ -22,7 +22,7 @@ from damian.delays.laws import (
     law_of,
 )
 from damian.delays.samplers import Sampler
-from damian.scenario import ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.transforms import RewardDelay
 
 STREAMS, STEPS = 1000, 100

@@ -25,8 +25,8 @@ from helpers import (
 from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
-from damian.env import UavEnv
-from damian.scenario import ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import UavEnv
 from damian.server.rewards import INDIVIDUAL, SYSTEM
 from damian.world.landing import ActionConfig
 

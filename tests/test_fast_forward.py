@@ -12,12 +12,12 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from damian.clocks import ClockConfig
 from damian.common.errors import InputError
-from damian.delayed import ACTION, REWARD, DelayedEnv, make_env
 from damian.delays.laws import DelayConfig
-from damian.env import UavEnv
-from damian.scenario import ScenarioConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.pipeline import ACTION, REWARD, DelayedEnv, make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import UavEnv
 from damian.server.rewards import EpisodeConfig
 from damian.transforms.skip_until_ready import FastForward
 from damian.world.landing import ActionConfig

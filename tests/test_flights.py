@@ -30,8 +30,8 @@ from helpers import (
     usecase,
 )
 
-from damian.env import UavEnv
-from damian.scenario import RegionConfig, ScenarioConfig
+from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.uav_env import UavEnv
 from damian.server.rewards import EpisodeConfig
 from damian.world.battery import BatteryConfig, flight_drain
 from damian.world.landing import ActionConfig

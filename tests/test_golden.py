@@ -16,8 +16,8 @@ import shapely
 import torch
 from helpers import DATA, GOLDEN, act, nearest, told, usecase
 
-from damian.env import UavEnv
-from damian.scenario import ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import UavEnv
 from damian.server.features import Knowledge, Snapshot, observe
 from damian.server.rewards import Counters, RewardConfig, final_reward, reward, status
 from damian.world.battery import BatteryConfig

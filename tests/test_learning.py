@@ -12,12 +12,12 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
-from damian.env import UavEnv
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.uav_env import UavEnv
 from damian.mappo import Mappo, MappoConfig, add_advantages, losses_of, mappo_loss
 from damian.models import ModelConfig, make_actor, make_critic, random_policy
-from damian.scenario import RegionConfig, ScenarioConfig
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.storage import BackupdateStorage, server_view

@@ -10,8 +10,8 @@ from helpers import both_motions, everything
 from launch import launch
 from torchrl.envs import StepCounter
 
-from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
+from damian.envs.pipeline import make_env
 from damian.server.features import Snapshot
 
 TINY = ["frames=64", "worlds=4", "mappo.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.checkpoint import Checkpoint
 from train import main
 
-from damian.delayed import make_env
+from damian.envs.pipeline import make_env
 from damian.models import make_actor, make_critic
 
 TINY = ["frames=256", "worlds=8", "mappo.steps=16", "eval_episodes=4", "model.hidden=[16]"]

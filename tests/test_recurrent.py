@@ -17,9 +17,9 @@ from torchrl.data import Binary, Categorical, Composite, TensorDictReplayBuffer,
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.chain import DelayedEnv
-from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
 from damian.mappo import Mappo, MappoConfig, mappo_loss
 from damian.metrics import evaluate
 from damian.models import ModelConfig, make_actor

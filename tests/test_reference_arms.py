@@ -30,15 +30,15 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from train import learning_env, main, make_learner
 
-from damian.chain import DelayedEnv
-from damian.clocks import ClockConfig, SystemClock
-from damian.delayed import make_env, messages_are_late
 from damian.delays.laws import DelayConfig, Held, law_of
-from damian.env import EXTRAS, PRIVILEGED
+from damian.envs.clocks import ClockConfig, SystemClock
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env, messages_are_late
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import EXTRAS, PRIVILEGED
 from damian.mappo import Mappo, MappoConfig
 from damian.models import ModelConfig, make_critic
 from damian.sac import Sac
-from damian.scenario import ScenarioConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 

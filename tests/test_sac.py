@@ -13,9 +13,9 @@ from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.decisions import find_decisions, transitions
-from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
-from damian.env import PRIVILEGED, UavEnv
+from damian.envs.pipeline import make_env
+from damian.envs.uav_env import PRIVILEGED, UavEnv
 from damian.models import ModelConfig
 from damian.sac import LOSSES, Sac, SacConfig
 from damian.server.features import Snapshot

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from damian.common.errors import InputError
-from damian.scenario import RegionConfig, ScenarioConfig, leftovers
+from damian.envs.scenario import RegionConfig, ScenarioConfig, leftovers
 from damian.world.motion import MotionConfig
 
 

@@ -10,11 +10,11 @@ from torch import Tensor
 from torchrl.data import SamplerWithoutReplacement, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 
-from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
-from damian.env import EXTRAS
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import EXTRAS
 from damian.hindsight import Mail, hindsight, over_before
-from damian.scenario import ScenarioConfig
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig
 from damian.storage import BackupdateStorage, server_view

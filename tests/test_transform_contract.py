@@ -32,8 +32,8 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
 from damian.common.errors import InputError
-from damian.delayed import make_env
 from damian.delays.laws import DelayConfig
+from damian.envs.pipeline import make_env
 from damian.transforms import (
     ActionDelay,
     ActionHistory,

@@ -18,8 +18,8 @@ from helpers import (
     told,
 )
 
-from damian.env import UavEnv
-from damian.scenario import RegionConfig, ScenarioConfig
+from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.uav_env import UavEnv
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
 from damian.world.landing import ActionConfig

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from damian.common.errors import InputError
-from damian.scenario import ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.server.features import EXACT, Knowledge, Snapshot, observe, stack
 from damian.server.rewards import Counters, Status, final_reward, reward, status
 from damian.world.airspace import Airspace, rows

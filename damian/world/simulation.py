@@ -12,7 +12,7 @@ from torch import Tensor
 
 from damian.common import counter_rng
 from damian.common.errors import InputError
-from damian.scenario import ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.server.features import Snapshot
 from damian.world.airspace import Airspace, inside, nearest_points, rows
 from damian.world.battery import (

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from damian.clocks import ClockConfig
 from damian.common import checks
 from damian.delays.laws import DelayConfig
+from damian.envs.clocks import ClockConfig
 from damian.server.features import ObservationConfig
 from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.world.airspace import Airspace, build_airspace

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
-from damian.chain import ACTION, DelayedEnv
 from damian.common import checks
 from damian.delays.laws import law_of
-from damian.env import UavEnv
-from damian.scenario import ScenarioConfig
+from damian.envs.delayed_env import ACTION, DelayedEnv
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import UavEnv
 from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,

@@ -10,7 +10,7 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian.common import counter_rng
 from damian.common.compiling import compiled
-from damian.env import Shown, UavEnv
+from damian.envs.uav_env import Shown, UavEnv
 from damian.transforms.base import Entries, Memory, Stateful, taken, wide
 from damian.transforms.skip_until_ready import FastForward
 from damian.world.state import Rows, where

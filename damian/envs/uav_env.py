@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 
 from damian.common import counter_rng
 from damian.common.compiling import compiled
-from damian.scenario import ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.server.server import Features, Server
 from damian.world.airspace import rows
 from damian.world.simulation import Simulation
