@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.envs.delayed_env import DelayedEnv
-from damian.recurrent import prime
+from damian.learners.recurrent import prime
 from damian.server.features import Snapshot
 from damian.server.server import Server
 

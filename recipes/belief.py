@@ -22,11 +22,11 @@ from settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.figures import Beliefs, plot_beliefs
-from damian.models import random_policy
 from damian.server.features import Snapshot
 
 TABLE, FIGURE = "belief.csv", "belief.png"

@@ -29,7 +29,7 @@ from tqdm import tqdm
 from train import learning_env, make_collector, make_learner, ticks
 
 from damian.envs.clocks import SystemClock
-from damian.mappo import Mappo, MappoConfig, add_advantages
+from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}

@@ -19,7 +19,7 @@ from train import report, unseen
 
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
-from damian.models import make_actor
+from damian.learners.networks import make_actor
 
 
 def fly(config: TrainConfig, folder: Path) -> None:

@@ -39,8 +39,8 @@ from tqdm import tqdm
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.models import ModelConfig
-from damian.sac import Sac, SacConfig
+from damian.learners.networks import ModelConfig
+from damian.learners.sac import Sac, SacConfig
 from damian.transforms import ActionHistory, ObservationDelay
 
 ARMS = ("undelayed", "naive", "history")

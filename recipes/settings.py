@@ -17,9 +17,9 @@ from damian.envs.clocks import SystemClock
 from damian.envs.pipeline import is_late
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import PRIVILEGED
-from damian.mappo import MappoConfig
-from damian.models import ModelConfig
-from damian.sac import SacConfig
+from damian.learners.mappo import MappoConfig
+from damian.learners.networks import ModelConfig
+from damian.learners.sac import SacConfig
 
 CONF = str(Path(__file__).parents[1] / "conf")
 """Absolute, so that a recipe can be imported as well as run."""

@@ -29,19 +29,19 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import RewardSum, StepCounter, TransformedEnv
 from tqdm import tqdm
 
+from damian.baselines.greedy import greedy_policy
+from damian.baselines.random import random_policy
 from damian.comparison import GREEDY, MODE, RANDOM, SAMPLED
 from damian.envs.clocks import SystemClock
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env, messages_are_late
-from damian.greedy import greedy_policy
-from damian.mappo import Mappo
+from damian.learners.mappo import Mappo
+from damian.learners.recurrent import prime
+from damian.learners.sac import Sac
 from damian.metrics import EpisodeLog, Evaluation, evaluate
-from damian.models import random_policy
-from damian.recurrent import prime
+from damian.replay.backupdate import BackupdateStorage, TimeStorage, server_view
 from damian.runs import CHECKPOINT, CONFIG, FIGURE, Interrupt, MetricsLog, plot_learning_curve, save_results
-from damian.sac import Sac
 from damian.server.features import Snapshot
-from damian.storage import BackupdateStorage, TimeStorage, server_view
 
 
 @dataclass

@@ -12,10 +12,10 @@ from train import learning_env, make_learner, train
 from damian.delays.laws import DelayConfig
 from damian.envs.clocks import ClockConfig, SystemClock
 from damian.envs.delayed_env import DelayedEnv
-from damian.mappo import Mappo, MappoConfig
-from damian.models import ModelConfig
-from damian.sac import Sac, SacConfig
-from damian.storage import BackupdateStorage
+from damian.learners.mappo import Mappo, MappoConfig
+from damian.learners.networks import ModelConfig
+from damian.learners.sac import Sac, SacConfig
+from damian.replay.backupdate import BackupdateStorage
 
 AWARE = {
     "none": {},

@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from train import learning_env, spotting, ticks
 
+from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.laws import DelayConfig
 from damian.envs.clocks import ClockConfig, SystemClock
-from damian.models import random_policy
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig
 

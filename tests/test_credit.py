@@ -8,11 +8,11 @@ from helpers import everything
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.decisions import find_decisions, transitions
 from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import make_env
-from damian.mappo import MappoConfig, add_advantages
-from damian.models import ModelConfig, make_actor, make_critic
+from damian.learners.mappo import MappoConfig, add_advantages
+from damian.learners.networks import ModelConfig, make_actor, make_critic
+from damian.replay.smdp import find_decisions, transitions
 from damian.server.rewards import EpisodeConfig
 
 GAMMA = 0.9

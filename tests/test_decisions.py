@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from damian.decisions import Decisions, find_decisions, transitions
+from damian.replay.smdp import Decisions, find_decisions, transitions
 
 T, B, N = 12, 5, 3
 

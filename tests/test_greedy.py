@@ -10,13 +10,13 @@ from helpers import clock, everything, told, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
+from damian.baselines.random import random_policy
 from damian.delays.laws import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import RegionConfig, ScenarioConfig
-from damian.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.metrics import evaluate
-from damian.models import random_policy
 from damian.server.features import ObservationConfig
 from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.world.landing import ActionConfig, displacement

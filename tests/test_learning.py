@@ -12,15 +12,16 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from damian.baselines.random import random_policy
 from damian.delays.laws import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import RegionConfig, ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.mappo import Mappo, MappoConfig, add_advantages, losses_of, mappo_loss
-from damian.models import ModelConfig, make_actor, make_critic, random_policy
+from damian.learners.mappo import Mappo, MappoConfig, add_advantages, losses_of, mappo_loss
+from damian.learners.networks import ModelConfig, make_actor, make_critic
+from damian.replay.backupdate import BackupdateStorage, server_view
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig, RewardConfig
-from damian.storage import BackupdateStorage, server_view
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
 

@@ -11,13 +11,13 @@ from helpers import MOTIONS, both_motions, everything, square
 from tensordict import TensorDictBase
 from torchrl.envs import RewardSum, StepCounter
 
+from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.laws import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.metrics import EpisodeLog, Evaluation, evaluate, evaluation
-from damian.models import random_policy
 from damian.runs import MetricsLog, read_metrics, results_table, save_results
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig, RewardConfig

@@ -15,7 +15,7 @@ from torchrl.checkpoint import Checkpoint
 from train import main
 
 from damian.envs.pipeline import make_env
-from damian.models import make_actor, make_critic
+from damian.learners.networks import make_actor, make_critic
 
 TINY = ["frames=256", "worlds=8", "mappo.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["sac.steps=16", "sac.updates=2", "sac.batch=32", "sac.warm_up=100"]

@@ -36,9 +36,9 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env, messages_are_late
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS, PRIVILEGED
-from damian.mappo import Mappo, MappoConfig
-from damian.models import ModelConfig, make_critic
-from damian.sac import Sac
+from damian.learners.mappo import Mappo, MappoConfig
+from damian.learners.networks import ModelConfig, make_critic
+from damian.learners.sac import Sac
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 

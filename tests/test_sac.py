@@ -12,15 +12,15 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.decisions import find_decisions, transitions
 from damian.delays.laws import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import PRIVILEGED, UavEnv
-from damian.models import ModelConfig
-from damian.sac import LOSSES, Sac, SacConfig
+from damian.learners.networks import ModelConfig
+from damian.learners.sac import LOSSES, Sac, SacConfig
+from damian.replay.backupdate import BackupdateStorage, TimeStorage, server_view
+from damian.replay.smdp import find_decisions, transitions
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig
-from damian.storage import BackupdateStorage, TimeStorage, server_view
 from damian.world.landing import ActionConfig
 
 SMALL = ModelConfig(hidden=[16])

@@ -14,10 +14,10 @@ from damian.delays.laws import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
-from damian.hindsight import Mail, hindsight, over_before
+from damian.replay.backupdate import BackupdateStorage, server_view
+from damian.replay.hindsight import Mail, hindsight, over_before
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig
-from damian.storage import BackupdateStorage, server_view
 
 LONGEST = 5
 LATE = {"law": "uniform", "low": 0, "high": LONGEST}

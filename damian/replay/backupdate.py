@@ -8,7 +8,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
-from damian.hindsight import Mail, hindsight, over_before
+from damian.replay.hindsight import Mail, hindsight, over_before
 from damian.server.features import Snapshot
 from damian.server.server import Server
 

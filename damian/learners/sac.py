@@ -14,9 +14,9 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 
 from damian.common import checks
-from damian.decisions import find_decisions, transitions
-from damian.models import ModelConfig, make_action_value, make_actor
-from damian.storage import TimeStorage
+from damian.learners.networks import ModelConfig, make_action_value, make_actor
+from damian.replay.backupdate import TimeStorage
+from damian.replay.smdp import find_decisions, transitions
 
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha")
 

@@ -14,7 +14,7 @@ from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, TanhNorm
 from torchrl.modules.distributions import NormalParamExtractor
 
 from damian.common import checks
-from damian.recurrent import AgentGRU
+from damian.learners.recurrent import AgentGRU
 
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
@@ -132,19 +132,6 @@ def make_action_value(
         return TensorDictModule(config.network(n_seen, spec.n, env.device), keys, ["action_value"])
     network = config.network(n_seen + spec.shape[-1], 1, env.device)
     return TensorDictModule(network, [*keys, ("agents", "action")], ["state_action_value"])
-
-
-def random_policy(env: EnvBase) -> TensorDictModule:
-    """Uniform over the legal actions: what every result is compared with."""
-
-    def draw(seen: torch.Tensor) -> torch.Tensor:
-        if masked:
-            return torch.multinomial(seen.flatten(0, -2).float(), 1).view(seen.shape[:-1])
-        return spec.rand(seen.shape[:1])
-
-    spec, masked = env.full_action_spec_unbatched["agents", "action"], _has_mask(env)
-    seen = "action_mask" if masked else "observation"
-    return _module(draw, seen, "action")
 
 
 def _has_mask(env: EnvBase) -> bool:

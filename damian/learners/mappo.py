@@ -14,9 +14,9 @@ from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
 from damian.common import checks
-from damian.models import ModelConfig, make_actor, make_critic
-from damian.recurrent import CARRIED
-from damian.storage import BackupdateStorage
+from damian.learners.networks import ModelConfig, make_actor, make_critic
+from damian.learners.recurrent import CARRIED
+from damian.replay.backupdate import BackupdateStorage
 
 LEARNT: list[NestedKey] = [
     *(("agents", key) for key in ("observation", "action_mask", "action", "action_log_prob", "advantage")),

@@ -1,0 +1,1 @@
+"""Policies that learn nothing, to compare learners with: a random one and a scripted one."""

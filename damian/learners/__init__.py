@@ -1,0 +1,1 @@
+"""Algorithms that learn a policy: MAPPO and SAC, their networks, and when they learn."""

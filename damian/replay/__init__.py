@@ -1,0 +1,1 @@
+"""Stored steps: back-updating with late messages, and decisions as semi-Markov transitions."""
