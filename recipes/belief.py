@@ -26,7 +26,7 @@ from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
-from damian.figures import Beliefs, plot_beliefs
+from damian.evaluation.belief_figure import Beliefs, plot_beliefs
 from damian.server.features import Snapshot
 
 TABLE, FIGURE = "belief.csv", "belief.png"

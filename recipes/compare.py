@@ -32,9 +32,9 @@ from settings import CONF
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison
-from damian.comparison_report import LABELS, markdown, plot_curves, plot_norms
-from damian.runs import read_metrics
+from damian.evaluation.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison
+from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
+from damian.evaluation.run_folder import read_metrics
 
 ALL_RESULTS, TABLE, MARKDOWN, FIGURE = "results.csv", "table.csv", "table.md", "figure.png"
 SEEDS, EPISODES = 10, 100

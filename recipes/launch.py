@@ -23,7 +23,7 @@ from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
 from damian.envs.scenario import leftovers
-from damian.runs import CHECKPOINT, CONFIG
+from damian.evaluation.run_folder import CHECKPOINT, CONFIG
 
 
 def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:

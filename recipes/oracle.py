@@ -21,8 +21,8 @@ from torchrl.envs import StepCounter
 
 from damian.common.errors import InputError
 from damian.envs.pipeline import messages_are_late
-from damian.metrics import evaluate
-from damian.runs import save_results
+from damian.evaluation.metrics import evaluate
+from damian.evaluation.run_folder import save_results
 from damian.server.features import Snapshot
 from damian.server.server import Server
 

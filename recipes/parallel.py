@@ -24,7 +24,7 @@ from tqdm import tqdm
 from train import train
 
 from damian.common.errors import InputError
-from damian.runs import CHECKPOINT, CONFIG, RESULTS
+from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
 
 LOG = "log.txt"
 _SPAWN = multiprocessing.get_context("spawn")

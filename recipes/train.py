@@ -31,16 +31,24 @@ from tqdm import tqdm
 
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
-from damian.comparison import GREEDY, MODE, RANDOM, SAMPLED
 from damian.envs.clocks import SystemClock
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env, messages_are_late
+from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED
+from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate
+from damian.evaluation.run_folder import (
+    CHECKPOINT,
+    CONFIG,
+    FIGURE,
+    Interrupt,
+    MetricsLog,
+    plot_learning_curve,
+    save_results,
+)
 from damian.learners.mappo import Mappo
 from damian.learners.recurrent import prime
 from damian.learners.sac import Sac
-from damian.metrics import EpisodeLog, Evaluation, evaluate
 from damian.replay.backupdate import BackupdateStorage, TimeStorage, server_view
-from damian.runs import CHECKPOINT, CONFIG, FIGURE, Interrupt, MetricsLog, plot_learning_curve, save_results
 from damian.server.features import Snapshot
 
 

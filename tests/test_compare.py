@@ -10,9 +10,9 @@ from compare import start
 from helpers import check_refused
 from settings import CONF
 
-from damian.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison
-from damian.comparison_report import markdown, plot_curves, plot_norms
-from damian.statistics import interquartile_mean
+from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison
+from damian.evaluation.report import markdown, plot_curves, plot_norms
+from damian.evaluation.statistics import interquartile_mean
 
 SMALL = ["frames=16", "worlds=2", "mappo.steps=4", "mappo.epochs=1", "eval_episodes=3", "model.hidden=[4]"]
 TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,unaware]", f"overrides=[{','.join(SMALL)}]"]

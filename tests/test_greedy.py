@@ -16,7 +16,7 @@ from damian.delays.laws import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import RegionConfig, ScenarioConfig
-from damian.metrics import evaluate
+from damian.evaluation.metrics import evaluate
 from damian.server.features import ObservationConfig
 from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.world.landing import ActionConfig, displacement

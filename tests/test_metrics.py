@@ -17,8 +17,8 @@ from damian.delays.laws import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
-from damian.metrics import EpisodeLog, Evaluation, evaluate, evaluation
-from damian.runs import MetricsLog, read_metrics, results_table, save_results
+from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate, evaluation
+from damian.evaluation.run_folder import MetricsLog, read_metrics, results_table, save_results
 from damian.server.features import Snapshot
 from damian.server.rewards import EpisodeConfig, RewardConfig
 from damian.server.server import Server

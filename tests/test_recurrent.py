@@ -20,12 +20,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from damian.delays.laws import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
+from damian.evaluation.metrics import evaluate
+from damian.evaluation.run_folder import CHECKPOINT
 from damian.learners.mappo import Mappo, MappoConfig, mappo_loss
 from damian.learners.networks import ModelConfig, make_actor
 from damian.learners.recurrent import BEFORE, HIDDEN, prime
-from damian.metrics import evaluate
 from damian.replay.backupdate import BackupdateStorage, server_view
-from damian.runs import CHECKPOINT
 from damian.server.rewards import EpisodeConfig
 
 GRU = ModelConfig(hidden=[16, 8], rnn="gru")

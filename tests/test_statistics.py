@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from damian.common.errors import InputError
-from damian.statistics import bootstrap, interquartile_mean, interval, normalised, recovery, resampled
+from damian.evaluation.statistics import (
+    bootstrap,
+    interquartile_mean,
+    interval,
+    normalised,
+    recovery,
+    resampled,
+)
 
 
 def means(scores):

@@ -7,7 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from damian.statistics import LEAST_GAP, Floats, bootstrap, interquartile_mean, normalised, recovery
+from damian.evaluation.statistics import (
+    LEAST_GAP,
+    Floats,
+    bootstrap,
+    interquartile_mean,
+    normalised,
+    recovery,
+)
 
 SAMPLED, MODE, RANDOM, GREEDY = "trained, sampled", "trained, mode", "random", "greedy"
 SCRIPTED = (RANDOM, GREEDY)

@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from damian.comparison import NOT_LATE, RANDOM, SCRIPTED, SEEN, TRUE, Comparison, Line
-from damian.figures import COLOURS
-from damian.statistics import Floats, bootstrap
+from damian.evaluation.belief_figure import COLOURS
+from damian.evaluation.comparison import NOT_LATE, RANDOM, SCRIPTED, SEEN, TRUE, Comparison, Line
+from damian.evaluation.statistics import Floats, bootstrap
 
 Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 """By task, delay and arm: for each seed the rows of its ``metrics.csv``."""

@@ -10,7 +10,7 @@ import matplotlib
 from torch.utils.tensorboard import SummaryWriter
 
 from damian.common.errors import InputError
-from damian.metrics import Evaluation
+from damian.evaluation.metrics import Evaluation
 
 matplotlib.use("Agg")
 
