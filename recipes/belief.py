@@ -16,9 +16,9 @@ from typing import cast
 import hydra
 import numpy as np
 import torch
-from launch import launch, perform, prepare, reported, save_config
 from omegaconf import DictConfig
-from settings import CONF, TrainConfig
+from shared.launch import launch, perform, prepare, reported, save_config
+from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 

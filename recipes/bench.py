@@ -21,7 +21,7 @@ import torch
 from bench_training import HEADER, training
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from settings import CONF, TrainConfig
+from shared.settings import CONF, TrainConfig
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv

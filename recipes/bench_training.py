@@ -13,8 +13,8 @@ from typing import NamedTuple, cast
 
 import torch
 from hydra import compose, initialize_config_dir
-from launch import checked, quoted
-from settings import CONF, TrainConfig
+from shared.launch import checked, quoted
+from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn

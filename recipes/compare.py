@@ -24,11 +24,11 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from launch import checked, launch, one_line, quoted, reported
 from omegaconf import MISSING, DictConfig
 from omegaconf.errors import OmegaConfBaseException
-from parallel import LOG, Run, check_stored, perform_all
-from settings import CONF
+from shared.launch import checked, launch, one_line, quoted, reported
+from shared.parallel import LOG, Run, check_stored, perform_all
+from shared.settings import CONF
 
 from damian.common import checks
 from damian.common.errors import InputError

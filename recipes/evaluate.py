@@ -10,9 +10,9 @@ folder gets config.yaml, result.csv and result.md.
 from pathlib import Path
 
 import hydra
-from launch import launch, load, perform, prepare, reported, save_config
 from omegaconf import DictConfig
-from settings import CONF, TrainConfig
+from shared.launch import launch, load, perform, prepare, reported, save_config
+from shared.settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
 from torchrl.modules import ProbabilisticActor
 from train import report, unseen

@@ -12,9 +12,9 @@ from pathlib import Path
 import hydra
 import torch
 from evaluate import stored
-from launch import launch, perform, prepare, reported, save_config
 from omegaconf import DictConfig
-from settings import CONF, TrainConfig
+from shared.launch import launch, perform, prepare, reported, save_config
+from shared.settings import CONF, TrainConfig
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import StepCounter

@@ -19,9 +19,9 @@ from typing import cast
 
 import hydra
 import torch
-from launch import launch, load, perform, prepare, reported, save_config
 from omegaconf import DictConfig, OmegaConf
-from settings import CONF, TrainConfig
+from shared.launch import launch, load, perform, prepare, reported, save_config
+from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.collectors import Collector

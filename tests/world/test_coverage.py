@@ -18,7 +18,7 @@ from damian.common.errors import InputError
 from damian.world import coverage
 from damian.world.coverage import build_tables, covered_share
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 R = 56.2341
 
 

@@ -23,8 +23,8 @@ from helpers import (
     same,
     square,
 )
-from launch import launch
-from settings import TrainConfig
+from shared.launch import launch
+from shared.settings import TrainConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type

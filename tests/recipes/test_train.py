@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 from helpers import check_refused
-from launch import launch
 from omegaconf import OmegaConf
-from settings import TrainConfig
+from shared.launch import launch
+from shared.settings import TrainConfig
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint
 from train import main
@@ -20,7 +20,7 @@ from damian.learners.networks import make_actor, make_critic
 TINY = ["frames=256", "worlds=8", "mappo.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["sac.steps=16", "sac.updates=2", "sac.batch=32", "sac.warm_up=100"]
 both_algorithms = pytest.mark.parametrize("algo", ["algo=mappo", "algo=sac"])
-GOLDEN = Path(__file__).parent / "data"
+GOLDEN = Path(__file__).parents[1] / "data"
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from damian.world.motion import (
     time_law,
 )
 
-GOLDEN = json.loads((Path(__file__).parent / "data" / "motion_energy_coverage.json").read_text())
+GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
 CASES = GOLDEN["uav_trajectories"]["cases"]
 FLIGHT_RUN = GOLDEN["action_delay_env_run_usecase1_FL2"]
 DEGREES = [3, 5, 7]

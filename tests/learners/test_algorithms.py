@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from helpers import everything
-from settings import LoggerConfig, TrainConfig
+from shared.settings import LoggerConfig, TrainConfig
 from train import learning_env, make_learner, train
 
 from damian.delays.laws import DelayConfig

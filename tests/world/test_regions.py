@@ -18,7 +18,7 @@ from damian.world.regions.geojson import read_geojson
 from damian.world.regions.polygon import landing_lattice
 from damian.world.regions.region import Region
 
-DATA = Path(__file__).parent / "data" / "regions"
+DATA = Path(__file__).parents[1] / "data" / "regions"
 FIR, ZONES = DATA / "fir.csv", DATA / "zones.geojson"
 SHIPPED = Path(damian.__file__).parent / "data" / "fir.csv"
 DEGREE_M = EARTH_RADIUS_M * np.pi / 180

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 from helpers import square
-from settings import TrainConfig
+from shared.settings import TrainConfig
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from train import learning_env, spotting, ticks

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from belief import main
 from helpers import check_refused
-from launch import launch
 from matplotlib.image import imread
 from omegaconf import OmegaConf
+from shared.launch import launch
 
 UNDELAYED = ["delay.obs=0", "delay.loss=0"]
 FLYING = ["motion=polynomial", "clock.simulation=1s"]

@@ -10,8 +10,8 @@ import pytest
 import train
 from evaluate import main
 from helpers import check_refused
-from launch import launch
 from omegaconf import OmegaConf
+from shared.launch import launch
 
 TRAINED = [
     "frames=64",

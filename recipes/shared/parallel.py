@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from evaluate import fly
-from launch import one_line, perform
 from omegaconf import OmegaConf
-from settings import TrainConfig
 from tqdm import tqdm
 from train import train
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
+from shared.launch import one_line, perform
+from shared.settings import TrainConfig
 
 LOG = "log.txt"
 _SPAWN = multiprocessing.get_context("spawn")

@@ -21,7 +21,7 @@ from damian.world.battery import (
 )
 from damian.world.motion import fly, minimum_time
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 ENERGY = json.loads((DATA / "motion_energy_coverage.json").read_text())["energy"]
 ODD_RUN = ENERGY["instantaneous_env_run_usecase1"]
 START = json.loads((DATA / "usecase1.json").read_text())["scenario"]["uav_start_positions"][0]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from damian.common.errors import InputError
 from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, leg_duration, locate
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 SCENARIO = json.loads((DATA / "usecase1.json").read_text())["scenario"]
 GOLDEN = json.loads((DATA / "motion_energy_coverage.json").read_text())
 

@@ -21,7 +21,7 @@ from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import SacConfig
 
-CONF = str(Path(__file__).parents[1] / "conf")
+CONF = str(Path(__file__).parents[2] / "conf")
 """Absolute, so that a recipe can be imported as well as run."""
 
 

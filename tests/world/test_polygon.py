@@ -20,7 +20,7 @@ from damian.world.regions.polygon import (
     sample_interior,
 )
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 GOLDEN = json.loads((DATA / "motion_energy_coverage.json").read_text())
 EXAMPLES = GOLDEN["discretisation_examples"]
 reproducible = settings(max_examples=40, derandomize=True, deadline=None)

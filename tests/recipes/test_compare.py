@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from compare import start
 from helpers import check_refused
-from settings import CONF
+from shared.settings import CONF
 
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison
 from damian.evaluation.report import markdown, plot_curves, plot_norms

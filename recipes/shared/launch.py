@@ -18,12 +18,12 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
 from damian.envs.scenario import leftovers
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
+from shared.settings import CONF, TrainConfig
 
 
 def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 import train
 from helpers import both_motions, everything
-from launch import launch
+from shared.launch import launch
 from torchrl.envs import StepCounter
 
 from damian.delays.laws import DelayConfig

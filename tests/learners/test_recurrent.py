@@ -11,7 +11,7 @@ import pytest
 import torch
 import train
 from helpers import check_refused, everything
-from launch import launch
+from shared.launch import launch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Categorical, Composite, TensorDictReplayBuffer, Unbounded
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
