@@ -27,7 +27,7 @@ from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.evaluation.belief_figure import Beliefs, plot_beliefs
-from damian.server.features import Snapshot
+from damian.world.messages import Messages
 
 TABLE, FIGURE = "belief.csv", "belief.png"
 POSITIONS = ("true_east_m", "true_north_m", "believed_east_m", "believed_north_m")
@@ -36,19 +36,21 @@ COLUMNS = ("time_s", "uav", *POSITIONS, "age_s", "arrived", "lost")
 
 def fly(config: TrainConfig) -> Beliefs:
     """One episode of the random policy."""
-    env = make_env(config.flown, 1, config.seed, config.device, extras=["message", "state", "reward_terms"])
+    env = make_env(
+        config.eval_scenario, 1, config.seed, config.device, extras=["message", "state", "reward_terms"]
+    )
     flight = env.rollout(config.horizon, random_policy(env))[0].cpu()
-    keys = ["state", *(("agents", name) for name in ("message", "talks", "received", "delay"))]
+    keys = ["state", *(("agents", name) for name in ("message", "message_sent", "received", "delay"))]
     parts = [part.select(*keys, strict=False) for part in (flight[:1], flight["next"])]
-    return beliefs(cast(TensorDictBase, torch.cat(parts)), cast(UavEnv, env.base_env))  # type: ignore[arg-type]
+    return beliefs(cast(TensorDictBase, torch.cat(parts)), env.uav_env)  # type: ignore[arg-type]
 
 
 def beliefs(shown: TensorDictBase, env: UavEnv) -> Beliefs:
     """What was shown at each instant, [T + 1], by name; ``env`` is where the flight has left it."""
     agents, state = cast(TensorDictBase, shown["agents"]), cast(Tensor, shown["state"])
-    message, talks = cast(Tensor, agents["message"]), cast(Tensor, agents["talks"]).clone()
-    talks[0] = False  # what is held after a reset
-    held = Snapshot.unpack(agents.get("received", message))
+    message, message_sent = cast(Tensor, agents["message"]), cast(Tensor, agents["message_sent"]).clone()
+    message_sent[0] = False  # what is held after a reset
+    held = Messages.unpack(agents.get("received", message))
     dt, steps = env.scenario.clock.dt, torch.arange(len(state), dtype=torch.float64)
     positions = state[:, : 3 * env.n_agents].unflatten(-1, (env.n_agents, 3))[..., :2]
     return Beliefs(
@@ -56,12 +58,14 @@ def beliefs(shown: TensorDictBase, env: UavEnv) -> Beliefs:
         true=np.asarray(positions),
         believed=np.asarray(held.position),
         age=np.asarray((steps.unsqueeze(-1) - held.time / dt).round() * dt),  # times are float32
-        sent=np.asarray(talks),
-        delay=np.asarray(agents.get("delay", torch.zeros_like(talks[..., None], dtype=torch.long))[..., 0]),
+        sent=np.asarray(message_sent),
+        delay=np.asarray(
+            agents.get("delay", torch.zeros_like(message_sent[..., None], dtype=torch.long))[..., 0]
+        ),
         source=np.asarray(state[:, -2:]),
         region=env.simulation.airspace.regions[int(env.state.region)].polygon,
         radius=env.simulation.radius,
-        jumps=not env.simulation.flies,
+        jumps=env.simulation.vehicles.instant,
     )
 
 
@@ -96,10 +100,10 @@ def show(config: TrainConfig, folder: Path) -> None:
 
 @hydra.main(version_base=None, config_path=CONF, config_name="belief")
 @reported
-def main(written: DictConfig) -> None:
-    if written.resume is not None:
+def main(composed: DictConfig) -> None:
+    if composed.resume is not None:
         raise InputError("resume: a flight of the random policy has nothing to go on with")
-    perform(*prepare(written), show)
+    perform(*prepare(composed), show)
 
 
 if __name__ == "__main__":

@@ -27,13 +27,16 @@ from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
 from tqdm import tqdm
 
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import BatteryConfig, MotionConfig, ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
-from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
+from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
+from damian.server.termination import EpisodeConfig
+from damian.world.battery import BatteryConfig
+from damian.world.motion import MotionConfig
 
 RIVAL, BARE = "VMAS discovery", "bare"
 COMPILED_TOO = (BARE, "whole chain", "every transform")
@@ -68,18 +71,18 @@ QUICK = Sizes(
 
 
 def scenarios() -> Scenarios:
-    """The paper's second use case, as ``+usecase=2`` trains it, and the same place with everything on."""
+    """The paper's second use case as its scenario trains it, and the same place with everything on."""
     with initialize_config_dir(CONF, version_base=None):
-        written = compose("train", overrides=["+usecase='2'"])
+        written = compose("train", overrides=["scenario=paper/usecase2"])
     paper = cast(TrainConfig, OmegaConf.to_object(written))
     full = replace(
         paper,
-        region=replace(paper.region, start_positions=None, situations=1024),
+        region=replace(paper.region, start_positions=None, initial_conditions=1024),
         motion=MotionConfig(kind="polynomial"),
         battery=BatteryConfig(enabled=True),
         actions=replace(paper.actions, mask=True),
         observation=ObservationConfig(list(LOCAL), list(GLOBAL), ctde=True),
-        task=RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 1.0)),
+        reward=RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 1.0)),
         episode=EpisodeConfig(max_steps=100),
     )
     return {"use case 2": paper, "everything": full}
@@ -90,7 +93,7 @@ def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:
     return replace(
         scenario,
         agents=agents,
-        region=replace(scenario.region, start_positions=None, situations=1024),
+        region=replace(scenario.region, start_positions=None, initial_conditions=1024),
         motion=replace(scenario.motion, max_level=30.0),  # room for 50 flight levels
     )
 

@@ -13,7 +13,7 @@ from typing import NamedTuple, cast
 
 import torch
 from hydra import compose, initialize_config_dir
-from shared.launch import checked, quoted
+from shared.launch import checked
 from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -28,14 +28,15 @@ from torchrl.objectives.utils import ValueEstimators
 from tqdm import tqdm
 from train import learning_env, make_collector, make_learner, ticks
 
-from damian.envs.clocks import SystemClock
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
+from damian.learners.schedule import SystemClock
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
 """Does one value stand for all agents? Then the critic has a third of our critic's work, else as much."""
-PAPER = "+usecase=2 delay=paper"
-ARMS = ("+usecase=2", PAPER, f"{PAPER} aware=backupdate", f"{PAPER} aware=both")
+UNDELAYED = "scenario=paper/usecase2"
+PAPER = f"{UNDELAYED} delay=paper"
+ARMS = (UNDELAYED, PAPER, f"{PAPER} aware=backupdate", f"{PAPER} aware=both")
 """What ``recipes/train.py`` is told."""
 HEADER = (
     "training",
@@ -75,22 +76,22 @@ def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
 
 def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
     """What these overrides make, on larger batches."""
-    batch = [f"worlds={worlds}", f"mappo.steps={steps}", "mappo.epochs=4", "mappo.minibatches=4"]
+    batch = [f"worlds={worlds}", f"learner.steps={steps}", "learner.epochs=4", "learner.minibatches=4"]
     with initialize_config_dir(CONF, version_base=None):
-        return checked(compose("train", overrides=quoted([*words.split(), *batch])))
+        return checked(compose("train", overrides=[*words.split(), *batch]))
 
 
 def damian(config: TrainConfig) -> Iterator[Seconds]:
     """Train as ``recipes/train.py`` does; yields what each iteration took."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    learner = cast(Mappo, make_learner(config, env, clock))
+    learner = cast(Mappo, make_learner(config, env))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     batches = ticks(collector, clock)
     while True:
         begin = time.perf_counter()
         batch = next(batches)
         collected = time.perf_counter()
-        known = learner.known(batch)
+        known = learner.backupdated_batch(batch)
         corrected = time.perf_counter()
         add_advantages(known, learner.critic, learner.config)
         learner.optimize(known)
@@ -99,16 +100,16 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
 
 def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
     """Train as TorchRL's users do: its own networks and loss, and a replay buffer for the minibatches."""
-    worlds, steps = config.worlds, config.update_steps
+    worlds, steps, learner = config.worlds, config.update_steps, cast(MappoConfig, config.learner)
     env = vmas_env(worlds, config.agents)
     actor, critic = vmas_actor(env, config), vmas_critic(env, config, together)
-    loss = vmas_loss(actor, critic, config.mappo)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=config.mappo.lr)
+    loss = vmas_loss(actor, critic, learner)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=learner.lr)
     collector = make_collector(env, actor, worlds * steps)
     memory = TensorDictReplayBuffer(
         storage=LazyTensorStorage(worlds * steps),
         sampler=SamplerWithoutReplacement(),
-        batch_size=worlds * steps // config.mappo.minibatches,
+        batch_size=worlds * steps // learner.minibatches,
     )
     batches = iter(collector)
     while True:
@@ -118,9 +119,9 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
         with torch.no_grad():
             loss.value_estimator(batch)
         memory.extend(batch.reshape(-1))
-        for _ in range(config.mappo.epochs):
+        for _ in range(learner.epochs):
             for steps_of_worlds in memory:
-                descend(loss, optimizer, steps_of_worlds, config.mappo.max_grad_norm)
+                descend(loss, optimizer, steps_of_worlds, learner.max_grad_norm)
         collector.update_policy_weights_()
         yield Seconds(collected - begin, 0.0, time.perf_counter() - collected)
 
@@ -173,7 +174,7 @@ def vmas_network(env: TransformedEnv, config: TrainConfig, n_out: int, centralis
 
 def vmas_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig) -> MAPPOLoss:
     """TorchRL's loss under VMAS's names."""
-    loss = MAPPOLoss(actor, critic, clip_epsilon=config.clip, entropy_coeff=config.entropy)
+    loss = MAPPOLoss(actor, critic, clip_epsilon=config.clip_epsilon, entropy_coeff=config.entropy_coeff)
     loss.set_keys(reward=("agents", "reward"), value=("agents", "state_value"))
     loss.make_value_estimator(ValueEstimators.MAGAE, gamma=config.gamma, lmbda=config.lmbda)
     return loss

@@ -2,7 +2,7 @@
 
     python recipes/compare.py experiment=usecase2 seeds=10 processes=2
     python recipes/compare.py experiment=delaybench "tasks=[tracking]" "arms=[undelayed,naive,both]"
-    python recipes/compare.py experiment=usecase2 seeds=2 "overrides=[frames=1000,eval_episodes=8]"
+    python recipes/compare.py experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
     python recipes/compare.py experiment=usecase2 report_only=true
 
 conf/experiment says what is compared. Runs lie in runs/EXPERIMENT/TASK/DELAY/ARM/seed_N and print into
@@ -22,11 +22,9 @@ import hydra
 from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig
-from omegaconf.errors import OmegaConfBaseException
-from shared.launch import checked, launch, one_line, quoted, reported
+from shared.launch import COMPOSITION_ERRORS, checked, launch, one_line, reported
 from shared.parallel import LOG, Run, check_stored, perform_all
 from shared.settings import CONF
 
@@ -136,10 +134,10 @@ def _seeds(config: CompareConfig, folder: Path, words: list[str]) -> Iterator[Ru
     how = config.experiment.arms[arm]
     words = ["logger=csv", *words, *how.overrides, *config.overrides]
     try:
-        first = checked(compose("train", quoted(words)))
+        first = checked(compose("train", words))
         if how.policy_of is None:
             first.check_learning()
-    except (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError) as error:
+    except COMPOSITION_ERRORS as error:
         raise InputError(f"{task}/{delay}/{arm}: {one_line(error)}") from error
     for seed in range(config.experiment.first_seed, config.experiment.first_seed + config.seeds):
         last = f"seed_{seed}"
@@ -219,10 +217,10 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="compare")
 @reported
-def main(written: DictConfig) -> None:
+def main(composed: DictConfig) -> None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise InputError("-m: a comparison runs all its arms and seeds by itself; leave it out")
-    config: CompareConfig = checked(written)
+    config: CompareConfig = checked(composed)
     folder = Path(HydraConfig.get().runtime.output_dir)
     runs = plan(config, folder)
     for run in runs:
@@ -243,19 +241,5 @@ def main(written: DictConfig) -> None:
         sys.exit(1)
 
 
-def start() -> None:
-    """Run the command line, whose overrides=[frames=1000,worlds=8] Hydra reads only with quotes."""
-    sys.argv = [_listed(word) for word in sys.argv]
-    launch(main, CompareConfig)
-
-
-def _listed(word: str) -> str:
-    written = re.fullmatch(r"overrides=\[([^'\"]+)\]", word)
-    if not written:
-        return word
-    every = re.split(r",\s*(?=[+~]*[\w./]+=)", written[1])  # a comma before a key; others are within values
-    return f"overrides=[{','.join(repr(each) for each in every)}]"
-
-
 if __name__ == "__main__":
-    start()
+    launch(main, CompareConfig)

@@ -15,7 +15,7 @@ from shared.launch import launch, load, perform, prepare, reported, save_config
 from shared.settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
 from torchrl.modules import ProbabilisticActor
-from train import report, unseen
+from train import make_eval_env, report
 
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
@@ -37,7 +37,7 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
     """
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
-    env = unseen(config)
+    env = make_eval_env(config)
     actor = make_actor(env, config.model)
     load(Checkpoint(actor=actor), Path(config.checkpoint), "checkpoint")
     return env, actor
@@ -45,8 +45,8 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
-def main(written: DictConfig) -> None:
-    perform(*prepare(written), fly)
+def main(composed: DictConfig) -> None:
+    perform(*prepare(composed), fly)
 
 
 if __name__ == "__main__":

@@ -20,20 +20,20 @@ from torch import Tensor
 from torchrl.envs import StepCounter
 
 from damian.common.errors import InputError
-from damian.envs.pipeline import messages_are_late
+from damian.envs.pipeline import has_message_delay
 from damian.evaluation.metrics import evaluate
 from damian.evaluation.run_folder import save_results
-from damian.server.features import Snapshot
 from damian.server.server import Server
+from damian.world.messages import Messages
 
-ALL = Snapshot._fields
+ALL = Messages._fields
 PLACE = ("position", "target", "track", "trail")
 """What a UAV can tell from its own past actions; what it has heard is not among it."""
 
 
 def foresee(config: TrainConfig, folder: Path) -> None:
     """Evaluate with more and more that is known on time, and fill the folder."""
-    if not messages_are_late(config):
+    if not has_message_delay(config):
         raise InputError("delay.obs: nothing is late: there is nothing to know earlier")
     env, actor = stored(config)
     save_config(config, folder)
@@ -48,14 +48,14 @@ def foresee(config: TrainConfig, folder: Path) -> None:
     }
     rows = {}
     for name, known in whose.items():
-        env.set_seed(config.unseen_seed)  # the same episodes for everyone
-        policy = TensorDictSequential([informed(env.worlds.server, *known), actor])  # type: ignore[list-item]
+        env.set_seed(config.eval_seed)  # the same episodes for everyone
+        policy = TensorDictSequential([observe_with_timely_messages(env.server, *known), actor])  # type: ignore[list-item]
         rows[name] = evaluate(env, policy, config.horizon)
     table = save_results(rows, folder, config.episode.success_share is not None, late=True)
     print(f"\nwhat a UAV knows on time:\n\n{table}")
 
 
-def informed(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDictModule:
+def observe_with_timely_messages(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDictModule:
     """Shows each UAV what the server would tell it if it had known some things on time.
 
     Args:
@@ -65,7 +65,7 @@ def informed(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDi
     """
 
     def see(received: Tensor, message: Tensor, shown: Tensor, steps: Tensor) -> Tensor:
-        known = server.informed(received, message, steps.squeeze(-1), on_time, fields)
+        known = server.observe_with_timely_messages(received, message, steps.squeeze(-1), on_time, fields)
         return torch.cat([known, shown[..., known.shape[-1] :]], -1)  # what it remembers by itself stays
 
     names = ("received", "message", "observation")
@@ -75,8 +75,8 @@ def informed(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDi
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
-def main(written: DictConfig) -> None:
-    perform(*prepare(written), foresee)
+def main(composed: DictConfig) -> None:
+    perform(*prepare(composed), foresee)
 
 
 if __name__ == "__main__":

@@ -37,8 +37,10 @@ from torchrl.envs import (
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from damian import keys
 from damian.common import checks
 from damian.common.errors import InputError
+from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.transforms import ActionHistory, ObservationDelay
@@ -91,10 +93,11 @@ def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
 
 def make_learner(env: EnvBase, run: Run) -> Sac:
     """The learner of our UAVs, on a memory that takes single steps."""
-    config = SacConfig(lr=LR, alpha_lr=LR, gamma=GAMMA, tau=TAU, alpha=1.0)
-    memory = ReplayBuffer(storage=LazyTensorStorage(run.steps), batch_size=BATCH)
+    config = SacConfig(lr=LR, alpha_lr=LR, gamma=GAMMA, tau=TAU, alpha_init=1.0)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(run.steps), batch_size=BATCH)
     model = ModelConfig(hidden=[run.hidden, run.hidden], activation="relu")
-    return Sac(env, model, config, memory, critic_sees="observation")
+    setup = LearningSetup(model, 1, 1, 1, critic_key=keys.OBSERVATION)
+    return Sac(env, config, setup, buffer)
 
 
 def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
@@ -104,9 +107,9 @@ def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
         with torch.no_grad():
             chosen = env.rand_action(seen) if step < RANDOM_STEPS else learner.actor(seen)
             after, seen = env.step_and_maybe_reset(chosen)
-        learner.memory.add(after.select(*STORED))
+        learner.buffer.add(after.select(*STORED))
         if step >= RANDOM_STEPS:
-            learner.improve(learner.memory.sample())
+            learner.update(learner.buffer.sample())
         bar.update()
         if after["next", "done"].item():
             bar.set_postfix({"return": f"{after['next', 'episode_reward'].item():.0f}"})

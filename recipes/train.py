@@ -1,8 +1,8 @@
 """Train UAVs with MAPPO or SAC, and show what they have learnt beside a random policy.
 
     python recipes/train.py agents=3 scenario=spotting motion=polynomial seed=1
-    python recipes/train.py +usecase=2 delay=paper aware=both
-    python recipes/train.py algo=sac scenario=tracking actions=continuous
+    python recipes/train.py scenario=paper/usecase2 delay=paper aware=both
+    python recipes/train.py learner=sac scenario=tracking actions=continuous
     python recipes/train.py -m seed=0,1,2 agents=3,5
     python recipes/train.py resume=runs/2026-01-31_12-00-00
 
@@ -19,8 +19,8 @@ from typing import cast
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
-from shared.launch import launch, load, perform, prepare, reported, save_config
+from omegaconf import DictConfig
+from shared.launch import launch, load, perform, prepare, reported, save_config, stored_config
 from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
@@ -29,11 +29,11 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import RewardSum, StepCounter, TransformedEnv
 from tqdm import tqdm
 
+from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
-from damian.envs.clocks import SystemClock
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env, messages_are_late
+from damian.envs.pipeline import has_message_delay, make_env
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED
 from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate
 from damian.evaluation.run_folder import (
@@ -45,11 +45,15 @@ from damian.evaluation.run_folder import (
     plot_learning_curve,
     save_results,
 )
-from damian.learners.mappo import Mappo
-from damian.learners.recurrent import prime
-from damian.learners.sac import Sac
-from damian.replay.backupdate import BackupdateStorage, TimeStorage, server_view
-from damian.server.features import Snapshot
+from damian.keys import next_key
+from damian.learners.base import Learner
+from damian.learners.recurrent import add_recurrent_state
+from damian.learners.schedule import SystemClock
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.recompute import server_recompute
+from damian.replay.time_storage import TimeStorage
+from damian.server.server import Server
+from damian.world.messages import Messages
 
 
 @dataclass
@@ -68,46 +72,37 @@ class Progress:
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment that policies are trained in."""
-    read = looks_back(config) or config.clock.trigger is not None
-    extras = ["reward_terms", *["message"] * read, *["privileged"] * (config.critic == "privileged")]
-    env = make_env(config.learnt, config.worlds, config.seed, config.device, extras)
+    messages = config.backupdates or config.clock.trigger is not None
+    privileged = config.critic == "privileged"
+    extras = ["reward_terms", *["message"] * messages, *["privileged"] * privileged]
+    env = make_env(config.train_scenario, config.worlds, config.seed, config.device, extras)
     if config.compile:
         env.compile()
-    episode_reward = RewardSum(in_keys=[("agents", "reward")], out_keys=[("agents", "episode_reward")])
-    env.append_transform(episode_reward)
+    env.append_transform(RewardSum(in_keys=[keys.REWARD], out_keys=[keys.EPISODE_REWARD]))
     env.append_transform(StepCounter())
     return env
 
 
-def looks_back(config: TrainConfig) -> bool:
-    """Is there anything to correct, and should it be."""
-    return config.backupdate and messages_are_late(config)
+def make_learner(config: TrainConfig, env: DelayedEnv) -> Learner:
+    """The learner, on a replay buffer in which late messages correct the steps if they should."""
+    setup = config.learning_setup
+    size = config.learner.buffer_size(setup)
+    buffer = None if size is None else make_buffer(config, env.server, size)
+    return config.learner.make(env, setup, buffer)
 
 
-def make_learner(config: TrainConfig, env: DelayedEnv, clock: SystemClock) -> Mappo | Sac:
-    """The algorithm, on a memory in which late messages correct what is learnt from if they should."""
-    settle = config.longest_delay if config.settle else 0
-    if config.algo == "mappo":
-        shortest = (clock.longest + 2 * config.longest_delay) * config.worlds
-        memory = make_memory(config, env, shortest) if looks_back(config) else None
-        seen, recompute = config.critic_sees, config.recompute_actor
-        return Mappo(env, config.model, config.mappo, memory, settle, recompute, seen)
-    memory = make_memory(config, env, config.sac.memory // config.worlds * config.worlds)
-    return Sac(env, config.model, config.sac, memory, settle, config.critic_sees)
-
-
-def make_memory(config: TrainConfig, env: DelayedEnv, capacity: int) -> ReplayBuffer:
-    """What keeps the latest steps of the worlds, so many in all."""
-    if not looks_back(config):
-        return ReplayBuffer(storage=TimeStorage(capacity, device=config.device))
-    view = server_view(env.worlds.server, actor=config.recompute_actor)
-    storage = BackupdateStorage(capacity, view, config.longest_delay, device=config.device)
+def make_buffer(config: TrainConfig, server: Server, size: int) -> ReplayBuffer:
+    """A replay buffer of the latest steps, so many over all worlds."""
+    if not config.backupdates:
+        return ReplayBuffer(storage=TimeStorage(size, device=config.device))
+    recompute = server_recompute(server, actor=config.recompute_actor)
+    storage = BackupdateStorage(size, recompute, config.longest_delay, device=config.device)
     return ReplayBuffer(storage=storage)
 
 
 def make_collector(env: TransformedEnv, actor: torch.nn.Module, frames: int) -> Collector:
     """Collects batches of so many steps, without end."""
-    prime(env, actor)
+    add_recurrent_state(env, actor)
     return Collector(
         env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
     )
@@ -129,8 +124,8 @@ def ticks(collector: Collector, clock: SystemClock) -> Iterator[TensorDictBase]:
 
 def spotting(batch: TensorDictBase) -> torch.Tensor:
     """Which UAVs spot the source after a batch [B, T], as the server knows, [B, N]."""
-    agents = cast(TensorDictBase, batch["next", "agents"][:, -1])
-    return Snapshot.unpack(agents.get("received", agents["message"])).spotted
+    after = cast(TensorDictBase, batch["next"][:, -1])
+    return Messages.unpack(after.get(keys.RECEIVED, after[keys.MESSAGE])).spotted
 
 
 def train(config: TrainConfig, folder: Path) -> None:
@@ -141,17 +136,15 @@ def train(config: TrainConfig, folder: Path) -> None:
     """
     config.check_learning()
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    learner = make_learner(config, env, clock)
+    learner = make_learner(config, env)
     progress, episodes = Progress(), EpisodeLog()
     state = {"progress": progress, "episodes": episodes, "clock": clock, "rng": GlobalRNGState()}
-    checkpoint = Checkpoint(**learner.parts(), **state)
+    checkpoint = Checkpoint(**learner.components(), **state)
     if config.resume:
         load(checkpoint, folder, "resume")
         env.set_seed(config.seed + 1_000_003 * progress.updates)  # not the first episodes once more
     elif config.checkpoint:
-        load(
-            checkpoint, Path(config.checkpoint), "checkpoint", ["actor", *["critic"] * same_algorithm(config)]
-        )
+        load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", *["critic"] * same_learner(config)])
     save_config(config, folder)
     log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
@@ -174,16 +167,19 @@ def train(config: TrainConfig, folder: Path) -> None:
     collector.shutdown()
     if interrupt.asked:
         sys.exit(f"interrupted; go on with resume={folder}")
-    random = report(config, folder, unseen(config), learner.actor)
-    plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {config.algo.upper()}")
+    random = report(config, folder, make_eval_env(config), learner.actor)
+    plot_learning_curve(
+        log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {config.learner.name.upper()}"
+    )
     print(f"learning curve: {folder / FIGURE}")
 
 
-def same_algorithm(config: TrainConfig) -> bool:
-    """Has the policy to begin with been learnt by the same algorithm, so that its critic fits?"""
-    saved = Path(str(config.checkpoint)) / CONFIG
-    stored = cast(DictConfig, OmegaConf.load(saved)) if saved.is_file() else {}
-    return stored.get("algo", config.algo) == config.algo
+def same_learner(config: TrainConfig) -> bool:
+    """Has the same learner trained the policy to begin with, so that its critic fits?"""
+    folder = Path(str(config.checkpoint))
+    if not (folder / CONFIG).is_file():
+        return True
+    return stored_config(folder, "checkpoint").learner.name == config.learner.name
 
 
 def progress_bar(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> tqdm:
@@ -200,13 +196,13 @@ def enough(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> boo
 
 def mean_terms(batch: TensorDictBase) -> dict[str, float]:
     """Mean of each weighted reward term, over steps, worlds and UAVs."""
-    terms = cast(TensorDictBase, batch["next", "agents", "reward_terms"])
+    terms = cast(TensorDictBase, batch[next_key(keys.REWARD_TERMS)])
     return {f"reward/{name}": term.mean().item() for name, term in terms.items()}
 
 
-def unseen(config: TrainConfig) -> DelayedEnv:
+def make_eval_env(config: TrainConfig) -> DelayedEnv:
     """An environment of situations that were not trained on, a world for each episode of an evaluation."""
-    return make_env(config.flown, config.eval_episodes, config.unseen_seed, config.device, ["message"])
+    return make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, ["message"])
 
 
 def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module) -> Evaluation:
@@ -217,20 +213,20 @@ def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.M
     """
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
-        env.set_seed(config.unseen_seed)  # the same episodes for every policy
+        env.set_seed(config.eval_seed)  # the same episodes for every policy
         return evaluate(env, policy, config.horizon, sample)
 
     random = fly(random_policy(env))
     rows = {SAMPLED: fly(actor), MODE: fly(actor, False), RANDOM: random, GREEDY: fly(greedy_policy(env))}
-    table = save_results(rows, folder, config.episode.success_share is not None, messages_are_late(config))
+    table = save_results(rows, folder, config.episode.success_share is not None, has_message_delay(config))
     print(f"\n{table}\n")
     return random
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
-def main(written: DictConfig) -> None:
-    perform(*prepare(written), train)
+def main(composed: DictConfig) -> None:
+    perform(*prepare(composed), train)
 
 
 if __name__ == "__main__":

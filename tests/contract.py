@@ -14,10 +14,10 @@ from damian.envs.uav_env import UavEnv
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
-    Clock,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
+    SampleAndHold,
     ServerNode,
 )
 
@@ -72,7 +72,7 @@ def uavs() -> EnvBase:
 
 def unserved() -> EnvBase:
     """The same, without a server node."""
-    return UavEnv(square(), num_worlds=2, extras=["message"], serves=False)
+    return UavEnv(square(), num_worlds=2, extras=["message"], messages_only=True)
 
 
 class Case(NamedTuple):
@@ -99,16 +99,16 @@ CASES = {
     "ActionHistory, agents": Case(
         uavs, lambda: ActionHistory(2, ACTION, append_to=SEEN, recorded_key="ready")
     ),
-    "Clock, one world": Case(cartpole, lambda: Clock(3)),
-    "Clock, worlds": Case(Drift, lambda: Clock(2, in_keys_inv=["action"])),
-    "Clock, agents": Case(uavs, lambda: Clock("2s", [SEEN], [ACTION], ready_key=("agents", "ready"))),
+    "Clock, one world": Case(cartpole, lambda: SampleAndHold(3)),
+    "Clock, worlds": Case(Drift, lambda: SampleAndHold(2, in_keys_inv=["action"])),
+    "Clock, agents": Case(uavs, lambda: SampleAndHold("2s", [SEEN], [ACTION], ready_key=("agents", "ready"))),
     "CumulativeReward, one world": Case(cartpole, lambda: CumulativeReward(3)),
     "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
     "CumulativeReward, agents": Case(uavs, lambda: CumulativeReward(3, 0.5, REWARD)),
     "ObservationDelay, one world": Case(cartpole, lambda: ObservationDelay(LATE)),
     "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"}, fresh_key="fresh")),
     "ObservationDelay, agents": Case(
-        uavs, lambda: ObservationDelay(LATE, [SEEN], loss=0.2, delay_key="delay", sent_key="talks")
+        uavs, lambda: ObservationDelay(LATE, [SEEN], loss=0.2, delay_key="delay", sent_key="message_sent")
     ),
     "RewardDelay, one world": Case(cartpole, lambda: RewardDelay(LATE)),
     "RewardDelay, worlds": Case(Drift, lambda: RewardDelay({"law": "geometric"})),

@@ -20,7 +20,7 @@ from damian.delays.samplers import Sampler
 
 def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
     """Delays of the messages sent at the steps 1, 2, ... by senders with these streams [M], [T, M]."""
-    memory, delays = sampler.begin(streams), []
+    memory, delays = sampler.initial_state(streams), []
     for clock in range(1, n_steps + 1):
         delay, memory = sampler(streams, torch.tensor(clock), memory)
         delays.append(delay)
@@ -131,7 +131,7 @@ class Counting(EnvBase):
         flag = Binary(shape=agents, n=n_agents, dtype=torch.bool)
         seen = Unbounded((*agents, 7), dtype=torch.float64)
         self.action_spec = group(action=action)
-        self.observation_spec = group(observation=seen, talks=flag, ready=flag.clone())
+        self.observation_spec = group(observation=seen, message_sent=flag, ready=flag.clone())
         self.reward_spec = group(reward=Unbounded((*agents, 1)))
         self._begin(torch.ones(worlds_shape, dtype=torch.bool))
         self.episode = torch.zeros(worlds_shape, dtype=torch.long)
@@ -140,7 +140,7 @@ class Counting(EnvBase):
         shape = (*self.batch_size, self.n_agents)
         x = (7 * self.names.unsqueeze(-1) + torch.arange(self.n_agents)) % 101
         self.x = torch.where(mask.unsqueeze(-1), x, self.x if hasattr(self, "x") else x)
-        self.executed, self.acts = torch.zeros(shape), torch.ones(shape)
+        self.executed, self.action_valid = torch.zeros(shape), torch.ones(shape)
 
     def _flag(self, salt: int) -> Tensor:
         """A flag that is true two times out of three, [B, N]."""
@@ -153,12 +153,14 @@ class Counting(EnvBase):
         shape = (*self.batch_size, self.n_agents)
         names, agents = self.names.unsqueeze(-1).expand(shape), torch.arange(self.n_agents).expand(shape)
         total, episode = torch.full(shape, self.total), self.episode.unsqueeze(-1).expand(shape)
-        seen = torch.stack([names, agents, total, episode, self.x, self.executed, self.acts], -1).double()
+        seen = torch.stack(
+            [names, agents, total, episode, self.x, self.executed, self.action_valid], -1
+        ).double()
         lies = torch.zeros(shape, dtype=torch.bool)
         if self.tampered is not None and self.tampered[2] == self.total:
             lies[self.tampered[:2]] = True
         seen = seen - lies.unsqueeze(-1) * 1000.0
-        values = {"observation": seen, "talks": self._flag(0), "ready": self._flag(1)}
+        values = {"observation": seen, "message_sent": self._flag(0), "ready": self._flag(1)}
         self.lies = lies
         return TensorDict({"agents": TensorDict(values, shape)}, self.batch_size)
 
@@ -176,7 +178,7 @@ class Counting(EnvBase):
             action = (action * action.new_tensor([1.0, 10.0])).round().sum(-1)
         self.x = (3 * self.x + action.long() + 1) % 101
         self.executed = action
-        self.acts = tensordict.get(("agents", "acts"), self.acts)
+        self.action_valid = tensordict.get(("agents", "action_valid"), self.action_valid)
         shown = self._show()
         reward = (self.x + 100 * self.names.unsqueeze(-1) - 1000 * self.lies).float()
         shown["agents"].set("reward", reward.unsqueeze(-1))

@@ -14,13 +14,16 @@ from torch import Tensor
 from twin import Uav
 
 from damian.envs.clocks import ClockConfig
-from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.features import GLOBAL, LOCAL, Knowledge, ObservationConfig, Snapshot
-from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig, ServerContext
+from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
+from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
+from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 from damian.world.state import State
 
@@ -46,7 +49,7 @@ def usecase(case: int, **changed: Any) -> ScenarioConfig:
         vertices=golden["polygon_vertices_ring"][:-1],
         lattice_step=golden["step_m"],
         lattice_angle=golden["deg"],
-        situations=1,
+        initial_conditions=1,
         start_positions=golden["uav_start_positions"],
     )
     observation = ObservationConfig(
@@ -68,7 +71,7 @@ def usecase(case: int, **changed: Any) -> ScenarioConfig:
         ),
         "actions": ActionConfig(distances=distances, headings=headings, mask=False),
         "observation": observation,
-        "task": task,
+        "reward": task,
         "episode": EpisodeConfig(max_steps=golden["max_episode_len"], success_share=golden["perc_needed"]),
     }
     return ScenarioConfig(**(sections | changed))
@@ -76,7 +79,7 @@ def usecase(case: int, **changed: Any) -> ScenarioConfig:
 
 def square(**changed: Any) -> ScenarioConfig:
     """Three UAVs start side by side in a small square, the source in its middle."""
-    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, situations=8)
+    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=8)
     sections = {
         "region": region,
         "source": SourceConfig(level_db=135.0, position=[100.0, 100.0]),
@@ -88,13 +91,13 @@ def square(**changed: Any) -> ScenarioConfig:
 def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) -> ScenarioConfig:
     """Every feature, every reward term, a walking source that is heard now and then, batteries."""
     sections = {
-        "region": RegionConfig(min_area=20_000, max_area=60_000, pool=3, situations=12),
+        "region": RegionConfig(min_area=20_000, max_area=60_000, pool=3, initial_conditions=12),
         "motion": MotionConfig(kind=motion, max_speed=20.0, max_acceleration=10.0),
         "source": walking(emission="per_step", emission_probability=0.7),
         "battery": BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=20.0),
         "actions": ActionConfig(kind=kind),
         "observation": ObservationConfig(local_features=list(LOCAL), global_features=list(GLOBAL)),
-        "task": RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5), bonus=1.0, penalty=0.25),
+        "reward": RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5), bonus=1.0, penalty=0.25),
         "episode": EpisodeConfig(max_steps=8, success_share=1.0, discharged_share=1.0),
     }
     return ScenarioConfig(**(sections | changed))
@@ -110,7 +113,7 @@ def tracking(emission: str) -> dict[str, Any]:
     """Sections of a tracking task."""
     return {
         "source": walking(emission=emission),
-        "task": RewardConfig(spotted=0.0, spotting_agents=0.5, source_drift=0.5, source_time=0.5),
+        "reward": RewardConfig(spotted=0.0, spotting_agents=0.5, source_drift=0.5, source_time=0.5),
         "observation": ObservationConfig(global_features=["source_drift", "source_bearing"]),
     }
 
@@ -120,24 +123,24 @@ KINDS: dict[str, dict[str, Any]] = {
     "tracking, emission per stop": tracking("per_stop"),
     "tracking, emission per step": tracking("per_step"),
     "coverage": {
-        "task": RewardConfig(spotted=0.0, coverage=1.0),
+        "reward": RewardConfig(spotted=0.0, coverage=1.0),
         "observation": ObservationConfig(global_features=["coverage", "agent_distances"]),
     },
     "energy": {
         "battery": BatteryConfig(enabled=True, capacity_kwh=0.2, charging_power_kw=40.0),
-        "task": RewardConfig(battery=0.5),
+        "reward": RewardConfig(battery=0.5),
         "observation": ObservationConfig(local_features=["battery", "spotted"], ctde=True),
         "episode": EpisodeConfig(max_steps=5, discharged_share=0.5),
     },
     "mixed": {
-        name: getattr(everything(), name) for name in ("source", "battery", "observation", "task", "episode")
+        name: getattr(everything(), name) for name in ("source", "battery", "observation", "reward", "episode")
     },
 }
 """Sections of each kind of scenario."""
 
 REGIONS = {
-    "fixed": RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, situations=4),
-    "pool": RegionConfig(min_area=20_000, max_area=60_000, pool=2, situations=8),
+    "fixed": RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=4),
+    "pool": RegionConfig(min_area=20_000, max_area=60_000, pool=2, initial_conditions=8),
 }
 
 
@@ -169,9 +172,9 @@ def play(
     return shown
 
 
-def told(shown: TensorDictBase) -> Snapshot:
+def told(shown: TensorDictBase) -> Messages:
     """The messages that the UAVs sent last, field by field."""
-    return Snapshot.unpack(shown["agents", "message"])
+    return Messages.unpack(shown["agents", "message"])
 
 
 def same(one: TensorDictBase, other: TensorDictBase) -> bool:
@@ -223,14 +226,14 @@ def random_worlds(
     return worlds
 
 
-def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Snapshot, Knowledge]:
+def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, ServerContext]:
     """The same worlds in the package's own form, [B, N]."""
 
     def column(read: Callable[[Uav], Any], dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.tensor([[read(uav) for uav in uavs] for _, uavs in worlds], dtype=dtype)
 
     place = column(lambda uav: uav.place)
-    snapshot = Snapshot(
+    snapshot = Messages(
         time=torch.zeros(place.shape[:-1]),
         position=place,
         target=place,
@@ -242,7 +245,7 @@ def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Snapshot, Knowle
         detected_position=column(lambda uav: uav.heard_from),
         trail=torch.zeros(*place.shape[:-1], 2, dtype=torch.long),
     )
-    server = Knowledge(
+    server = ServerContext(
         now=torch.tensor([now for now, _ in worlds]),
         scale=torch.full((len(worlds),), SCALE),
         time_scale=TIME_SCALE,
@@ -283,7 +286,7 @@ def one_uav(**changed) -> ScenarioConfig:
     region = RegionConfig(
         kind="vertices",
         vertices=[[0.0, 0.0], [400.0, 0.0], [400.0, 200.0], [0.0, 200.0]],
-        situations=1,
+        initial_conditions=1,
         start_positions=[[60.0, 100.0]],
     )
     sections = {

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 import shapely
 
-from damian.server.rewards import INDIVIDUAL, EpisodeConfig, RewardConfig
+from damian.server.rewards import INDIVIDUAL, RewardConfig
+from damian.server.termination import EpisodeConfig
 
 
 @dataclass
@@ -143,7 +144,9 @@ def final(ended: tuple[bool, bool, bool], steps: int, task: RewardConfig) -> flo
     return -task.penalty if terminated or truncated else 0.0
 
 
-def book(preferences: Sequence[Sequence[int]], standing: Sequence[int], ready: Sequence[bool]) -> list[int]:
+def assign_landing_points(
+    preferences: Sequence[Sequence[int]], standing: Sequence[int], ready: Sequence[bool]
+) -> list[int]:
     """Points by preference, in index order; what others stand on or have booked is not free."""
     booked: list[int] = []
     for i, wanted in enumerate(preferences):
@@ -183,7 +186,9 @@ class World:
         wanted = [self._preferences(*pair) for pair in zip(self.uavs, moves, strict=True)]
         standing = [uav.point for uav in self.uavs]
         self.steps += 1
-        for uav, point in zip(self.uavs, book(wanted, standing, [True] * len(standing)), strict=True):
+        for uav, point in zip(
+            self.uavs, assign_landing_points(wanted, standing, [True] * len(standing)), strict=True
+        ):
             self._move(uav, point)
             self._listen(uav)
         now = self.steps * self.dt

@@ -12,10 +12,11 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
+from damian import keys
+from damian.common.tensors import gather_rows
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
-from damian.server.features import Snapshot
-from damian.world.airspace import rows
+from damian.world.messages import Messages
 
 BLUR_M = 5.0
 """How uncertain a place just told is: landing points stand for the ground around them."""
@@ -35,10 +36,11 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     Stateless and deterministic: equal messages, equal actions. Writes ``("agents", "action")`` [B, N], or
     [B, N, 2] if actions are continuous. The environment must have ``message`` among its extras.
     """
-    shown = env.observation_spec["agents"].keys()
-    names = {"message": "received" if "received" in shown else "message", "age": "age", "mask": "action_mask"}
-    reads: dict[str, NestedKey] = {name: ("agents", key) for name, key in names.items() if key in shown}
-    return TensorDictModule(Greedy(env.worlds), reads, [("agents", "action")])
+    available = env.observation_spec.keys(True, True)
+    message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
+    wanted = {"message": message, "age": keys.AGE, "mask": keys.ACTION_MASK}
+    in_keys: dict[str, NestedKey] = {name: key for name, key in wanted.items() if key in available}
+    return TensorDictModule(Greedy(env.uav_env), in_keys, [keys.ACTION])
 
 
 class Greedy:
@@ -46,7 +48,7 @@ class Greedy:
 
     def __init__(self, worlds: UavEnv) -> None:
         scenario, simulation = worlds.scenario, worlds.simulation
-        source, terms = scenario.source, {*scenario.task.terms} - {"coverage", "battery", "mean_distance"}
+        source, terms = scenario.source, {*scenario.reward.terms} - {"coverage", "battery", "mean_distance"}
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
@@ -60,7 +62,7 @@ class Greedy:
 
     def __call__(self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
         """Actions for messages [B, N, M] of these ages [steps], [B, N, 1], under a mask [B, N, A]."""
-        held = Snapshot.unpack(message)
+        held = Messages.unpack(message)
         region = held.trail[:, 0, 0] // self.points.shape[1]
         ground = self.points[region]
         wanted = self.fresh(held, ground)
@@ -77,14 +79,14 @@ class Greedy:
             return self.best_action(held, gain, left, mask)
         return self.best_move(held, gain, flown, left, ground)
 
-    def fresh(self, held: Snapshot, ground: Tensor) -> Tensor:
+    def fresh(self, held: Messages, ground: Tensor) -> Tensor:
         """1 where ground [B, L, 2] is the UAV's own and not in its latest footprints, else 0, [B, N, L]."""
         apart = _apart(held.target, ground)
         own = apart <= apart.amin(1, keepdim=True)
-        been = _apart(rows(self.points.flatten(0, 1), held.trail), ground.unsqueeze(1))
+        been = _apart(gather_rows(self.points.flatten(0, 1), held.trail), ground.unsqueeze(1))
         return (own & (been > self.radius).all(-2)).float()
 
-    def believe(self, held: Snapshot, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
+    def believe(self, held: Messages, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
         """How likely the source is on ground [B, L, 2], up to 1, [B, 1, L]; is that recent, [B, 1, 1].
 
         Heard within a footprint, the source has gone on since: two deviations at its full speed. A footprint
@@ -103,15 +105,15 @@ class Greedy:
         gone = torch.where(latest.isfinite(), latest * self.speed, torch.inf)
         return (log - log.amax(-1, keepdim=True)).exp(), gone <= RECENT * self.radius
 
-    def best_action(self, held: Snapshot, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
+    def best_action(self, held: Messages, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
         """The best legal action, [B, N]; by landing point: its gain, and how far the goal is, [B, N, L]."""
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = held.trail[..., :1] * len(action) + action
-        point, flown = (rows(table[:, 0], row) for table in self.candidates.ranking)
+        point, flown = (gather_rows(table[:, 0], row) for table in self.candidates.ranking)
         gain, left = (numbers.gather(-1, point.long()) for numbers in (gain, left))
         return _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)
 
-    def best_move(self, held: Snapshot, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor) -> Tensor:
+    def best_move(self, held: Messages, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor) -> Tensor:
         """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2]."""
         best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
         east, north = (_pick(ground, best) - held.target).unbind(-1)

@@ -49,7 +49,7 @@ class Sampler(nn.Module):
         """May a message never arrive."""
         return bool((self.chances[:, -1] > 1e-9).any())
 
-    def begin(self, streams: Tensor) -> Tensor:
+    def initial_state(self, streams: Tensor) -> Tensor:
         """State of each channel at first, from its stream of random numbers [M]."""
         return (counter_rng.uniform(streams) < self._bad).long()
 
@@ -78,7 +78,7 @@ class Recorded(Sampler):
         code = [longest + 1 if delay < 0 else delay for delay in delays]
         self.register_buffer("_delays", torch.tensor(code), persistent=False)
 
-    def begin(self, streams: Tensor) -> Tensor:
+    def initial_state(self, streams: Tensor) -> Tensor:
         return counter_rng.bits(streams) % len(self._delays)
 
     def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -97,8 +97,8 @@ class HeldSampler(Sampler):
         self.drawn = drawn
         self.certain = None if self.loses else self.longest
 
-    def begin(self, streams: Tensor) -> Tensor:
-        return self.drawn.begin(streams)
+    def initial_state(self, streams: Tensor) -> Tensor:
+        return self.drawn.initial_state(streams)
 
     def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         delay, memory = self.drawn(streams, clock, memory)

@@ -7,25 +7,24 @@ import torch
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
+from damian import keys
 from damian.common import checks
 from damian.delays.laws import law_of
-from damian.envs.delayed_env import ACTION, DelayedEnv
-from damian.envs.scenario import ScenarioConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
 from damian.envs.uav_env import UavEnv
 from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
-    Clock,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
+    SampleAndHold,
     ServerNode,
+    SkipUntilReady,
 )
-from damian.transforms.skip_until_ready import FastForward
 from damian.world.landing import ActionConfig
-
-REWARD, SEEN = ("agents", "reward"), ("agents", "observation")
 
 
 def make_env(
@@ -35,140 +34,160 @@ def make_env(
     device: torch.device | str = "cpu",
     extras: Collection[str] = (),
 ) -> DelayedEnv:
-    """The environment of a scenario with everything that is late in it.
+    """The environment of a scenario with all of its delays.
 
     Args:
         scenario: with its ``delay`` and ``clock``.
         num_worlds: B.
         seed: of the worlds, and of the delays.
-        device: where everything lives.
-        extras: as in ``UavEnv``; with ``message`` also ``received`` (what the
-            server holds), its ``age`` [steps], and the ``delay`` of what is sent, under ``"agents"``.
+        device: of all tensors.
+        extras: as in ``UavEnv``; with ``message`` also ``received`` (the messages that the server holds),
+            their ``age`` [steps], and the ``delay`` of the messages sent, under ``"agents"``.
 
     Raises:
-        InputError: the scenario asks for something impossible, or for messages between skipped steps.
+        InputError: the scenario asks for something impossible, or for the messages of skipped steps.
     """
     should = "skips steps, but back-updating and evaluation need the messages of every one"
     checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, should)
-    late = messages_are_late(scenario)
-    shown = {*extras, "message"} if late else extras
-    env = UavEnv(scenario, num_worlds, seed, device, shown, serves=not late)
-    delayed = DelayedEnv(env, chain(scenario, env.server, extras))
-    delayed.set_seed(seed)
-    return delayed
+    delayed = has_message_delay(scenario)
+    simulation = make_simulation(scenario, seed)
+    server = make_server(scenario, simulation)
+    env = UavEnv(
+        scenario,
+        num_worlds,
+        seed,
+        device,
+        {*extras, "message"} if delayed else extras,
+        simulation=simulation,
+        server=server,
+        messages_only=delayed,
+    )
+    pipeline = DelayedEnv(env, make_transforms(scenario, server, extras))
+    pipeline.set_seed(seed)
+    return pipeline
 
 
-def chain(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> Compose:
-    """The transforms of a scenario in their order; what the policy chooses passes them backwards."""
-    served = serving(scenario, server, extras) if messages_are_late(scenario) else []
-    parts = [*deciding(scenario), *served, *paying(scenario), *seeing(scenario)]
-    parts += skipping(scenario, extras)
-    return Compose(*parts)  # type: ignore[arg-type]
+def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> Compose:
+    """The transforms of a scenario in their order; a policy's action passes them backwards."""
+    transforms = [
+        *action_transforms(scenario),
+        *(server_transforms(scenario, server, extras) if has_message_delay(scenario) else []),
+        *reward_transforms(scenario),
+        *observation_transforms(scenario),
+        *skip_transforms(scenario, extras),
+    ]
+    return Compose(*transforms)  # type: ignore[arg-type]
 
 
-def deciding(scenario: ScenarioConfig) -> list[Transform]:
-    """Actions on their way to the UAVs; one that was not ready when it chose has chosen nothing."""
+def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
+    """The delay of actions; a UAV that was not ready when it chose sends none."""
     delay, clock = scenario.delay, scenario.clock
-    if not is_late(delay.act, clock.dt) and clock.steps("agents") == 1:
+    if not has_delay(delay.act, clock.dt) and clock.steps("agents") == 1:
         return []
-    act = law_of(delay.act, "delay.act")
-    hold = holding(scenario.actions)
-    return [ActionDelay(act, ACTION, default=hold, dt=clock.dt, sent_key="ready", fresh_key="acts")]
+    law, hold = law_of(delay.act, "delay.act"), hold_action(scenario.actions)
+    return [
+        ActionDelay(
+            law, keys.ACTION, default=hold, dt=clock.dt, sent_key="ready", valid_key=keys.ACTION_VALID
+        )
+    ]
 
 
-def messages_are_late(scenario: ScenarioConfig) -> bool:
-    """Does the server hold anything else than what was just sent."""
-    return scenario.delay.loss > 0 or is_late(scenario.delay.uplink, scenario.clock.dt)
-
-
-def serving(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
-    """Messages on their way to the server node, and what it makes of those that have arrived."""
-    delay = scenario.delay
+def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
+    """The delay of messages to the server node, and its outputs for those that have arrived."""
+    delay, read = scenario.delay, "message" in extras
     uplink = ObservationDelay(
         delay.uplink,
-        [("agents", "message")],
-        [("agents", "received")],
+        [keys.MESSAGE],
+        [keys.RECEIVED],
         loss=delay.loss,
         order=delay.order,
         dt=scenario.clock.dt,
-        sent_key="talks",
-        age_key="age" if "message" in extras or remembers_unknown(scenario) else None,
-        delay_key="delay" if "message" in extras else None,
+        sent_key=keys.MESSAGE_SENT,
+        age_key=keys.AGE if read or history_since_message(scenario) else None,
+        delay_key=keys.DELAY if read else None,
     )
-    unread = [] if "message" in extras else [("agents", k) for k in ("message", "received", "talks")]
-    return [uplink, ServerNode(server, drop=unread, terms="reward_terms" in extras)]
+    unread = [] if read else [keys.MESSAGE, keys.RECEIVED, keys.MESSAGE_SENT]
+    return [uplink, ServerNode(server, dropped_keys=unread, reward_terms="reward_terms" in extras)]
 
 
-def paying(scenario: ScenarioConfig) -> list[Transform]:
-    """Rewards on their way."""
+def reward_transforms(scenario: ScenarioConfig) -> list[Transform]:
+    """The delay of rewards, and their discounted sum."""
     delay, dt = scenario.delay, scenario.clock.dt
-    late = [RewardDelay(law_of(delay.rew, "delay.rew"), REWARD, dt=dt)] if is_late(delay.rew, dt) else []
-    window = delay.reward_window
-    summed = [CumulativeReward(window, delay.reward_discount, REWARD)] if window > 1 else []
-    return [*late, *summed]
+    transforms: list[Transform] = []
+    if has_delay(delay.rew, dt):
+        transforms.append(RewardDelay(law_of(delay.rew, "delay.rew"), keys.REWARD, dt=dt))
+    if delay.reward_window > 1:
+        transforms.append(CumulativeReward(delay.reward_window, delay.reward_discount, keys.REWARD))
+    return transforms
 
 
-def seeing(scenario: ScenarioConfig) -> list[Transform]:
-    """When the server broadcasts, when the UAVs listen, and what they remember by themselves."""
+def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
+    """The clocks of the server and of the UAVs, and the UAVs' action history."""
     clock, n_actions = scenario.clock, scenario.delay.history
     transforms: list[Transform] = []
     if clock.steps("server") > 1:
-        transforms.append(Clock(clock.steps("server"), [SEEN, ("agents", "global_observation")]))
+        observations = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION]
+        transforms.append(SampleAndHold(clock.steps("server"), observations))
     if clock.steps("agents") > 1:
-        transforms.append(Clock(clock.steps("agents"), [SEEN], ready_key=("agents", "ready")))
+        transforms.append(SampleAndHold(clock.steps("agents"), [keys.OBSERVATION], ready_key=keys.READY))
     if n_actions:
         history = ActionHistory(
             n_actions,
-            ACTION,
-            append_to=SEEN,
+            keys.ACTION,
+            append_to=keys.OBSERVATION,
             codes=action_codes(scenario.actions),
-            default=holding(scenario.actions),
+            default=hold_action(scenario.actions),
             recorded_key="ready",
-            age_key="age" if remembers_unknown(scenario) else None,
+            age_key=keys.AGE if history_since_message(scenario) else None,
         )
         transforms.append(history)
     return transforms
 
 
-def skipping(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
-    """Steps in which nobody can choose."""
+def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
+    """Steps that last until some UAV can choose."""
     if not scenario.clock.skip:
         return []
-    named = scenario.task.terms if "reward_terms" in extras else []
-    terms = [("agents", "reward_terms", name) for name in named]
-    return [FastForward(scenario.clock.skip_discount, [REWARD, *terms])]
+    names = scenario.reward.terms if "reward_terms" in extras else []
+    terms = [(*keys.REWARD_TERMS, name) for name in names]
+    return [SkipUntilReady(scenario.clock.skip_discount, [keys.REWARD, *terms])]
 
 
-def remembers_unknown(scenario: ScenarioConfig) -> bool:
-    """Is a UAV's memory of its actions one of those that the server, as it answers, cannot know of?
+def history_since_message(scenario: ScenarioConfig) -> bool:
+    """Does a UAV's action history hold only the actions that the server's answer cannot reflect yet?
 
-    With late actions or slow clocks nobody knows which these are, and it is one of all; so it is if the UAV
-    knows where it is without them.
+    With delayed actions or slow clocks a UAV cannot tell which these are, and a UAV that knows its own
+    messages needs no such choice: then the history holds all of the latest actions.
     """
     delay, clock = scenario.delay, scenario.clock
-    prompt = not is_late(delay.act, clock.dt) and clock.steps("server") == clock.steps("agents") == 1
-    blind = not scenario.observation.own
-    return delay.history > 0 and blind and prompt and messages_are_late(scenario)
+    prompt = not has_delay(delay.act, clock.dt) and clock.steps("server") == clock.steps("agents") == 1
+    return delay.history > 0 and not scenario.observation.own and prompt and has_message_delay(scenario)
 
 
-def is_late(law: Any, dt: float) -> bool:
-    """Does a law, as a person writes it, delay anything."""
+def has_message_delay(scenario: ScenarioConfig) -> bool:
+    """May the server hold another message of a UAV than the one that it sent in this step?"""
+    return scenario.delay.loss > 0 or has_delay(scenario.delay.uplink, scenario.clock.dt)
+
+
+def has_delay(law: Any, dt: float) -> bool:
+    """Does a law, as a person writes it, ever delay anything?"""
     return law_of(law).sampler(dt).certain != 0
 
 
-def holding(actions: ActionConfig) -> int:
-    """The action that holds the position, or the first one if there is none (discrete); distance 0."""
+def hold_action(actions: ActionConfig) -> int:
+    """The discrete action that holds the position, or the first one if there is none; 0 if continuous."""
     discrete = actions.kind == "discrete" and 0.0 in actions.distances
     return actions.distances.index(0.0) * len(actions.headings) if discrete else 0
 
 
 def action_codes(actions: ActionConfig) -> Tensor | None:
-    """Discrete actions as an actor sees its past ones: how far east and north, each in [0, 1], [A, 2].
+    """Discrete actions as an actor sees its past ones: displacement east and north, each in [0, 1], [A, 2].
 
-    Displacements, not distance and heading: where a UAV must be by now is then a sum over what it sees.
+    Displacements rather than distance and heading, because their sum tells where a UAV must be by now. None
+    for continuous actions, which are shown as they are.
     """
     if actions.kind == "continuous":
-        return None  # they are just that
+        return None
     distance, heading = actions.table().unbind(-1)
     there = torch.stack([heading.sin(), heading.cos()], -1) * (distance / distance.max()).unsqueeze(-1)
     return (there + 1) / 2

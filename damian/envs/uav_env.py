@@ -1,67 +1,73 @@
-"""``UavEnv``: the simulation as a TorchRL environment. Keys and specs are set here only."""
+"""``UavEnv``: the simulation as a TorchRL environment."""
 
 import os
-from collections.abc import Callable, Collection
-from typing import Any
+from collections.abc import Collection
+from typing import Any, cast
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
+from damian import keys
 from damian.common import counter_rng
 from damian.common.compiling import compiled
-from damian.envs.scenario import ScenarioConfig
+from damian.common.tensors import gather_rows, tree_map
+from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
 from damian.server.server import Features, Server
-from damian.world.airspace import rows
 from damian.world.simulation import Simulation
-from damian.world.state import SITUATION, Rows, State, tree_map
+from damian.world.state import INITIAL_CONDITION, PackedState, State
 
-Shown = dict[str, Any]
-"""What a step shows, as nested dictionaries of tensors."""
+Outputs = dict[NestedKey, Tensor]
+"""Entries of a step or a reset, by key."""
 
 EXTRAS = ("message", "state", "reward_terms")
-PRIVILEGED = "privileged_observation"
+"""Optional outputs; ``privileged`` is another one, for reference arms."""
+
+_DONE = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
 
 
 class UavEnv(EnvBase):
-    """B worlds in which N UAVs search for, track and cover things.
+    """B worlds in which N UAVs search for, track and cover things, without any delay.
 
-    Nothing is delayed here: whatever ``scenario.delay`` and the slower clocks of ``scenario.clock`` say is
-    the business of transforms (``damian.delayed.make_env`` puts them together).
+    ``damian.envs.pipeline.make_env`` adds the delays and slower clocks of a scenario as transforms.
 
-    Batch size ``[B]``. What belongs to the UAVs stands under ``"agents"``, batch size ``[B, N]``:
+    Batch size ``[B]``. Entries of the UAVs lie under ``"agents"``, batch size ``[B, N]``:
 
-    - ``action``: discrete [B, N], or continuous [B, N, 2] in [0, 1] (SPEC 2);
+    - ``action``: discrete [B, N], or continuous [B, N, 2] in [0, 1]: distance and heading (paper, section
+    3.3);
     - ``action_mask``: discrete actions that would do something, [B, N, A] (if ``actions.mask``);
     - ``ready``: may the UAV choose now, [B, N];
     - ``observation``, ``global_observation``: features of the actor [B, N, F], of the critic [B, N, G];
-    - ``message``: the latest message of each UAV, [B, N, M] (``Snapshot.unpack`` names its numbers), and
-      ``talks``: sent just now, [B, N];
-    - ``privileged_observation``: ``global_observation`` as if nothing were late or lost, and how far east and
-      north of the UAV the source really is, over the region's size, in [-1, 1] each; [B, N, G + 2];
+    - ``message``: the latest message of each UAV, [B, N, M] (``Messages.unpack`` names its fields), and
+      ``message_sent``: was it sent in this step, [B, N];
+    - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, and the true
+    offset
+      from the UAV to the source (east, north, over the region's size, in [-1, 1]); [B, N, G + 2];
     - ``reward``: eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
-    At the root stand ``state`` (simulator truth: for drawing and reference arms, never for an actor),
+    At the root lie ``state`` (the simulator's truth: for drawing and reference arms, never for an actor),
     ``success``, and TorchRL's ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also
-    ``source_over``. A step reads, beside the action, the flag ``("agents", "acts")`` [B, N] if there is one:
-    an action of a UAV whose flag is false is none, as if it were not ready.
+    ``source_over``. A step reads, beside the action, the flag ``("agents", "action_valid")`` [B, N] if it
+    exists: a UAV whose flag is false does not act, as if it were not ready.
 
     Args:
-        scenario: what a world is made of.
+        scenario: all settings; the defaults if not given.
         num_worlds: B.
-        seed: of the regions and situations drawn at construction, and of the worlds' streams.
-        device: where everything lives.
-        extras: which of ``message``, ``state``, ``reward_terms`` and (reference arms only) ``privileged``
-            are shown; each costs time, so leave out what nobody reads (delays read the messages).
-        serves: False leaves it to a ``ServerNode`` transform to make something of the messages: what it
-            writes is empty after a step.
+        seed: of the regions and initial conditions drawn at construction, and of the worlds' random streams.
+        device: of all tensors.
+        extras: which of ``message``, ``state``, ``reward_terms`` and (reference arms only) ``privileged`` are
+            output; each costs time. Delays need ``message``.
+        simulation: the physics; built from the scenario and the seed if not given.
+        server: computes observations, rewards and ends from messages; likewise.
+        messages_only: a step outputs no observation, reward or end, because a ``ServerNode`` transform
+            computes them from the messages that have arrived.
 
-    ``UavEnv(..., compile=True)`` compiles the step (half a minute at first, then up to twice as fast).
+    ``UavEnv(...).compile()`` compiles the step (half a minute at first, then up to twice as fast).
 
     Raises:
         InputError: the scenario asks for something impossible.
@@ -74,34 +80,33 @@ class UavEnv(EnvBase):
         seed: int = 0,
         device: torch.device | str = "cpu",
         extras: Collection[str] = EXTRAS,
-        serves: bool = True,
+        *,
+        simulation: Simulation | None = None,
+        server: Server | None = None,
+        messages_only: bool = False,
     ) -> None:
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
         self.scenario = scenario or ScenarioConfig()
-        self.extras = frozenset(extras)
-        self.serves = serves
-        self.simulation = Simulation(self.scenario, seed)
-        self.server = Server(self.scenario, self.simulation.airspace, self.simulation.radius)
-        first = self.simulation.initial
-        features = self.server.features(first.sent, first.steps)
-        self._first = _merged(self._show(first, features), self._nothing_yet(first))
-        self._blank = self._empty()
+        self.extras, self.messages_only = frozenset(extras), messages_only
+        self.simulation = simulation or make_simulation(self.scenario, seed)
+        self.server = server or make_server(self.scenario, self.simulation)
+        self._reset_outputs = self._outputs_at_reset(self.simulation.initial)
         self._make_specs()
         self.set_seed(seed)
-        self._advance = self._advance_some = self.play
-        self._restart = self.begin
+        self._step_fn = self._masked_step_fn = self.step_fn
+        self._reset_fn = self.reset_fn
         self.to(torch.device(device))
 
     def compile(self, **options: Any) -> "UavEnv":
-        """Compile what a step computes, as one graph, in place of TorchRL's bookkeeping around it.
+        """Compile the computation of a step as one graph.
 
         Args:
-            options: for ``torch.compile``, in place of what suits a CPU.
+            options: for ``torch.compile``, instead of those that suit a CPU.
         """
-        # Two graphs, as whether there are flags is not checked by what is kept of the guards.
-        self._advance = compiled(self.play, **options)
-        self._advance_some = compiled(self.play, **options)
-        self._restart = compiled(self.begin, **options)
+        # Two graphs, because the guards that are kept do not check whether there are flags.
+        self._step_fn = compiled(self.step_fn, **options)
+        self._masked_step_fn = compiled(self.step_fn, **options)
+        self._reset_fn = compiled(self.reset_fn, **options)
         return self
 
     def to(self, device: DEVICE_TYPING) -> "UavEnv":
@@ -111,11 +116,9 @@ class UavEnv(EnvBase):
             return self
         super().to(device)
         self.simulation.to(device)
-        self._first, self._blank = (
-            _map(lambda table: table.to(device), shown) for shown in (self._first, self._blank)
-        )
-        self.worlds = tree_map(lambda t: t.to(device), self.worlds)
         self.server.to(device)
+        self._reset_outputs = {key: table.to(device) for key, table in self._reset_outputs.items()}
+        self.worlds = tree_map(lambda t: t.to(device), self.worlds)
         return self
 
     @property
@@ -125,7 +128,7 @@ class UavEnv(EnvBase):
 
     @property
     def state(self) -> State:
-        """Everything that changes; assign it to put the worlds into a situation of your own."""
+        """Everything that changes; assign it to put the worlds into another state."""
         return self.simulation.layout.unpack(self.worlds)
 
     @state.setter
@@ -133,7 +136,7 @@ class UavEnv(EnvBase):
         self.worlds = self.simulation.layout.pack(state)
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world its own stream, [B] integers; the next reset is its first episode."""
+        """Give every world its own random stream, [B] integers; the next reset begins its first episode."""
         row = torch.zeros_like(seeds)
         first = tree_map(lambda table: table.index_select(0, row), self.simulation.initial)
         self.state = first._replace(seed=seeds)
@@ -145,107 +148,102 @@ class UavEnv(EnvBase):
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        agents = tensordict.get("agents")
-        action, acts = agents.get("action"), agents.get("acts", None)
-        if acts is None:
-            self.worlds, shown = self._advance(self.worlds, action)
+        action, valid = tensordict.get(keys.ACTION), tensordict.get(keys.ACTION_VALID, None)
+        if valid is None:
+            self.worlds, outputs = self._step_fn(self.worlds, action)
         else:
-            self.worlds, shown = self._advance_some(self.worlds, action, acts)
-        return self.tensordict(shown)
+            self.worlds, outputs = self._masked_step_fn(self.worlds, action, valid)
+        return self.to_tensordict(outputs)
 
     @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        self.worlds, shown = self._restart(self.worlds, mask.view(-1))
-        return self.tensordict(shown)  # TorchRL keeps what the other worlds showed
+        self.worlds, outputs = self._reset_fn(self.worlds, mask.view(-1))
+        return self.to_tensordict(outputs)  # TorchRL keeps the entries of the other worlds
 
-    # Pure functions of the state; ``play`` and ``begin`` compile.
+    # Pure functions of the state, which compile.
 
-    def begin(self, worlds: Rows, mask: Tensor) -> tuple[Rows, Shown]:
-        """New episodes in the worlds of the mask [B], and what each world begins with."""
+    def reset_fn(self, worlds: PackedState, mask: Tensor) -> tuple[PackedState, Outputs]:
+        """New episodes in the worlds of the mask [B], and the outputs with which each world's episode
+        begins."""
         if torch.compiler.is_compiling():  # no shapes that depend on data
             fresh = self.simulation.next_episode(worlds)
             worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
         else:
             worlds = self.simulation.reset(worlds, mask)
-        situation = worlds.integers[:, SITUATION]
-        return worlds, _map(lambda table: table.index_select(0, situation), self._first)
+        condition = worlds.integers[:, INITIAL_CONDITION]
+        return worlds, {k: table.index_select(0, condition) for k, table in self._reset_outputs.items()}
 
-    def play(self, worlds: Rows, action: Tensor, acts: Tensor | None = None) -> tuple[Rows, Shown]:
-        """One step: physics, then what the server makes of the messages."""
-        state = self.simulation.step(self.simulation.layout.unpack(worlds), action, acts)
+    def step_fn(
+        self, worlds: PackedState, action: Tensor, valid: Tensor | None = None
+    ) -> tuple[PackedState, Outputs]:
+        """One step: the physics, then the server's outputs for the messages."""
+        state = self.simulation.step(self.simulation.layout.unpack(worlds), action, valid)
         packed = self.simulation.layout.pack(state)
-        if not self.serves:
-            return packed, _merged(self._show(state), self._blank)
+        if self.messages_only:
+            return packed, self._state_outputs(state)
         features = self.server.features(state.sent, state.steps)
-        shown = self._show(state, features)
-        total, terms, ended = self.server.judge(features, state.sent, state.steps, state.source_over)
-        shown["agents"]["reward"] = total.unsqueeze(-1)
+        outputs = self._state_outputs(state, features)
+        result = self.server.reward_and_status(features, state.sent, state.steps, state.source_over)
+        outputs[keys.REWARD] = result.reward.unsqueeze(-1)
         if "reward_terms" in self.extras:
-            shown["agents"]["reward_terms"] = terms
-        return packed, shown | ended.entries()
+            outputs |= {(*keys.REWARD_TERMS, name): term for name, term in result.terms.items()}
+        return packed, outputs | result.status.entries()
 
-    def _show(self, state: State, features: Features | None = None) -> Shown:
-        """What is shown of a state, at a reset as after a step; terms and success have not come yet."""
-        agents: Shown = {"ready": self.simulation.ready(state)}
+    def _state_outputs(self, state: State, features: Features | None = None) -> Outputs:
+        """The outputs that follow from a state, and from the features of its messages if these are given."""
+        outputs: Outputs = {keys.READY: self.simulation.ready(state)}
         if features is not None:
-            agents["observation"], agents["global_observation"] = self.server.observations(features)
+            observation, global_observation = self.server.observations(features)
+            outputs |= {keys.OBSERVATION: observation, keys.GLOBAL_OBSERVATION: global_observation}
         if self.scenario.actions.kind == "discrete" and self.scenario.actions.mask:
-            agents["action_mask"] = self.simulation.action_mask(state)
+            outputs[keys.ACTION_MASK] = self.simulation.action_mask(state)
         if "message" in self.extras:
-            agents |= {"message": state.sent.pack(), "talks": state.talks}
+            outputs |= {keys.MESSAGE: state.sent.pack(), keys.MESSAGE_SENT: state.message_sent}
         if "privileged" in self.extras:
-            agents[PRIVILEGED] = self._truth(state, features)
-        shown: Shown = {"agents": agents}
+            outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, features)
         if self.scenario.episode.end_with_source:
-            shown["source_over"] = state.source_over.unsqueeze(-1)
+            outputs[keys.SOURCE_OVER] = state.source_over.unsqueeze(-1)
         if "state" in self.extras:
             truth = [state.position.flatten(1), state.battery, state.source]
-            shown["state"] = torch.cat(truth, -1)
-        return shown
+            outputs[keys.STATE] = torch.cat(truth, -1)
+        return outputs
 
-    def _truth(self, state: State, features: Features | None) -> Tensor:
-        """What a privileged critic sees, [B, N, G + 2]."""
-        _, seen = self.server.observations(features or self.server.features(state.sent, state.steps))
-        scale = rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
+    def _privileged(self, state: State, features: Features | None) -> Tensor:
+        """Observation of a critic that knows the simulator's truth, [B, N, G + 2]."""
+        _, known = self.server.observations(features or self.server.features(state.sent, state.steps))
+        scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
         toward = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
-        return torch.cat([seen, toward.clamp(-1, 1)], -1)
+        return torch.cat([known, toward.clamp(-1, 1)], -1)
 
-    def _empty(self) -> Shown:
-        """In place of what a ``ServerNode`` will make of the messages."""
-        made = {key: self._first[key] for key in (*_DONE, "success")}
-        names = ("observation", "global_observation", "reward_terms")
-        agents = {key: value for key, value in self._first["agents"].items() if key in names}
-        agents["reward"] = self._first["agents"]["observation"][..., :1]
-        n_worlds = self.batch_size[0]
-        return _map(lambda x: x.new_zeros(n_worlds, *x.shape[1:]), made | {"agents": agents})
+    def _outputs_at_reset(self, initial: State) -> Outputs:
+        """What a reset to each of the Q initial conditions outputs, [Q, ...] each."""
+        outputs = self._state_outputs(initial, self.server.features(initial.sent, initial.steps))
+        if "reward_terms" in self.extras:
+            zero = torch.zeros_like(initial.track)
+            outputs |= {(*keys.REWARD_TERMS, name): zero for name in self.scenario.reward.terms}
+        false = torch.zeros_like(initial.source_over).unsqueeze(-1)
+        return outputs | dict.fromkeys((*_DONE, keys.SUCCESS), false)
 
-    def _nothing_yet(self, state: State) -> Shown:
-        """Rewards, success and ends before anything has happened; the terms only if they are shown."""
-        zero, no = torch.zeros_like(state.track), torch.zeros_like(state.source_over).unsqueeze(-1)
-        terms = dict.fromkeys(self.scenario.task.terms, zero)
-        agents = {"reward_terms": terms} if "reward_terms" in self.extras else {}
-        return {"agents": agents, **dict.fromkeys((*_DONE, "success"), no)}
+    # TensorDicts and specs.
 
-    # Keys and specs.
-
-    def tensordict(self, shown: Shown) -> TensorDict:
-        """What is shown, with batch sizes."""
-        agents = shown.pop("agents")
+    def to_tensordict(self, outputs: Outputs) -> TensorDict:
+        """Outputs as a TensorDict with batch sizes."""
         shape = (*self.batch_size, self.n_agents)
-        nested = {
-            key: TensorDict(value, shape, device=self.device) if isinstance(value, dict) else value
-            for key, value in agents.items()
-        }
-        shown["agents"] = TensorDict(nested, shape, device=self.device)
-        return TensorDict(shown, self.batch_size, device=self.device)
+        levels = _levels(outputs)
+        root, agents = dict(levels.pop((), {})), dict(levels.pop((keys.AGENTS,), {}))
+        for path, level in levels.items():
+            agents[path[-1]] = TensorDict(level, shape, device=self.device)
+        root[keys.AGENTS] = TensorDict(agents, shape, device=self.device)
+        return TensorDict(root, self.batch_size, device=self.device)
 
     def _make_specs(self) -> None:
         worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
-        shown = {key: value for key, value in self._first.items() if key not in _DONE}
-        self.observation_spec = _spec_of(shown, worlds, self.device, self.n_agents)
+        ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in _DONE}
+        others: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}
+        self.observation_spec = self._specs_of(others)
         config = self.scenario.actions
         if config.kind == "discrete":
             action = Categorical(config.n_actions, shape=agents, device=self.device)
@@ -258,44 +256,33 @@ class UavEnv(EnvBase):
         self.reward_spec = Composite(
             agents=Composite(reward=reward, shape=agents), shape=worlds, device=self.device
         )
-        ends = {key: self._first[key] for key in _DONE}
-        self.done_spec = _spec_of(ends, worlds, self.device, self.n_agents)
+        self.done_spec = self._specs_of(ends)
+
+    def _specs_of(self, tables: Outputs) -> Composite:
+        """Specs of outputs, read off examples with any number of worlds."""
+        shape = torch.Size((*self.batch_size, self.n_agents))
+        levels = _levels({key: self._spec_of(key, table) for key, table in tables.items()})
+        root, agents = levels.pop((), {}), levels.pop((keys.AGENTS,), {})
+        for path, level in levels.items():
+            agents[path[-1]] = Composite(level, shape=shape, device=self.device)
+        if agents:
+            root[keys.AGENTS] = Composite(agents, shape=shape, device=self.device)
+        return Composite(root, shape=self.batch_size, device=self.device)
+
+    def _spec_of(self, key: NestedKey, table: Tensor) -> TensorSpec:
+        shape = torch.Size((*self.batch_size, *table.shape[1:]))
+        if table.dtype == torch.bool:
+            return Binary(shape[-1], shape=shape, dtype=torch.bool, device=self.device)
+        if key in (keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.PRIVILEGED_OBSERVATION):
+            low = -1.0 if key == keys.PRIVILEGED_OBSERVATION else 0.0
+            return Bounded(low, 1.0, shape=shape, dtype=table.dtype, device=self.device)
+        return Unbounded(shape, dtype=table.dtype, device=self.device)
 
 
-_DONE = ("done", "terminated", "truncated")
-
-
-def _merged(some: Shown, others: Shown) -> Shown:
-    """Both, and both of what stands under ``agents``."""
-    return some | others | {"agents": some["agents"] | others["agents"]}
-
-
-def _map(function: Callable[[Tensor], Tensor], shown: Shown) -> Shown:
-    """Apply a function to the tensors of nested dictionaries."""
-    return {
-        key: _map(function, value) if isinstance(value, dict) else function(value)
-        for key, value in shown.items()
-    }
-
-
-def _spec_of(shown: Shown, worlds: torch.Size, device: torch.device, n_agents: int) -> Composite:
-    """Specs of what is shown, read off an example with any number of worlds."""
-
-    def leaf(name: str, example: Tensor) -> TensorSpec:
-        shape = torch.Size((*worlds, *example.shape[1:]))
-        if example.dtype == torch.bool:
-            return Binary(shape[-1], shape=shape, dtype=torch.bool, device=device)
-        if name in ("observation", "global_observation", PRIVILEGED):
-            low = -1.0 if name == PRIVILEGED else 0.0
-            return Bounded(low, 1.0, shape=shape, dtype=example.dtype, device=device)
-        return Unbounded(shape, dtype=example.dtype, device=device)
-
-    def branch(level: Shown, shape: torch.Size) -> Composite:
-        inner = torch.Size((*worlds, n_agents))
-        specs = {
-            name: branch(value, inner) if isinstance(value, dict) else leaf(name, value)
-            for name, value in level.items()
-        }
-        return Composite(specs, shape=shape, device=device)
-
-    return branch(shown, worlds)
+def _levels(entries: dict[NestedKey, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
+    """Entries by the path of their TensorDict, and there by name."""
+    levels: dict[tuple[str, ...], dict[str, Any]] = {}
+    for key, value in entries.items():
+        *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)
+        levels.setdefault(tuple(path), {})[name] = value
+    return levels

@@ -9,10 +9,11 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from damian import keys
 from damian.envs.delayed_env import DelayedEnv
-from damian.learners.recurrent import prime
-from damian.server.features import Snapshot
+from damian.learners.recurrent import add_recurrent_state
 from damian.server.server import Server
+from damian.world.messages import Messages
 
 
 @dataclass(frozen=True)
@@ -45,43 +46,46 @@ def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = Tr
 
     Args:
         env: batch [B], with ``message`` among its extras.
-        policy: what chooses.
+        policy: chooses the actions.
         horizon: steps after which an episode without an end is cut.
-        sample: draw from the policy; else take its mode.
+        sample: draw actions from the policy; else take its mode.
     """
-    prime(env, policy)
+    add_recurrent_state(env, policy)
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
     with set_exploration_type(mode):
-        flown = env.rollout(horizon, policy, break_when_any_done=False)
-    return evaluation(flown, env.worlds.server)
+        rollout = env.rollout(horizon, policy, break_when_any_done=False)
+    return evaluation(rollout, env.server)
 
 
-def evaluation(flown: TensorDictBase, server: Server) -> Evaluation:
-    """What the first episode of each world in a flight [B, T] comes to."""
-    horizon, after = flown.shape[1], cast(TensorDictBase, flown["next"])
-    elapsed = torch.arange(1, horizon + 1, device=flown.device).expand(flown.shape)
-    message = after["agents", "message"]
-    truth = server.serve(Snapshot.unpack(message), elapsed, after.get("source_over", None))
-    told = _until(after["done"].squeeze(-1))
-    true = told & _until(truth.status.terminated)
-    success, won = _ever(after["success"].squeeze(-1), told), _ever(truth.status.success, true)
-    can_fail = server.config.episode.success_share is not None
-    steps, won_at = (
-        torch.where(ever | (not can_fail), until.sum(-1), horizon)
-        for ever, until in ((success, told), (won, true))
+def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
+    """Measures of the first episode of each world in a rollout [B, T]."""
+    horizon, after = rollout.shape[1], cast(TensorDictBase, rollout["next"])
+    elapsed = torch.arange(1, horizon + 1, device=rollout.device).expand(rollout.shape)
+    message = after[keys.MESSAGE]
+    truth = server(Messages.unpack(message), elapsed, after.get(keys.SOURCE_OVER, None))
+    perceived = _until(after[keys.DONE].squeeze(-1))
+    true = perceived & _until(truth.status.terminated)
+    success, true_success = (
+        _ever(after[keys.SUCCESS].squeeze(-1), perceived),
+        _ever(truth.status.success, true),
     )
-    held = Snapshot.unpack(after.get(("agents", "received"), message))
-    age = elapsed.unsqueeze(-1) - held.time / server.dt
-    late, lost = _late(cast(TensorDictBase, after["agents"]), told)
+    can_succeed = server.episode.success_share is not None
+    steps, true_steps = (
+        torch.where(ever | (not can_succeed), until.sum(-1), horizon)
+        for ever, until in ((success, perceived), (true_success, true))
+    )
+    held = Messages.unpack(after.get(keys.RECEIVED, message))
+    age = held.age(elapsed * server.dt) / server.dt
+    late, lost = _message_shares(after, perceived)
     return Evaluation(
-        episodes=len(told),
+        episodes=len(perceived),
         success_rate=_mean(success),
         steps=_mean(steps),
-        episode_return=_mean((after["agents", "reward"].squeeze(-1).mean(-1) * told).sum(-1)),
-        true_success_rate=_mean(won),
-        true_steps=_mean(won_at),
+        episode_return=_mean((after[keys.REWARD].squeeze(-1).mean(-1) * perceived).sum(-1)),
+        true_success_rate=_mean(true_success),
+        true_steps=_mean(true_steps),
         true_return=_mean((truth.reward.mean(-1) * true).sum(-1)),
-        age=_mean(age[told]),
+        age=_mean(age[perceived]),
         late=late,
         lost=lost,
     )
@@ -96,12 +100,13 @@ def _ever(flag: Tensor, among: Tensor) -> Tensor:
     return (flag & among).any(-1)
 
 
-def _late(agents: TensorDictBase, counts: Tensor) -> tuple[float, float]:
-    """Shares of the messages sent in the steps [B, T] that count: late ones, and lost ones."""
-    sent = cast(Tensor, agents["talks"])[counts]
-    if "delay" not in agents or not sent.any():
+def _message_shares(after: TensorDictBase, counted: Tensor) -> tuple[float, float]:
+    """Shares of late and of lost ones among the messages sent in the counted steps [B, T]."""
+    sent = cast(Tensor, after[keys.MESSAGE_SENT])[counted]
+    delay = after.get(keys.DELAY, None)
+    if delay is None or not sent.any():
         return 0.0, 0.0
-    delay = cast(Tensor, agents["delay"]).squeeze(-1)[counts][sent]
+    delay = delay.squeeze(-1)[counted][sent]
     return _mean(delay > 0), _mean(delay < 0)
 
 
@@ -125,9 +130,9 @@ class EpisodeLog:
     def add(self, batch: TensorDictBase) -> None:
         """Take the episodes that end in a batch [B, T] with ``RewardSum`` and ``StepCounter``."""
         by_time = cast(TensorDictBase, batch["next"]).transpose(0, 1)
-        done = by_time["done"].squeeze(-1)
-        keys = (("agents", "episode_reward"), "success", "step_count")
-        ended = [cast(Tensor, by_time[key])[done].float().flatten(1).mean(1) for key in keys]
+        done = by_time[keys.DONE].squeeze(-1)
+        measured = (keys.EPISODE_REWARD, keys.SUCCESS, keys.STEP_COUNT)
+        ended = [cast(Tensor, by_time[key])[done].float().flatten(1).mean(1) for key in measured]
         for row in torch.stack(ended, -1).tolist():
             self._weight = self.factor * self._weight + 1
             self._sums = [self.factor * old + new for old, new in zip(self._sums, row, strict=True)]

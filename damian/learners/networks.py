@@ -1,6 +1,5 @@
 """Actors and critics: one network shared by all UAVs, so that a policy can fly any number of them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import cast
 
@@ -13,6 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, TanhNormal
 from torchrl.modules.distributions import NormalParamExtractor
 
+from damian import keys
 from damian.common import checks
 from damian.learners.recurrent import AgentGRU
 
@@ -67,77 +67,72 @@ def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
     Discrete actions: a categorical distribution over the legal ones. Continuous actions: a tanh-normal
     on their bounds.
     """
-    spec = env.full_action_spec_unbatched["agents", "action"]
+    spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
-        masked = _has_mask(env)
-        keys = {"logits": ("agents", "logits")}
+        masked = keys.ACTION_MASK in env.observation_spec.keys(True, True)
+        in_keys = {"logits": keys.LOGITS}
         return ProbabilisticActor(
-            _actor_network(env, config, spec.n, "logits"),
-            in_keys=keys | {"mask": ("agents", "action_mask")} if masked else keys,  # type: ignore[arg-type]
-            out_keys=[("agents", "action")],
+            _actor_network(env, config, spec.n, keys.LOGITS),
+            in_keys=in_keys | {"mask": keys.ACTION_MASK} if masked else in_keys,  # type: ignore[arg-type]
+            out_keys=[keys.ACTION],
             distribution_class=MaskedCategorical if masked else torch.distributions.Categorical,
             distribution_kwargs={"neg_inf": -1e8} if masked else {},
             return_log_prob=True,
-            log_prob_key=("agents", "action_log_prob"),
+            log_prob_key=keys.ACTION_LOG_PROB,
         )
     bounds = cast(Bounded, spec)
     low, high = (bound.reshape(-1, spec.shape[-1])[0] for bound in (bounds.low, bounds.high))
     return ProbabilisticActor(
-        _actor_network(env, config, 2 * spec.shape[-1], "loc", "scale"),
-        in_keys=[("agents", "loc"), ("agents", "scale")],
-        out_keys=[("agents", "action")],
+        _actor_network(env, config, 2 * spec.shape[-1], keys.LOC, keys.SCALE),
+        in_keys=[keys.LOC, keys.SCALE],
+        out_keys=[keys.ACTION],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": low, "high": high},
         return_log_prob=True,
-        log_prob_key=("agents", "action_log_prob"),
+        log_prob_key=keys.ACTION_LOG_PROB,
     )
 
 
-def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *shown: str) -> TensorDictModule:
-    """What is seen to the parameters of a distribution, by name: logits, or location and scale."""
-    n_features = env.observation_spec["agents", "observation"].shape[-1]
+def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: NestedKey) -> TensorDictModule:
+    """From observations to the parameters of a distribution: logits, or location and scale."""
+    n_features = env.observation_spec[keys.OBSERVATION].shape[-1]
 
-    def show(network: nn.Module, seen: str) -> TensorDictModule:
-        normal = shown == ("loc", "scale")
-        return _module(nn.Sequential(network, NormalParamExtractor()) if normal else network, seen, *shown)
+    def head(network: nn.Module, in_key: NestedKey) -> TensorDictModule:
+        normal = len(out_keys) == 2
+        module = nn.Sequential(network, NormalParamExtractor()) if normal else network
+        return TensorDictModule(module, in_keys=[in_key], out_keys=list(out_keys))
 
     if not config.recurrent:
-        return show(config.network(n_features, n_out, env.device), "observation")
-    head = nn.Linear(config.hidden[-1], n_out, device=env.device)
+        return head(config.network(n_features, n_out, env.device), keys.OBSERVATION)
+    linear = nn.Linear(config.hidden[-1], n_out, device=env.device)
     gru = config.gru(n_features, env.device)
-    return TensorDictSequential([gru, show(head, "hidden")])  # type: ignore[list-item]
+    return TensorDictSequential([gru, head(linear, keys.HIDDEN)])  # type: ignore[list-item]
 
 
-def make_critic(env: EnvBase, config: ModelConfig, seen: str = "global_observation") -> TensorDictModule:
-    """Values ``("agents", "state_value")`` [*, N, 1] from what the critic sees, ``("agents", seen)``."""
-    n_features = env.observation_spec["agents", seen].shape[-1]
-    return _module(config.network(n_features, 1, env.device), seen, "state_value")
+def make_critic(
+    env: EnvBase, config: ModelConfig, critic_key: NestedKey = keys.GLOBAL_OBSERVATION
+) -> TensorDictModule:
+    """Values ``("agents", "state_value")`` [*, N, 1] from what the critic sees."""
+    n_features = env.observation_spec[critic_key].shape[-1]
+    network = config.network(n_features, 1, env.device)
+    return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
 
 
 def make_action_value(
-    env: EnvBase, config: ModelConfig, seen: str = "global_observation"
+    env: EnvBase, config: ModelConfig, critic_key: NestedKey = keys.GLOBAL_OBSERVATION
 ) -> TensorDictModule:
-    """Values of actions, from what the critic sees and what the actor does.
+    """Values of actions, from what the critic sees and what the actor sees.
 
-    Without what the actor sees, such as its past actions, the actor could not learn what these are good for.
+    Without the actor's observation, which holds its past actions, the actor could not learn what these tell.
 
     Returns:
         discrete: ``action_value`` [*, A], of each action; continuous: ``state_action_value`` [*, 1], of
         ``("agents", "action")``.
     """
-    keys: list[NestedKey] = [("agents", name) for name in dict.fromkeys((seen, "observation"))]
-    n_seen = sum(env.observation_spec[key].shape[-1] for key in keys)
-    spec = env.full_action_spec_unbatched["agents", "action"]
+    in_keys: list[NestedKey] = list(dict.fromkeys((critic_key, keys.OBSERVATION)))
+    n_features = sum(env.observation_spec[key].shape[-1] for key in in_keys)
+    spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
-        return TensorDictModule(config.network(n_seen, spec.n, env.device), keys, ["action_value"])
-    network = config.network(n_seen + spec.shape[-1], 1, env.device)
-    return TensorDictModule(network, [*keys, ("agents", "action")], ["state_action_value"])
-
-
-def _has_mask(env: EnvBase) -> bool:
-    return ("agents", "action_mask") in env.observation_spec.keys(True, True)
-
-
-def _module(network: Callable[..., torch.Tensor], seen: str, *shown: str) -> TensorDictModule:
-    keys: list[NestedKey] = [("agents", name) for name in shown]
-    return TensorDictModule(network, in_keys=[("agents", seen)], out_keys=keys)
+        return TensorDictModule(config.network(n_features, spec.n, env.device), in_keys, ["action_value"])
+    network = config.network(n_features + spec.shape[-1], 1, env.device)
+    return TensorDictModule(network, [*in_keys, keys.ACTION], ["state_action_value"])

@@ -10,11 +10,10 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import InitTracker, TensorDictPrimer, TransformedEnv
 from torchrl.modules import recurrent_mode
 
-SEEN, HIDDEN, BEFORE = (("agents", name) for name in ("observation", "hidden", "hidden_before"))
-BEGINS = "is_init"
+from damian import keys
 
-CARRIED: list[NestedKey] = [BEFORE, BEGINS]
-"""What the replay of a sequence reads beside what was seen."""
+RECURRENT_KEYS: list[NestedKey] = [keys.HIDDEN_BEFORE, keys.IS_INIT]
+"""Entries that the replay of a sequence reads, beside observations."""
 
 
 class AgentGRU(TensorDictModuleBase):
@@ -36,16 +35,16 @@ class AgentGRU(TensorDictModuleBase):
         self, encoder: nn.Module, n_features: int, n_hidden: int, device: torch.device | None = None
     ) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = [SEEN, HIDDEN], [HIDDEN, BEFORE]  # type: ignore[assignment]
+        self.in_keys, self.out_keys = [keys.OBSERVATION, keys.HIDDEN], [keys.HIDDEN, keys.HIDDEN_BEFORE]  # type: ignore[assignment]
         self.encoder, self.cell = encoder, nn.GRUCell(n_features, n_hidden, device=device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        features = self.encoder(tensordict[SEEN])
+        features = self.encoder(tensordict[keys.OBSERVATION])
         if recurrent_mode():
-            first, begins = tensordict[BEFORE][:, 0], tensordict[BEGINS]
-            return tensordict.set(HIDDEN, self.replay(features, first, begins))
-        before = tensordict[HIDDEN]
-        return tensordict.set(BEFORE, before).set(HIDDEN, self.step(features, before))
+            first, begins = tensordict[keys.HIDDEN_BEFORE][:, 0], tensordict[keys.IS_INIT]
+            return tensordict.set(keys.HIDDEN, self.replay(features, first, begins))
+        before = tensordict[keys.HIDDEN]
+        return tensordict.set(keys.HIDDEN_BEFORE, before).set(keys.HIDDEN, self.step(features, before))
 
     def step(self, features: Tensor, hidden: Tensor) -> Tensor:
         """The hidden state after [*, N, H] from features [*, N, E] and the one before [*, N, H]."""
@@ -67,13 +66,14 @@ class AgentGRU(TensorDictModuleBase):
         return torch.stack(after, 1)
 
 
-def prime(env: TransformedEnv, policy: nn.Module) -> None:
-    """Let an environment hold the hidden states of a policy, zeros at first; once, and only if it has any."""
+def add_recurrent_state(env: TransformedEnv, policy: nn.Module) -> None:
+    """Let an environment carry the hidden states of a policy, zeros at a reset; once, and only if it has
+    any."""
     cells = [module.cell for module in policy.modules() if isinstance(module, AgentGRU)]
-    if not cells or HIDDEN in env.observation_spec.keys(True, True):
+    if not cells or keys.HIDDEN in env.observation_spec.keys(True, True):
         return
-    seen = cast(Composite, env.observation_spec["agents"])
-    agents = Composite(hidden=Unbounded(torch.Size((*seen.shape, cells[0].hidden_size))), shape=seen.shape)
-    held = Composite(agents=agents, shape=env.batch_size, device=cast(torch.device, env.device))
-    env.append_transform(InitTracker(BEGINS))
-    env.append_transform(TensorDictPrimer(held))
+    shape = cast(Composite, env.observation_spec[keys.AGENTS]).shape
+    agents = Composite(hidden=Unbounded(torch.Size((*shape, cells[0].hidden_size))), shape=shape)
+    primer = Composite(agents=agents, shape=env.batch_size, device=cast(torch.device, env.device))
+    env.append_transform(InitTracker(keys.IS_INIT))
+    env.append_transform(TensorDictPrimer(primer))

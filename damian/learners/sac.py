@@ -1,4 +1,4 @@
-"""Soft actor-critic made from TorchRL's losses, learning from single decisions; keys are set here only."""
+"""Soft actor-critic made from TorchRL's losses, on single decisions drawn from a replay buffer."""
 
 import math
 from dataclasses import dataclass
@@ -13,82 +13,94 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 
+from damian import keys
 from damian.common import checks
-from damian.learners.networks import ModelConfig, make_action_value, make_actor
-from damian.replay.backupdate import TimeStorage
+from damian.keys import next_key
+from damian.learners.base import LearnerConfig, LearningSetup
+from damian.learners.networks import make_action_value, make_actor
 from damian.replay.smdp import find_decisions, transitions
+from damian.replay.time_storage import TimeStorage
 
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha")
 
 
 @dataclass
-class SacConfig:
+class SacConfig(LearnerConfig):
     """Soft actor-critic (Haarnoja et al. 2018; discrete: Christodoulou 2019) with one shared policy."""
 
+    name: str = "sac"
     lr: float = 1e-3
     """Learning rate of Adam."""
+    steps: int = 4
+    """Steps of every world between two rounds of updates, unless ``clock.system`` says otherwise."""
     alpha_lr: float = 1e-2
-    """That of the temperature's logarithm, which has to find the scale of the rewards first."""
-    gamma: float = 0.95
-    """Discount factor of a step."""
-    tau: float = 0.01
-    """How far the target networks move to the learnt ones at each update."""
-    alpha: float = 0.01
+    """Learning rate of the temperature's logarithm, which has to find the scale of the rewards first."""
+    alpha_init: float = 0.01
     """Temperature to begin with: weight of the entropy."""
-    entropy: float = 0.5
+    tau: float = 0.01
+    """How far the target networks move towards the trained ones at each update."""
+    target_entropy: float = 0.5
     """Entropy that the temperature aims at (discrete actions): share of that of a uniform choice among the
     legal actions of each UAV. Continuous actions aim at minus their dimensions, on [-1, 1]."""
     n_steps: int = 1
     """Decisions whose rewards are summed before a value is estimated (n-step returns)."""
-    steps: int = 4
-    """Steps of every world between two rounds of learning."""
     updates: int = 4
     """Updates in a round."""
-    batch: int = 512
+    batch_size: int = 512
     """Decisions in an update."""
-    memory: int = 200_000
-    """Latest steps, over all worlds, that are learnt from."""
+    buffer_steps: int = 200_000
+    """Size of the replay buffer: latest steps, over all worlds."""
     warm_up: int = 5_000
     """Steps, over all worlds, before learning begins."""
 
     def __post_init__(self) -> None:
-        for name in ("lr", "alpha_lr", "tau", "alpha"):
-            checks.above(f"sac.{name}", getattr(self, name), 0.0)
-        for name in ("gamma", "tau", "entropy"):
-            checks.in_range(f"sac.{name}", getattr(self, name), 0.0, 1.0)
-        for name in ("n_steps", "steps", "updates", "batch", "memory"):
-            checks.in_range(f"sac.{name}", getattr(self, name), 1)
-        checks.in_range("sac.warm_up", self.warm_up, 0, self.memory)
+        super().__post_init__()
+        for name in ("alpha_lr", "tau", "alpha_init"):
+            checks.above(f"learner.{name}", getattr(self, name), 0.0)
+        for name in ("tau", "target_entropy"):
+            checks.in_range(f"learner.{name}", getattr(self, name), 0.0, 1.0)
+        for name in ("n_steps", "updates", "batch_size", "buffer_steps"):
+            checks.in_range(f"learner.{name}", getattr(self, name), 1)
+        checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_steps)
+
+    def check(self, setup: LearningSetup) -> None:
+        should = "is for learner=mappo only: SAC learns from single decisions, without the steps before them"
+        checks.require(not setup.model.recurrent, "model.rnn", setup.model.rnn, should)
+        should = "is for learner=mappo only: SAC has no importance ratios"
+        checks.require(not setup.recompute_actor, "recompute_actor", True, should)
+        least = setup.longest_period + 2 * setup.longest_delay
+        checks.in_range("learner.buffer_steps", self.buffer_steps, setup.worlds * least, unit="steps")
+        checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")
+
+    def buffer_size(self, setup: LearningSetup) -> int:
+        return self.buffer_steps // setup.worlds * setup.worlds
+
+    def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "Sac":
+        if buffer is None:
+            raise ValueError("buffer: SAC needs a replay buffer on a TimeStorage")
+        return Sac(env, self, setup, buffer)
 
 
 class Sac:
-    """A learner: takes steps as they are collected, and improves its actor on decisions drawn from memory.
+    """Stores steps as they are collected, and learns from decisions drawn from all of them.
 
     A decision of one UAV is a sample of the one policy that all share, so that steps at which a UAV is not
     ready never enter a loss.
 
     Args:
-        env: for the specs.
-        model: of actor and critics.
+        env: for its specs.
         config: how to learn.
-        memory: buffer on a ``TimeStorage``; on a ``BackupdateStorage``, late messages correct what it holds.
-        settle: learn from steps only so many steps later.
-        critic_sees: what the critics see of each UAV, beside what its actor does.
+        setup: of the run.
+        buffer: replay buffer on a ``TimeStorage``; on a ``BackupdateStorage``, late messages correct its
+            steps.
     """
 
-    def __init__(
-        self,
-        env: EnvBase,
-        model: ModelConfig,
-        config: SacConfig,
-        memory: ReplayBuffer,
-        settle: int = 0,
-        critic_sees: str = "global_observation",
-    ) -> None:
-        self.config, self.memory, self.settle = config, memory, settle
-        self.actor = make_actor(env, model)
-        self.loss = sac_loss(self.actor, make_action_value(env, model, critic_sees), env, config)
-        # A checkpoint brings what was learnt, not with which discount.
+    def __init__(self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer) -> None:
+        self.config, self.setup, self.buffer = config, setup, buffer
+        self.actor = make_actor(env, setup.model)
+        action_value = make_action_value(env, setup.model, setup.critic_key)
+        self.loss = sac_loss(self.actor, action_value, env, config)
+        # A checkpoint restores the networks, but not the discount: that of this run counts.
         self.loss.register_load_state_dict_post_hook(
             lambda loss, _: loss.make_value_estimator(gamma=config.gamma)
         )
@@ -96,38 +108,38 @@ class Sac:
         temperature = {"params": [self.loss.log_alpha], "lr": config.alpha_lr}
         self.optimizer = torch.optim.Adam([{"params": networks}, temperature], lr=config.lr, fused=True)
         self.targets = SoftUpdate(self.loss, tau=config.tau)
-        masked = ("agents", "action_mask") in self.actor.in_keys
-        self.seen = ["observation", critic_sees, *["action_mask"] * masked]
+        masked = keys.ACTION_MASK in self.actor.in_keys
+        self.observed = ["observation", setup.critic_key[-1], *["action_mask"] * masked]
 
-    def parts(self) -> dict[str, Any]:
-        """What a checkpoint keeps; the memory fills anew."""
+    def components(self) -> dict[str, Any]:
+        """Networks and optimiser that a checkpoint keeps; the replay buffer fills anew."""
         return {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Remember a batch [B, T], and do a round of updates.
+        """Store a batch [B, T], and do a round of updates.
 
         Returns:
             the mean losses, nan before learning begins.
         """
-        self.memory.extend(batch.exclude(*_UNREAD))
-        storage = cast(TimeStorage, self.memory.storage)
+        self.buffer.extend(batch.exclude(*_UNREAD))
+        storage = cast(TimeStorage, self.buffer.storage)
         steps, order = storage.steps, storage.latest()
-        known = order[: max(len(order) - self.settle, 0)]
-        ready, then = (cast(Tensor, steps[key])[known] for key in (_READY, ("next", *_READY)))
-        done, terminated = (steps["next", key][known].squeeze(-1) for key in ("done", "terminated"))
-        decisions = find_decisions(ready, then, done, terminated, self.config.n_steps)
+        settled = order[: max(len(order) - self.setup.settle_steps, 0)]
+        ready, ready_next = (cast(Tensor, steps[k])[settled] for k in (keys.READY, next_key(keys.READY)))
+        done, terminated = (steps[next_key(key)][settled].squeeze(-1) for key in (keys.DONE, keys.TERMINATED))
+        decisions = find_decisions(ready, ready_next, done, terminated, self.config.n_steps)
         if len(order) * batch.shape[0] < self.config.warm_up or not len(decisions.begin):
             return dict.fromkeys(LOSSES, math.nan)
         sums = dict.fromkeys(LOSSES, 0.0)
         for _ in range(self.config.updates):
-            drawn = decisions.draw(self.config.batch)
-            losses = self.improve(transitions(steps, order, drawn, self.config.gamma, self.seen))
+            sample = decisions.sample(self.config.batch_size)
+            losses = self.update(transitions(steps, order, sample, self.config.gamma, self.observed))
             sums = {name: sums[name] + losses[name].item() for name in LOSSES}
         return {name: total / self.config.updates for name, total in sums.items()}
 
-    def improve(self, drawn: TensorDictBase) -> TensorDictBase:
+    def update(self, batch: TensorDictBase) -> TensorDictBase:
         """One update from transitions [K]; returns the losses."""
-        losses = self.loss(drawn)
+        losses = self.loss(batch)
         self.optimizer.zero_grad()
         (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
         self.optimizer.step()
@@ -135,32 +147,44 @@ class Sac:
         return losses.detach()
 
 
-_READY = ("agents", "ready")
 _UNREAD: list[NestedKey] = [
     "collector",
-    *(("agents", name) for name in ("logits", "loc", "scale", "action_log_prob", "episode_reward")),
-    *(("agents", name) for name in ("message", "received", "delay", "age", "talks")),
-    *(("next", "agents", name) for name in ("reward_terms", "episode_reward")),
+    keys.LOGITS,
+    keys.LOC,
+    keys.SCALE,
+    keys.ACTION_LOG_PROB,
+    keys.EPISODE_REWARD,
+    keys.MESSAGE,
+    keys.RECEIVED,
+    keys.DELAY,
+    keys.AGE,
+    keys.MESSAGE_SENT,
+    next_key(keys.REWARD_TERMS),
+    next_key(keys.EPISODE_REWARD),
 ]
-"""Entries of a step that nobody learns from: a memory is large."""
+"""Entries of a step that nothing here reads: a replay buffer is large."""
 
 
 def sac_loss(
     actor: ProbabilisticActor, action_value: TensorDictModule, env: EnvBase, config: SacConfig
 ) -> SACLoss | DiscreteSACLoss:
-    """Two critics, learnt temperature; on single decisions [K] under the keys of ``UavEnv``."""
-    spec = env.full_action_spec_unbatched["agents", "action"]
+    """Two critics and a learnt temperature, on single decisions [K] under the keys of ``UavEnv``."""
+    spec = env.full_action_spec_unbatched[keys.ACTION]
     # A loop over two critics is faster on a CPU than vmap.
-    options: dict[str, Any] = {"loss_function": "l2", "alpha_init": config.alpha, "deactivate_vmap": True}
+    options: dict[str, Any] = {
+        "loss_function": "l2",
+        "alpha_init": config.alpha_init,
+        "deactivate_vmap": True,
+    }
     if isinstance(spec, Categorical):
-        loss = MaskedDiscreteSACLoss(actor, action_value, spec.n, config.entropy, **options)
+        loss = MaskedDiscreteSACLoss(actor, action_value, spec.n, config.target_entropy, **options)
     else:
-        # Of one UAV, whose actions lie in bounds of their own instead of [-1, 1].
+        # The target of one UAV, whose actions lie in bounds of their own instead of [-1, 1].
         bounds = cast(Bounded, spec)
         width = (bounds.high - bounds.low).reshape(-1, spec.shape[-1])[0]
         target = ((width / 2).log() - 1).sum().item()
         loss = SACLoss(actor, action_value, target_entropy=target, **options)
-    loss.set_keys(action=("agents", "action"), reward=("agents", "reward"))
+    loss.set_keys(action=keys.ACTION, reward=keys.REWARD)
     loss.make_value_estimator(gamma=config.gamma)
     return loss
 
@@ -174,15 +198,15 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
     def __init__(
         self, actor: ProbabilisticActor, action_value: TensorDictModule, n: int, share: float, **options: Any
     ) -> None:
-        zero: Any = 0.0  # of what ``actor_loss`` reports
+        zero: Any = 0.0  # ``actor_loss`` subtracts the target itself
         super().__init__(
             actor, action_value, action_space="categorical", num_actions=n, target_entropy=zero, **options
         )
         self.share, self.n_actions = share, n
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """TorchRL's; what the temperature sees is by how much each state's entropy misses its target."""
+        """TorchRL's loss; the temperature's loss gets by how much each state's entropy misses its target."""
         loss, seen = super().actor_loss(tensordict)
-        mask = tensordict.get(("agents", "action_mask"), None)
+        mask = tensordict.get(keys.ACTION_MASK, None)
         legal = torch.tensor(self.n_actions) if mask is None else mask.sum(-1)
         return loss, {"log_prob": seen["log_prob"] + self.share * legal.log()}

@@ -1,4 +1,4 @@
-"""A replay-buffer storage that puts late messages in their place (SPEC 4, back-updating)."""
+"""A replay-buffer storage that corrects stored steps as late messages arrive (paper, section 3.4)."""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -6,67 +6,43 @@ from typing import Any, cast
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage
 
-from damian.replay.hindsight import Mail, hindsight, over_before
-from damian.server.features import Snapshot
-from damian.server.server import Server
+from damian import keys
+from damian.common.tensors import expand_mask
+from damian.keys import next_key
+from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
+from damian.replay.time_storage import TimeStorage
 
 Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
-"""From steps [T, B] and what was known after each, [T, B, N, F]: the entries after the step, corrected."""
+"""From steps [T, B] and the newest messages known of each, [T, B, N, M]: entries after the step, by key.
 
+``("next", "done")``, ``("next", "terminated")`` and ``("next", "truncated")`` [T, B, 1] must be among them.
+"""
 
-SEEN = ("observation", "global_observation")
-"""Entries of the agents that are shown after a step and before the next."""
-
-
-class TimeStorage(LazyTensorStorage):
-    """Keeps steps in order of time, [T, B].
-
-    The writer must be a round robin (TorchRL's default) over steps of the same B worlds.
-
-    Args:
-        max_size: steps of worlds, T times B.
-        options: of ``LazyTensorStorage``.
-    """
-
-    def __init__(self, max_size: int, **options: Any) -> None:
-        super().__init__(max_size, ndim=2, **options)
-
-    @property
-    def steps(self) -> TensorDictBase:
-        """All there is room for, [T, B], not in order: see ``latest``."""
-        return cast(TensorDictBase, self._storage)
-
-    def latest(self, n_steps: int | None = None) -> Tensor:
-        """Places of the latest steps, or of all, in order of time, [min(n_steps, T)]."""
-        stored = cast(int, self._len_along_dim0)
-        n_steps = stored if n_steps is None else min(n_steps, stored)
-        last = int(torch.as_tensor(self._last_cursor).view(-1)[-1])
-        return torch.arange(last - n_steps + 1, last + 1, device=self.device) % stored
+OBSERVATIONS = ("observation", "global_observation")
+"""Entries of the agents that are output after a step and read before the next."""
 
 
 class BackupdateStorage(TimeStorage):
     """Keeps steps in order of time, and corrects them as late messages arrive.
 
-    Whenever steps are written, the latest of them and those before to which a message may still have
-    belonged are seen again with all that has arrived by the last one: what follows from the messages (the
-    entries that ``recompute`` returns) is replaced, and so are observations among them at the next step of
-    the same episode. What is not among them, such as what the actor saw, did, and with which probability,
-    stays.
+    Whenever steps are written, these and the earlier ones to which a message may still belong are recomputed
+    from all messages that have arrived by the last step: the entries that ``recompute`` returns replace the
+    stored ones, and observations among them also replace those before the next step of the same episode.
+    Other entries, such as what the actor saw, its action and its log-probability, stay.
 
-    Entries are added: ``valid`` [T, B, 1], false where the episode had ended already as one knows now;
-    ``cut`` [T, B, 1], true where the environment was really reset (where it was, but the task had not ended
-    after all, the step is truncated); ``(group, "backupdated")`` [T, B, N, 1], true where a message that
-    came late took the place of what was held.
+    Entries are added: ``valid`` [T, B, 1], false where the episode had ended already, as the server knows
+    now; ``reset_after`` [T, B, 1], true where the environment was reset (if it was, but the task had not
+    ended after all, the step is truncated); ``(group, "backupdated")`` [T, B, N, 1], true where a late
+    message replaced the one that the server held.
 
     Args:
-        max_size: steps of worlds, T times B; T must be at least a batch's steps and twice ``longest``.
-        recompute: what follows from messages (``server_view``).
-        longest: largest delay of a message [steps].
-        group: the TensorDict of the agents, with ``message``, ``received``, ``delay``, ``age`` and
-            ``global_observation``.
-        begins_key: steps of the episode so far, [T, B, 1] (``StepCounter``); 0 where it begins.
+        max_size: T times B; T must be at least a batch's steps and twice ``longest``.
+        recompute: entries that follow from messages (for UAVs ``server_recompute``).
+        longest: longest delay of a message [steps].
+        group: the TensorDict of the agents, which has ``message``, ``received``, ``delay``, ``age`` and,
+            before and after the step, the observations that ``recompute`` returns.
+        step_count_key: steps of the episode so far, [T, B, 1] (``StepCounter``); 0 where it begins.
         options: of ``LazyTensorStorage``.
     """
 
@@ -76,24 +52,25 @@ class BackupdateStorage(TimeStorage):
         recompute: Recompute,
         longest: int,
         *,
-        group: str = "agents",
-        begins_key: NestedKey = "step_count",
+        group: str = keys.AGENTS,
+        step_count_key: NestedKey = keys.STEP_COUNT,
         **options: Any,
     ) -> None:
         super().__init__(max_size, **options)
-        self.recompute, self.longest, self.group, self.begins_key = recompute, longest, group, begins_key
+        self.recompute, self.longest, self.group = recompute, longest, group
+        self.step_count_key = step_count_key
 
     def set(  # type: ignore[override]
         self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True
     ) -> None:
-        """Write steps [T, B] at these places of the first dimension, and look back."""
+        """Write steps [T, B] at these indices of the first dimension, and back-update."""
         self._check(data)
-        done = data["next", "done"]
-        data = data.copy().update({"valid": torch.ones_like(done), "cut": done.clone()})
+        done = data[next_key(keys.DONE)]
+        data = data.copy().update({keys.VALID: torch.ones_like(done), keys.RESET_AFTER: done.clone()})
         delay = data["next", self.group, "delay"]
         data[self.group, "backupdated"] = torch.zeros_like(delay, dtype=torch.bool)
         super().set(cursor, data, set_cursor=set_cursor)
-        self.look_back(len(data) + self.longest)
+        self.backupdate(len(data) + self.longest)
 
     def _check(self, data: TensorDictBase) -> None:
         needs, n_worlds = len(data) + 2 * self.longest, data.shape[1]
@@ -113,88 +90,61 @@ class BackupdateStorage(TimeStorage):
             world: of the senders, [K].
             agent: likewise, [K].
             steps_ago: when each was generated, in steps before the latest, [K].
-            message: [K, F].
+            message: packed, [K, M].
 
         Raises:
-            ValueError: one is older than the storage looks back.
+            ValueError: a message is older than the longest delay, or than the stored steps.
         """
         oldest, least = int(steps_ago.max()), int(steps_ago.min())
-        known = min(self.longest, cast(int, self._len_along_dim0) - 1)
-        if least < 0 or oldest > known:
-            raise ValueError(f"steps_ago: {least} to {oldest} is not between 0 and {known}")
-        place = self.latest(oldest + 1).flip(0)[steps_ago]
+        reach = min(self.longest, cast(int, self._len_along_dim0) - 1)
+        if least < 0 or oldest > reach:
+            raise ValueError(f"steps_ago: {least} to {oldest} is not between 0 and {reach}")
+        index = self.latest(oldest + 1).flip(0)[steps_ago]
         after = cast(TensorDictBase, self._storage["next", self.group])
-        after["message"][place, world, agent] = message
-        after["delay"][place, world, agent, 0] = steps_ago
-        self.look_back(oldest + 1)
+        after["message"][index, world, agent] = message
+        after["delay"][index, world, agent, 0] = steps_ago
+        self.backupdate(oldest + 1)
 
-    def look_back(self, n_steps: int) -> None:
-        """Correct the latest steps with all that has arrived by the last one."""
-        index = self.latest(n_steps + self.longest)  # what was sent before them may belong to them
-        corrected = self.corrected(self._storage[index])
+    def backupdate(self, n_steps: int) -> None:
+        """Correct the latest steps with all messages that have arrived by the last one."""
+        index = self.latest(n_steps + self.longest)  # messages sent before them may belong to them
+        recomputed = self.recomputed(self._storage[index])
         rows = index[-n_steps:]
-        for key, value in corrected.items():
+        for key, value in recomputed.items():
             self._storage.get(key)[rows] = value[-len(rows) :]
         self._bump_mutation_revision()
 
-    def corrected(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
-        """The entries of consecutive steps [T, B] as they are known after the last of them."""
-        group, begins = self.group, steps[self.begins_key].squeeze(-1) == 0
-        after = cast(TensorDictBase, steps["next", group])
-        mail = Mail(
-            sent=after["message"],
-            delay=after["delay"].squeeze(-1),
-            held=after["received"],
-            age=after["age"].squeeze(-1).long(),
+    def recomputed(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """The corrected entries of consecutive steps [T, B], as known after the last of them."""
+        group, begins = self.group, steps[self.step_count_key].squeeze(-1) == 0
+        agents = cast(TensorDictBase, steps["next", group])
+        log = MessageLog(
+            sent=agents["message"],
+            delay=agents["delay"].squeeze(-1),
+            held=agents["received"],
+            age=agents["age"].squeeze(-1).long(),
         )
-        beliefs = hindsight(mail)
-        after = self.recompute(steps, beliefs)
-        cut, terminated = steps["cut"], after["next", "terminated"]
-        after["next", "truncated"] = after["next", "truncated"] | (cut & ~terminated)
-        after["next", "done"] = after["next", "done"] | cut
-        already = ~steps["valid"][0].squeeze(-1) & ~begins[0]
-        over = over_before(after["next", "done"].squeeze(-1), begins, already)
-        began = begins.clone()
-        began[0] = True  # the step before it is not at hand
+        known = latest_arrived(log)
+        after = self.recompute(steps, known)
+        done, terminated, truncated = map(next_key, (keys.DONE, keys.TERMINATED, keys.TRUNCATED))
+        reset = steps[keys.RESET_AFTER]
+        after[truncated] = after[truncated] | (reset & ~after[terminated])
+        after[done] = after[done] | reset
+        already = ~steps[keys.VALID][0].squeeze(-1) & ~begins[0]
+        over = ended_before(after[done].squeeze(-1), begins, already)
+        first = begins.clone()
+        first[0] = True  # the step before it is not among these
         before = {
-            (group, name): _one_later(after["next", group, name], steps[group, name], began)
-            for name in SEEN
+            (group, name): _shift(after["next", group, name], steps[group, name], first)
+            for name in OBSERVATIONS
             if ("next", group, name) in after
         }
-        replaced = (beliefs != mail.held).any(-1, keepdim=True)
-        return {**after, **before, (group, "backupdated"): replaced, "valid": ~over.unsqueeze(-1)}
+        replaced = (known != log.held).any(-1, keepdim=True)
+        return {**after, **before, (group, "backupdated"): replaced, keys.VALID: ~over.unsqueeze(-1)}
 
 
-def _one_later(after: Tensor, seen: Tensor, began: Tensor) -> Tensor:
-    """What was seen before each step [T, B, ...]: what is known after the one before, but at a beginning."""
-    before = torch.cat([after[:1], after[:-1]])
-    return torch.where(began.view(*began.shape, *[1] * (seen.dim() - 2)), seen, before)
-
-
-def server_view(server: Server, terms: bool = False, actor: bool = False) -> Recompute:
-    """What the server node makes of messages, for a ``BackupdateStorage``.
-
-    Args:
-        server: of the environment.
-        terms: correct ``reward_terms`` too.
-        actor: and what the server tells the actors, in front of what they remember by themselves.
-    """
-
-    def recompute(steps: TensorDictBase, beliefs: Tensor) -> dict[NestedKey, Tensor]:
-        elapsed, over = steps["next", "step_count"].squeeze(-1), steps.get(("next", "source_over"), None)
-        served = server.serve(Snapshot.unpack(beliefs), elapsed, over)
-        entries: dict[NestedKey, Tensor] = {
-            ("next", "agents", "global_observation"): served.global_observation,
-            ("next", "agents", "reward"): served.reward.unsqueeze(-1),
-        }
-        if actor:
-            message = steps["next", "agents", "message"]
-            own = server.config.observation.own
-            told = server.informed(beliefs, message, elapsed) if own else served.observation
-            seen = steps["next", "agents", "observation"]
-            entries["next", "agents", "observation"] = torch.cat([told, seen[..., told.shape[-1] :]], -1)
-        if terms:
-            entries |= {("next", "agents", "reward_terms", k): v for k, v in served.terms.items()}
-        return entries | {("next", k): v for k, v in served.status.entries().items()}
-
-    return recompute
+def _shift(after: Tensor, before: Tensor, first: Tensor) -> Tensor:
+    """Observations before each step [T, B, ...]: those after the previous step, but not where ``first`` [T,
+    B]."""
+    previous = torch.cat([after[:1], after[:-1]])
+    return torch.where(expand_mask(first, before), before, previous)

@@ -1,7 +1,7 @@
-"""Features turned into named reward terms (eq. 5-8), and the end of an episode.
+"""Features turned into named reward terms (paper, eq. 5-8).
 
-``reward`` and ``status`` are pure and batched, as ``observe`` is. A term's name is its feature, its
-weight's key and its tag in the logs.
+``reward`` is pure and batched, as ``observe`` is. A term's name is its feature, its weight's key and its
+tag in the logs.
 """
 
 import math
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.server.features import Snapshot
+from damian.server.termination import Status
 
 INDIVIDUAL = ("coverage", "spotted", "battery")
 SYSTEM = (
@@ -78,9 +78,9 @@ class RewardConfig:
     def __post_init__(self) -> None:
         for name in (*INDIVIDUAL, *SYSTEM, "individual", "system", "bonus", "penalty"):
             value = getattr(self, name)
-            checks.require(math.isfinite(value), f"task.{name}", value, "is not a finite weight")
-        checks.one_of("task.drift", self.drift, ["smooth", "printed"])
-        checks.in_range("task.desired_spotting", self.desired_spotting, 0.0, 1.0)
+            checks.require(math.isfinite(value), f"reward.{name}", value, "is not a finite weight")
+        checks.one_of("reward.drift", self.drift, ["smooth", "printed"])
+        checks.in_range("reward.desired_spotting", self.desired_spotting, 0.0, 1.0)
 
     @property
     def terms(self) -> list[str]:
@@ -94,31 +94,6 @@ class RewardConfig:
         return getattr(self, name) * group
 
 
-@dataclass
-class EpisodeConfig:
-    """When an episode ends (SPEC 5). With every end switched off the task is persistent."""
-
-    max_steps: int | None = 50
-    """Time limit [steps]; none if not given."""
-    since_detection: bool = False
-    """Count the limit from the latest detection instead of from the start."""
-    success_share: float | None = None
-    """Share of the UAVs that must spot at once for success; no success if not given."""
-    discharged_share: float | None = None
-    """Share of empty UAVs that ends the episode; never if not given."""
-    end_with_source: bool = False
-    """End when the source has finished its walk."""
-
-    def __post_init__(self) -> None:
-        if self.max_steps is not None:
-            checks.in_range("episode.max_steps", self.max_steps, 1)
-        for name in ("success_share", "discharged_share"):
-            value = getattr(self, name)
-            if value is not None:
-                checks.above(f"episode.{name}", value, 0.0)
-                checks.in_range(f"episode.{name}", value, 0.0, 1.0)
-
-
 class Counters(NamedTuple):
     """What reward and status need besides the features."""
 
@@ -126,21 +101,6 @@ class Counters(NamedTuple):
     """Elapsed steps of the episode, [*]."""
     motions: Tensor
     """Motions since each UAV last spotted, [*, N]."""
-
-
-class Status(NamedTuple):
-    """How the task stands, each [*] bool."""
-
-    success: Tensor
-    terminated: Tensor
-    truncated: Tensor
-
-    def entries(self) -> dict[str, Tensor]:
-        """As TorchRL shows it, with ``done``, each [*, 1]."""
-        done = self.terminated | self.truncated
-        flags = {"success": self.success, "done": done}
-        flags |= {"terminated": self.terminated, "truncated": self.truncated}
-        return {name: flag.unsqueeze(-1) for name, flag in flags.items()}
 
 
 def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig) -> dict[str, Tensor]:
@@ -159,53 +119,11 @@ def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig
     }
 
 
-def status(
-    snapshot: Snapshot,
-    steps: Tensor,
-    now: Tensor,
-    source_over: Tensor,
-    dt: float,
-    config: EpisodeConfig,
-) -> Status:
-    """Does the episode end, and how, as far as the server knows (SPEC 5).
-
-    Time limits truncate, all else terminates; a success at the last step is a success.
-
-    Args:
-        snapshot: messages held by the server, [*, N].
-        steps: elapsed steps, [*].
-        now: time [s], [*].
-        source_over: has the source finished its walk, [*].
-        dt: length of a step [s].
-        config: which ends count.
-    """
-    n_agents = snapshot.spotted.shape[-1]
-    no = torch.zeros_like(source_over)
-    success = over = late = no
-    if config.success_share is not None:
-        success = snapshot.spotted.sum(-1) >= share_of(config.success_share, n_agents)
-    if config.discharged_share is not None:
-        over = (snapshot.battery <= 0).sum(-1) >= share_of(config.discharged_share, n_agents)
-    if config.end_with_source:
-        over = over | source_over
-    if config.max_steps is not None:
-        waited = steps
-        if config.since_detection:
-            waited = (now - snapshot.detected_time.amax(-1).clamp(min=0)) / dt
-        late = waited >= config.max_steps - 1e-3
-    return Status(success, success | over, late & ~(success | over))
-
-
 def final_reward(ended: Status, counters: Counters, config: RewardConfig) -> Tensor:
     """Bonus on success, penalty at any other end, the same for every UAV, [*]."""
     bonus = config.bonus / counters.steps.clamp(min=1) if config.bonus_over_steps else config.bonus
     failure = (ended.terminated | ended.truncated) & ~ended.success
     return ended.success * bonus - failure * config.penalty
-
-
-def share_of(share: float, n_agents: int) -> int:
-    """The least number of UAVs that is at least a share of them, and at least one."""
-    return max(1, math.ceil(share * n_agents - 1e-9))
 
 
 def _per_motion(value: Tensor, counters: Counters) -> Tensor:

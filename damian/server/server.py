@@ -1,7 +1,7 @@
-"""The server node: what it makes of the messages that it holds, whenever and wherever it is asked.
+"""The server node: observations, rewards and the task's status from the messages that it holds.
 
-Asked by the environment (nothing delayed), by the ``ServerNode`` transform (what has arrived), and by a
-learner's storage (what has arrived by the time of learning): one copy of every formula.
+The environment asks it when nothing is delayed, the ``ServerNode`` transform for the messages that have
+arrived, and a replay storage for those that have arrived by the time of learning: one copy of every formula.
 """
 
 from collections.abc import Sequence
@@ -11,28 +11,31 @@ import torch
 from torch import Tensor
 
 from damian.common.errors import InputError
-from damian.envs.scenario import ScenarioConfig
-from damian.server.features import EXACT, Knowledge, Snapshot, observe, stack
-from damian.server.rewards import Counters, Status, final_reward, reward, status
-from damian.world.airspace import Airspace, rows
+from damian.common.tensors import gather_rows
+from damian.server.features import ObservationConfig, ServerContext, observe, stack
+from damian.server.rewards import Counters, RewardConfig, final_reward, reward
+from damian.server.termination import EpisodeConfig, Status, status
+from damian.world.airspace import Airspace
+from damian.world.battery import BatteryConfig
 from damian.world.coverage import FootprintTables, build_tables
+from damian.world.messages import MAX_EXACT_INTEGER, Messages
 
 Features = dict[str, Tensor]
 
 
-class Judgement(NamedTuple):
-    """What the UAVs get for how the task stands."""
+class RewardAndStatus(NamedTuple):
+    """The UAVs' rewards, and how the task stands."""
 
     reward: Tensor
-    """Eq. 8 with bonus and penalty, [*, N]."""
+    """Paper, eq. 8, with bonus and penalty, [*, N]."""
     terms: dict[str, Tensor]
     """Its weighted terms by name, [*, N]."""
     status: Status
     """[*]."""
 
 
-class Service(NamedTuple):
-    """All that the UAVs and the learner get from the server."""
+class ServerOutputs(NamedTuple):
+    """Everything that the server computes from messages."""
 
     observation: Tensor
     """Of the actors, [*, N, F]."""
@@ -47,29 +50,44 @@ class Service(NamedTuple):
 
 
 class Server:
-    """Features, rewards and status of snapshots [*, N], with any leading dimensions.
+    """Features, rewards and status of messages [*, N], with any leading dimensions.
 
     Args:
-        scenario: what is asked for.
-        airspace: where the UAVs fly.
+        observation: which features actor and critic see.
+        reward: weights of the reward terms.
+        episode: when an episode ends.
+        battery: for the resolution with which levels are observed.
+        airspace: regions and landing points.
         radius: of a UAV's footprint [m].
+        dt: length of a step [s].
+        time_scale: what times are divided by [s].
 
     Raises:
         InputError: more landing points than a message can number.
     """
 
-    def __init__(self, scenario: ScenarioConfig, airspace: Airspace, radius: float) -> None:
-        if airspace.points.shape[:2].numel() >= EXACT:
+    def __init__(
+        self,
+        observation: ObservationConfig,
+        reward: RewardConfig,
+        episode: EpisodeConfig,
+        battery: BatteryConfig,
+        airspace: Airspace,
+        *,
+        radius: float,
+        dt: float,
+        time_scale: float,
+    ) -> None:
+        if airspace.points.shape[:2].numel() >= MAX_EXACT_INTEGER:
             raise InputError("region.lattice_step: a message cannot number so many landing points")
-        self.config = scenario
-        self.dt = scenario.clock.dt
-        observation, task = scenario.observation, scenario.task
-        self._wanted = sorted({*observation.actor, *observation.critic, *task.terms})
+        self.observation, self.reward, self.episode, self.battery = observation, reward, episode, battery
+        self.dt, self.time_scale = dt, time_scale
+        self._names = sorted({*observation.actor, *observation.critic, *reward.terms})
         self._scale = airspace.scale
         self._max_points = airspace.max_points
         self._points = airspace.points.flatten(0, 1)
         self._footprints: FootprintTables | None = None
-        if "coverage" in self._wanted:
+        if "coverage" in self._names:
             polygons = [region.polygon for region in airspace.regions]
             places = airspace.points.double().cpu().numpy()
             self._footprints = build_tables(polygons, places, radius)
@@ -81,83 +99,86 @@ class Server:
             self._footprints = self._footprints.to(device)
         return self
 
-    def features(self, snapshot: Snapshot, steps: Tensor, names: list[str] | None = None) -> Features:
-        """What the observations and the rewards are made of (Table 2).
+    def __call__(self, messages: Messages, steps: Tensor, source_over: Tensor | None = None) -> ServerOutputs:
+        """Everything at once; arguments as of ``reward_and_status``, with a source that never ends if not
+        given."""
+        over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
+        features = self.features(messages, steps)
+        result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
+        return ServerOutputs(*self.observations(features), *result)
+
+    def features(self, messages: Messages, steps: Tensor, names: list[str] | None = None) -> Features:
+        """The features of observations and rewards (paper, Table 2).
 
         Args:
-            snapshot: the messages held, [*, N].
+            messages: held by the server, [*, N].
             steps: elapsed in the episode, [*].
-            names: only these; everything that somebody wants, if not given.
+            names: wanted features; every one that an observation or a reward term needs, if not given.
         """
-        knowledge = Knowledge(
+        context = ServerContext(
             now=steps * self.dt,
-            scale=self._scales(snapshot),
-            time_scale=self.config.time_scale,
-            battery=self.config.battery,
+            scale=self._scales(messages),
+            time_scale=self.time_scale,
+            battery=self.battery,
             footprints=self._footprints,
             points=self._points,
-            age_scale=self.config.observation.age_scale,
-            newest=self.config.observation.estimate == "newest",
+            age_scale=self.observation.age_scale,
+            newest=self.observation.estimate == "newest",
         )
-        return observe(snapshot, knowledge, names or self._wanted)
+        return observe(messages, context, names or self._names)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
-        """What the actors see [*, N, F], and the critic [*, N, G]."""
-        wanted = self.config.observation
-        return stack(features, wanted.actor), stack(features, wanted.critic)
+        """Observations of the actors [*, N, F], and of the critic [*, N, G]."""
+        return stack(features, self.observation.actor), stack(features, self.observation.critic)
 
-    def informed(
+    def observe_with_timely_messages(
         self,
         received: Tensor,
-        message: Tensor,
+        sent: Tensor,
         steps: Tensor,
         on_time: Tensor | None = None,
-        fields: Sequence[str] = Snapshot._fields,
+        fields: Sequence[str] = Messages._fields,
     ) -> Tensor:
-        """What each actor sees if it knows some messages at once, [*, N, F].
+        """Observations of actors that know some messages without delay, [*, N, F].
 
         Args:
-            received: what the server holds, [*, N, M].
-            message: what the UAVs sent last, [*, N, M].
+            received: packed messages that the server holds, [*, N, M].
+            sent: packed messages that the UAVs sent last, [*, N, M].
             steps: elapsed in the episode, [*].
-            on_time: whose messages, by who is told and who has sent, [N, N]; one's own, if not given.
-            fields: what of them.
+            on_time: row i, column j: does UAV i know UAV j's message at once, [N, N]; only its own if not
+                given.
+            fields: fields of the messages that are known at once.
         """
-        n_agents, names = received.shape[-2], self.config.observation.actor
+        n_agents, names = received.shape[-2], self.observation.actor
         if on_time is None:
             on_time = torch.eye(n_agents, dtype=torch.bool, device=received.device)
-        timely = torch.where(on_time.unsqueeze(-1), message.unsqueeze(-3), received.unsqueeze(-3))
-        known = Snapshot.unpack(received.unsqueeze(-3).expand_as(timely))  # [*, N, N], by who is told
-        timely = Snapshot.unpack(timely)._asdict()
+        timely = torch.where(on_time.unsqueeze(-1), sent.unsqueeze(-3), received.unsqueeze(-3))
+        known = Messages.unpack(received.unsqueeze(-3).expand_as(timely))  # [*, N, N], first by who knows
+        timely = Messages.unpack(timely)._asdict()
         known = known._replace(**{name: timely[name] for name in fields})
-        told = stack(self.features(known, steps.unsqueeze(-1).expand(received.shape[:-1]), names), names)
-        return told.diagonal(dim1=-3, dim2=-2).movedim(-1, -2)
+        features = self.features(known, steps.unsqueeze(-1).expand(received.shape[:-1]), names)
+        return stack(features, names).diagonal(dim1=-3, dim2=-2).movedim(-1, -2)
 
-    def judge(self, features: Features, snapshot: Snapshot, steps: Tensor, source_over: Tensor) -> Judgement:
-        """Rewards and status (eq. 5-8, SPEC 5).
+    def reward_and_status(
+        self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor
+    ) -> RewardAndStatus:
+        """Rewards (paper, eq. 5-8) and the end of the episode.
 
         Args:
-            features: of the snapshot.
-            snapshot: the messages held, [*, N].
+            features: of the messages.
+            messages: held by the server, [*, N].
             steps: elapsed in the episode, [*].
             source_over: has the source finished its walk, [*].
         """
-        task, counters = self.config.task, Counters(steps, snapshot.motions)
-        ended = status(snapshot, steps, steps * self.dt, source_over, self.dt, self.config.episode)
-        terms = reward(features, counters, task)
-        final = final_reward(ended, counters, task).unsqueeze(-1).expand_as(snapshot.track)
-        return Judgement(sum(terms.values(), start=final), terms, ended)
+        counters = Counters(steps, messages.motions)
+        ended = status(messages, steps, steps * self.dt, source_over, self.dt, self.episode)
+        terms = reward(features, counters, self.reward)
+        final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
+        return RewardAndStatus(sum(terms.values(), start=final), terms, ended)
 
-    def serve(self, snapshot: Snapshot, steps: Tensor, source_over: Tensor | None = None) -> Service:
-        """Everything at once; arguments as of ``judge``, with a source that never ends if not given."""
-        over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
-        features = self.features(snapshot, steps)
-        judged = self.judge(features, snapshot, steps, over.view(steps.shape))
-        return Service(*self.observations(features), *judged)
-
-    def _scales(self, snapshot: Snapshot) -> Tensor:
-        """Largest vertex distance of each world's region, which its landing points tell, [*]."""
-        here = snapshot.trail[..., 0, 0]
+    def _scales(self, messages: Messages) -> Tensor:
+        """Largest vertex distance of each world's region, which follows from its landing points, [*]."""
+        here = messages.trail[..., 0, 0]
         if len(self._scale) == 1:
             return self._scale.expand(here.shape)
-        return rows(self._scale, here // self._max_points)
+        return gather_rows(self._scale, here // self._max_points)

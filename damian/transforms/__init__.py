@@ -1,21 +1,27 @@
-"""Delays, memories and clocks as TorchRL transforms; all but ``ServerNode`` work on any environment."""
+"""Delays, memories and clocks as TorchRL transforms; all but ``ServerNode`` work on any environment.
+
+``SkipUntilReady`` needs a ``DelayedEnv`` on a ``UavEnv``.
+"""
 
 from damian.transforms.action_delay import ActionDelay
 from damian.transforms.action_history import ActionHistory
-from damian.transforms.base import Stateful, check_order
+from damian.transforms.base import StatefulTransform
 from damian.transforms.observation_delay import ObservationDelay
+from damian.transforms.order import check_order
 from damian.transforms.reward_delay import CumulativeReward, RewardDelay
-from damian.transforms.sample_and_hold import Clock
+from damian.transforms.sample_and_hold import SampleAndHold
 from damian.transforms.server_node import ServerNode
+from damian.transforms.skip_until_ready import SkipUntilReady
 
 __all__ = [
     "ActionDelay",
     "ActionHistory",
-    "Clock",
     "CumulativeReward",
     "ObservationDelay",
     "RewardDelay",
+    "SampleAndHold",
     "ServerNode",
-    "Stateful",
+    "SkipUntilReady",
+    "StatefulTransform",
     "check_order",
 ]

@@ -8,12 +8,13 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from damian.common import checks
-from damian.transforms.action_delay import OnActions
-from damian.transforms.base import Change, Entries, Memory, Uses, as_rows, beside, from_rows, wide
-from damian.world.airspace import rows
+from damian.common.tensors import expand_mask, gather_rows
+from damian.transforms.action_specs import ActionTransform
+from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows, sibling_key
+from damian.transforms.order import KeyUsage
 
 
-class ActionHistory(OnActions):
+class ActionHistory(ActionTransform):
     """Shows an agent its own latest actions: with them a delayed environment is Markovian again.
 
     What it records is what was chosen, so it comes after whatever delays or holds actions. The latest
@@ -49,19 +50,19 @@ class ActionHistory(OnActions):
         checks.whole("steps", steps, 1)
         super().__init__(action_key, default)
         appended = [append_to] if append_to is not None else []
-        self.in_keys, self.out_keys = appended, appended or [beside(self.action_key, out_key)]
-        self.steps, self.recorded_key = steps, beside(self.action_key, recorded_key)
+        self.in_keys, self.out_keys = appended, appended or [sibling_key(self.action_key, out_key)]
+        self.steps, self.recorded_key = steps, sibling_key(self.action_key, recorded_key)
         self.codes = codes
-        self.act_keys = [self.action_key, *([self.recorded_key] if self.recorded_key else [])]
-        self.age_key = beside(self.action_key, age_key)
+        self.action_keys = [self.action_key, *([self.recorded_key] if self.recorded_key else [])]
+        self.age_key = sibling_key(self.action_key, age_key)
         self._reads = [self.age_key] if self.age_key else []
-        self.see_keys = [*self.in_keys, *self._reads]
+        self.step_keys = [*self.in_keys, *self._reads]
 
     @property
-    def uses(self) -> Uses:
-        return Uses(reads=self._reads, appends=self.in_keys, records=[self.action_key])
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(reads=self._reads, appends=self.in_keys, records=[self.action_key])
 
-    def allocate(self, tensordict: TensorDictBase) -> Memory:
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
         actions = self.actions
         scale = {"low": actions.low, "width": actions.width}
         scale |= {} if self.codes is None else {"codes": self.codes.to(actions.initial.device)}
@@ -69,12 +70,12 @@ class ActionHistory(OnActions):
         since = torch.zeros(len(first), self.steps, dtype=torch.long, device=first.device)
         return scale | {"first": first, "recent": first, "since": since}
 
-    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         first = memory["first"]
-        memory = memory | {"recent": torch.where(wide(mask, first), first, memory["recent"])}
-        return self.see(memory, entries)
+        memory = memory | {"recent": torch.where(expand_mask(mask, first), first, memory["recent"])}
+        return self.on_step(memory, entries)
 
-    def act(self, memory: Memory, entries: Entries) -> Change:
+    def on_action(self, memory: Memory, entries: Entries) -> Change:
         recent = memory["recent"]
         latest = self._encode(memory, as_rows(entries[self.action_key], self.rows))
         longer = torch.cat([recent[:, latest.shape[-1] :], latest], -1)
@@ -85,7 +86,7 @@ class ActionHistory(OnActions):
             longer, since = torch.where(recorded, longer, recent), torch.where(recorded, since, old + 1)
         return memory | {"recent": longer, "since": since}, {}
 
-    def see(self, memory: Memory, entries: Entries) -> Change:
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
         recent, key = memory["recent"], self.out_keys[0]
         if self.age_key:
             unknown = memory["since"] <= entries[self.age_key].reshape(-1, 1)
@@ -97,7 +98,7 @@ class ActionHistory(OnActions):
     def _encode(self, scale: Memory, action: Tensor) -> Tensor:
         """Actions [M, ...] as numbers [M, A]."""
         if self.codes is not None:
-            return rows(scale["codes"], action)
+            return gather_rows(scale["codes"], action)
         return ((action.float() - scale["low"]) / scale["width"]).view(len(action), -1).float()
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]

@@ -1,69 +1,50 @@
-"""What the transforms share: a memory that lives in buffers, seeds, and their order."""
+"""The base class of transforms with memory: buffers, seeds, and the hooks that subclasses fill in."""
 
-import itertools
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn, cast
+from collections.abc import Sequence
+from typing import Any, NoReturn, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.data import Composite
 from torchrl.envs import Compose, EnvBase, Transform
 
 from damian.common import counter_rng
-from damian.common.errors import InputError
-
-Memory = dict[str, Tensor]
-"""What a transform remembers, by the name of its buffer."""
-
-Entries = dict[NestedKey, Tensor]
-"""Entries of a TensorDict, by key."""
-
-Change = tuple[Memory, Entries]
-"""What is remembered from now on, and the entries that are written."""
-
-
-class Uses(NamedTuple):
-    """What a transform does with keys: decides which of two must come first."""
-
-    reads: Sequence[NestedKey] = ()
-    """Read from what the environment shows."""
-    makes: Sequence[NestedKey] = ()
-    """Written anew, whatever was there."""
-    holds: Sequence[NestedKey] = ()
-    """Held back for some time."""
-    appends: Sequence[NestedKey] = ()
-    """Made longer by what the actor knows by itself."""
-    replaces: Sequence[NestedKey] = ()
-    """Actions that the environment gets in place of the chosen ones."""
-    records: Sequence[NestedKey] = ()
-    """Actions that are remembered as they were chosen."""
+from damian.common.tensors import expand_mask
+from damian.transforms.entries import (
+    Change,
+    Entries,
+    Memory,
+    flag_rows,
+    row_shape,
+    select_entries,
+)
+from damian.transforms.order import KeyUsage, check_order, leaf_transforms
 
 
-class Stateful(Transform):
-    """A transform with a memory: one row for each world, or for each agent of each world.
+class StatefulTransform(Transform):
+    """A transform with memory: one row for each world, or for each agent of each world.
 
     An entry under a nested key, such as ``("agents", "observation")``, has a row for each element of the
-    batch size of its innermost TensorDict; an entry at the root has one for each world. The memory is made
-    at the first reset, and kept in buffers: it is saved with ``state_dict`` (not as a copy: some of it is
-    written in place), moves with ``to``, and travels into worker processes. The worlds are not in it.
+    batch size of its innermost TensorDict; an entry at the root has one for each world. The memory is
+    allocated at the first reset and kept in buffers: ``state_dict`` saves it (by reference: copy what you
+    keep, as some of it is written in place), ``to`` moves it, and it travels into worker processes.
 
-    What a subclass does is written as pure functions of its memory and of entries, ``begin`` (after a
-    reset), ``act`` (before a step) and ``see`` (after it), so that a whole chain compiles into one graph.
+    A subclass consists of pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before
+    the environment steps) and ``on_step`` (after it). So a whole pipeline compiles into one graph.
 
     Args:
-        seed: of everything that is drawn; without one, drawn from torch's global generator at the first
-            reset.
+        seed: of everything that the transform draws; without one, the seed is drawn from torch's global
+            generator at the first reset.
     """
 
-    act_keys: Sequence[NestedKey] = ()
-    """Entries that ``act`` is given, if they are there."""
-    see_keys: Sequence[NestedKey] = ()
-    """Entries that ``begin`` and ``see`` are given, if they are there."""
-    drop: Sequence[NestedKey] = ()
-    """Entries that are not passed on."""
+    action_keys: Sequence[NestedKey] = ()
+    """Entries that ``on_action`` gets, if they exist."""
+    step_keys: Sequence[NestedKey] = ()
+    """Entries that ``on_reset`` and ``on_step`` get, if they exist."""
+    dropped_keys: Sequence[NestedKey] = ()
+    """Entries that are removed from the output."""
     sent_key: NestedKey | None = None
-    """Flag that says which rows send something now, if not all do."""
+    """Flag that says which rows send a message in this step; None if all do."""
 
     def __init__(
         self,
@@ -80,32 +61,41 @@ class Stateful(Transform):
         self._seed: int | None = seed
         self._world_seeds: Tensor | None = None
 
-    # Pure, for subclasses.
+    # Pure functions, for subclasses.
 
-    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        """Forget the rows of the mask [M], which begin with these entries of a reset."""
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        """Clear the memory of the rows of the mask [M], whose new episodes begin with these entries."""
         return memory, {}
 
-    def act(self, memory: Memory, entries: Entries) -> Change:
-        """What the environment is told, of what the policy chose."""
+    def on_action(self, memory: Memory, entries: Entries) -> Change:
+        """Change the entries on their way from the policy to the environment."""
         return memory, {}
 
-    def see(self, memory: Memory, entries: Entries) -> Change:
-        """What is shown, of what the environment shows after a step."""
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
+        """Change the entries that the environment outputs after a step."""
         return memory, {}
 
-    def only(self, before: Memory, after: Memory, moves: Tensor) -> Memory:
-        """The memory after a step of the worlds of the mask [B] alone, in which no others sent anything."""
-        rows = self.rows_of(moves)
+    def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
+        """The memory after a step of the worlds of the mask [B] alone; no other world has sent anything."""
+        rows = self.expand_worlds(stepped)
         return {
-            name: new if new is before[name] else torch.where(wide(rows, new), new, before[name])
+            name: new if new is before[name] else torch.where(expand_mask(rows, new), new, before[name])
             for name, new in after.items()
         }
 
-    # Once, for subclasses.
+    def skipped_worlds(self, entries: Entries) -> Tensor | None:
+        """Worlds [B] that must step once more before a step is output; None for a transform that never
+        asks."""
+        return None
 
-    def allocate(self, tensordict: TensorDictBase) -> Memory:
-        """The memory before the first reset, whose entries are given."""
+    def merge_steps(self, entries: Entries, later: Entries, stepped: Tensor) -> Entries:
+        """One output for several steps, once the worlds of the mask [B] have stepped once more."""
+        raise NotImplementedError
+
+    # Called once, for subclasses.
+
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        """The memory before the first reset, which has these entries."""
         return {}
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
@@ -114,29 +104,29 @@ class Stateful(Transform):
 
     @property
     def row_key(self) -> NestedKey:
-        """An entry whose place says what a row is."""
+        """An entry that has one element for each row."""
         return self.in_keys[0]
 
     @property
-    def uses(self) -> Uses:
-        """What this transform does with which keys."""
-        return Uses()
+    def key_usage(self) -> KeyUsage:
+        """What this transform does with which keys, for ``check_order``."""
+        return KeyUsage()
 
     # TorchRL's hooks.
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = None
-        if self.begun:
+        if self.has_memory:
             self._check_rows(tensordict_reset)
             mask = flag_rows(tensordict, "_reset", self.row_key, self.rows)
         else:
             self._rows = self.find_rows(tensordict_reset)
-            self.remember(self.allocate(tensordict_reset))
+            self.set_memory(self.init_memory(tensordict_reset))
         if mask is None:
             device = next((value.device for value in self.memory.values()), None)
             mask = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
-        change = self.begin(self.memory, taken(tensordict_reset, self.see_keys), mask)
-        return self._write(tensordict_reset, change)  # TorchRL keeps what the other worlds showed
+        change = self.on_reset(self.memory, select_entries(tensordict_reset, self.step_keys), mask)
+        return self._write(tensordict_reset, change)  # TorchRL keeps the entries of the other worlds
 
     def _check_rows(self, tensordict: TensorDictBase) -> None:
         rows = self.find_rows(tensordict)
@@ -147,14 +137,16 @@ class Stateful(Transform):
             )
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if not self.act_keys:
+        if not self.action_keys:
             return tensordict
         self.check()
-        return self._write(tensordict, self.act(self.memory, taken(tensordict, self.act_keys)))
+        entries = select_entries(tensordict, self.action_keys)
+        return self._write(tensordict, self.on_action(self.memory, entries))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self.check()
-        return self._write(next_tensordict, self.see(self.memory, taken(next_tensordict, self.see_keys)))
+        entries = select_entries(next_tensordict, self.step_keys)
+        return self._write(next_tensordict, self.on_step(self.memory, entries))
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -163,18 +155,18 @@ class Stateful(Transform):
 
     def _write(self, tensordict: TensorDictBase, change: Change) -> TensorDictBase:
         memory, entries = change
-        self.remember(memory)
+        self.set_memory(memory)
         for key, value in entries.items():
             tensordict.set(key, value)
-        for key in self.drop:
+        for key in self.dropped_keys:
             tensordict.pop(key, None)
         return tensordict
 
     # The memory.
 
     @property
-    def begun(self) -> bool:
-        """Is there a memory yet."""
+    def has_memory(self) -> bool:
+        """Has there been a reset, which allocates the memory."""
         return self._rows is not None
 
     @property
@@ -183,21 +175,21 @@ class Stateful(Transform):
         assert self._rows is not None
         return self._rows
 
-    def rows_of(self, worlds: Tensor) -> Tensor:
-        """A mask of worlds [B] as one of rows [M]."""
+    def expand_worlds(self, worlds: Tensor) -> Tensor:
+        """A mask of worlds [B] as a mask of rows [M]."""
         return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
     @property
     def memory(self) -> Memory:
-        """Everything that changes."""
+        """Everything that the transform remembers."""
         return cast(Memory, dict(self._buffers))
 
-    def remember(self, memory: Memory) -> None:
-        """Put what has changed in the place of what was."""
+    def set_memory(self, memory: Memory) -> None:
+        """Replace the buffers of these names."""
         self._buffers.update(memory)
 
-    def forget(self) -> None:
-        """Begin anew: the next reset is the first."""
+    def clear_memory(self) -> None:
+        """Remove the memory: the next reset counts as the first."""
         self._rows = None
         self._buffers.clear()
 
@@ -217,27 +209,28 @@ class Stateful(Transform):
         }
         saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
         devices = {name: buffer.device for name, buffer in self.memory.items()}
-        self.forget()  # TorchRL also loads what holds nothing of ours: then the next reset is the first
-        self.remember({k: v.detach().clone().to(devices.get(k, v.device)) for k, v in saved.items()})
+        # TorchRL also loads states that hold nothing of this transform: then the next reset is the first.
+        self.clear_memory()
+        self.set_memory({k: v.detach().clone().to(devices.get(k, v.device)) for k, v in saved.items()})
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
-    def clone(self) -> "Stateful":
-        """The same transform, with a memory of its own that is still empty."""
+    def clone(self) -> "StatefulTransform":
+        """The same transform, without memory."""
         copied = super().clone()
-        copied.forget()
+        copied.clear_memory()
         return copied
 
     # Seeds.
 
     def set_seed(self, seed: int | None) -> None:
-        """Draw everything anew from the next reset on, which is the first."""
+        """Draw from new random streams, beginning with the next reset, which counts as the first."""
         self._seed, self._world_seeds = seed, None
-        self.forget()
+        self.clear_memory()
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world its own stream, [B] integers: it draws alone what it draws among others."""
+        """Give every world its own stream, [B] integers: it draws the same alone as among others."""
         self._seed, self._world_seeds = None, seeds
-        self.forget()
+        self.clear_memory()
 
     def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
         """A random stream for each row, [M]."""
@@ -251,18 +244,18 @@ class Stateful(Transform):
         each = torch.arange(self.rows.numel() // n_worlds, device=device)
         return counter_rng.bits(worlds.view(-1, 1), each).flatten()
 
-    # Where it may stand.
+    # Where the transform may stand.
 
     def set_container(self, container: Any) -> None:
         super().set_container(container)
         while isinstance(container, Compose):
-            check_order(_leaves(container))
+            check_order(leaf_transforms(container))
             above = container.__dict__.get("_container")
             container = above() if above is not None else None
 
     @property
     def env(self) -> EnvBase:
-        """The environment with the transforms in front of this one."""
+        """The environment with the transforms before this one."""
         parent = self.parent
         if parent is None:
             self._refuse()
@@ -270,7 +263,7 @@ class Stateful(Transform):
 
     def check(self) -> None:
         """Refuse to work without an environment that has been reset."""
-        if not self.begun or self.container is None:
+        if not self.has_memory or self.container is None:
             self._refuse()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -285,94 +278,3 @@ class Stateful(Transform):
             f"{name} remembers earlier steps, so it works only on an environment that is reset and "
             f"stepped: TransformedEnv(env, {name}(...))"
         )
-
-
-def check_order(chain: Sequence[Transform]) -> None:
-    """Refuse an order in which a transform undoes or misses another's work.
-
-    Raises:
-        InputError: names the two, the key, and which must come first.
-    """
-    ours = [transform for transform in chain if isinstance(transform, Stateful)]
-    for early, late in itertools.combinations(ours, 2):
-        a, b = early.uses, late.uses
-        for key in _both([*a.reads, *a.holds, *a.appends], b.makes):
-            raise _wrong(late, early, f"{key} is made there and used here")
-        for key in _both(a.records, b.replaces):
-            raise _wrong(late, early, f"{key} must be recorded as it was chosen")
-        for key in _both(a.appends, b.holds):
-            raise _wrong(late, early, f"what it appends to {key} is known at once, not held back")
-
-
-def _wrong(first: Transform, second: Transform, why: str) -> InputError:
-    names = type(second).__name__, type(first).__name__
-    return InputError(f"order of transforms: {names[0]} must come after {names[1]}, as {why}")
-
-
-def _both(some: Sequence[NestedKey], others: Sequence[NestedKey]) -> list[NestedKey]:
-    return [key for key in some if key in others]
-
-
-def _leaves(compose: Compose) -> list[Transform]:
-    """The transforms of nested Composes, in order."""
-    return [leaf for t in compose for leaf in (_leaves(t) if isinstance(t, Compose) else [t])]
-
-
-def row_shape(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
-    """The batch size of the TensorDict in which an entry lies."""
-    inner = tensordict.get(key[:-1]) if isinstance(key, tuple) and len(key) > 1 else tensordict
-    return inner.batch_size
-
-
-def spec_rows(specs: Composite, key: NestedKey) -> torch.Size:
-    """The same, told by specs."""
-    return (specs[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else specs).shape
-
-
-def as_rows(value: Tensor, rows: torch.Size) -> Tensor:
-    """An entry [*rows, ...] as [M, ...]."""
-    return value.reshape(rows.numel(), *value.shape[len(rows) :])
-
-
-def from_rows(value: Tensor, rows: torch.Size) -> Tensor:
-    """Back again: [M, ...] as [*rows, ...]."""
-    return value.view((*rows, *value.shape[1:]))
-
-
-def taken(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
-    """Those of the entries that are there, without their gradients."""
-    found = {key: tensordict.get(key, None) for key in keys}
-    return {key: value.detach() for key, value in found.items() if value is not None}
-
-
-def flag_rows(
-    tensordict: TensorDictBase | Mapping[NestedKey, Tensor], name: str, key: NestedKey, rows: torch.Size
-) -> Tensor | None:
-    """The flag ``name`` (such as ``_reset`` or ``done``) that governs an entry, for each of its rows [M].
-
-    The one nearest to the entry counts, from its own TensorDict outwards; None if there is none.
-    """
-    for flag_key in flag_keys(name, key):
-        flag = tensordict.get(flag_key, None)
-        if flag is not None:
-            flag = flag.any(-1)
-            return flag.view((*flag.shape, *[1] * (len(rows) - flag.dim()))).expand(rows).reshape(-1)
-    return None
-
-
-def flag_keys(name: str, key: NestedKey) -> list[NestedKey]:
-    """Where a flag may stand that governs an entry, the nearest place first."""
-    path = key[:-1] if isinstance(key, tuple) else ()
-    return [(*path[:depth], name) for depth in range(len(path), 0, -1)] + [name]
-
-
-def beside(key: NestedKey, name: NestedKey | None) -> NestedKey | None:
-    """A bare name as a key beside another one: ``age`` beside ``("agents", "observation")``."""
-    if name is None or not isinstance(name, str) or isinstance(key, str):
-        return name
-    return (*key[:-1], name)
-
-
-def wide(mask: Tensor, like: Tensor) -> Tensor:
-    """A mask [M] as [M, 1, ...]."""
-    return mask.view(-1, *[1] * (like.dim() - 1))

@@ -9,23 +9,23 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
 from damian.common import checks
-from damian.delays.delay_line import Delivery, Mailbox
-from damian.delays.laws import ORDERS, law_of
-from damian.transforms.base import (
+from damian.delays.delay_line import ORDERS, DelayLine, Delivery
+from damian.delays.laws import law_of
+from damian.transforms.base import StatefulTransform
+from damian.transforms.entries import (
     Change,
     Entries,
     Memory,
-    Stateful,
-    Uses,
     as_rows,
-    beside,
     from_rows,
+    select_entries,
+    sibling_key,
     spec_rows,
-    taken,
 )
+from damian.transforms.order import KeyUsage
 
 
-class ObservationDelay(Stateful):
+class ObservationDelay(StatefulTransform):
     """Shows what has arrived instead of what is: each step's entries travel as one message.
 
     After a reset the first message is there at once. Without a delay nothing changes, bit for bit.
@@ -46,7 +46,7 @@ class ObservationDelay(Stateful):
         sent_key: which rows send in this step, [...] bool; all of them if not given.
         seed: of the delays.
 
-    A bare name for one of the last keys means one beside ``in_keys[0]``.
+    A bare name for one of the last keys means one sibling_key ``in_keys[0]``.
 
     Raises:
         InputError: an impossible law.
@@ -70,28 +70,28 @@ class ObservationDelay(Stateful):
         checks.one_of("order", order, ORDERS)
         super().__init__(in_keys, out_keys or in_keys, seed=seed)
         self.sampler = law_of(delay).sampler(dt, loss)
-        self.mailbox = Mailbox(self.sampler, order)
+        self.line = DelayLine(self.sampler, order)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
-            beside(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
+            sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
-        self.see_keys = [*self.in_keys, *([self.sent_key] if self.sent_key else [])]
+        self.step_keys = [*self.in_keys, *([self.sent_key] if self.sent_key else [])]
 
     @property
-    def uses(self) -> Uses:
+    def key_usage(self) -> KeyUsage:
         made = [key for key in self.out_keys if key not in self.in_keys]
-        return Uses(reads=self.see_keys, holds=self.in_keys, makes=made)
+        return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=made)
 
-    def allocate(self, tensordict: TensorDictBase) -> Memory:
-        values = self._values(taken(tensordict, self.in_keys))
-        return self.mailbox.allocate(values, self.streams(tensordict.batch_size, values[0].device))
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        values = self._values(select_entries(tensordict, self.in_keys))
+        return self.line.init_memory(values, self.streams(tensordict.batch_size, values[0].device))
 
-    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        memory, delivery = self.mailbox.begin(memory, self._values(entries), mask)
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory, delivery = self.line.reset(memory, self._values(entries), mask)
         return memory, self._shown(delivery)
 
-    def see(self, memory: Memory, entries: Entries) -> Change:
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
         sent = entries[self.sent_key].reshape(-1) if self.sent_key else None
-        memory, delivery = self.mailbox.exchange(memory, self._values(entries), sent)
+        memory, delivery = self.line.step(memory, self._values(entries), sent)
         return memory, self._shown(delivery)
 
     def _values(self, entries: Entries) -> list[Tensor]:

@@ -7,24 +7,24 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian.common import checks
-from damian.delays.delay_line import after
+from damian.common.tensors import expand_mask
+from damian.delays.delay_line import advance_slot
 from damian.delays.laws import LOSES, law_of
-from damian.transforms.base import (
+from damian.transforms.base import StatefulTransform
+from damian.transforms.entries import (
     Change,
     Entries,
     Memory,
-    Stateful,
-    Uses,
     as_rows,
     flag_keys,
     flag_rows,
     from_rows,
     spec_rows,
-    wide,
 )
+from damian.transforms.order import KeyUsage
 
 
-class OnRewards(Stateful):
+class RewardTransform(StatefulTransform):
     """A transform that remembers rewards, as ``past`` [K, M, ...]."""
 
     n_past: int
@@ -33,30 +33,30 @@ class OnRewards(Stateful):
     def __init__(self, reward_key: NestedKey, seed: int | None = None) -> None:
         super().__init__([reward_key], [reward_key], seed=seed)
         self.reward_key: NestedKey = self.in_keys[0]
-        self.see_keys = [self.reward_key, *flag_keys("done", self.reward_key)]
+        self.step_keys = [self.reward_key, *flag_keys("done", self.reward_key)]
 
     @property
-    def uses(self) -> Uses:
-        return Uses(holds=[self.reward_key])
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(delays=[self.reward_key])
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         return spec_rows(self.env.full_reward_spec, self.reward_key)
 
-    def allocate(self, tensordict: TensorDictBase) -> Memory:
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
         example = as_rows(self.env.full_reward_spec[self.reward_key].zero(), self.rows)
         return {"past": example.new_zeros(self.n_past, *example.shape)}
 
-    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         past = memory["past"]
-        return memory | {"past": past.masked_fill(wide(mask, past[0]), 0)}, {}
+        return memory | {"past": past.masked_fill(expand_mask(mask, past[0]), 0)}, {}
 
-    def only(self, before: Memory, after: Memory, moves: Tensor) -> Memory:
+    def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
         old, new = before["past"], after["past"]
-        past = torch.where(wide(self.rows_of(moves), old[0]), new, old)
-        return super().only(before, after | {"past": old}, moves) | {"past": past}
+        past = torch.where(expand_mask(self.expand_worlds(stepped), old[0]), new, old)
+        return super().merge_worlds(before, after | {"past": old}, stepped) | {"past": past}
 
 
-class RewardDelay(OnRewards):
+class RewardDelay(RewardTransform):
     """Pays each reward some steps later; what is still owed when an episode ends is paid with its last step.
 
     It must come after whatever ends episodes (such as a ``StepCounter`` with a limit).
@@ -82,34 +82,34 @@ class RewardDelay(OnRewards):
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
 
-    def allocate(self, tensordict: TensorDictBase) -> Memory:
-        memory = super().allocate(tensordict)
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        memory = super().init_memory(tensordict)
         streams = self.streams(tensordict.batch_size, memory["past"].device)
-        channel = self.sampler.begin(streams)
+        channel = self.sampler.initial_state(streams)
         zero = torch.zeros_like(streams)
-        return memory | {"clock": zero, "today": zero.clone(), "streams": streams, "channel": channel}
+        return memory | {"clock": zero, "slot": zero.clone(), "streams": streams, "channel": channel}
 
-    def see(self, memory: Memory, entries: Entries) -> Change:
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
         clock, owed = memory["clock"] + 1, memory["past"]
         reward = as_rows(entries[self.reward_key], self.rows)
         delay, channel = self.sampler(memory["streams"], clock, memory["channel"])
-        today = after(memory["today"], 1, self.n_past)
-        due = after(today, delay, self.n_past)
+        slot_now = advance_slot(memory["slot"], 1, self.n_past)
+        due = advance_slot(slot_now, delay, self.n_past)
         rows = torch.arange(len(reward), device=delay.device)
-        row, here = (slot * len(reward) + rows for slot in (due, today))
+        row, here = (slot * len(reward) + rows for slot in (due, slot_now))
         flat = owed.flatten(0, 1).index_add(0, row, reward)
         paid = flat.index_select(0, here)
         owed = flat.index_fill(0, here, 0).view_as(owed)
         done = flag_rows(entries, "done", self.reward_key, self.rows)
         if done is not None:
-            over = wide(done, paid)
+            over = expand_mask(done, paid)
             paid = torch.where(over, paid + owed.sum(0), paid)
             owed = owed.masked_fill(over, 0)
-        memory = memory | {"clock": clock, "today": today, "channel": channel, "past": owed}
+        memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "past": owed}
         return memory, {self.reward_key: from_rows(paid, self.rows)}
 
 
-class CumulativeReward(OnRewards):
+class CumulativeReward(RewardTransform):
     """Replaces a reward by the discounted sum of the latest ones (eq. 4 of the paper).
 
     R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode. With one step
@@ -129,7 +129,7 @@ class CumulativeReward(OnRewards):
         self.n_past = steps
         self.weights = [gamma**age for age in range(steps)]
 
-    def see(self, memory: Memory, entries: Entries) -> Change:
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
         reward = as_rows(entries[self.reward_key], self.rows)
         past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
         dtype = reward.dtype if reward.dtype.is_floating_point else torch.get_default_dtype()

@@ -7,11 +7,14 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian.common import checks
+from damian.common.tensors import expand_mask
 from damian.delays.laws import Delay, in_steps
-from damian.transforms.base import Change, Entries, Memory, Stateful, Uses, as_rows, from_rows, taken, wide
+from damian.transforms.base import StatefulTransform
+from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows, select_entries
+from damian.transforms.order import KeyUsage
 
 
-class Clock(Stateful):
+class SampleAndHold(StatefulTransform):
     """Between two ticks entries stay what they were, and actions too (paper, section 3.6).
 
     Every episode begins with a tick. With a period of one step nothing changes.
@@ -40,15 +43,15 @@ class Clock(Stateful):
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
         self.ready_key = ready_key
-        self.act_keys = self.in_keys_inv
-        self.see_keys = [*self.in_keys, *([ready_key] if ready_key else [])]
+        self.action_keys = self.in_keys_inv
+        self.step_keys = [*self.in_keys, *([ready_key] if ready_key else [])]
 
     @property
-    def uses(self) -> Uses:
-        return Uses(reads=self.see_keys, holds=self.in_keys, replaces=self.in_keys_inv)
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(reads=self.step_keys, delays=self.in_keys, replaces=self.in_keys_inv)
 
-    def allocate(self, tensordict: TensorDictBase) -> Memory:
-        seen = taken(tensordict, self.in_keys)
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        seen = select_entries(tensordict, self.in_keys)
         device = seen[self.in_keys[0]].device
         elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
         held = {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(seen.values())}
@@ -58,14 +61,14 @@ class Clock(Stateful):
         }
         return {"elapsed": elapsed, **held, **acted}
 
-    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
         return self._hold(memory, entries, self.in_keys, "held", mask)
 
-    def act(self, memory: Memory, entries: Entries) -> Change:
+    def on_action(self, memory: Memory, entries: Entries) -> Change:
         return self._hold(memory, entries, self.in_keys_inv, "acted", self._ticks(memory))
 
-    def see(self, memory: Memory, entries: Entries) -> Change:
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
         memory = memory | {"elapsed": memory["elapsed"] + 1}
         ticks = self._ticks(memory)
         memory, shown = self._hold(memory, entries, self.in_keys, "held", ticks)
@@ -85,7 +88,7 @@ class Clock(Stateful):
         shown: Entries = {}
         for i, key in enumerate(keys):
             new, old = as_rows(entries[key], self.rows), memory[f"{name}_{i}"]
-            held = torch.where(wide(take, new), new, old)
+            held = torch.where(expand_mask(take, new), new, old)
             memory = memory | {f"{name}_{i}": held}
             shown[key] = from_rows(held, self.rows)
         return memory, shown

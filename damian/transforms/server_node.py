@@ -1,4 +1,4 @@
-"""The server node of SPEC 3, on what has arrived."""
+"""The server node as a transform: it works on the messages that have arrived."""
 
 from collections.abc import Sequence
 
@@ -7,72 +7,77 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from damian.server.features import Snapshot
+from damian import keys
 from damian.server.server import Server
-from damian.transforms.base import Change, Entries, Memory, Stateful, Uses
+from damian.transforms.base import StatefulTransform
+from damian.transforms.entries import Change, Entries, Memory
+from damian.transforms.order import KeyUsage
+from damian.world.messages import Messages
 
-_AGENTS = ("observation", "global_observation", "reward")
-_TASK = ("success", "done", "terminated", "truncated")
 
+class ServerNode(StatefulTransform):
+    """Computes observations, rewards and the task's status from the messages that have arrived.
 
-class ServerNode(Stateful):
-    """Turns the messages that have arrived into observations, rewards and the status of the task.
-
-    It writes what ``UavEnv`` writes by itself when nothing is delayed. After a reset the server holds the
-    first message of every UAV, so that what the environment shows then stays as it is.
+    It writes the entries that ``UavEnv`` itself writes when nothing is delayed. After a reset the server
+    holds the first message of every UAV, so that the environment's own outputs stay.
 
     Args:
-        server: of the environment (``env.server``).
+        server: computes everything.
         message_key: the messages that the server holds, [B, N, M].
-        drop: entries that nobody reads later; each costs time at every step.
-        terms: write ``("agents", "reward_terms")`` too.
+        dropped_keys: entries that nobody reads later; each costs time at every step.
+        reward_terms: write ``("agents", "reward_terms")`` too.
     """
 
     def __init__(
         self,
         server: Server,
-        message_key: NestedKey = ("agents", "received"),
+        message_key: NestedKey = keys.RECEIVED,
         *,
-        drop: Sequence[NestedKey] = (),
-        terms: bool = False,
+        dropped_keys: Sequence[NestedKey] = (),
+        reward_terms: bool = False,
     ) -> None:
-        named = server.config.task.terms if terms else []
-        made = [("agents", name) for name in _AGENTS] + [("agents", "reward_terms", name) for name in named]
-        super().__init__([message_key], [*made, *_TASK])
-        self.server, self.drop, self.terms = server, list(drop), terms
-        self.own_key = ("agents", "message") if server.config.observation.own else None
-        self.see_keys = [*self.in_keys, "source_over", *([self.own_key] if self.own_key else [])]
+        names = server.reward.terms if reward_terms else []
+        created = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.REWARD]
+        created += [(*keys.REWARD_TERMS, name) for name in names]
+        ends = [keys.SUCCESS, keys.DONE, keys.TERMINATED, keys.TRUNCATED]
+        super().__init__([message_key], [*created, *ends])
+        self.server, self.dropped_keys, self.reward_terms = server, list(dropped_keys), reward_terms
+        self.own_key = keys.MESSAGE if server.observation.own else None
+        self.step_keys = [*self.in_keys, keys.SOURCE_OVER, *([self.own_key] if self.own_key else [])]
 
     @property
     def row_key(self) -> NestedKey:
-        return "done"
+        return keys.DONE
 
     @property
-    def uses(self) -> Uses:
+    def key_usage(self) -> KeyUsage:
         own = [self.own_key] if self.own_key else []
-        return Uses(reads=[*self.in_keys, *own], makes=self.out_keys)
+        return KeyUsage(reads=[*self.in_keys, *own], creates=self.out_keys)
 
-    def allocate(self, tensordict: TensorDictBase) -> Memory:
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
         messages = tensordict.get(self.in_keys[0])
         return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=messages.device)}
 
-    def begin(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         return {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, {}
 
-    def see(self, memory: Memory, entries: Entries) -> Change:
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
         steps = elapsed.view(self.rows)
-        served = self.server.serve(Snapshot.unpack(received), steps, entries.get("source_over"))
+        outputs = self.server(Messages.unpack(received), steps, entries.get(keys.SOURCE_OVER))
         if self.own_key:
-            known = self.server.informed(received, entries[self.own_key], steps)
-            served = served._replace(observation=known)
-        seen = [served.observation, served.global_observation, served.reward.unsqueeze(-1)]
-        made: Entries = {("agents", name): value for name, value in zip(_AGENTS, seen, strict=True)}
-        if self.terms:
-            made |= {("agents", "reward_terms", name): term for name, term in served.terms.items()}
-        return {"elapsed": elapsed}, made | served.status.entries()
+            own = self.server.observe_with_timely_messages(received, entries[self.own_key], steps)
+            outputs = outputs._replace(observation=own)
+        written: Entries = {
+            keys.OBSERVATION: outputs.observation,
+            keys.GLOBAL_OBSERVATION: outputs.global_observation,
+            keys.REWARD: outputs.reward.unsqueeze(-1),
+        }
+        if self.reward_terms:
+            written |= {(*keys.REWARD_TERMS, name): term for name, term in outputs.terms.items()}
+        return {"elapsed": elapsed}, written | outputs.status.entries()
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        for key in self.drop:
+        for key in self.dropped_keys:
             del observation_spec[key]
         return observation_spec

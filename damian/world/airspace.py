@@ -101,11 +101,6 @@ def nearest_points(points: Tensor, target: Tensor, n: int) -> Tensor:
     return (east.square() + north.square() + order).topk(n, dim=-1, largest=False).indices
 
 
-def rows(table: Tensor, index: Tensor) -> Tensor:
-    """``table[index]`` for a table [M, ...] and any shape of index; several times as fast on a CPU."""
-    return table.index_select(0, index.flatten()).view(*index.shape, *table.shape[1:])
-
-
 def _edges(polygon: shapely.Geometry) -> np.ndarray:
     """Every edge of every ring, [E, 4] metres."""
     rings = shapely.get_rings(shapely.get_parts(polygon))

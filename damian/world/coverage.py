@@ -52,7 +52,7 @@ def build_tables(
 ) -> FootprintTables:
     """Tables for the landing points ``points[r, l]`` [m] of ``polygons[r]``, shape ``[R, L, 2]``.
 
-    A landing point's flat id is ``r * L + l``. Rows of NaN pad; nothing counts as covered there.
+    A landing point's flat id is ``r * L + l``. PackedState of NaN pad; nothing counts as covered there.
     ``radius`` is the footprint's [m]. Polygons may be concave, in several parts and have holes.
 
     Accuracy of one footprint's area with 16 words, over random polygons and up to 5 other discs:

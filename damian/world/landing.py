@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.world.airspace import Airspace, inside, nearest_points, rows
+from damian.common.tensors import gather_rows
+from damian.world.airspace import Airspace, inside, nearest_points
 
 MAX_PAIRS = 2_000_000_000
 """Pairs of a landing point's action and a landing point that are compared at construction: a minute."""
@@ -80,7 +81,7 @@ class Candidates:
         if config.kind == "discrete":
             self._rank_all()
 
-    def of(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Ranking, Tensor]:
+    def rank(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Ranking, Tensor]:
         """Candidates, and each UAV's row among them [B, N].
 
         Args:
@@ -156,7 +157,9 @@ class Candidates:
         return self
 
 
-def book(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_points: int) -> Tensor:
+def assign_landing_points(
+    ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_points: int
+) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point.
 
     A point is free if no other UAV stands on it or is bound for it (SPEC 2); a UAV's own always is. Most
@@ -173,8 +176,8 @@ def book(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_point
     Returns:
         Booked point of each UAV, [B, N].
     """
-    reached = rows(ranking.distance[:, 0], row) <= reach
-    choice = torch.where(reached, rows(ranking.point[:, 0], row).long(), standing)
+    reached = gather_rows(ranking.distance[:, 0], row) <= reach
+    choice = torch.where(reached, gather_rows(ranking.point[:, 0], row).long(), standing)
     moves = choice != standing
     # How many stand on each point or want to move there: who finds more than itself may have to yield.
     claims = standing.new_zeros(len(standing), n_points, dtype=torch.int16)
@@ -203,9 +206,9 @@ def _settle(
     worlds = contested.nonzero().squeeze(-1)
     if len(worlds):
         row, standing, reach = (t.index_select(0, worlds) for t in (row, standing, reach))
-        reached = rows(distance, row) <= reach.unsqueeze(-1)
-        candidates = torch.where(reached, rows(point, row), standing.unsqueeze(-1))
-        settled.index_copy_(0, worlds, _book_in_order(candidates, standing, n_points))
+        reached = gather_rows(distance, row) <= reach.unsqueeze(-1)
+        candidates = torch.where(reached, gather_rows(point, row), standing.unsqueeze(-1))
+        settled.index_copy_(0, worlds, _assign_in_order(candidates, standing, n_points))
     return settled
 
 
@@ -214,7 +217,7 @@ def _(point, distance, row, standing, reach, choice, contested, n_points):  # fo
     return torch.empty_like(choice)
 
 
-def _book_in_order(candidates: Tensor, standing: Tensor, n_points: int) -> Tensor:
+def _assign_in_order(candidates: Tensor, standing: Tensor, n_points: int) -> Tensor:
     """Serial choice as the fixed point of "take the best candidate that no earlier UAV has taken".
 
     After r rounds the first r + 1 UAVs are settled, so that N - 1 rounds suffice; mostly one or two do.

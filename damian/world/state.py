@@ -1,14 +1,11 @@
 """The state of B worlds: by name for the physics, as one row per world for resets and compilers."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from damian.server.features import Snapshot
-
-Tree = TypeVar("Tree", bound=NamedTuple)
+from damian.world.messages import Messages
 
 
 class State(NamedTuple):
@@ -18,8 +15,8 @@ class State(NamedTuple):
     """The world's random stream, [B]."""
     episode: Tensor
     """Episodes begun, [B]."""
-    situation: Tensor
-    """What the episode began with, [B]."""
+    initial_condition: Tensor
+    """Number of the initial condition of the episode, [B]."""
     region: Tensor
     """[B]."""
     steps: Tensor
@@ -48,35 +45,17 @@ class State(NamedTuple):
     """East, north [m], [B, 2]."""
     source_over: Tensor
     """Has the source finished its walk, [B]."""
-    talks: Tensor
+    message_sent: Tensor
     """Did the UAV send a message in this step, [B, N]."""
-    sent: Snapshot
+    sent: Messages
     """The latest message of each UAV, [B, N]."""
 
 
-def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
-    """Apply a function to the tensors of nested named tuples."""
-    values: list[Any] = [
-        tree_map(function, *leaf) if hasattr(leaf[0], "_fields") else function(*leaf)
-        for leaf in zip(tree, *others, strict=True)
-    ]
-    return tree._make(values)
-
-
-def where(mask: Tensor, new: Tree, old: Tree) -> Tree:
-    """Take whole rows of ``new`` where the mask [B] (or [B, N]) says so."""
-
-    def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(mask.view(*mask.shape, *[1] * (a.dim() - mask.dim())), a, b)
-
-    return tree_map(pick, new, old)
-
-
-SEED, EPISODE, SITUATION = 0, 1, 2
+SEED, EPISODE, INITIAL_CONDITION = 0, 1, 2
 """Columns of these fields among a world's integers: the first of ``State``."""
 
 
-class Rows(NamedTuple):
+class PackedState(NamedTuple):
     """A state as one row per world and type: few tensors to copy, to guard and to save."""
 
     floats: Tensor
@@ -87,7 +66,7 @@ class Rows(NamedTuple):
     """[B, K]."""
 
 
-class Layout:
+class StateLayout:
     """Where each field of a state lies in its rows.
 
     Args:
@@ -97,12 +76,12 @@ class Layout:
     def __init__(self, example: State) -> None:
         self._fields = [(leaf.dtype, leaf.shape[1:]) for leaf in _leaves(example)]
 
-    def pack(self, state: State) -> Rows:
+    def pack(self, state: State) -> PackedState:
         """A state as rows."""
         leaves = [leaf.flatten(1) if leaf.dim() > 1 else leaf[:, None] for leaf in _leaves(state)]
-        return Rows(*[torch.cat([x for x in leaves if x.dtype == t], 1) for t in _TYPES])
+        return PackedState(*[torch.cat([x for x in leaves if x.dtype == t], 1) for t in _TYPES])
 
-    def unpack(self, rows: Rows) -> State:
+    def unpack(self, rows: PackedState) -> State:
         """The state that the rows hold; its fields are views of them."""
         columns = {
             dtype: iter(table.split([shape.numel() for t, shape in self._fields if t == dtype], 1))
@@ -113,7 +92,7 @@ class Layout:
             for dtype, shape in self._fields
         ]
         n = len(State._fields) - 1  # the message comes last
-        return State._make([*leaves[:n], Snapshot._make(leaves[n:])])
+        return State._make([*leaves[:n], Messages._make(leaves[n:])])
 
 
 _TYPES = (torch.float32, torch.int64, torch.bool)

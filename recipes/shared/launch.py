@@ -1,4 +1,4 @@
-"""What every recipe shares: from a command line to a checked configuration, and errors that are one line."""
+"""From a command line to a checked configuration, with errors that are one line."""
 
 import difflib
 import functools
@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -13,6 +14,7 @@ os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises; ``launch`` print
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import torch
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -21,32 +23,72 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
-from damian.envs.scenario import leftovers
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
-from shared.settings import CONF, TrainConfig
+from shared.settings import LEARNERS, TrainConfig
+
+COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError)
+"""What Hydra raises for overrides that it cannot compose."""
 
 
-def prepare(written: DictConfig) -> tuple[TrainConfig, Path]:
+def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
     """The checked configuration of what Hydra composed, and the run folder.
 
-    A resumed run goes on in its own folder with its own configuration; only how long it lasts may change.
+    A resumed run goes on in its own folder with its own configuration; only how long it lasts may change. The
+    overrides of a run named by ``checkpoint`` hold too, where the command line gives no others.
 
     Raises:
-        InputError: a value is impossible, a key means nothing, or there is nothing to resume.
+        InputError: a value is impossible, a key is unknown, or there is nothing to resume.
     """
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    if written.resume is not None:
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
+    hydra = HydraConfig.get()
+    folder, overrides = Path(hydra.runtime.output_dir), list(hydra.overrides.task)
+    if composed.resume is not None:
+        if hydra.mode == RunMode.MULTIRUN:
             raise InputError("resume: one run goes on at a time; leave out -m")
         _drop_empty(folder)
-        folder = Path(written.resume)
-        written = _resumed(folder, HydraConfig.get().overrides.task)
-    elif (folder / CONFIG).exists():
+        folder = Path(composed.resume)
+        return checked(_resumed(folder, overrides)), folder
+    if (folder / CONFIG).exists():
         raise InputError(f"hydra.run.dir: {folder} holds a run already; resume={folder} goes on with it")
-    config = checked(written)
-    if config.resume is None:
-        config.overrides = list(HydraConfig.get().overrides.task)
+    if composed.checkpoint is not None:
+        overrides = inherited(Path(composed.checkpoint), overrides)
+        composed = composed_with(str(hydra.job.config_name), overrides)
+    config = checked(composed)
+    config.overrides = overrides
     return config, folder
+
+
+def composed_with(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    """What Hydra composes from overrides.
+
+    Raises:
+        InputError: they cannot be composed.
+    """
+    try:
+        return compose(config_name, list(overrides))
+    except COMPOSITION_ERRORS as error:
+        raise InputError(one_line(error)) from error
+
+
+def inherited(folder: Path, overrides: Sequence[str]) -> list[str]:
+    """The overrides of the run in a folder, where these give no others, and these.
+
+    Raises:
+        InputError: the run's configuration cannot be read.
+    """
+    if not (folder / CONFIG).is_file():
+        return list(overrides)  # loading the checkpoint will say what is missing
+    given = [_key(word) for word in overrides]
+    saved = cast(list[str], OmegaConf.to_container(stored_config(folder, "checkpoint"))["overrides"])  # type: ignore
+    return [word for word in saved if not any(_sets(key, _key(word)) for key in given)] + list(overrides)
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _sets(given: str, key: str) -> bool:
+    """Does an override of the one, perhaps a group, also decide about the other?"""
+    return key == given or key.startswith(f"{given}.")
 
 
 def perform(config: TrainConfig, folder: Path, program: Callable[[TrainConfig, Path], None]) -> None:
@@ -56,17 +98,27 @@ def perform(config: TrainConfig, folder: Path, program: Callable[[TrainConfig, P
     program(config, folder)
 
 
-def checked(written: DictConfig) -> Any:
-    """The configuration of what was composed, as its schema says: a ``TrainConfig``, or another one.
+def checked(composed: DictConfig) -> Any:
+    """A composed configuration as an instance of its schema: a ``TrainConfig``, or another one.
 
     Raises:
-        InputError: a value is impossible, or a key means nothing.
+        InputError: a value is impossible, or a key is unknown.
     """
-    config = OmegaConf.to_object(written)
-    unknown = leftovers(written, config)
+    config = OmegaConf.to_object(composed)
+    unknown = unknown_keys(composed, config)
     if unknown:
         raise InputError(no_such_key(unknown[0]))
     return config
+
+
+def unknown_keys(composed: Any, config: Any, path: str = "") -> list[str]:
+    """Keys that no field of the config takes: Hydra's ``+a.b=1`` adds them past a schema."""
+    known = {f.name: getattr(config, f.name) for f in fields(config)}
+    unknown = [f"{path}{key}" for key in composed if key not in known]
+    for key, value in known.items():
+        if hasattr(value, "__dataclass_fields__") and key in composed:
+            unknown += unknown_keys(composed[key], value, f"{path}{key}.")
+    return unknown
 
 
 def save_config(config: TrainConfig, folder: Path) -> None:
@@ -75,15 +127,32 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     OmegaConf.save(OmegaConf.structured(config), folder / CONFIG)
 
 
-def load(checkpoint: Checkpoint, folder: Path, key: str, parts: Collection[str] | None = None) -> None:
-    """Restore a checkpoint, or some parts of it, from a run folder that ``key`` names.
+def stored_config(folder: Path, key: str) -> DictConfig:
+    """The configuration of the run in a folder that ``key`` names; what it lacks has its default.
+
+    Raises:
+        InputError: it cannot be read, or another version has written it.
+    """
+    file = folder / CONFIG
+    try:
+        saved = cast(DictConfig, OmegaConf.load(file))
+        if "algo" in saved:
+            raise InputError("damian 0.1 wrote it, whose settings had other names: train again")
+        schema = OmegaConf.structured(TrainConfig(learner=LEARNERS[saved.learner.name]()))
+        return cast(DictConfig, OmegaConf.merge(schema, saved))
+    except Exception as error:  # a damaged file can raise anything
+        raise InputError(f"{key}: {file}: {one_line(error)}") from error
+
+
+def load(checkpoint: Checkpoint, folder: Path, key: str, components: Collection[str] | None = None) -> None:
+    """Restore a checkpoint, or some components of it, from a run folder that ``key`` names.
 
     Raises:
         InputError: it is incomplete, or of another configuration.
     """
     try:
-        checkpoint.load(folder / CHECKPOINT, components=parts)
-    except Exception as error:  # whatever a spoilt file makes of itself
+        checkpoint.load(folder / CHECKPOINT, components=components)
+    except Exception as error:  # a damaged file can raise anything
         raise InputError(f"{key}: {folder / CHECKPOINT}: {one_line(error)}") from error
 
 
@@ -98,11 +167,8 @@ def _resumed(folder: Path, overrides: Sequence[str]) -> DictConfig:
     for needed in (CONFIG, CHECKPOINT):
         if not (folder / needed).exists():
             raise InputError(f"resume: {folder} holds no {needed}, so there is nothing to go on with")
-    try:
-        saved = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(folder / CONFIG))
-    except Exception as error:
-        raise InputError(f"resume: {folder / CONFIG}: {one_line(error)}") from None
-    return cast(DictConfig, OmegaConf.merge(saved, OmegaConf.from_dotlist(list(overrides))))
+    changed = OmegaConf.from_dotlist(list(overrides))
+    return cast(DictConfig, OmegaConf.merge(stored_config(folder, "resume"), changed))
 
 
 _begun: list[bool] = []
@@ -110,22 +176,22 @@ _begun: list[bool] = []
 
 
 def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-    """Turn what a person got wrong into one line on stderr and exit code 2, and leave no folder."""
+    """Turn wrong input into one line on stderr and exit code 2, and leave no folder."""
 
     @functools.wraps(main)
-    def checked(written: DictConfig) -> None:
+    def checked_main(composed: DictConfig) -> None:
         _begun.append(True)
         try:
-            main(written)
+            main(composed)
         except (InputError, OmegaConfBaseException) as error:
             _drop_empty(Path(HydraConfig.get().runtime.output_dir))
             _give_up(error)
 
-    return checked
+    return checked_main
 
 
 _schemas: list[type] = [TrainConfig]
-"""Whose keys the program that runs knows, its own first."""
+"""Whose keys the program knows, its own first."""
 
 
 def launch(main: Callable[[], Any], schema: type = TrainConfig) -> None:
@@ -133,42 +199,11 @@ def launch(main: Callable[[], Any], schema: type = TrainConfig) -> None:
     _schemas[:] = dict.fromkeys([schema, TrainConfig])
     _begun.clear()
     try:
-        words = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))  # flags first
-        sys.argv[1:] = quoted(inherited(words))
         main()
-    except (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError) as error:
+    except COMPOSITION_ERRORS as error:
         if _begun:
-            raise  # no wrong input but our mistake: its traceback is needed
+            raise  # a bug, whose traceback is needed
         _give_up(error)
-
-
-def inherited(words: list[str]) -> list[str]:
-    """Overrides, and those of the run whose ``checkpoint`` they name, where they give no others.
-
-    Raises:
-        InputError: the run's configuration cannot be read.
-    """
-    value = next((word.partition("=")[2] for word in words if word.startswith("checkpoint=")), "")
-    file = Path(value.strip("'\"")) / CONFIG
-    if "," in value and value[:1] not in "'\"":
-        raise InputError("checkpoint: one at a time, as each run brings its overrides along")
-    if not value or not file.is_file():
-        return words  # whoever wants to load it will say so
-    try:
-        saved = cast(list[str], OmegaConf.to_container(OmegaConf.load(file))["overrides"])  # type: ignore
-        given = [_key(word) for word in words]
-        return words + [word for word in saved if not any(_sets(key, _key(word)) for key in given)]
-    except Exception as error:  # whatever a spoilt file makes of itself
-        raise InputError(f"checkpoint: {file}: {one_line(error)}") from error
-
-
-def _key(override: str) -> str:
-    return override.lstrip("+~").partition("=")[0]
-
-
-def _sets(given: str, key: str) -> bool:
-    """Does an override of the one, perhaps a group, also decide about the other?"""
-    return key == given or key.startswith(f"{given}.")
 
 
 def _give_up(error: Exception) -> NoReturn:
@@ -176,18 +211,8 @@ def _give_up(error: Exception) -> NoReturn:
     sys.exit(2)
 
 
-def quoted(words: list[str]) -> list[str]:
-    """Overrides with quotes where an option of a group looks like a number, or like nothing, to Hydra."""
-    groups = "|".join(folder.name for folder in Path(CONF).iterdir() if folder.is_dir())
-    return [re.sub(rf"^(\+?(?:{groups})=)([\d,]+|null)$", _with_quotes, word) for word in words]
-
-
-def _with_quotes(match: re.Match[str]) -> str:
-    return match[1] + ",".join(f"'{number}'" for number in match[2].split(","))
-
-
 def _drop_empty(folder: Path) -> None:
-    """Remove a run folder that holds nothing, and what Hydra made around it."""
+    """Remove a run folder that holds nothing, and the folders that Hydra made around it."""
     if not folder.is_dir() or any(folder.iterdir()):
         return
     folder.rmdir()
@@ -200,24 +225,42 @@ def _drop_empty(folder: Path) -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """What is wrong, from the deepest cause, without Hydra's tails of types, paths and hints."""
+    """What is wrong, from the deepest cause, without Hydra's lines of types, paths and hints."""
     while isinstance(error.__cause__, OmegaConfBaseException):
         error = error.__cause__
     text, _, _ = str(error).partition("Config search path")
+    if "mismatched input '='" in text:
+        return "a value with = in it needs quotes, such as \"overrides=['frames=1000','worlds=8']\""
     key = re.search(r"full_key: (\S+)", text)
     if key and re.search(r"Key '.*' (is )?not in ", text):
         return no_such_key(key[1])
     tails = ("full_key", "reference_type", "object_type", "Set the env")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    told, *more = [line for line in lines if not line.startswith(tails)] or [type(error).__name__]
-    told = " ".join([told, ", ".join(more).replace(":,", ":")]).strip()
-    return f"{key[1]}: {told}" if key else told
+    first, *more = [line for line in lines if not line.startswith(tails)] or [type(error).__name__]
+    message = " ".join([first, ", ".join(more).replace(":,", ":")]).strip()
+    return f"{key[1]}: {message}" if key else message
+
+
+_RENAMED = {
+    "task": "reward",
+    "algo": "learner",
+    "mappo": "learner",
+    "sac": "learner",
+    "usecase": "scenario=paper/usecase1 or paper/usecase2, not usecase",
+    "delaybench": "scenario=delaybench/tracking and the like, not delaybench",
+    "region.situations": "region.initial_conditions",
+}
+"""Words of damian 0.1, and those that took their place."""
 
 
 def no_such_key(key: str) -> str:
     """The message for an unknown key, with the nearest known one."""
     if re.match(r"delay\.(obs|act|rew)\.", key):
         return f"{key}: no setting of the law that is there already; write another law over delay=none"
+    group = key.partition(".")[0]
+    renamed = _RENAMED.get(key, _RENAMED.get(group))
+    if renamed:
+        return f"{key}: no such key; since damian 0.2 it is {renamed}"
     near = (
         difflib.get_close_matches(key, map(str, _keys(OmegaConf.structured(schema))), n=1, cutoff=0.75)
         for schema in _schemas

@@ -23,7 +23,7 @@ from train import train
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
-from shared.launch import one_line, perform
+from shared.launch import one_line, perform, stored_config
 from shared.settings import TrainConfig
 
 LOG = "log.txt"
@@ -74,10 +74,9 @@ def check_stored(run: Run) -> None:
     if not (run.folder / CONFIG).exists():
         return
     try:
-        stored = OmegaConf.load(run.folder / CONFIG)
-        stored = OmegaConf.merge(OmegaConf.to_container(OmegaConf.structured(TrainConfig)), stored)
-    except Exception as error:  # whatever a spoilt file makes of itself
-        raise InputError(f"{run.folder / CONFIG}: {one_line(error)}; delete the folder") from error
+        stored = stored_config(run.folder, "hydra.run.dir")
+    except InputError as error:
+        raise InputError(f"{error}; delete the folder") from error
     asked = OmegaConf.create(OmegaConf.to_yaml(OmegaConf.structured(run.config)))
     known, wanted = (dict(_leaves(OmegaConf.to_container(config))) for config in (stored, asked))
     for key in wanted | known:

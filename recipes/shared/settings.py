@@ -1,4 +1,4 @@
-"""Everything that the recipes can be told: a scenario (``damian.scenario``), and how to learn in it."""
+"""All settings of the recipes: a scenario (``damian.envs.scenario``), and how to learn in it."""
 
 import os
 import re
@@ -10,19 +10,23 @@ from pathlib import Path
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
+from omegaconf import MISSING, OmegaConf
 
+from damian import keys
 from damian.common import checks
-from damian.envs.clocks import SystemClock
-from damian.envs.pipeline import is_late
+from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
-from damian.envs.uav_env import PRIVILEGED
+from damian.learners.base import LearnerConfig, LearningSetup
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import SacConfig
+from damian.learners.schedule import SystemClock
 
 CONF = str(Path(__file__).parents[2] / "conf")
 """Absolute, so that a recipe can be imported as well as run."""
+
+LEARNERS: dict[str, type[LearnerConfig]] = {config().name: config for config in (MappoConfig, SacConfig)}
+"""Settings of each learner, by ``learner.name``."""
 
 
 @dataclass
@@ -39,10 +43,8 @@ class LoggerConfig:
 class TrainConfig(ScenarioConfig):
     """Everything that ``recipes/train.py`` can be told."""
 
-    algo: str = "mappo"
-    """mappo or sac."""
-    mappo: MappoConfig = field(default_factory=MappoConfig)
-    sac: SacConfig = field(default_factory=SacConfig)
+    learner: LearnerConfig = field(default_factory=MappoConfig)
+    """``MappoConfig`` or ``SacConfig``."""
     model: ModelConfig = field(default_factory=ModelConfig)
     critic: str = "server"
     """What the critic sees: what the ``server`` holds, or ``privileged``, what is true (regime R1)."""
@@ -60,8 +62,8 @@ class TrainConfig(ScenarioConfig):
     checkpoint_every: int = 20
     """Updates between two checkpoints."""
     backupdate: bool = False
-    """Put late messages in their place before learning from the steps that they belong to (SPEC 4): what the
-    critic sees, rewards and ends of episodes; what the actor saw stays."""
+    """Correct stored steps with the messages that arrive late before learning from them (paper, section 3.4):
+    observations of the critic, rewards and ends of episodes; observations of the actor stay."""
     settle: bool = False
     """With ``backupdate``: learn from a step only when none of its messages can be under way any more."""
     recompute_actor: bool = False
@@ -82,7 +84,9 @@ class TrainConfig(ScenarioConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.one_of("algo", self.algo, ("mappo", "sac"))
+        matches = type(self.learner) is LEARNERS.get(self.learner.name)
+        should = f"is not the learner of these settings: choose one with learner={'|'.join(LEARNERS)}"
+        checks.require(matches, "learner.name", self.learner.name, should)
         checks.one_of("critic", self.critic, ("server", "privileged"))
         checks.in_range("seed", self.seed, 0, 2**31)
         for name in ("worlds", "eval_episodes"):
@@ -95,53 +99,35 @@ class TrainConfig(ScenarioConfig):
         checks.device("device", self.device)
 
     def check_learning(self) -> None:
-        """Make sure that it can be learnt like this; what is only flown need not.
+        """Refuse what cannot be learnt like this; what is only flown need not be.
 
         Raises:
             InputError: names the key that does not fit.
         """
-        checked = {"mappo": self._check_mappo, "sac": self._check_sac}
-        checked[self.algo]()
+        self.learner.check(self.learning_setup)
         self._check_skip()
+        self._check_backupdate()
         held = self.delay.hold == "max" and self.longest_delay == 0
-        checks.require(not held, "delay.hold", "max", "means nothing without late messages (delay.obs)")
-        # What is corrected are single rewards, and what the server knows at every step.
-        others = {
+        checks.require(not held, "delay.hold", "max", "means nothing without delayed messages (delay.obs)")
+
+    def _check_backupdate(self) -> None:
+        """Back-updating corrects single rewards, and what the server knows at every step."""
+        incompatible = {
             "delay.reward_window": (self.delay.reward_window, self.delay.reward_window > 1),
-            "delay.rew": (self.delay.rew, is_late(self.delay.rew, self.clock.dt)),
+            "delay.rew": (self.delay.rew, has_delay(self.delay.rew, self.clock.dt)),
             "clock.server": (self.clock.server, self.clock.steps("server") > 1),
         }
-        for key, (value, set_) in others.items():
+        for key, (value, given) in incompatible.items():
             should = "does not go with backupdate=true, which would undo it"
-            checks.require(not (self.backupdate and set_), key, value, should)
+            checks.require(not (self.backupdate and given), key, value, should)
         for key in ("settle", "recompute_actor"):
             alone = getattr(self, key) and not self.backupdate
             checks.require(not alone, key, True, "means nothing without backupdate=true")
 
-    def _check_mappo(self) -> None:
-        shortest, recurrent = SystemClock(self.clock, self.update_steps).shortest, self.model.recurrent
-        most = self.worlds if recurrent else self.worlds * shortest
-        checks.in_range("mappo.minibatches", self.mappo.minibatches, 1, most)
-        longest = self.longest_delay
-        should = f"needs more than {longest} steps, the longest delay, between two updates: {shortest}"
-        checks.require(not self.settle or longest < shortest, "settle", True, should)
-        should = "does not go with model.rnn: what a UAV remembers is not corrected"
-        checks.require(not (recurrent and self.recompute_actor), "recompute_actor", True, should)
-
-    def _check_sac(self) -> None:
-        should = "is for algo=mappo only: SAC learns from single decisions, without what came before them"
-        checks.require(not self.model.recurrent, "model.rnn", self.model.rnn, should)
-        should = "is for algo=mappo only: SAC has no importance ratios"
-        checks.require(not self.recompute_actor, "recompute_actor", True, should)
-        least = SystemClock(self.clock, self.update_steps).longest + 2 * self.longest_delay
-        checks.in_range("sac.memory", self.sac.memory, self.worlds * least, unit="steps")
-        room = self.sac.memory // self.worlds * self.worlds
-        checks.in_range("sac.warm_up", self.sac.warm_up, 0, room, unit="steps")
-
     def _check_skip(self) -> None:
-        should = "does not go with model.rnn: a flight is remembered at every step, not only at decisions"
+        should = "does not go with model.rnn: hidden states change at every step, not only at decisions"
         checks.require(not (self.model.recurrent and self.clock.skip), "clock.skip", True, should)
-        discount, should = self.clock.skip_discount, "is that of the algorithm while it learns; leave it out"
+        discount, should = self.clock.skip_discount, "is that of the learner while it learns; leave it out"
         checks.require(discount == 1, "clock.skip_discount", discount, should)
 
     @property
@@ -150,29 +136,47 @@ class TrainConfig(ScenarioConfig):
         return self.delay.uplink.sampler(self.clock.dt).longest
 
     @property
-    def critic_sees(self) -> str:
-        """Name of the entry that the critic reads."""
-        return PRIVILEGED if self.critic == "privileged" else "global_observation"
-
-    @property
     def update_steps(self) -> int:
-        """Steps of every world before the first update: the system clock's, or the algorithm's."""
-        return self.clock.steps("system") if self.clock.system else getattr(self, self.algo).steps
+        """Steps of every world before the first update: the system clock's period, or the learner's."""
+        return self.clock.steps("system") if self.clock.system else self.learner.steps
 
     @property
-    def flown(self) -> ScenarioConfig:
-        """What an evaluation flies: every step, for its measures."""
+    def learning_setup(self) -> LearningSetup:
+        """What a learner must know of this run."""
+        clock = SystemClock(self.clock, self.update_steps)
+        return LearningSetup(
+            model=self.model,
+            worlds=self.worlds,
+            shortest_period=clock.shortest,
+            longest_period=clock.longest,
+            longest_delay=self.longest_delay,
+            backupdate=self.backupdates,
+            settle=self.settle,
+            recompute_actor=self.recompute_actor,
+            critic_key=keys.PRIVILEGED_OBSERVATION
+            if self.critic == "privileged"
+            else keys.GLOBAL_OBSERVATION,
+        )
+
+    @property
+    def backupdates(self) -> bool:
+        """Is back-updating wanted, and is there any message to correct with."""
+        return self.backupdate and has_message_delay(self)
+
+    @property
+    def eval_scenario(self) -> ScenarioConfig:
+        """The scenario of an evaluation, which measures every step."""
         return replace(self, clock=replace(self.clock, skip=False, skip_discount=1.0))
 
     @property
-    def learnt(self) -> ScenarioConfig:
-        """What is trained in: rewards of skipped steps are discounted as the learner does."""
-        discount = getattr(self, self.algo).gamma if self.clock.skip else 1.0
+    def train_scenario(self) -> ScenarioConfig:
+        """The scenario of training: within a skipped step, rewards are discounted as the learner does."""
+        discount = self.learner.gamma if self.clock.skip else 1.0
         return replace(self, clock=replace(self.clock, skip_discount=discount))
 
     @property
-    def unseen_seed(self) -> int:
-        """Of the situations that a policy is evaluated in, and not trained."""
+    def eval_seed(self) -> int:
+        """Seed of the initial conditions of an evaluation, which are not those of training."""
         return self.seed + 10_000
 
     @property
@@ -182,13 +186,18 @@ class TrainConfig(ScenarioConfig):
         return 4 * limit if self.episode.since_detection else limit
 
 
-ConfigStore.instance().store(name="schema", node=TrainConfig)
+_STORE = ConfigStore.instance()
+_SCHEMA = OmegaConf.structured(TrainConfig)
+_SCHEMA.learner = MISSING  # which the group ``learner`` fills in
+_STORE.store(name="schema", node=_SCHEMA)
+for _name, _config in LEARNERS.items():
+    _STORE.store(group="schema/learner", name=_name, node=_config)
 OmegaConf.register_new_resolver("shipped", lambda name: str(files("damian") / "data" / name))
 
 
 def _plain(name: str) -> str:
-    """A folder's name without quotes and brackets, and not too long for a file system."""
-    plain = re.sub(r"[^\w.=,-]", "", name)
+    """A folder's name without quotes, brackets and slashes, and not too long for a file system."""
+    plain = re.sub(r"[^\w.=,-]", "", name.replace("/", "-"))
     return plain if len(plain) <= 100 else f"{plain[:90]}_{zlib.crc32(plain.encode()):08x}"
 
 

@@ -12,14 +12,16 @@ from torch import Tensor
 
 from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.baselines.random import random_policy
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.evaluation.metrics import evaluate
 from damian.server.features import ObservationConfig
-from damian.server.rewards import EpisodeConfig, RewardConfig
+from damian.server.rewards import RewardConfig
+from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig, displacement
+from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 FIELD = [[0.0, 0.0], [400.0, 0.0], [400.0, 400.0], [0.0, 400.0]]
@@ -33,13 +35,13 @@ SEARCH = RewardConfig(spotted=0.0, spotting_agents=1.0)
 def field(**changed) -> DelayedEnv:
     """Three UAVs across a large square; a source in a corner that none of them hears."""
     region = RegionConfig(
-        kind="vertices", vertices=FIELD, lattice_step=32.0, situations=4, start_positions=STARTS
+        kind="vertices", vertices=FIELD, lattice_step=32.0, initial_conditions=4, start_positions=STARTS
     )
     sections = {
         "region": region,
         "source": SourceConfig(level_db=135.0, position=[390.0, 10.0]),
         "actions": FINE,
-        "task": SEARCH,
+        "reward": SEARCH,
     }
     return make_env(ScenarioConfig(**(sections | changed)), 2, extras=["message"])
 
@@ -47,7 +49,7 @@ def field(**changed) -> DelayedEnv:
 def landing(env: DelayedEnv, shown: TensorDictBase) -> Tensor:
     """Where the policy sends the UAVs of the first world, if alone there, [N, 2]."""
     action = greedy_policy(env)(shown)["agents", "action"][0]
-    worlds = env.worlds
+    worlds = env.uav_env
     if worlds.scenario.actions.kind == "discrete":
         distance, heading = worlds.scenario.actions.table()[action].unbind(-1)
     else:
@@ -77,7 +79,7 @@ def test_all_fly_to_where_one_has_heard_the_source_and_that_one_stays(actions):
     shown = heard(env, [200.0, 200.0])
     there = told(shown).position[0, 1]
     apart = torch.linalg.vector_norm(landing(env, shown) - there, dim=-1)
-    assert (apart <= env.worlds.simulation.radius).all()
+    assert (apart <= env.uav_env.simulation.radius).all()
     assert apart[1] == 0
 
 
@@ -85,7 +87,7 @@ def test_what_was_heard_long_ago_of_a_source_at_rest_still_counts_but_of_one_tha
     moving = SourceConfig(level_db=135.0, motion="dynamic", speed=20.0)
     ends = [landing(env, heard(env, [200.0, 200.0], 8)) for env in (field(), field(source=moving))]
     apart = [torch.cdist(end[::2], torch.tensor([[200.0, 200.0]])) for end in ends]
-    radius = field().worlds.simulation.radius
+    radius = field().uav_env.simulation.radius
     assert (apart[0] <= 2 * radius).all()
     assert (apart[1] > 2 * radius).all()
 
@@ -94,7 +96,7 @@ def test_a_source_just_lost_is_looked_for_around_the_silent_footprint_and_not_in
     env = field(source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
     shown = heard(env, [200.0, 200.0], ago=2.0)
     away = torch.linalg.vector_norm(landing(env, shown)[1] - told(shown).position[0, 1])
-    assert env.worlds.simulation.radius < away < 3 * env.worlds.simulation.radius
+    assert env.uav_env.simulation.radius < away < 3 * env.uav_env.simulation.radius
 
 
 @pytest.mark.parametrize("task", [SEARCH, COVER], ids=["search", "coverage"])
@@ -103,7 +105,7 @@ def test_before_anything_is_heard_the_uavs_leave_for_fresh_ground_of_their_own(t
     shown = env.reset()
     start, end = told(shown).position[0], landing(env, shown)
     apart = torch.cdist(end, start)
-    assert (apart.diagonal() > env.worlds.simulation.radius).all()
+    assert (apart.diagonal() > env.uav_env.simulation.radius).all()
     assert torch.equal(apart.argmin(-1), torch.arange(3))
 
 
@@ -112,7 +114,7 @@ def test_a_source_beyond_reach_is_flown_to_as_far_as_can_be(kind):
     env = field(actions=replace(FINE, kind=kind))
     shown, there = heard(env, [380.0, 380.0]), torch.tensor([380.0, 380.0])
     start, end = told(shown).position[0, 0], landing(env, shown)[0]
-    assert (start - there).norm() > 300 + env.worlds.simulation.radius
+    assert (start - there).norm() > 300 + env.uav_env.simulation.radius
     assert (start - there).norm() - (end - there).norm() > 250
 
 
@@ -120,20 +122,20 @@ def test_a_source_beyond_reach_is_flown_to_as_far_as_can_be(kind):
     ("sections", "seeks"),
     [
         ({}, False),
-        ({"task": replace(COVER, mean_distance=1.0)}, False),
+        ({"reward": replace(COVER, mean_distance=1.0)}, False),
         ({"episode": EpisodeConfig(success_share=0.5)}, True),
     ],
 )
 def test_without_a_reward_for_the_source_nobody_flies_to_it(sections, seeks):
     seen = ObservationConfig(global_features=["coverage"], local_features=[])
-    env = field(**{"task": COVER, "observation": seen} | sections)
+    env = field(**{"reward": COVER, "observation": seen} | sections)
     ends = [landing(env, heard(env, place)) for place in ([200.0, 200.0], [50.0, 350.0])]
     assert torch.equal(*ends) is not seeks
 
 
 def test_fresh_ground_is_ones_own_and_under_none_of_ones_latest_footprints():
     env = make_env(everything(), 4, extras=["message"])
-    policy, held = Greedy(env.worlds), told(env.rollout(4, random_policy(env))["next"][:, -1])
+    policy, held = Greedy(env.uav_env), told(env.rollout(4, random_policy(env))["next"][:, -1])
     assert (held.trail[..., 0] != held.trail[..., 1]).any()
     points, been = policy.points.flatten(0, 1).tolist(), held.trail.tolist()
     ground = policy.points[held.trail[:, 0, 0] // policy.points.shape[1]]
@@ -149,7 +151,7 @@ def test_fresh_ground_is_ones_own_and_under_none_of_ones_latest_footprints():
 @pytest.mark.parametrize("seed", range(4))
 def test_what_is_believed_of_a_place_is_what_one_uav_after_the_other_says_of_it(seed):
     env = field(source=walking(emission="per_step", emission_probability=0.7))
-    policy, radius = Greedy(env.worlds), env.worlds.simulation.radius
+    policy, radius = Greedy(env.uav_env), env.uav_env.simulation.radius
     torch.manual_seed(seed)
     places, times = 400 * torch.rand(2, 2, 3, 2), 8.0 + torch.randint(2, (2, 3))
     detected = torch.minimum(torch.tensor([-1.0, 0.0, 5.0, 9.0])[torch.randint(4, (2, 3))], times)
@@ -181,7 +183,7 @@ def test_what_is_believed_of_a_place_is_what_one_uav_after_the_other_says_of_it(
 def test_the_uavs_fly_where_most_fresh_ground_is_seen_and_there_the_shortest_way():
     scenario = everything(task=COVER, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 8, extras=["message"])
-    policy, radius = Greedy(env.worlds), env.worlds.simulation.radius
+    policy, radius = Greedy(env.uav_env), env.uav_env.simulation.radius
     shown = env.rollout(4, random_policy(env))["next"][:, -1]
     held, legal = told(shown), shown["agents", "action_mask"]
     region = held.trail[:, 0, 0] // policy.points.shape[1]
@@ -260,19 +262,19 @@ def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_othe
 
 def test_regions_of_different_sizes_have_their_own_ground_only():
     env = make_env(everything(), 2, extras=["message"])
-    seen = Greedy(env.worlds).near.sum(1)
-    for region, points in enumerate(env.worlds.simulation.airspace.points):
+    seen = Greedy(env.uav_env).near.sum(1)
+    for region, points in enumerate(env.uav_env.simulation.airspace.points):
         real = points[points[:, 0].isfinite()]
         apart = torch.linalg.vector_norm(real.unsqueeze(0) - real.unsqueeze(1), dim=-1)
-        near = (apart <= env.worlds.simulation.radius).sum(0)
+        near = (apart <= env.uav_env.simulation.radius).sum(0)
         assert torch.equal(seen[region, : len(real)], near.float())
-    assert not env.worlds.simulation.airspace.points.isfinite().all()
+    assert not env.uav_env.simulation.airspace.points.isfinite().all()
 
 
 @pytest.mark.parametrize("actions", [FINE, CONTINUOUS], ids=["discrete", "continuous"])
 def test_of_equally_good_places_the_nearest_is_flown_to(actions):
     env = make_env(everything(actions=actions), 4, extras=["message"])
-    policy = Greedy(env.worlds)
+    policy = Greedy(env.uav_env)
     assert not policy.real.all()
     # What only fills the table of a smaller region is no place, however much it promises.
     policy.near = (~policy.real).float().unsqueeze(1).expand_as(policy.near)
@@ -301,7 +303,7 @@ def test_late_messages_make_what_was_heard_old():
 
 def test_any_number_of_uavs_is_flown_and_clearly_better_than_by_chance():
     torch.manual_seed(0)
-    region = RegionConfig(min_area=60_000, max_area=90_000, pool=2, situations=16)
+    region = RegionConfig(min_area=60_000, max_area=90_000, pool=2, initial_conditions=16)
     for agents in (1, 3, 7):
         scenario = ScenarioConfig(agents=agents, region=region, source=walking(), task=SEARCH)
         env = make_env(scenario, 32, 5, extras=["message"])

@@ -9,18 +9,8 @@ from torch import Tensor
 
 from damian.common import counter_rng
 from damian.common.errors import InputError
-from damian.delays.laws import (
-    LONGEST,
-    Burst,
-    Constant,
-    DelayConfig,
-    Geometric,
-    Law,
-    Trace,
-    Uniform,
-    in_steps,
-    law_of,
-)
+from damian.delays.config import DelayConfig
+from damian.delays.laws import LONGEST, Burst, Constant, Geometric, Law, Trace, Uniform, in_steps, law_of
 from damian.delays.samplers import Sampler
 from damian.envs.scenario import ScenarioConfig
 from damian.transforms import RewardDelay

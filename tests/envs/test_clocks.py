@@ -13,10 +13,11 @@ from train import learning_env, spotting, ticks
 
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
-from damian.delays.laws import DelayConfig
-from damian.envs.clocks import ClockConfig, SystemClock
-from damian.server.features import Snapshot
-from damian.server.rewards import EpisodeConfig
+from damian.delays.config import DelayConfig
+from damian.envs.clocks import ClockConfig
+from damian.learners.schedule import SystemClock
+from damian.server.termination import EpisodeConfig
+from damian.world.messages import Messages
 
 SPOTTED, QUIET = torch.tensor([[False, True]]), torch.tensor([[False, False]])
 WORLDS = 4
@@ -178,7 +179,7 @@ def test_a_batch_has_the_steps_of_the_current_period_and_none_is_lost_or_doubled
     changes = {b - a for (a, _), (b, _) in itertools.pairwise(found)}
     assert (changes == {0}) if kind == "fixed" else (min(changes) < 0 < max(changes))
     for (period, batch), (following, _) in itertools.pairwise(found):
-        spots = Snapshot.unpack(batch["next", "agents", "received"][:, -1]).spotted.any(-1)
+        spots = Messages.unpack(batch["next", "agents", "received"][:, -1]).spotted.any(-1)
         assert spots.equal(spotting(batch).any(-1))
         expected = SystemClock(setting.clock, 5)
         expected.period = period

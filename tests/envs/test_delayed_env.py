@@ -24,14 +24,24 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from damian.delays.laws import DelayConfig, law_of
+from damian.delays.config import DelayConfig
+from damian.delays.laws import law_of
 from damian.envs.clocks import ClockConfig
-from damian.envs.pipeline import ACTION, REWARD, SEEN, DelayedEnv, chain, holding, make_env, serving
+from damian.envs.pipeline import (
+    ACTION,
+    REWARD,
+    SEEN,
+    DelayedEnv,
+    chain,
+    hold_action,
+    make_env,
+    server_transforms,
+)
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS, UavEnv
-from damian.server.features import Snapshot
-from damian.server.rewards import EpisodeConfig
-from damian.transforms import ActionDelay, Clock, CumulativeReward, RewardDelay
+from damian.server.termination import EpisodeConfig
+from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
+from damian.world.messages import Messages
 from damian.world.signal_source import SourceConfig
 
 READY, BROADCAST = ("agents", "ready"), ("agents", "global_observation")
@@ -71,15 +81,15 @@ def over_time(shown: Sequence[TensorDictBase], key: Any) -> Tensor:
 
 def by_hand(scenario: ScenarioConfig, n_worlds: int) -> DelayedEnv:
     """The whole chain, although nothing is late."""
-    env = UavEnv(scenario, n_worlds, extras=EXTRAS, serves=False)
-    keys = {"sent_key": "ready", "fresh_key": "acts"}
+    env = UavEnv(scenario, n_worlds, extras=EXTRAS, messages_only=True)
+    keys = {"sent_key": "ready", "fresh_key": "action_valid"}
     chain = [
-        ActionDelay(0, ACTION, default=holding(scenario.actions), **keys),
-        *serving(scenario, env.server, EXTRAS),
+        ActionDelay(0, ACTION, default=hold_action(scenario.actions), **keys),
+        *server_transforms(scenario, env.server, EXTRAS),
         RewardDelay(0, REWARD),
         CumulativeReward(1, 0.9, REWARD),
-        Clock(1, [SEEN, BROADCAST]),
-        Clock(1, [SEEN], ready_key=READY),
+        SampleAndHold(1, [SEEN, BROADCAST]),
+        SampleAndHold(1, [SEEN], ready_key=READY),
     ]
     chained = DelayedEnv(env, Compose(*chain))
     chained.set_seed(0)
@@ -146,7 +156,7 @@ def test_every_delay_keeps_the_specs(late, motion, kind):
 def test_without_extras_the_specs_are_kept_and_no_message_is_shown(late):
     env = make_env(everything(**DELAYS[late]), 2)
     check_env_specs(env, seed=0, break_when_any_done="both")
-    assert not {"message", "received", "age", "delay", "talks"} & set(env.reset()["agents"].keys())
+    assert not {"message", "received", "age", "delay", "message_sent"} & set(env.reset()["agents"].keys())
 
 
 # No peeking.
@@ -272,7 +282,7 @@ def test_messages_late_by_i_and_actions_by_j_are_messages_late_by_their_sum(i, j
         for t in range(12):
             action = (heard(td).abs().sum(-1) * 10).long() % scenario.actions.n_actions
             heards.append(heard(td))
-            action = torch.full_like(action, holding(scenario.actions)) if t < n_holds else action
+            action = torch.full_like(action, hold_action(scenario.actions)) if t < n_holds else action
             td = env.step_and_maybe_reset(td.set(ACTION, action))[1]
             states.append(td["state"])
         return torch.stack(heards), torch.stack(states)
@@ -297,7 +307,7 @@ def test_what_the_server_holds_is_as_old_as_it_says(late, motion):
         steps += 1
         for td in (stepped, following):
             age = td[AGE].squeeze(-1)
-            assert Snapshot.unpack(td[RECEIVED]).time.equal((steps - age) * dt)
+            assert Messages.unpack(td[RECEIVED]).time.equal((steps - age) * dt)
             old += (age > 1).sum().item()
             steps = steps * ~stepped["done"]  # what follows is shown after the reset
         assert following[AGE].squeeze(-1)[stepped["done"].squeeze(-1)].sum() == 0
@@ -315,7 +325,7 @@ def test_a_reset_gives_the_server_everybody_s_first_message_at_once():
         assert td[RECEIVED].equal(td[MESSAGE])
         assert not td[AGE].any()
         assert not td["agents", "delay"].any()
-        assert not Snapshot.unpack(td[RECEIVED]).time.any()
+        assert not Messages.unpack(td[RECEIVED]).time.any()
 
 
 def test_where_every_message_is_lost_the_server_believes_the_first_one_for_the_whole_episode():
@@ -410,7 +420,7 @@ def test_between_two_ticks_of_the_servers_clock_nothing_new_is_seen():
 
 def test_a_uav_sees_what_the_server_had_broadcast_by_its_own_tick():
     fast, slowly = (delayed(slow(**clocks)) for clocks in ({}, {"agents": "4s", "server": "2s"}))
-    holds = torch.full((4, 3), holding(fast.scenario.actions))
+    holds = torch.full((4, 3), hold_action(fast.scenario.actions))
     raw, shown = play(fast, lambda t: holds, 20), play(slowly, lambda t: holds, 20)
     for t in range(21):
         assert shown[2 * t][BROADCAST].equal(raw[2 * (t - t % 2)][BROADCAST])
@@ -443,7 +453,7 @@ def test_an_action_chosen_while_not_ready_is_never_executed(act, motion, agents)
 def test_a_step_at_once_does_what_each_transform_does_by_itself(motion, changed):
     scenario = everything(motion, **changed)
     whole, graph = delayed(scenario), delayed(scenario).compile(backend="eager")
-    world = UavEnv(scenario, 4, extras=EXTRAS, serves=whole.base_env.serves)
+    world = UavEnv(scenario, 4, extras=EXTRAS, serves=whole.base_env.messages_only)
     plain = TransformedEnv(world, chain(scenario, world.server, EXTRAS))  # transform by transform
     for number, transform in enumerate(plain.transform):
         transform.set_seed(7919 * (number + 1))
@@ -496,10 +506,10 @@ def test_the_flag_of_those_who_act_reaches_the_worlds(compiles):
     td = env.rand_action(env.reset())
     env.step(td.clone())
     td = env.rand_action(env.reset())
-    td["agents", "acts"] = torch.zeros(4, 3, dtype=torch.bool)
-    before = env.worlds.state.goal.clone()
+    td["agents", "action_valid"] = torch.zeros(4, 3, dtype=torch.bool)
+    before = env.uav_env.state.goal.clone()
     assert env.step(td)["next", "agents", "ready"].all()
-    assert env.worlds.state.goal.equal(before)
+    assert env.uav_env.state.goal.equal(before)
 
 
 def test_environments_that_exist_already_go_into_workers():

@@ -27,7 +27,8 @@ from helpers import (
     walking,
 )
 
-from damian.server.rewards import EpisodeConfig, RewardConfig
+from damian.server.rewards import RewardConfig
+from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
 from damian.world.motion import MotionConfig
 from damian.world.signal_source import SourceConfig
@@ -139,7 +140,7 @@ def test_a_flight_drains_what_it_should_whatever_the_step():
         cost = flight_drain(env.state.vertical[0, 0], length, battery).item()
         duration = flight(env)
         levels = [env.state.battery.item()]
-        while not env.simulation.landed(env.state).all():
+        while not env.simulation.vehicles.on_ground(env.state).all():
             go(env, HERE)
             levels.append(env.state.battery.item())
         assert all(a >= b for a, b in itertools.pairwise(levels))
@@ -156,7 +157,7 @@ def test_an_instant_flight_drains_as_much():
     origin = env.simulation.points[env.state.goal.item()]
     go(env, EAST)
     length = torch.linalg.vector_norm(env.simulation.points[env.state.goal.item()] - origin)
-    cost = flight_drain(env.simulation.vertical[0], length, battery).item()
+    cost = flight_drain(env.simulation.vehicles.vertical[0], length, battery).item()
     assert env.state.battery.item() == pytest.approx(100 - cost, abs=1e-4)
 
 
@@ -169,7 +170,7 @@ def test_a_target_beyond_the_batterys_reach_is_not_flown_to(motion):
     length = torch.linalg.vector_norm(
         env.simulation.points[env.state.goal.item()] - env.simulation.points[start.goal.item()]
     )
-    cost = flight_drain(env.simulation.vertical[0], length, battery)
+    cost = flight_drain(env.simulation.vehicles.vertical[0], length, battery)
     for factor, flies in ((0.99, False), (1.01, True)):
         env.state = start._replace(battery=factor * cost.view(1, 1))
         go(env, EAST)
@@ -213,7 +214,7 @@ def test_a_uav_charges_from_the_step_after_its_landing_on():
     length = torch.linalg.vector_norm(goal - origin)
     cost = flight_drain(env.state.vertical[0, 0], length, battery).item()
     go(env, *[HERE] * (math.ceil(flight(env)) - 1))
-    assert env.simulation.landed(env.state).all()
+    assert env.simulation.vehicles.on_ground(env.state).all()
     assert env.state.battery.item() == pytest.approx(100 - cost, abs=1e-3)
     gain = charge_gain(torch.tensor(1.0), battery).item()
     go(env, HERE)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from damian.common.errors import InputError
-from damian.envs.scenario import RegionConfig, ScenarioConfig, leftovers
+from damian.envs.scenario import ScenarioConfig, leftovers
 from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
 
 
 def test_the_library_needs_no_hydra_and_no_yaml():

@@ -106,7 +106,7 @@ def test_without_extras_observations_and_rewards_are_the_same(motion):
         assert same(one.select(*other.keys(True, True)), other)
         n_differences += len(set(one.keys(True, True)) - set(other.keys(True, True)))
     assert n_differences > 0
-    kept = {"reward_terms", "message", "talks"} & set(poor.reset()["agents"].keys())
+    kept = {"reward_terms", "message", "message_sent"} & set(poor.reset()["agents"].keys())
     assert not kept
     assert "state" not in poor.reset()
 

@@ -13,15 +13,16 @@ from torchrl.envs import RewardSum, StepCounter
 
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate, evaluation
 from damian.evaluation.run_folder import MetricsLog, read_metrics, results_table, save_results
-from damian.server.features import Snapshot
-from damian.server.rewards import EpisodeConfig, RewardConfig
+from damian.server.rewards import RewardConfig
 from damian.server.server import Server
+from damian.server.termination import EpisodeConfig
+from damian.world.messages import Messages
 
 HORIZON = 24
 BURSTS = {"law": "burst", "enter": 0.3, "leave": 0.3, "good": 0, "bad": 5, "bad_loss": 0.2}
@@ -39,7 +40,7 @@ def together(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
     sections = {
         "motion": MOTIONS[motion],
         "delay": delay,
-        "task": RewardConfig(spotted=0.3, source_distance=0.2, bonus=2.0, bonus_over_steps=True, penalty=0.5),
+        "reward": RewardConfig(spotted=0.3, source_distance=0.2, bonus=2.0, bonus_over_steps=True, penalty=0.5),
         "episode": EpisodeConfig(max_steps=20, success_share=0.6),
     }
     return square(**(sections | changed))
@@ -49,16 +50,16 @@ def flown(scenario: ScenarioConfig, n_worlds: int = 24) -> tuple[TensorDictBase,
     """A flight of the random policy [B, HORIZON], and the server."""
     torch.manual_seed(1)
     env = make_env(scenario, n_worlds, seed=2, extras=["message"])
-    return env.rollout(HORIZON, random_policy(env), break_when_any_done=False), env.worlds.server
+    return env.rollout(HORIZON, random_policy(env), break_when_any_done=False), env.server
 
 
 def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
     """Ages of what is held [steps], and of each message sent whether it is late or lost, in an episode."""
     agents, found = world["next", "agents"], {"age": [], "late": [], "lost": []}
-    for i in range(agents["talks"].shape[-1]):
+    for i in range(agents["message_sent"].shape[-1]):
         sent = {0: 0}  # the first message is there at once: when each was sent, and when it arrives
         for t in range(1, steps + 1):
-            if agents["talks"][t - 1, i]:
+            if agents["message_sent"][t - 1, i]:
                 delay = int(agents["delay"][t - 1, i]) if "delay" in agents else 0
                 found["late"].append(delay > 0)
                 found["lost"].append(delay == -1)
@@ -76,8 +77,10 @@ def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[
         after = world["next"][t - 1]
         row["episode_return"] += after["agents", "reward"].mean().item()
         row["success"] |= after["success"].item()
-        truth, steps = Snapshot.unpack(after["agents", "message"][None]), torch.tensor([t])
-        judged = server.judge(server.features(truth, steps), truth, steps, torch.zeros(1, dtype=torch.bool))
+        truth, steps = Messages.unpack(after["agents", "message"][None]), torch.tensor([t])
+        judged = server.reward_and_status(
+            server.features(truth, steps), truth, steps, torch.zeros(1, dtype=torch.bool)
+        )
         if not truly_over:
             row["true_return"] += judged.reward.mean().item()
         if truth.spotted.sum() >= needed and not truly_over:
@@ -166,7 +169,7 @@ def test_an_evaluation_flies_as_long_as_it_is_told_and_draws_or_takes_the_mode()
     row = evaluate(env(), policy, 6)
     torch.manual_seed(1)
     flight = env().rollout(6, policy, break_when_any_done=False)
-    assert row == evaluation(flight, env().worlds.server)
+    assert row == evaluation(flight, env().server)
     assert row.steps <= 6
 
 

@@ -9,12 +9,13 @@ from helpers import everything
 from shared.settings import LoggerConfig, TrainConfig
 from train import learning_env, make_learner, train
 
-from damian.delays.laws import DelayConfig
-from damian.envs.clocks import ClockConfig, SystemClock
+from damian.delays.config import DelayConfig
+from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
+from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage
 
 AWARE = {
@@ -99,7 +100,7 @@ def test_a_memory_has_room_for_whole_steps_of_the_longest_batch_and_all_that_is_
 def test_late_messages_correct_what_the_actor_saw_only_if_that_is_recomputed(recompute):
     learner, env = made("mappo", recompute_actor=recompute)
     batch = env.rollout(12, learner.actor, break_when_any_done=False)
-    known = learner.known(batch)
+    known = learner.backupdated_batch(batch)
     assert known["agents", "backupdated"].any()
     for key in ("observation", "action_log_prob"):
         assert known["agents", key].equal(batch["agents", key]) is not recompute

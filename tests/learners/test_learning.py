@@ -13,24 +13,27 @@ from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.baselines.random import random_policy
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.learners.mappo import Mappo, MappoConfig, add_advantages, losses_of, mappo_loss
+from damian.learners.mappo import Mappo, MappoConfig, add_advantages, mappo_loss, minibatch_losses
 from damian.learners.networks import ModelConfig, make_actor, make_critic
-from damian.replay.backupdate import BackupdateStorage, server_view
-from damian.server.features import Snapshot
-from damian.server.rewards import EpisodeConfig, RewardConfig
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.recompute import server_recompute
+from damian.server.rewards import RewardConfig
+from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
+from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
 
 SMALL = ModelConfig(hidden=[16])
 REWARD = ("next", "agents", "reward")
 
 
 def scenario(**changes) -> ScenarioConfig:
-    region = RegionConfig(min_area=20_000, max_area=40_000, situations=16)
+    region = RegionConfig(min_area=20_000, max_area=40_000, initial_conditions=16)
     return ScenarioConfig(**{"agents": 3, "region": region, **changes})
 
 
@@ -85,7 +88,7 @@ def collected(motion: str, kind: str):
         episode=EpisodeConfig(max_steps=9),
         motion=MotionConfig(kind=motion),
         actions=ActionConfig(kind=kind),
-        task=RewardConfig(spotted=1.0, source_distance=1.0),
+        reward=RewardConfig(spotted=1.0, source_distance=1.0),
     )
     env = UavEnv(config, 8)
     actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
@@ -117,7 +120,7 @@ def test_entries_without_a_decision_move_the_critic_only(kind, mask):
         batch["agents", "ready"] = torch.full_like(batch["agents", "ready"], ready)
         add_advantages(batch, critic, MappoConfig())
         loss.zero_grad()
-        sum(losses_of(batch.reshape(-1), loss).values()).backward()
+        sum(minibatch_losses(batch.reshape(-1), loss).values()).backward()
         grads = {n: p.grad.abs().sum().item() for n, p in loss.named_parameters() if p.grad is not None}
         actors = sum(g for n, g in grads.items() if n.startswith("actor"))
         return actors, sum(grads.values()) - actors
@@ -138,7 +141,7 @@ def test_objective_and_entropy_are_means_over_decisions():
     ready = batch["agents", "ready"]
     batch["agents", "advantage"] = torch.where(ready, 2.0, 5.0).unsqueeze(-1)
     assert not ready.all()
-    losses = losses_of(batch.reshape(-1), mappo_loss(actor, critic, MappoConfig(entropy=0.1)))
+    losses = minibatch_losses(batch.reshape(-1), mappo_loss(actor, critic, MappoConfig(entropy=0.1)))
     assert losses["loss_objective"].item() == pytest.approx(-2, abs=1e-5)  # ratios of 1
     entropy = actor.get_dist(batch).entropy()[ready].mean().item()
     assert losses["loss_entropy"].item() == pytest.approx(-0.1 * entropy, rel=1e-5)
@@ -232,7 +235,7 @@ def collected_late(kind: str, recompute_actor: bool) -> tuple[Mappo, TensorDictB
     scenario = everything(kind=kind, delay=late, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["message"])
     env.append_transform(StepCounter())
-    view = server_view(env.worlds.server, actor=recompute_actor)
+    view = server_recompute(env.server, actor=recompute_actor)
     memory = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, view, longest=5))
     torch.manual_seed(2)
     config = MappoConfig(minibatches=1, epochs=1)
@@ -250,7 +253,7 @@ def log_ratios(learner: Mappo, known: TensorDictBase, behaviour: Tensor) -> Tens
 @both_kinds
 def test_with_backupdating_the_first_importance_ratios_are_one_as_the_actor_saw_what_it_saw(kind):
     learner, batch = collected_late(kind, recompute_actor=False)
-    known, behaviour = learner.known(batch), batch["agents", "action_log_prob"]
+    known, behaviour = learner.backupdated_batch(batch), batch["agents", "action_log_prob"]
     assert known["agents", "observation"].equal(batch["agents", "observation"])
     assert known["agents", "action_log_prob"].equal(behaviour)
     assert known["agents", "backupdated"].any()
@@ -260,7 +263,7 @@ def test_with_backupdating_the_first_importance_ratios_are_one_as_the_actor_saw_
 @both_kinds
 def test_recompute_actor_hides_that_corrected_observations_were_never_acted_on(kind):
     learner, batch = collected_late(kind, recompute_actor=True)
-    known, behaviour = learner.known(batch), batch["agents", "action_log_prob"]
+    known, behaviour = learner.backupdated_batch(batch), batch["agents", "action_log_prob"]
     assert known["agents", "action"].equal(batch["agents", "action"])
     corrected = (known["agents", "observation"] != batch["agents", "observation"]).any(-1)
     assert 0.1 < corrected.float().mean() < 0.9
@@ -275,7 +278,7 @@ def test_recompute_actor_hides_that_corrected_observations_were_never_acted_on(k
 
 def test_an_observation_is_corrected_where_a_message_came_late_for_the_step_before():
     learner, batch = collected_late("discrete", recompute_actor=True)
-    known = learner.known(batch)
+    known = learner.backupdated_batch(batch)
     corrected = (known["agents", "observation"] != batch["agents", "observation"]).any(-1).any(-1)
     late = known["agents", "backupdated"].squeeze(-1).any(-1)
     begins = batch["step_count"].squeeze(-1) == 0
@@ -287,13 +290,13 @@ def test_an_observation_is_corrected_where_a_message_came_late_for_the_step_befo
 def test_what_has_settled_is_learnt_from_later_and_then_as_it_truly_was():
     learner, flight = collected_late("discrete", recompute_actor=False)
     short = everything(episode=EpisodeConfig(max_steps=9))
-    learner.settle, server = 5, make_env(short, 4, seed=1).worlds.server
-    known = torch.cat([learner.known(flight[:, t : t + 10]) for t in (0, 10, 20)], 1)
+    learner.settle, server = 5, make_env(short, 4, seed=1).server
+    known = torch.cat([learner.backupdated_batch(flight[:, t : t + 10]) for t in (0, 10, 20)], 1)
     assert known.shape[1] == len(flight[0]) - 5  # the first batch comes short
     settled = flight[:, :25]
     assert known["agents", "action"].equal(settled["agents", "action"])
     sent, steps = settled["next", "agents", "message"], settled["next", "step_count"].squeeze(-1)
-    truth = server.serve(Snapshot.unpack(sent), steps)
+    truth = server(Messages.unpack(sent), steps)
     assert known["next", "agents", "global_observation"].equal(truth.global_observation)
     assert not known["next", "agents", "global_observation"].equal(
         settled["next", "agents", "global_observation"]
@@ -302,7 +305,7 @@ def test_what_has_settled_is_learnt_from_later_and_then_as_it_truly_was():
 
 def test_what_was_corrected_is_reported_with_the_losses():
     learner, batch = collected_late("discrete", recompute_actor=False)
-    share = learner.known(batch)["agents", "backupdated"].float().mean().item()
+    share = learner.backupdated_batch(batch)["agents", "backupdated"].float().mean().item()
     learner, batch = collected_late("discrete", recompute_actor=False)
     losses = learner.learn(batch)
     assert losses["backupdated"] == share

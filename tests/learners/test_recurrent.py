@@ -17,16 +17,17 @@ from torchrl.data import Binary, Categorical, Composite, TensorDictReplayBuffer,
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.evaluation.metrics import evaluate
 from damian.evaluation.run_folder import CHECKPOINT
 from damian.learners.mappo import Mappo, MappoConfig, mappo_loss
 from damian.learners.networks import ModelConfig, make_actor
-from damian.learners.recurrent import BEFORE, HIDDEN, prime
-from damian.replay.backupdate import BackupdateStorage, server_view
-from damian.server.rewards import EpisodeConfig
+from damian.learners.recurrent import BEFORE, HIDDEN, add_recurrent_state
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.recompute import server_recompute
+from damian.server.termination import EpisodeConfig
 
 GRU = ModelConfig(hidden=[16, 8], rnn="gru")
 ROUNDING = 1e-5
@@ -130,13 +131,13 @@ def test_two_minibatches_are_two_halves_of_the_worlds():
 @pytest.mark.parametrize("settle", [0, 5])
 def test_a_batch_from_the_memory_begins_with_the_hidden_state_that_it_began_with(settle):
     env = late_env()
-    view = server_view(env.worlds.server)
+    view = server_recompute(env.server)
     memory = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, view, longest=5))
     learner = Mappo(env, GRU, MappoConfig(), memory, settle)
     parts = [*batches(env, learner.actor, 10, 3)]
     flight, at = torch.cat(parts, 1), 0
     for batch in parts:
-        known = learner.known(batch)
+        known = learner.backupdated_batch(batch)
         there = flight[:, at : at + known.shape[1]]
         assert known[BEFORE].equal(there[BEFORE])
         assert known[SEEN].equal(there[SEEN])
@@ -171,11 +172,11 @@ def test_each_uav_remembers_what_it_has_seen_itself():
 def test_an_environment_is_told_of_hidden_states_once_and_only_for_a_policy_that_has_any():
     env = late_env()
     before = len(env.transform)
-    prime(env, make_actor(env, ModelConfig(hidden=[8])))
+    add_recurrent_state(env, make_actor(env, ModelConfig(hidden=[8])))
     assert len(env.transform) == before
     actor = make_actor(env, GRU)
     for _ in range(2):
-        prime(env, actor)
+        add_recurrent_state(env, actor)
         assert len(env.transform) == before + 2
     assert {HIDDEN, "is_init"} <= set(env.observation_spec.keys(True, True))
 
@@ -258,7 +259,7 @@ def test_only_an_actor_that_remembers_learns_what_was_seen_before(rnn):
     learner = Mappo(env, ModelConfig(hidden=[16], rnn=rnn), config)
     for batch in batches(env, learner.actor, 6, 20):
         learner.learn(batch)
-    prime(env, learner.actor)
+    add_recurrent_state(env, learner.actor)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         flown = env.rollout(20, learner.actor, break_when_any_done=False)
     right = flown["next", "agents", "reward"][:, 3::4].mean().item()
@@ -267,7 +268,7 @@ def test_only_an_actor_that_remembers_learns_what_was_seen_before(rnn):
 
 # The recipes.
 
-TINY = ["frames=256", "worlds=8", "mappo.steps=16", "eval_episodes=4", "model.hidden=[16]", "logger=csv"]
+TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]", "logger=csv"]
 
 
 @pytest.fixture
@@ -312,8 +313,8 @@ def test_what_has_learnt_is_flown_by_more_uavs_and_by_the_oracle_and_goes_on(run
     [
         (["model.rnn=lstm"], "model.rnn: lstm is not one of none, gru"),
         (["model=gru", "model.hidden=[]"], "model.hidden: [] is no layer to be a gru"),
-        (["model=gru", "algo=sac"], "model.rnn: gru is for algo=mappo only"),
-        (["model=gru", "worlds=3"], "mappo.minibatches: 4 is not between 1 and 3"),
+        (["model=gru", "learner=sac"], "model.rnn: gru is for algo=mappo only"),
+        (["model=gru", "worlds=3"], "learner.minibatches: 4 is not between 1 and 3"),
         (
             ["model=gru", "delay=paper", "backupdate=true", "recompute_actor=true"],
             "recompute_actor: True does not go with model.rnn",

@@ -12,16 +12,18 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import PRIVILEGED, UavEnv
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import LOSSES, Sac, SacConfig
-from damian.replay.backupdate import BackupdateStorage, TimeStorage, server_view
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.recompute import server_recompute
 from damian.replay.smdp import find_decisions, transitions
-from damian.server.features import Snapshot
-from damian.server.rewards import EpisodeConfig
+from damian.replay.time_storage import TimeStorage
+from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
+from damian.world.messages import Messages
 
 SMALL = ModelConfig(hidden=[16])
 FAST = SacConfig(updates=2, batch=64, warm_up=0)
@@ -122,7 +124,7 @@ def late_env():
 
 def test_a_late_message_corrects_transitions_that_are_stored_already():
     env = late_env()
-    view = server_view(env.worlds.server)
+    view = server_recompute(env.server)
     memory = ReplayBuffer(storage=BackupdateStorage(60 * 4, view, longest=5))
     learner = Sac(env, SMALL, FAST, memory, settle=5)
     batch = flown(env, learner.actor, 40)
@@ -132,7 +134,7 @@ def test_a_late_message_corrects_transitions_that_are_stored_already():
     held = storage.steps[storage.latest()[:-5]].transpose(0, 1)
     settled = batch[:, :-5]
     sent, elapsed = settled["next", "agents", "message"], settled["next", "step_count"].squeeze(-1)
-    truth = env.worlds.server.serve(Snapshot.unpack(sent), elapsed)
+    truth = env.server(Messages.unpack(sent), elapsed)
     assert held["next", "agents", "reward"].squeeze(-1).equal(truth.reward)
     assert held["next", "agents", "global_observation"].equal(truth.global_observation)
     assert not held["next", "agents", "reward"].equal(settled["next", "agents", "reward"])
@@ -146,7 +148,7 @@ class Watched(Sac):
 
     def improve(self, drawn: TensorDictBase) -> TensorDictBase:
         self.drawn = (*self.drawn, drawn.clone())
-        return super().improve(drawn)
+        return super().update(drawn)
 
 
 def two_decisions(flight: TensorDictBase, world: int, begin: int, agent: int, last: int) -> Tensor | None:
@@ -232,7 +234,7 @@ def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_a_share_
 def test_an_update_forgets_the_gradients_of_the_one_before():
     learner = watched(lr=1e-12, alpha_lr=1e-12)
     first = [weight.grad.clone() for weight in learner.loss.parameters()]
-    learner.improve(learner.drawn[0])
+    learner.update(learner.drawn[0])
     for weight, before in zip(learner.loss.parameters(), first, strict=True):
         torch.testing.assert_close(weight.grad, before)
 

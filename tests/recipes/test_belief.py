@@ -78,10 +78,10 @@ def test_the_belief_is_the_truth_as_old_as_the_table_says(run, motion, order):
 @pytest.mark.parametrize("motion", [[], FLYING])
 def test_without_delay_and_loss_the_server_knows_the_latest_message(run, capsys, motion):
     columns = table(run(*UNDELAYED, *motion))
-    talks = columns["arrived"] == 1
-    assert (columns["believed"] == columns["true"])[talks].all()
-    assert (columns["age_s"] == 0)[talks].all()
-    assert talks.all() == (motion == [])
+    message_sent = columns["arrived"] == 1
+    assert (columns["believed"] == columns["true"])[message_sent].all()
+    assert (columns["age_s"] == 0)[message_sent].all()
+    assert message_sent.all() == (motion == [])
     assert (columns["lost"] == 0).all()
     assert told(capsys)[1:] == ["late messages: 0.0%", "lost messages: 0.0%"]
 

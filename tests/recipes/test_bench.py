@@ -3,15 +3,15 @@
 import importlib.util
 
 from bench_training import ARMS, HEADER, RIVAL, RIVALS, Seconds, arm_config, median, rows, training
-from train import looks_back
+from train import backupdates
 
-from damian.envs.pipeline import messages_are_late
+from damian.envs.pipeline import has_message_delay
 
 
 def test_arms_differ_in_delay_and_awareness_only():
     configs = [arm_config(words, worlds=8, steps=16) for words in ARMS]
-    assert [messages_are_late(config) for config in configs] == [False, True, True, True]
-    assert [looks_back(config) for config in configs] == [False, False, True, True]
+    assert [has_message_delay(config) for config in configs] == [False, True, True, True]
+    assert [backupdates(config) for config in configs] == [False, False, True, True]
     assert [config.delay.history > 0 for config in configs] == [False, False, False, True]
     for config in configs:
         assert (config.agents, config.worlds, config.update_steps) == (3, 8, 16)

@@ -14,7 +14,7 @@ from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Com
 from damian.evaluation.report import markdown, plot_curves, plot_norms
 from damian.evaluation.statistics import interquartile_mean
 
-SMALL = ["frames=16", "worlds=2", "mappo.steps=4", "mappo.epochs=1", "eval_episodes=3", "model.hidden=[4]"]
+SMALL = ["frames=16", "worlds=2", "learner.steps=4", "learner.epochs=1", "eval_episodes=3", "model.hidden=[4]"]
 TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,unaware]", f"overrides=[{','.join(SMALL)}]"]
 ARMS = {
     "best": Arm(delayed=False),
@@ -140,7 +140,7 @@ def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(compare, capsys
 
 def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = SAMPLED) -> dict:
     """A row of which every measure is the value."""
-    where = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
+    where = {"reward": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
     names = ("true_return", "true_success_rate", "true_steps", "episode_return", "success_rate", "steps")
     return where | dict.fromkeys((*names, "age", "late", "lost", "episodes"), value)
 

@@ -16,7 +16,7 @@ from shared.launch import launch
 TRAINED = [
     "frames=64",
     "worlds=4",
-    "mappo.steps=8",
+    "learner.steps=8",
     "model.hidden=[16]",
     "eval_episodes=8",
     "episode.max_steps=10",
@@ -77,7 +77,7 @@ def test_a_policy_trained_with_three_is_flown_with_ten(fly):
 
 
 def test_a_policy_of_sac_flies_as_one_of_mappo_does(fly, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["train.py", "algo=sac", *TRAINED, "hydra.run.dir=soft"])
+    monkeypatch.setattr(sys, "argv", ["train.py", "learner=sac", *TRAINED, "hydra.run.dir=soft"])
     launch(train.main)
     assert results(fly("agents=5", of="soft")).keys() == {*results(tmp_path / "soft")}
 

@@ -10,11 +10,11 @@ from helpers import both_motions, everything
 from shared.launch import launch
 from torchrl.envs import StepCounter
 
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
-from damian.server.features import Snapshot
+from damian.world.messages import Messages
 
-TINY = ["frames=64", "worlds=4", "mappo.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]
+TINY = ["frames=64", "worlds=4", "learner.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]
 N_FEATURES = slice(None, -4)  # two past actions stand behind
 
 
@@ -26,14 +26,16 @@ def flown(motion, own=False):
     env = make_env(scenario, 4, seed=3, extras=["message"])
     env.append_transform(StepCounter())
     torch.manual_seed(1)
-    return env.rollout(15, break_when_any_done=False), env.worlds.server
+    return env.rollout(15, break_when_any_done=False), env.server
 
 
 def told(flight, server, on_time, fields=oracle.ALL):
-    """What ``informed`` shows at every step but the first, [B, T, N, F]."""
+    """What ``observe_with_timely_messages`` shows at every step but the first, [B, T, N, F]."""
     steps = flight["next"].select(("agents", "received"), ("agents", "message"), ("agents", "observation"))
     steps["step_count"] = flight["next", "step_count"]
-    return oracle.informed(server, on_time, fields)(steps.reshape(-1))["agents", "observation"]
+    return oracle.observe_with_timely_messages(server, on_time, fields)(steps.reshape(-1))[
+        "agents", "observation"
+    ]
 
 
 @both_motions
@@ -42,8 +44,8 @@ def test_nobodys_messages_on_time_change_nothing_and_everybodys_tell_all(motion)
     everybody = torch.ones(3, 3, dtype=torch.bool)
     seen = flight["next", "agents", "observation"].flatten(0, 1)
     assert told(flight, server, ~everybody).equal(seen)
-    truth = Snapshot.unpack(flight["next", "agents", "message"].flatten(0, 1))
-    expected = server.serve(truth, flight["next", "step_count"].flatten()).observation
+    truth = Messages.unpack(flight["next", "agents", "message"].flatten(0, 1))
+    expected = server(truth, flight["next", "step_count"].flatten()).observation
     assert told(flight, server, everybody)[..., N_FEATURES].equal(expected)
     assert not expected.equal(seen[..., N_FEATURES])
 
@@ -55,10 +57,10 @@ def test_each_uav_is_told_with_its_own_message_on_time_what_a_loop_over_uavs_say
     after = flight["next"].flatten(0, 1)
     shown = told(flight, server, torch.eye(3, dtype=torch.bool), fields)
     for uav in range(3):
-        held, sent = (Snapshot.unpack(after["agents", key].clone()) for key in ("received", "message"))
+        held, sent = (Messages.unpack(after["agents", key].clone()) for key in ("received", "message"))
         for name in fields:
             getattr(held, name)[:, uav] = getattr(sent, name)[:, uav]
-        served = server.serve(held, after["step_count"].view(-1))
+        served = server(held, after["step_count"].view(-1))
         assert shown[:, uav, N_FEATURES].equal(served.observation[:, uav])
     assert shown[..., -4:].equal(after["agents", "observation"][..., -4:])
 

@@ -30,15 +30,17 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from train import learning_env, main, make_learner
 
-from damian.delays.laws import DelayConfig, Held, law_of
-from damian.envs.clocks import ClockConfig, SystemClock
+from damian.delays.config import DelayConfig
+from damian.delays.laws import Held, law_of
+from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env, messages_are_late
+from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS, PRIVILEGED
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig, make_critic
 from damian.learners.sac import Sac
+from damian.learners.schedule import SystemClock
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 
@@ -56,7 +58,7 @@ TRUTH = ("agents", PRIVILEGED)
 
 def actions_for(env: DelayedEnv, n_steps: int) -> list[Tensor]:
     generator = torch.Generator().manual_seed(3)
-    return [random_actions(env.worlds, generator) for _ in range(n_steps)]
+    return [random_actions(env.uav_env, generator) for _ in range(n_steps)]
 
 
 def flown(
@@ -101,7 +103,7 @@ def test_held_messages_are_lost_as_often_as_before(law, tmp_path):
 
 def test_where_no_message_can_be_late_there_is_nothing_to_hold():
     nothing = everything(delay=DelayConfig(hold="max"))
-    assert not messages_are_late(nothing)
+    assert not has_message_delay(nothing)
     assert all_same(flown(nothing), flown(everything()))
 
 
@@ -172,7 +174,7 @@ def moved(place: list[float]) -> TensorDictBase:
     scenario = one_uav(delay=DelayConfig(loss=1.0))
     env = make_env(scenario, extras=["privileged"])
     env.reset()
-    env.worlds.state = env.worlds.state._replace(source=torch.tensor([place]))
+    env.uav_env.state = env.uav_env.state._replace(source=torch.tensor([place]))
     return go(env, HERE)
 
 
@@ -225,7 +227,7 @@ def test_the_critic_reads_what_was_asked_for(critic):
 def test_back_updating_leaves_the_truth_as_it_was():
     learner, env = learner_of(settings(backupdate=True))
     batch = env.rollout(12, learner.actor, break_when_any_done=False)
-    known = learner.known(batch)
+    known = learner.backupdated_batch(batch)
     assert known["agents", "backupdated"].any()
     assert not known["next", "agents", "global_observation"].equal(
         batch["next", "agents", "global_observation"]
@@ -238,8 +240,8 @@ def test_back_updating_leaves_the_truth_as_it_was():
 
 # On the command line.
 
-TINY = ["frames=200", "worlds=4", "mappo.steps=16", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
-SAC = ["algo=sac", "sac.warm_up=100", "sac.memory=1000", "sac.updates=1"]
+TINY = ["frames=200", "worlds=4", "learner.steps=16", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
+SAC = ["learner=sac", "learner.warm_up=100", "learner.buffer_steps=1000", "learner.updates=1"]
 
 
 @pytest.fixture
@@ -264,7 +266,7 @@ ARMS = [
 
 @pytest.mark.parametrize("overrides", ARMS, ids=["privileged", "privileged sac", "held"])
 def test_a_reference_arm_is_trained_and_flown(train, overrides):
-    folder = train("+delaybench=tracking", "delay=paper", *overrides)
+    folder = train("scenario=delaybench/tracking", "delay=paper", *overrides)
     assert (folder / "result.csv").is_file()
     assert (folder / "learning_curve.png").is_file()
 

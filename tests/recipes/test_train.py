@@ -17,9 +17,9 @@ from train import main
 from damian.envs.pipeline import make_env
 from damian.learners.networks import make_actor, make_critic
 
-TINY = ["frames=256", "worlds=8", "mappo.steps=16", "eval_episodes=4", "model.hidden=[16]"]
-TINY += ["sac.steps=16", "sac.updates=2", "sac.batch=32", "sac.warm_up=100"]
-both_algorithms = pytest.mark.parametrize("algo", ["algo=mappo", "algo=sac"])
+TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
+TINY += ["learner.steps=16", "learner.updates=2", "learner.batch_size=32", "learner.warm_up=100"]
+both_algorithms = pytest.mark.parametrize("algo", ["learner=mappo", "learner=sac"])
 GOLDEN = Path(__file__).parents[1] / "data"
 
 
@@ -61,7 +61,7 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
         ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
         ["scenario=energy", "motion=polynomial", "observation.ctde=true"],
         ["scenario=mixed", "logger=csv", "agents=1"],
-        ["scenario=spotting", "task=tracking", "region=usecase", "actions=continuous"],
+        ["scenario=spotting", "reward=tracking", "region=usecase", "actions=continuous"],
         ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
         ["delay=paper", "aware=both", "motion=polynomial"],
         ["delay=burst", "aware=backupdate", "scenario=mixed", "delay.order=arrival"],
@@ -91,14 +91,14 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
     [
         (["agent=3"], "agent: no such key; did you mean agents?"),
         (["algo=ppo"], "algo: ppo is not one of mappo, sac"),
-        (["algo=sac", "recompute_actor=true", "backupdate=true"], "recompute_actor: True is for algo=mappo"),
-        (["algo=sac", "sac.memory=100", "sac.warm_up=0"], "sac.memory: 100 steps is not at least"),
-        (["algo=sac", "worlds=60", "sac.warm_up=200000"], "sac.warm_up: 200000 steps is not between"),
+        (["learner=sac", "recompute_actor=true", "backupdate=true"], "recompute_actor: True is for algo=mappo"),
+        (["learner=sac", "learner.buffer_steps=100", "learner.warm_up=0"], "learner.memory: 100 steps is not at least"),
+        (["learner=sac", "worlds=60", "learner.warm_up=200000"], "learner.warm_up: 200000 steps is not between"),
         (["clock.skip=true", "model=gru"], "clock.skip: True does not go with model.rnn"),
         (["clock.skip=true", "clock.skip_discount=0.5"], "clock.skip_discount: 0.5 is that of the algorithm"),
         (["observation.own=true", "clock.server=2s", "clock.agents=2s"], "observation.own: True does not go"),
-        (["sac.warm_up=300000"], "sac.warm_up: 300000 is not between 0 and 200000"),
-        (["mappo.lrr=1"], "mappo.lrr: no such key; did you mean mappo.lr?"),
+        (["learner.warm_up=300000"], "learner.warm_up: 300000 is not between 0 and 200000"),
+        (["learner.lrr=1"], "learner.lrr: no such key; did you mean mappo.lr?"),
         (["+motion.foo=1"], "motion.foo: no such key"),
         (["+delay.foo=3"], "delay.foo: no such key"),
         (["delay.obs=-3"], "delay.obs: -3 is neither whole steps such as 3 nor a time such as 3s"),
@@ -113,7 +113,7 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
         (["delay.obs={law: trace, path: nowhere.csv}"], "nowhere.csv: no such file"),
         (["agents=two"], "agents: Value 'two'"),
         (["agents=0"], "agents: 0 is not at least 1"),
-        (["task=foo"], "'task/foo'"),
+        (["reward=foo"], "'task/foo'"),
         (["+usecase=3"], "'usecase/3'"),
         (["motion.degree=4"], "motion.degree: 4 is not one of 3, 5, 7"),
         (["clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
@@ -129,8 +129,8 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
         (["region.start_positions=[[0,0]]"], "region.start_positions: 1 places"),
         (["source.emission=per_stop"], "needs source.motion=dynamic"),
         (
-            ["worlds=7", "mappo.steps=3", "mappo.minibatches=22"],
-            "mappo.minibatches: 22 is not between 1 and 21",
+            ["worlds=7", "learner.steps=3", "learner.minibatches=22"],
+            "learner.minibatches: 22 is not between 1 and 21",
         ),
         (["clock.longest=8s"], "clock.longest: 8s means nothing without clock.trigger"),
         (["clock.trigger=2s", "clock.shortest=64s"], "clock.system: 32 steps is out of clock.shortest"),
@@ -144,7 +144,7 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
         (["worlds=1000000000000"], "worlds: 1000000000000 is not between 1 and 1e+06"),
         (["model.hidden=[100000000000]"], "model.hidden: 100000000000 is not between"),
         (["motion.max_speed=1e-300"], "motion.max_speed: 1e-300 m/s is not at least 0.001 m/s"),
-        (["task=3"], "'task/3'"),
+        (["reward=3"], "'task/3'"),
         (["algo=null"], "algo"),
         (["region.pool=64"], "region.pool: 64 means nothing with region.kind=fir"),
         (["episode.discharged_share=0.5"], "episode.discharged_share: 0.5 needs battery.enabled"),
@@ -183,7 +183,7 @@ def test_a_resumed_run_goes_on_below_its_own_rows(run, algo):
 
 
 def test_a_resumed_run_with_a_triggered_clock_goes_on_with_its_period(run):
-    quiet = ["source.level_db=106", "mappo.steps=4", "clock.trigger=2s", "clock.longest=10s"]
+    quiet = ["source.level_db=106", "learner.steps=4", "clock.trigger=2s", "clock.longest=10s"]
     folder = run(*TINY, *quiet, "frames=80", "delay.obs=2", "backupdate=true", folder="first")
     assert [row["frames"] / 8 for row in metrics(folder)] == [4, 4 + 6]
     run(f"resume={folder}", "frames=300", folder="second")
@@ -193,8 +193,8 @@ def test_a_resumed_run_with_a_triggered_clock_goes_on_with_its_period(run):
 
 def test_a_run_begins_with_the_policy_of_a_checkpoint_and_its_overrides(run):
     first = run(*TINY, "agents=2", folder="first")
-    still = run(f"checkpoint={first}", "mappo.lr=1e-30", "seed=1", folder="still")
-    fresh = run(*TINY, "agents=2", "mappo.lr=1e-30", "seed=1", folder="fresh")
+    still = run(f"checkpoint={first}", "learner.lr=1e-30", "seed=1", folder="still")
+    fresh = run(*TINY, "agents=2", "learner.lr=1e-30", "seed=1", folder="fresh")
     learnt, kept, other = (weights(folder, "actor", "critic") for folder in (first, still, fresh))
     assert {name.partition(".")[0] for name in learnt} == {"actor", "critic"}
     assert all(kept[name].equal(learnt[name]) for name in learnt)
@@ -205,7 +205,7 @@ def test_a_run_begins_with_the_policy_of_a_checkpoint_and_its_overrides(run):
 
 def test_one_algorithm_begins_with_the_policy_of_the_other(run):
     first = run(*TINY, folder="first")
-    second = run(*TINY, f"checkpoint={first}", "algo=sac", "sac.lr=1e-30", folder="second")
+    second = run(*TINY, f"checkpoint={first}", "learner=sac", "learner.lr=1e-30", folder="second")
     one, other = (weights(folder, "actor") for folder in (first, second))
     assert all(other[name].equal(one[name]) for name in one)
 
@@ -227,7 +227,7 @@ def test_every_policy_is_evaluated_in_the_same_episodes(run):
 
 
 def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):
-    folder = run(*TINY, "mappo.steps=16", folder="first")
+    folder = run(*TINY, "learner.steps=16", folder="first")
     with (folder / "metrics.csv").open("a") as file:
         file.write(",".join(["99999"] + ["0"] * (len(metrics(folder)[0]) - 1)) + "\n")
     run(f"resume={folder}", "frames=384", folder="second")
@@ -273,7 +273,7 @@ def test_a_folder_that_holds_a_run_is_not_written_over(run, capsys):
 
 
 def test_each_reward_term_has_its_column(run):
-    rows = metrics(run(*TINY, "task=tracking", "scenario=spotting"))
+    rows = metrics(run(*TINY, "reward=tracking", "scenario=spotting"))
     assert {"reward/spotting_agents", "reward/source_distance", "reward/source_time"} <= set(rows[0])
 
 
@@ -282,8 +282,8 @@ def test_a_run_without_a_single_decision_in_a_batch_goes_on(run):
         "agents=1",
         "worlds=1",
         "frames=60",
-        "mappo.steps=4",
-        "mappo.minibatches=1",
+        "learner.steps=4",
+        "learner.minibatches=1",
         "motion=polynomial",
         "motion.max_speed=5",
         "clock.simulation=1s",
@@ -314,7 +314,7 @@ def test_a_sweep_fills_one_folder_per_run(run, tmp_path):
 
 @pytest.mark.parametrize("case", [1, 2])
 def test_use_case_presets_are_the_golden_scenarios(run, case):
-    folder = run(*TINY, f"+usecase={case}", "mappo.minibatches=1")
+    folder = run(*TINY, f"+usecase={case}", "learner.minibatches=1")
     config = OmegaConf.load(folder / "config.yaml")
     golden = json.loads((GOLDEN / f"usecase{case}.json").read_text())
     scenario = golden["scenario"]

@@ -10,14 +10,15 @@ from torch import Tensor
 from torchrl.data import SamplerWithoutReplacement, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
-from damian.replay.backupdate import BackupdateStorage, server_view
-from damian.replay.hindsight import Mail, hindsight, over_before
-from damian.server.features import Snapshot
-from damian.server.rewards import EpisodeConfig
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
+from damian.replay.recompute import server_recompute
+from damian.server.termination import EpisodeConfig
+from damian.world.messages import Messages
 
 LONGEST = 5
 LATE = {"law": "uniform", "low": 0, "high": LONGEST}
@@ -27,7 +28,7 @@ WORLDS, UAVS = 3, 2
 # The pure function, against a loop.
 
 
-def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> tuple[Mail, Tensor]:
+def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> tuple[MessageLog, Tensor]:
     """Random messages that say when they were sent, what is held of them, and where episodes begin."""
 
     def rand(*shape: int) -> Tensor:
@@ -46,7 +47,7 @@ def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> t
                 came = [g for g in range(start, t + 1) if 0 <= delay[g, b, i] <= t - g]
                 latest = [g for g in came if g + delay[g, b, i] == max(h + delay[h, b, i] for h in came)]
                 held[t, b, i] = max((came if order == "generation" else latest), default=start - 1)
-    return Mail(sent.unsqueeze(-1).float(), delay, held.unsqueeze(-1).float(), sent - held), begins
+    return MessageLog(sent.unsqueeze(-1).float(), delay, held.unsqueeze(-1).float(), sent - held), begins
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])
@@ -56,7 +57,7 @@ def test_hindsight_does_what_a_loop_over_messages_does(loss, order):
     for _ in range(20):
         given, begins = mail(16, loss, order, generator)
         now = int(torch.randint(16, (), generator=generator))
-        known = hindsight(given, now)[..., 0]
+        known = latest_arrived(given, now)[..., 0]
         for b in range(WORLDS):
             for i in range(UAVS):
                 for t in range(now + 1):
@@ -72,7 +73,7 @@ def test_nothing_that_arrives_after_the_learning_instant_is_used():
     later = (arrives > now) | (torch.arange(16).view(-1, 1, 1) > now)
     spoilt = given._replace(sent=torch.where(later.unsqueeze(-1), torch.nan, given.sent))
     assert later[: now + 1].any()
-    assert hindsight(spoilt, now)[: now + 1].equal(hindsight(given, now)[: now + 1])
+    assert latest_arrived(spoilt, now)[: now + 1].equal(latest_arrived(given, now)[: now + 1])
 
 
 def test_an_episode_is_over_after_its_first_end():
@@ -80,9 +81,9 @@ def test_an_episode_is_over_after_its_first_end():
         return torch.tensor(flags, dtype=torch.bool).unsqueeze(-1)
 
     ended, begins = column(0, 1, 0, 1, 0, 0, 1), column(1, 0, 0, 0, 1, 0, 0)
-    assert over_before(ended, begins, torch.zeros(1).bool()).equal(column(0, 0, 1, 1, 0, 0, 0))
+    assert ended_before(ended, begins, torch.zeros(1).bool()).equal(column(0, 0, 1, 1, 0, 0, 0))
     begins[0] = False
-    assert over_before(ended, begins, torch.ones(1).bool()).equal(column(1, 1, 1, 1, 0, 0, 0))
+    assert ended_before(ended, begins, torch.ones(1).bool()).equal(column(1, 1, 1, 1, 0, 0, 0))
 
 
 # The storage, on flights.
@@ -106,7 +107,7 @@ def buffer(
     scenario: ScenarioConfig, capacity: int, n_worlds: int = 4, actor: bool = False, **options
 ) -> TensorDictReplayBuffer:
     env = make_env(scenario, n_worlds)
-    view = server_view(env.base_env.server, terms=True, actor=actor)
+    view = server_recompute(env.base_env.server, terms=True, actor=actor)
     storage = BackupdateStorage(capacity * n_worlds, view, LONGEST)
     return TensorDictReplayBuffer(storage=storage, batch_size=8, **options)
 
@@ -182,7 +183,7 @@ def test_backupdated_is_where_something_newer_than_what_was_held_came_late(motio
         stored.extend(part)
     flags = in_order(stored, 40)["agents", "backupdated"].squeeze(-1)
     delay = late["next", "agents", "delay"].squeeze(-1)
-    held = Snapshot.unpack(late["next", "agents", "received"]).time
+    held = Messages.unpack(late["next", "agents", "received"]).time
     step_count, expected = late["step_count"].squeeze(-1), torch.zeros_like(flags)
     for b in range(4):
         for t in range(40):
@@ -301,5 +302,5 @@ def test_it_is_saved_and_goes_on_as_before(tmp_path):
 
 def test_the_message_of_a_uav_says_when_it_was_sent():
     late = flight(replace(square(), delay=DelayConfig(obs=LATE)), 12)
-    sent = Snapshot.unpack(late["next", "agents", "message"])
+    sent = Messages.unpack(late["next", "agents", "message"])
     assert sent.time.equal(late["next", "step_count"].float().expand_as(sent.time))

@@ -13,7 +13,7 @@ from damian.envs.pipeline import make_env
 from damian.learners.mappo import MappoConfig, add_advantages
 from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.replay.smdp import find_decisions, transitions
-from damian.server.rewards import EpisodeConfig
+from damian.server.termination import EpisodeConfig
 
 GAMMA = 0.9
 

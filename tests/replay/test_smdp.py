@@ -94,5 +94,5 @@ def test_a_flight_of_three_steps_by_hand():
 def test_each_of_them_may_be_drawn_and_nothing_else():
     found = find_decisions(*flags(2))
     rows = {tuple(row) for row in torch.stack(found, -1).tolist()}
-    drawn = {tuple(row) for row in torch.stack(found.draw(5000), -1).tolist()}
+    drawn = {tuple(row) for row in torch.stack(found.sample(5000), -1).tolist()}
     assert drawn == rows

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig, Snapshot, observe, stack
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig, observe, stack
+from damian.world.messages import Messages
 
 NAMES = [name for name in (*LOCAL, *GLOBAL) if name != "coverage"]
 seeds = st.integers(0, 2**32 - 1)
@@ -111,12 +112,12 @@ def test_what_nobody_wants_is_not_computed():
 def test_leading_dimensions_are_free():
     snapshot, server = snapshot_of(random_worlds(0, 3, 0.5, 0.5))
     expected = stack(observe(snapshot, server, NAMES), NAMES)
-    deep = Snapshot(*[field.unflatten(0, (2, 2)) for field in snapshot])
+    deep = Messages(*[field.unflatten(0, (2, 2)) for field in snapshot])
     now, scale = (x.unflatten(0, (2, 2)) for x in (server.now, server.scale))
     seen = stack(observe(deep, server._replace(now=now, scale=scale), NAMES), NAMES)
     assert seen.shape == (2, 2, 3, len(NAMES) + 1)
     assert seen.flatten(0, 1).equal(expected)
-    alone = Snapshot(*[field[1] for field in snapshot])
+    alone = Messages(*[field[1] for field in snapshot])
     one = server._replace(now=server.now[1], scale=server.scale[1])
     torch.testing.assert_close(stack(observe(alone, one, NAMES), NAMES), expected[1])
 

@@ -11,18 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
-from damian.server.rewards import (
-    INDIVIDUAL,
-    SYSTEM,
-    Counters,
-    EpisodeConfig,
-    RewardConfig,
-    Status,
-    final_reward,
-    reward,
-    share_of,
-    status,
-)
+from damian.server.rewards import INDIVIDUAL, SYSTEM, Counters, RewardConfig, final_reward, reward
+from damian.server.termination import EpisodeConfig, Status, share_of, status
 
 NAMES = (*INDIVIDUAL, *SYSTEM)
 
@@ -200,15 +190,15 @@ def test_a_failure_costs_the_penalty_whether_by_time_or_by_battery(terminated):
     [
         (
             lambda: RewardConfig(coverage=math.nan),
-            "task.coverage: nan is not a finite weight",
+            "reward.coverage: nan is not a finite weight",
         ),
         (
             lambda: RewardConfig(drift="rough"),
-            "task.drift: rough is not one of smooth, printed",
+            "reward.drift: rough is not one of smooth, printed",
         ),
         (
             lambda: RewardConfig(desired_spotting=1.5),
-            "task.desired_spotting: 1.5 is not between 0 and 1",
+            "reward.desired_spotting: 1.5 is not between 0 and 1",
         ),
         (
             lambda: EpisodeConfig(max_steps=0),

@@ -13,13 +13,13 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from damian.common.errors import InputError
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import ACTION, REWARD, DelayedEnv, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.rewards import EpisodeConfig
-from damian.transforms.skip_until_ready import FastForward
+from damian.server.termination import EpisodeConfig
+from damian.transforms.skip_until_ready import SkipUntilReady
 from damian.world.landing import ActionConfig
 
 LATE = {"law": "uniform", "low": 1, "high": 5, "probability": 0.6}
@@ -59,8 +59,8 @@ def skips(scenario: ScenarioConfig, gamma: float = 1.0) -> ScenarioConfig:
 
 def choices(env: DelayedEnv) -> Tensor:
     """What each world does after each of its moments, [N_MOMENTS, B, N]."""
-    shape, generator = (N_MOMENTS, *env.batch_size, env.worlds.n_agents), torch.Generator().manual_seed(3)
-    return torch.randint(env.worlds.scenario.actions.n_actions, shape, generator=generator)
+    shape, generator = (N_MOMENTS, *env.batch_size, env.uav_env.n_agents), torch.Generator().manual_seed(3)
+    return torch.randint(env.uav_env.scenario.actions.n_actions, shape, generator=generator)
 
 
 def interrupt(
@@ -95,7 +95,7 @@ def by_steps(
     ends = 0
     while min(map(len, shown)) < 2 * N_MOMENTS:
         chosen = actions[moments.clamp(max=N_MOMENTS - 1), torch.arange(N_WORLDS)]
-        ignored = torch.randint(env.worlds.scenario.actions.n_actions, chosen.shape, generator=generator)
+        ignored = torch.randint(env.uav_env.scenario.actions.n_actions, chosen.shape, generator=generator)
         chosen = torch.where((passed == 0).unsqueeze(-1), chosen, ignored)
         after, td = env.step_and_maybe_reset(td.set(ACTION, chosen))
         seen = after["next"].clone()
@@ -231,11 +231,11 @@ def test_an_impossible_discount_is_refused(clock, told):
 @pytest.mark.parametrize("gamma", [-0.1, 1.1])
 def test_a_transform_with_an_impossible_discount_is_refused(gamma):
     with pytest.raises(InputError, match=f"gamma: {gamma}"):
-        FastForward(gamma)
+        SkipUntilReady(gamma)
 
 
 def test_where_nothing_can_stand_still_there_is_no_skipping():
-    env = TransformedEnv(UavEnv(square(), 2), FastForward())
+    env = TransformedEnv(UavEnv(square(), 2), SkipUntilReady())
     with pytest.raises(RuntimeError, match="FastForward works only in a DelayedEnv"):
         env.rollout(2)
 

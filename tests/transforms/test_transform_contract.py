@@ -32,17 +32,17 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
 from damian.common.errors import InputError
-from damian.delays.laws import DelayConfig
+from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
-    Clock,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
+    SampleAndHold,
     ServerNode,
-    Stateful,
+    StatefulTransform,
 )
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -58,7 +58,7 @@ def test_the_contract_covers_every_transform():
     concrete = {
         name
         for name, what in exported.items()
-        if inspect.isclass(what) and issubclass(what, Transform) and what is not Stateful
+        if inspect.isclass(what) and issubclass(what, Transform) and what is not StatefulTransform
     }
     assert concrete == {name.split(",")[0] for name in CASES}
     assert all(type(case.make()).__name__ == name.split(",")[0] for name, case in CASES.items())
@@ -391,7 +391,7 @@ WRONG = {
     "a history before an action delay": (lambda: ActionHistory(2), lambda: ActionDelay(LATE)),
     "a history before a clock of actions": (
         lambda: ActionHistory(2),
-        lambda: Clock(2, in_keys_inv=["action"]),
+        lambda: SampleAndHold(2, in_keys_inv=["action"]),
     ),
     "an observation delay after a history that appends": (
         lambda: ActionHistory(2, append_to="observation"),
@@ -399,7 +399,7 @@ WRONG = {
     ),
     "a clock after a history that appends": (
         lambda: ActionHistory(2, append_to="observation"),
-        lambda: Clock(2),
+        lambda: SampleAndHold(2),
     ),
     "a history that appends to what is made later": (
         lambda: ActionHistory(2, append_to="late"),
@@ -410,10 +410,10 @@ RIGHT = {
     "a history after an action delay": (lambda: ActionDelay(LATE), lambda: ActionHistory(2)),
     "a history that appends after a delay": (delay, lambda: ActionHistory(2, append_to="observation")),
     "a history that appends after a clock": (
-        lambda: Clock(2, in_keys_inv=["action"]),
+        lambda: SampleAndHold(2, in_keys_inv=["action"]),
         lambda: ActionHistory(2, append_to="observation"),
     ),
-    "a clock after a history that stands alone": (lambda: ActionHistory(2), lambda: Clock(2)),
+    "a clock after a history that stands alone": (lambda: ActionHistory(2), lambda: SampleAndHold(2)),
     "an action delay after an observation delay": (delay, lambda: ActionDelay(LATE)),
     "sums of late rewards": (lambda: RewardDelay(LATE), lambda: CumulativeReward(3)),
     "late sums of rewards": (lambda: CumulativeReward(3), lambda: RewardDelay(LATE)),
@@ -472,7 +472,7 @@ def server():
     return ServerNode(unserved().server)
 
 
-@pytest.mark.parametrize("late", [uplink, lambda: RewardDelay(2, REWARD), lambda: Clock(2, [SEEN])])
+@pytest.mark.parametrize("late", [uplink, lambda: RewardDelay(2, REWARD), lambda: SampleAndHold(2, [SEEN])])
 def test_a_server_node_stands_between_what_it_reads_and_what_reads_it(late):
     chain = [uplink, server, late] if late is not uplink else [uplink, server]
     env = TransformedEnv(unserved(), Compose(*(make() for make in chain)))

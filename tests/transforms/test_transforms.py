@@ -29,11 +29,11 @@ from damian.delays.laws import Burst, Geometric, Trace, Uniform
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
-    Clock,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
-    Stateful,
+    SampleAndHold,
+    StatefulTransform,
 )
 
 ACTION, REWARD, OBSERVATION = ("agents", "action"), ("agents", "reward"), ("agents", "observation")
@@ -64,7 +64,7 @@ def law(request, tmp_path):
     return LAWS[request.param](tmp_path)
 
 
-def delayed(*transforms: Stateful, worlds: Sequence[int] = WORLDS, **options: Any) -> TransformedEnv:
+def delayed(*transforms: StatefulTransform, worlds: Sequence[int] = WORLDS, **options: Any) -> TransformedEnv:
     """The counting worlds with transforms that draw for each world by itself."""
     for transform in transforms:
         transform.seed_worlds(torch.tensor(worlds))
@@ -101,12 +101,12 @@ def after(shown: Sequence[TensorDictBase], *key: str) -> list:
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])
-@pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "talks")])
+@pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "message_sent")])
 def test_everyone_holds_the_message_that_a_loop_over_messages_says(law, order, loss, sent_key):
     options = {"loss": loss, "order": order, "sent_key": sent_key, "fresh_key": "fresh", "delay_key": "delay"}
     transform = ObservationDelay(law, [OBSERVATION], [("agents", "seen")], **options)
     shown = play(delayed(transform), choices())
-    sent, talks = column(shown, *OBSERVATION), column(shown, "agents", "talks")
+    sent, message_sent = column(shown, *OBSERVATION), column(shown, "agents", "message_sent")
     told = {key: column(shown, "agents", key) for key in ("seen", "age", "fresh", "delay")}
     table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
     done, lost = column(shown, "done"), transform.sampler.lost
@@ -116,7 +116,7 @@ def test_everyone_holds_the_message_that_a_loop_over_messages_says(law, order, l
         for now in range(1, STEPS + 1):
             at, reset = 2 * now - 1, 2 * now
             delay = table[now - 1][row]
-            travels = delay < lost and (sent_key is None or talks[at][w][n])
+            travels = delay < lost and (sent_key is None or message_sent[at][w][n])
             fresh = receiver.step(now, sent[at][w][n], delay if travels else None)
             expected = [
                 receiver.holds.content,
@@ -134,7 +134,7 @@ def test_everyone_holds_the_message_that_a_loop_over_messages_says(law, order, l
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
 def test_everyone_executes_the_action_that_a_loop_over_choices_says(law, loss, sent_key):
     default = 5
-    options = {"loss": loss, "sent_key": sent_key, "fresh_key": "acts", "default": default}
+    options = {"loss": loss, "sent_key": sent_key, "fresh_key": "action_valid", "default": default}
     transform, chosen = ActionDelay(law, ACTION, **options), choices()
     shown = play(delayed(transform), chosen)
     ready = before(shown, "agents", "ready")
@@ -202,10 +202,12 @@ def test_the_cumulative_reward_is_equation_4(steps, gamma):
 @pytest.mark.parametrize("period", [1, 2, 3, 5])
 def test_between_two_ticks_what_is_seen_and_done_stays_and_nobody_is_ready(period):
     chosen, raw = choices(), Counting(WORLDS, N_AGENTS)
-    clock = Clock(period, [("agents", "talks")], [ACTION], ready_key=("agents", "ready"))
+    clock = SampleAndHold(period, [("agents", "message_sent")], [ACTION], ready_key=("agents", "ready"))
     shown, bare = play(delayed(clock), chosen), play(raw, chosen)
-    ready, seen = column(shown, "agents", "ready"), column(shown, "agents", "talks")
-    free, sent, done = (column(bare, *key) for key in (("agents", "ready"), ("agents", "talks"), ("done",)))
+    ready, seen = column(shown, "agents", "ready"), column(shown, "agents", "message_sent")
+    free, sent, done = (
+        column(bare, *key) for key in (("agents", "ready"), ("agents", "message_sent"), ("done",))
+    )
     executed = column(shown, *OBSERVATION)
     for w, n in ROWS:
         elapsed, holds, does = 0, sent[0][w][n], None
@@ -233,12 +235,16 @@ def test_everyone_remembers_the_actions_that_a_list_of_them_holds(steps, recorde
     found = torch.stack([td["agents", "action_history"] for td in shown])
     ready, done = before(shown, "agents", "ready"), after(shown, "done")
     for w, n in ROWS:
-        taken = []
+        select_entries = []
         for t in range(STEPS):
-            taken += [chosen[t][w, n].item()] * (recorded_key is None or ready[t][w][n])
-            assert found[2 * t + 1, w, n].equal(torch.tensor(last_actions(taken, steps, default)) / 6)
-            taken = [] if done[t][w][0] else taken
-            assert found[2 * t + 2, w, n].equal(torch.tensor(last_actions(taken, steps, default)) / 6)
+            select_entries += [chosen[t][w, n].item()] * (recorded_key is None or ready[t][w][n])
+            assert found[2 * t + 1, w, n].equal(
+                torch.tensor(last_actions(select_entries, steps, default)) / 6
+            )
+            select_entries = [] if done[t][w][0] else select_entries
+            assert found[2 * t + 2, w, n].equal(
+                torch.tensor(last_actions(select_entries, steps, default)) / 6
+            )
 
 
 @pytest.mark.parametrize("recorded_key", [None, "ready"])
@@ -251,14 +257,14 @@ def test_only_actions_that_what_is_shown_cannot_know_of_are_remembered(law, reco
     ages = column(shown, "agents", "age")
     ready, done = before(shown, "agents", "ready"), after(shown, "done")
     for w, n in ROWS:
-        taken: list[tuple[int, int]] = []
+        select_entries: list[tuple[int, int]] = []
         for t in range(STEPS):
-            taken += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
-            latest = last_actions(taken, 3, (-STEPS, default))
+            select_entries += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
+            latest = last_actions(select_entries, 3, (-STEPS, default))
             since = t + 1 - ages[2 * t + 1][w][n][0]  # when the message that is shown was generated
             unknown = [action if at >= since else default for at, action in latest]
             assert found[2 * t + 1, w, n].equal(torch.tensor(unknown) / 6)
-            taken = [] if done[t][w][0] else taken
+            select_entries = [] if done[t][w][0] else select_entries
 
 
 def test_the_actions_that_are_remembered_are_the_chosen_ones_not_the_executed():
@@ -336,7 +342,7 @@ def bare_history(kind: str) -> list[TensorDictBase]:
     return history(KINDS[kind].make(), KINDS[kind].steps)
 
 
-TRANSFORMS: dict[str, Callable[[Kind, Any], Stateful]] = {
+TRANSFORMS: dict[str, Callable[[Kind, Any], StatefulTransform]] = {
     "observation": lambda kind, law: ObservationDelay(law, [kind.observation], seed=1),
     "observation by arrival": lambda kind, law: ObservationDelay(
         law, [kind.observation], order="arrival", seed=1, fresh_key="fresh", delay_key="delay"
@@ -382,7 +388,7 @@ def test_without_a_delay_nothing_changes(kind, transform, nothing, tmp_path):
 def test_a_clock_that_always_ticks_a_window_of_a_step_and_a_memory_change_nothing(kind):
     of = KINDS[kind]
     for transform in (
-        Clock(1, [of.observation], [of.action]),
+        SampleAndHold(1, [of.observation], [of.action]),
         CumulativeReward(1, 0.5, of.reward),
         ActionHistory(2, of.action),
     ):
@@ -401,7 +407,7 @@ def test_every_delay_keeps_the_specs_of_every_environment(kind, law):
 def test_clocks_sums_and_memories_keep_the_specs_of_every_environment(kind):
     of = KINDS[kind]
     for transform in (
-        Clock(3, [of.observation], [of.action]),
+        SampleAndHold(3, [of.observation], [of.action]),
         CumulativeReward(4, 0.9, of.reward),
         ActionHistory(2, of.action),
         ActionHistory(2, of.action, append_to=of.observation),
@@ -417,7 +423,7 @@ def test_all_of_them_together_keep_the_specs_of_every_environment(kind):
         ObservationDelay(PAPER, [of.observation], loss=0.1, fresh_key="fresh", delay_key="delay"),
         RewardDelay(1, of.reward),
         CumulativeReward(3, 0.9, of.reward),
-        Clock(2, [of.observation]),
+        SampleAndHold(2, [of.observation]),
         ActionHistory(2, of.action, append_to=of.observation),
     ]
     check_env_specs(TransformedEnv(of.make(), Compose(*chain)), seed=0, break_when_any_done="both")
@@ -472,7 +478,8 @@ def test_a_choice_changes_nothing_before_it_is_executed():
     others = choices(n_steps=20)
     others[6][2, 1] += 1  # chosen before the 7th step
     rollouts = [
-        play(delayed(ActionDelay(4, ACTION), ends=0.0), acts) for acts in (choices(n_steps=20), others)
+        play(delayed(ActionDelay(4, ACTION), ends=0.0), action_valid)
+        for action_valid in (choices(n_steps=20), others)
     ]
     assert differs(*rollouts, *OBSERVATION).equal(lasting(11, 20, 2, 1, 20))
 
@@ -487,15 +494,17 @@ def test_a_reward_changes_nothing_before_it_is_paid():
 # Batches.
 
 
-def chain() -> list[Stateful]:
+def chain() -> list[StatefulTransform]:
     """One of each, all of them random where they can be."""
     keys = {"fresh_key": "fresh", "delay_key": "delay"}
     return [
         ActionDelay(Geometric(1, 4), ACTION, loss=0.1, sent_key="ready"),
-        ObservationDelay(Burst(0.2, 0.3), [OBSERVATION], [("agents", "seen")], sent_key="talks", **keys),
+        ObservationDelay(
+            Burst(0.2, 0.3), [OBSERVATION], [("agents", "seen")], sent_key="message_sent", **keys
+        ),
         RewardDelay(PAPER, REWARD),
         CumulativeReward(3, 0.9, REWARD),
-        Clock(2, [("agents", "seen")], ready_key=("agents", "ready")),
+        SampleAndHold(2, [("agents", "seen")], ready_key=("agents", "ready")),
         ActionHistory(3, ACTION, append_to=("agents", "seen"), recorded_key="ready"),
     ]
 

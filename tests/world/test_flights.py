@@ -30,12 +30,13 @@ from helpers import (
     usecase,
 )
 
-from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.rewards import EpisodeConfig
+from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig, flight_drain
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 from damian.world.state import State
 
@@ -51,7 +52,7 @@ def test_uavs_stand_on_landing_points_of_their_own_inside_the_region(n_agents, k
         kind="vertices",
         vertices=[[0.0, 0.0], [90.0, 0.0], [90.0, 40.0], [40.0, 40.0], [40.0, 90.0], [0.0, 90.0]],
         lattice_step=24.0,
-        situations=16,
+        initial_conditions=16,
         start_together=together,
     )
     scenario = ScenarioConfig(
@@ -79,7 +80,7 @@ def test_uavs_stand_on_landing_points_of_their_own_inside_the_region(n_agents, k
             clash &= ~both
         assert not clash.any()
         assert (goal < airspace.n_points[0]).all()
-        landed = env.simulation.landed(env.state)
+        landed = env.simulation.vehicles.on_ground(env.state)
         place = env.state.position[landed]
         assert place[..., :2].equal(env.simulation.points[goal[landed]])
         assert place[..., 2].abs().max(dim=0).values < 1e-5
@@ -133,7 +134,7 @@ def test_a_uav_is_ready_again_once_it_has_landed_and_sensed(sensing):
     shown += [go(env, EAST) for _ in range(math.ceil(duration + sensing) - 1)]
     for seconds, td in enumerate(shown, start=1):
         assert td["agents", "ready"].item() == (seconds >= duration + sensing)
-        assert td["agents", "talks"].item() == (seconds >= duration)
+        assert td["agents", "message_sent"].item() == (seconds >= duration)
     assert shown[-1]["agents", "ready"].item()
 
 
@@ -143,11 +144,11 @@ def test_in_flight_the_message_stays_the_last_one_and_its_time_does_too():
     flown = go(env, EAST)
     duration, landing = flight(env), None
     for _ in range(math.ceil(duration) - 1):
-        assert not flown["agents", "talks"].item()
+        assert not flown["agents", "message_sent"].item()
         assert flown["agents", "message"].equal(before)
         landing = flown = go(env, HERE)
     message = told(landing)
-    assert landing["agents", "talks"].item()
+    assert landing["agents", "message_sent"].item()
     assert message.time.item() == math.ceil(duration)
     assert message.position[0, 0].equal(env.simulation.points[env.state.goal.item()])
     assert message.position.equal(message.target)
@@ -205,7 +206,7 @@ def test_a_masked_action_holds_and_a_legal_one_that_leads_elsewhere_moves(energy
     battery = BatteryConfig(enabled=energy, capacity_kwh=0.05)
     scenario = ScenarioConfig(
         agents=1,
-        region=RegionConfig(min_area=20_000, max_area=50_000, pool=2, situations=8),
+        region=RegionConfig(min_area=20_000, max_area=50_000, pool=2, initial_conditions=8),
         battery=battery,
         episode=KEEPS_GOING,
     )
@@ -262,7 +263,7 @@ def test_the_trail_takes_one_place_for_each_decision_however_long_the_uav_senses
     for _ in range(60):
         due |= env.simulation.ready(env.state)
         shown = act(env, random_actions(env, generator))
-        for b, n in (due & shown["agents", "talks"]).nonzero().tolist():
+        for b, n in (due & shown["agents", "message_sent"]).nonzero().tolist():
             expected[b][n] = [env.state.goal[b, n].item(), *expected[b][n][:-1]]
             due[b, n] = False
             landings += 1
@@ -278,7 +279,7 @@ def test_a_uav_that_cannot_fly_there_keeps_nobody_else_from_a_point():
     bearing = torch.atan2(east, north) / math.tau % 1
     action = torch.stack([torch.hypot(east, north) / max(actions.distances), bearing], -1)
     state, goal = env.state, torch.tensor([pair])
-    cost = flight_drain(env.simulation.vertical[0], torch.hypot(east, north)[0], env.scenario.battery).item()
+    cost = flight_drain(env.simulation.vehicles.vertical[0], torch.hypot(east, north)[0], env.scenario.battery).item()
     for level, booked in ((100.0, [aim, None]), (0.99 * cost, [pair[0], aim]), (0.0, [pair[0], aim])):
         battery = torch.tensor([[level, 100.0]])
         env.state = state._replace(goal=goal, origin=goal, battery=battery)

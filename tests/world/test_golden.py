@@ -18,9 +18,11 @@ from helpers import DATA, GOLDEN, act, nearest, told, usecase
 
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.features import Knowledge, Snapshot, observe
-from damian.server.rewards import Counters, RewardConfig, final_reward, reward, status
+from damian.server.features import ServerContext, observe
+from damian.server.rewards import Counters, RewardConfig, final_reward, reward
+from damian.server.termination import status
 from damian.world.battery import BatteryConfig
+from damian.world.messages import Messages
 from damian.world.motion import MotionConfig
 
 EPISODES = "episodes_usecase_settings"
@@ -194,7 +196,7 @@ def test_recorded_points_give_the_recorded_detections_and_motions(case, n_flags,
     assert (motions[side_effect] > 0).all()
 
 
-def scene(case: int, records: list[Move]) -> tuple[Snapshot, Knowledge, Counters]:
+def scene(case: int, records: list[Move]) -> tuple[Messages, ServerContext, Counters]:
     """What the server knew after each transition; everybody believes in its estimate."""
     golden = GOLDEN[case]["scenario"]
     place = column(records, "positions")
@@ -205,7 +207,7 @@ def scene(case: int, records: list[Move]) -> tuple[Snapshot, Knowledge, Counters
     flags = [[i in m.after["server"]["spotting_ids"] for i in ids] for m in records]
     number = torch.tensor([m.number for m in records])
     motions = torch.tensor([m.motions for m in records]) + 1
-    snapshot = Snapshot(
+    snapshot = Messages(
         time=zeros + number[:, None],
         position=place,
         target=place,
@@ -217,7 +219,7 @@ def scene(case: int, records: list[Move]) -> tuple[Snapshot, Knowledge, Counters
         detected_position=zeros[..., None] + estimate[:, None],
         trail=torch.zeros(*zeros.shape, 2, dtype=torch.long),
     )
-    server = Knowledge(
+    server = ServerContext(
         now=number.float(),
         scale=torch.full((len(records),), golden["max_distance_normaliser_m"]),
         time_scale=golden["time_max_normaliser"],
@@ -367,9 +369,9 @@ def test_recorded_episodes_have_the_recorded_totals_and_ends(case, ends):
     snapshot, server, counters = scene(case, records)
     never = torch.zeros(len(records), dtype=torch.bool)
     ended = status(snapshot, counters.steps, server.now, never, 1.0, config.episode)
-    terms = reward(observe(snapshot, server, config.task.terms), counters, config.task)
+    terms = reward(observe(snapshot, server, config.reward.terms), counters, config.reward)
     total = torch.stack([*terms.values()]).sum(0)
-    total += final_reward(ended, counters, config.task)[:, None]
+    total += final_reward(ended, counters, config.reward)[:, None]
     torch.testing.assert_close(total, column(records, "reward"), atol=TOLERANCE, rtol=0)
     assert total.numel() == {1: 48, 2: 204}[case]
     outcome = [INFO.get(move.after["info"]) for move in records]

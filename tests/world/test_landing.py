@@ -15,7 +15,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
 from damian.world.airspace import build_airspace, inside, nearest_points
-from damian.world.landing import ActionConfig, Candidates, Ranking, book, displacement
+from damian.world.landing import ActionConfig, Candidates, Ranking, assign_landing_points, displacement
 from damian.world.regions.region import Region
 
 
@@ -37,7 +37,7 @@ def fleets(seed, n_worlds, n_agents, n_points, together):
 def booked(ranked, row, standing, ready, n_points):
     """Points booked by UAVs that are ready or not, however far they can fly."""
     ranking = Ranking(ranked, torch.zeros(ranked.shape))
-    return book(ranking, row, standing, torch.where(ready, 0.0, -1.0), n_points)
+    return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0), n_points)
 
 
 @settings(max_examples=150, deadline=None)
@@ -52,7 +52,10 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
     case = fleets(seed, 6, n_agents, n_points, together)
     ranked, row, standing, ready = map(torch.as_tensor, case)
     ours = booked(ranked.int(), row, standing, ready, n_points)
-    expected = [twin.book(ranked[row[b]].tolist(), standing[b].tolist(), ready[b].tolist()) for b in range(6)]
+    expected = [
+        twin.assign_landing_points(ranked[row[b]].tolist(), standing[b].tolist(), ready[b].tolist())
+        for b in range(6)
+    ]
     assert ours.tolist() == expected
 
 
@@ -83,8 +86,8 @@ def test_a_point_that_is_left_in_this_step_is_not_free_yet():
 def test_a_point_out_of_reach_is_left_to_whoever_can_fly_there():
     ranking = Ranking(torch.tensor([[5, 7, 1], [5, 2, 0]]), torch.tensor([[9.0, 4.0, 0.0], [9.0, 0.0, 4.0]]))
     row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
-    assert book(ranking, row, standing, torch.tensor([[8.0, 9.0]]), 8).tolist() == [[1, 5]]
-    assert book(ranking, row, standing, torch.tensor([[9.0, 9.0]]), 8).tolist() == [[5, 2]]
+    assert assign_landing_points(ranking, row, standing, torch.tensor([[8.0, 9.0]]), 8).tolist() == [[1, 5]]
+    assert assign_landing_points(ranking, row, standing, torch.tensor([[9.0, 9.0]]), 8).tolist() == [[5, 2]]
 
 
 def test_from_a_common_start_one_may_stay_and_the_others_leave():
@@ -182,8 +185,8 @@ def test_the_discrete_table_equals_the_continuous_path():
         share = [[d / 153.9, heading(math.degrees(h))] for d, h in table.tolist()]
         action = torch.tensor(share).expand(count, -1, -1)
         regions = torch.full((count,), region)
-        ranking, row = discrete.of(flat, regions, number)
-        loose, loose_row = continuous.of(flat, regions, action)
+        ranking, row = discrete.rank(flat, regions, number)
+        loose, loose_row = continuous.rank(flat, regions, action)
         assert loose_row.shape == row.shape == flat.shape
         assert ranking.point[row][..., :1].long().equal(loose.point[loose_row][..., :1])
         compared += row.numel()
@@ -203,7 +206,7 @@ def test_candidates_are_the_points_nearest_the_target_or_the_own_one(kind):
     if kind == "continuous":
         moves = share[:, 0] * torch.tensor([153.9, 2 * math.pi])
     action = number if kind == "discrete" else share
-    ranking, row = ways.of(flat, torch.zeros(len(flat), dtype=torch.long), action)
+    ranking, row = ways.rank(flat, torch.zeros(len(flat), dtype=torch.long), action)
     outside = 0
     for own, (distance, bearing) in enumerate(moves.tolist()):
         x, y = points[own]

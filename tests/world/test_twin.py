@@ -18,11 +18,13 @@ from helpers import (
     told,
 )
 
-from damian.envs.scenario import RegionConfig, ScenarioConfig
+from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
-from damian.server.rewards import INDIVIDUAL, SYSTEM, EpisodeConfig, RewardConfig
+from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
+from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
+from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 # The slow twin.
@@ -36,7 +38,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> Scena
     task = dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5) | {"coverage": 0.0}
     return ScenarioConfig(
         agents=n_agents,
-        region=RegionConfig(min_area=15_000, max_area=60_000, pool=3, situations=24),
+        region=RegionConfig(min_area=15_000, max_area=60_000, pool=3, initial_conditions=24),
         source=SourceConfig(level_db=138.0),
         actions=ActionConfig(
             kind=kind,
@@ -46,7 +48,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> Scena
         observation=ObservationConfig(
             local_features=list(LOCAL), global_features=TWIN_FEATURES, time_scale=9.0, estimate=estimate
         ),
-        task=RewardConfig(**task, bonus=2.0, bonus_over_steps=True, penalty=0.5),
+        reward=RewardConfig(**task, bonus=2.0, bonus_over_steps=True, penalty=0.5),
         episode=EpisodeConfig(5, since_detection=since, success_share=None if since else 0.5),
         clock=clock("2s"),
     )
@@ -66,7 +68,7 @@ def twins(env: UavEnv) -> list[twin.World]:
             scale=airspace.scale[region].item(),
             time_scale=9.0,
             dt=2.0,
-            task=env.scenario.task,
+            task=env.scenario.reward,
             episode=env.scenario.episode,
             uavs=[twin.Uav(tuple(points[p]), p) for p in first.tolist()],
             newest=env.scenario.observation.estimate == "newest",
@@ -130,7 +132,7 @@ def test_the_coverage_counts_the_last_landing_points_within_a_hundredth():
     window = 3
     scenario = everything(
         observation=ObservationConfig(global_features=["coverage"], window=window),
-        task=RewardConfig(spotted=0.0, coverage=1.0),
+        reward=RewardConfig(spotted=0.0, coverage=1.0),
         episode=KEEPS_GOING,
     )
     env = fresh(scenario, num_worlds=3)

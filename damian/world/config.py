@@ -1,0 +1,65 @@
+"""Settings of the physics: how many UAVs fly over which region, how they move, and what they listen for."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from damian.common import checks
+from damian.world.airspace import Airspace, build_airspace
+from damian.world.battery import BatteryConfig
+from damian.world.landing import ActionConfig
+from damian.world.motion import MotionConfig, flight_levels
+from damian.world.regions.config import RegionConfig
+from damian.world.signal_source import SourceConfig
+
+FLIGHT_LEVEL_M = 30.48
+"""A flight level is a hundred feet."""
+
+
+@dataclass
+class WorldConfig:
+    """Everything that the simulation reads."""
+
+    agents: int = 3
+    """Number of UAVs."""
+    region: RegionConfig = field(default_factory=RegionConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    source: SourceConfig = field(default_factory=SourceConfig)
+    battery: BatteryConfig = field(default_factory=BatteryConfig)
+    actions: ActionConfig = field(default_factory=ActionConfig)
+
+    def __post_init__(self) -> None:
+        checks.in_range("agents", self.agents, 1)
+        flight_levels(self.motion, self.agents)
+        starts = self.region.start_positions
+        checks.require(
+            starts is None or len(starts) == self.agents,
+            "region.start_positions",
+            f"{len(starts or [])} places",
+            f"are not one for each of the {self.agents} UAVs (agents)",
+        )
+
+    def airspace(self, rng: np.random.Generator) -> Airspace:
+        """Regions with their landing lattices.
+
+        Raises:
+            InputError: a wrong file or polygon, or fewer landing points than UAVs.
+        """
+        region = self.region
+        regions = region.regions(rng)
+        for level in flight_levels(self.motion, self.agents):
+            for low, high in (r.levels for r in regions if r.levels is not None):
+                checks.in_range(
+                    "motion.min_level + i * motion.level_separation",
+                    level,
+                    low * FLIGHT_LEVEL_M,
+                    high * FLIGHT_LEVEL_M,
+                    "m",
+                )
+        return build_airspace(
+            regions,
+            region.lattice_step,
+            region.lattice_angle,
+            region.n_landing_points,
+            self.agents,
+        )

@@ -1,0 +1,89 @@
+"""The messages that UAVs send to the server node: their fields, and each message as one row of numbers.
+
+To add a field, declare it in ``Messages`` and fill it in ``Simulation._sense``; packing, delays and replay
+follow from the declaration.
+"""
+
+from typing import Annotated, NamedTuple, get_type_hints
+
+import torch
+from torch import Tensor
+
+MAX_EXACT_INTEGER = 2**24
+"""Messages are rows of float32: integers up to this are exact."""
+
+
+class Column(NamedTuple):
+    """How a field is packed."""
+
+    width: int | None = 1
+    """Numbers that it takes; None for as many as the other fields leave (one field at most)."""
+    dtype: torch.dtype = torch.float32
+
+
+class Messages(NamedTuple):
+    """One message of each UAV, with any leading dimensions; each field [*, N] or [*, N, width].
+
+    A message carries what the paper lists (section 3.2) and, so that features and rewards follow from
+    messages alone, the UAV's count of motions and its latest landing points.
+    """
+
+    time: Annotated[Tensor, Column()]
+    """Generation time [s]."""
+    position: Annotated[Tensor, Column(2)]
+    """East, north [m]."""
+    target: Annotated[Tensor, Column(2)]
+    """Landing point that the UAV is bound for, east, north [m]."""
+    track: Annotated[Tensor, Column()]
+    """Heading of the latest flight, clockwise from north [rad]."""
+    battery: Annotated[Tensor, Column()]
+    """Battery level, not rounded [%]."""
+    spotted: Annotated[Tensor, Column(dtype=torch.bool)]
+    """Does the UAV spot the source."""
+    motions: Annotated[Tensor, Column(dtype=torch.long)]
+    """Motions since the UAV spotted the source before this message, holding included."""
+    detected_time: Annotated[Tensor, Column()]
+    """Time of the latest detection [s]; -1 if there was none."""
+    detected_position: Annotated[Tensor, Column(2)]
+    """Position of the UAV at its latest detection, east, north [m]."""
+    trail: Annotated[Tensor, Column(None, torch.long)]
+    """Flat ids of the UAV's last landing points, newest first, [*, N, window]."""
+
+    @classmethod
+    def blank(cls, trail: Tensor) -> "Messages":
+        """Zeros in every field, no detection, and the given landing points, [*, N, window] long."""
+        width = sum(column.width or 0 for column in _COLUMNS) + trail.shape[-1]
+        blank = cls.unpack(torch.zeros(*trail.shape[:-1], width))
+        return blank._replace(detected_time=blank.detected_time - 1, trail=trail)
+
+    def pack(self) -> Tensor:
+        """Messages as rows of numbers, fields in order, [*, N, M] float32."""
+        fields = zip(self, _COLUMNS, strict=True)
+        parts = [(field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields]
+        return torch.cat(parts, -1)
+
+    @classmethod
+    def unpack(cls, rows: Tensor) -> "Messages":
+        """The fields of packed messages [*, N, M]; float fields are views of them."""
+        rest = rows.shape[-1] - sum(column.width or 0 for column in _COLUMNS)
+        parts = rows.split([column.width or rest for column in _COLUMNS], -1)
+        return cls._make(_read(part, column) for part, column in zip(parts, _COLUMNS, strict=True))
+
+    def age(self, now: Tensor) -> Tensor:
+        """Age of information: time since each message was generated [s], [*, N].
+
+        Args:
+            now: current time [s], [*].
+        """
+        return now.unsqueeze(-1) - self.time
+
+
+_COLUMNS: list[Column] = [
+    hint.__metadata__[0] for hint in get_type_hints(Messages, include_extras=True).values()
+]
+
+
+def _read(part: Tensor, column: Column) -> Tensor:
+    """A field [*, N] or [*, N, width] from its packed numbers [*, N, width]."""
+    field = part.squeeze(-1) if column.width == 1 else part
+    return field > 0.5 if column.dtype == torch.bool else field.to(column.dtype)

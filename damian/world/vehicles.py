@@ -1,0 +1,214 @@
+"""How UAVs move between landing points, how long that takes, and what it does to their batteries."""
+
+from abc import ABC, abstractmethod
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from damian.common.tensors import gather_rows, tree_where
+from damian.world.airspace import Airspace, nearest_points
+from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
+from damian.world.config import WorldConfig
+from damian.world.messages import Messages
+from damian.world.motion import flight_levels, fly, minimum_time
+from damian.world.regions.polygon import MAX_COORDINATE_M
+from damian.world.state import State
+
+TIME_EPS = 1e-4
+"""Seconds; far below any step, far above float32 error within an episode."""
+
+Model = TypeVar("Model", bound="MotionModel")
+
+
+class MotionModel(ABC):
+    """Motion of N UAVs in B worlds, as pure functions of their state.
+
+    Args:
+        config: of motion and battery.
+        airspace: landing points.
+        dt: length of a step [s].
+    """
+
+    instant: bool
+    """Is a UAV at its target as soon as a step ends."""
+
+    def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
+        self.motion, self.battery, self.dt = config.motion, config.battery, dt
+        self.points = airspace.points.flatten(0, 1)
+        self.levels = torch.tensor(flight_levels(config.motion, config.agents))
+        self.vertical = self.shortest_time(self.levels)
+        self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
+        self.charge = float(charge_gain(torch.tensor(dt), config.battery))
+        self.chargers = _charging_points(config, airspace)
+
+    def to(self: Model, device: torch.device) -> Model:
+        """Move the tables, in place."""
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(self, name, value.to(device))
+        return self
+
+    @abstractmethod
+    def ready(self, state: State) -> Tensor:
+        """May each UAV choose now, [B, N]."""
+
+    @abstractmethod
+    def on_ground(self, state: State) -> Tensor:
+        """Does each UAV stand on its landing point, [B, N]."""
+
+    @abstractmethod
+    def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
+        """Legal actions [B, N, A]: the valid ones, but only ``hold`` [A] for a UAV that is not ready [B, N,
+        1]."""
+
+    @abstractmethod
+    def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
+        """Set out for the landing points ``goal``.
+
+        Args:
+            state: before; its ``goal`` is where each UAV stands, or is bound for.
+            goal: flat ids, [B, N].
+            ready: has the UAV chosen just now, [B, N].
+            departs: and chosen to fly, [B, N].
+        """
+
+    @abstractmethod
+    def move(self, state: State) -> State:
+        """Position and battery after a step of ``dt``."""
+
+    @abstractmethod
+    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
+        """The new messages of UAVs on the ground [B, N], and those that the others sent before."""
+
+    @abstractmethod
+    def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
+        """Which UAVs add their landing point to their trail, [B, N]; None for all of them."""
+
+    def reach(self, state: State) -> Tensor:
+        """How far each UAV may fly now [m], [B, N]: 0 if it can only hold, negative if it may not choose."""
+        if self.battery.enabled:
+            left = cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
+        else:
+            left = torch.full_like(state.battery, MAX_COORDINATE_M)
+        return torch.where(self.ready(state), left, -1.0)
+
+    def length(self, origin: Tensor, goal: Tensor) -> Tensor:
+        """Distance between landing points by flat id [m]."""
+        offset = gather_rows(self.points, goal) - gather_rows(self.points, origin)
+        return torch.linalg.vector_norm(offset, dim=-1)
+
+    def shortest_time(self, length: Tensor) -> Tensor:
+        """Duration of a flight phase of this length [s]."""
+        motion = self.motion
+        return minimum_time(length, motion.degree, motion.max_speed, motion.max_acceleration)
+
+    def drain_or_charge(self, state: State, drain: Tensor, rests: Tensor) -> State:
+        """Batteries after a step in which they lose ``drain`` [%], or charge where a UAV rests, each [B,
+        N]."""
+        gain = self.charge * (rests & gather_rows(self.chargers, state.goal))
+        return state._replace(battery=(state.battery - drain + gain).clamp(0, 100))
+
+
+class InstantMotion(MotionModel):
+    """A UAV is at its target when the step ends: "no action delay" in the paper (section 5)."""
+
+    instant = True
+
+    def ready(self, state: State) -> Tensor:
+        return torch.ones_like(state.message_sent)
+
+    def on_ground(self, state: State) -> Tensor:
+        return torch.ones_like(state.message_sent)
+
+    def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
+        return valid
+
+    def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
+        return state._replace(origin=state.goal, goal=goal)
+
+    def move(self, state: State) -> State:
+        place = gather_rows(self.points, state.goal)
+        state = state._replace(position=torch.cat([place, torch.zeros_like(place[..., :1])], -1))
+        if not self.battery.enabled:
+            return state
+        length = self.length(state.origin, state.goal)
+        drain = flight_drain(self.vertical, length, self.battery) * (length > 0)
+        return self.drain_or_charge(state, drain, length == 0)
+
+    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
+        return messages
+
+    def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
+        return action_valid
+
+
+class PolynomialFlight(MotionModel):
+    """Takeoff, level flight and landing take their time; then a UAV senses before it may choose again."""
+
+    instant = False
+
+    def ready(self, state: State) -> Tensor:
+        return state.elapsed >= self.duration(state) + self.motion.sensing_time - TIME_EPS
+
+    def on_ground(self, state: State) -> Tensor:
+        return state.elapsed >= self.duration(state) - TIME_EPS
+
+    def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
+        return torch.where(ready, valid, hold)
+
+    def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
+        state = state._replace(origin=torch.where(ready, state.goal, state.origin), goal=goal)
+        cruise = self.shortest_time(self.length(state.origin, state.goal))
+        return state._replace(
+            elapsed=torch.where(ready, 0.0, state.elapsed),
+            vertical=torch.where(ready, self.vertical * departs, state.vertical),
+            cruise=torch.where(ready, cruise, state.cruise),
+            used=torch.where(ready, 0.0, state.used),
+        )
+
+    def move(self, state: State) -> State:
+        elapsed = state.elapsed + self.dt
+        position, cruised = fly(
+            gather_rows(self.points, state.origin),
+            gather_rows(self.points, state.goal),
+            self.levels,
+            elapsed,
+            state.vertical,
+            state.cruise,
+            self.motion.degree,
+        )
+        state = state._replace(elapsed=elapsed, position=position)
+        if not self.battery.enabled:
+            return state
+        used = used_so_far(elapsed, state.vertical, state.cruise, cruised, self.battery)
+        landed_before = elapsed - self.dt >= self.duration(state) - TIME_EPS
+        drained = self.drain_or_charge(state, used - state.used, landed_before)
+        return drained._replace(used=used)
+
+    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
+        return tree_where(on_ground, messages, before)
+
+    def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
+        """One for each decision, however long the UAV then senses at its landing point."""
+        waited = (state.elapsed > self.dt + TIME_EPS) & state.message_sent
+        return on_ground & ~waited
+
+    def duration(self, state: State) -> Tensor:
+        """Of the latest flight [s], [B, N]; 0 if the UAV held."""
+        return 2 * state.vertical + state.cruise
+
+
+MOTION_MODELS: dict[str, type[MotionModel]] = {"instant": InstantMotion, "polynomial": PolynomialFlight}
+"""By ``motion.kind``."""
+
+
+def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
+    """At which landing points UAVs charge, [R*L] bool."""
+    places = config.battery.charging_points
+    n_regions, n_points = airspace.points.shape[:2]
+    if places is None:
+        return torch.ones(n_regions * n_points, dtype=torch.bool)
+    nearest = nearest_points(airspace.points.unsqueeze(1), torch.tensor(places), 1).squeeze(-1)
+    flat = nearest + n_points * torch.arange(n_regions).unsqueeze(-1)
+    return torch.zeros(n_regions * n_points, dtype=torch.bool).index_fill(0, flat.flatten(), True)
