@@ -99,9 +99,11 @@ CASES = {
     "ActionHistory, agents": Case(
         uavs, lambda: ActionHistory(2, ACTION, append_to=SEEN, recorded_key="ready")
     ),
-    "Clock, one world": Case(cartpole, lambda: SampleAndHold(3)),
-    "Clock, worlds": Case(Drift, lambda: SampleAndHold(2, in_keys_inv=["action"])),
-    "Clock, agents": Case(uavs, lambda: SampleAndHold("2s", [SEEN], [ACTION], ready_key=("agents", "ready"))),
+    "SampleAndHold, one world": Case(cartpole, lambda: SampleAndHold(3)),
+    "SampleAndHold, worlds": Case(Drift, lambda: SampleAndHold(2, in_keys_inv=["action"])),
+    "SampleAndHold, agents": Case(
+        uavs, lambda: SampleAndHold("2s", [SEEN], [ACTION], ready_key=("agents", "ready"))
+    ),
     "CumulativeReward, one world": Case(cartpole, lambda: CumulativeReward(3)),
     "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
     "CumulativeReward, agents": Case(uavs, lambda: CumulativeReward(3, 0.5, REWARD)),

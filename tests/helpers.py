@@ -16,6 +16,8 @@ from twin import Uav
 from damian.envs.clocks import ClockConfig
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
+from damian.learners.base import LearningSetup
+from damian.learners.networks import ModelConfig
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig, ServerContext
 from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.termination import EpisodeConfig
@@ -133,7 +135,8 @@ KINDS: dict[str, dict[str, Any]] = {
         "episode": EpisodeConfig(max_steps=5, discharged_share=0.5),
     },
     "mixed": {
-        name: getattr(everything(), name) for name in ("source", "battery", "observation", "reward", "episode")
+        name: getattr(everything(), name)
+        for name in ("source", "battery", "observation", "reward", "episode")
     },
 }
 """Sections of each kind of scenario."""
@@ -320,6 +323,12 @@ def fresh(scenario: ScenarioConfig, num_worlds: int = 1, **options) -> UavEnv:
 def flight(env: UavEnv) -> float:
     """Duration of the flight that has just begun [s]."""
     return (2 * env.state.vertical + env.state.cruise).item()
+
+
+def learning(model: ModelConfig, settle: int = 0, **changed: Any) -> LearningSetup:
+    """What a learner must know of a run, which waits so many steps before it learns from a step."""
+    setup = LearningSetup(model, 1, 1, 1, longest_delay=settle, settle=settle > 0)
+    return setup._replace(**changed)
 
 
 def check_refused(recipe: Callable[[], Any], told: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,8 +22,8 @@ from damian.transforms import (
     RewardDelay,
     SampleAndHold,
     ServerNode,
-    SkipUntilReady,
 )
+from damian.transforms.skip_until_ready import SkipUntilReady
 from damian.world.landing import ActionConfig
 
 

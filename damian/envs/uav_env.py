@@ -153,6 +153,8 @@ class UavEnv(EnvBase):
             self.worlds, outputs = self._step_fn(self.worlds, action)
         else:
             self.worlds, outputs = self._masked_step_fn(self.worlds, action, valid)
+        if self.messages_only:  # TorchRL expects a reward from every environment
+            outputs[keys.REWARD] = self.full_reward_spec[keys.REWARD].zero()
         return self.to_tensordict(outputs)
 
     @torch.no_grad()

@@ -1,6 +1,6 @@
 """Delays, memories and clocks as TorchRL transforms; all but ``ServerNode`` work on any environment.
 
-``SkipUntilReady`` needs a ``DelayedEnv`` on a ``UavEnv``.
+``damian.transforms.skip_until_ready`` holds one more, which only a ``DelayedEnv`` on a ``UavEnv`` takes.
 """
 
 from damian.transforms.action_delay import ActionDelay
@@ -11,7 +11,6 @@ from damian.transforms.order import check_order
 from damian.transforms.reward_delay import CumulativeReward, RewardDelay
 from damian.transforms.sample_and_hold import SampleAndHold
 from damian.transforms.server_node import ServerNode
-from damian.transforms.skip_until_ready import SkipUntilReady
 
 __all__ = [
     "ActionDelay",
@@ -21,7 +20,6 @@ __all__ = [
     "RewardDelay",
     "SampleAndHold",
     "ServerNode",
-    "SkipUntilReady",
     "StatefulTransform",
     "check_order",
 ]

@@ -24,7 +24,7 @@ from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
-from shared.settings import LEARNERS, TrainConfig
+from shared.settings import CONF, LEARNERS, TrainConfig
 
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError)
 """What Hydra raises for overrides that it cannot compose."""
@@ -141,7 +141,7 @@ def stored_config(folder: Path, key: str) -> DictConfig:
         schema = OmegaConf.structured(TrainConfig(learner=LEARNERS[saved.learner.name]()))
         return cast(DictConfig, OmegaConf.merge(schema, saved))
     except Exception as error:  # a damaged file can raise anything
-        raise InputError(f"{key}: {file}: {one_line(error)}") from error
+        raise InputError(f"{key}: {file}: {one_line(error)}") from None
 
 
 def load(checkpoint: Checkpoint, folder: Path, key: str, components: Collection[str] | None = None) -> None:
@@ -229,8 +229,12 @@ def one_line(error: BaseException) -> str:
     while isinstance(error.__cause__, OmegaConfBaseException):
         error = error.__cause__
     text, _, _ = str(error).partition("Config search path")
-    if "mismatched input '='" in text:
+    if re.search(r"mismatched input '='|no viable alternative at input '\[\w+='", text):
         return "a value with = in it needs quotes, such as \"overrides=['frames=1000','worlds=8']\""
+    if option := re.search(r"Could not find '([\w-]+)/(\S+)'", text):
+        return _no_such_option(*option.groups())
+    if "Config group override must be a string" in text:
+        return next(map(_not_an_option, filter(_is_bare, sys.argv[1:])), text)
     key = re.search(r"full_key: (\S+)", text)
     if key and re.search(r"Key '.*' (is )?not in ", text):
         return no_such_key(key[1])
@@ -239,6 +243,22 @@ def one_line(error: BaseException) -> str:
     first, *more = [line for line in lines if not line.startswith(tails)] or [type(error).__name__]
     message = " ".join([first, ", ".join(more).replace(":,", ":")]).strip()
     return f"{key[1]}: {message}" if key else message
+
+
+def _no_such_option(group: str, option: str) -> str:
+    folder = Path(CONF) / group
+    known = sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
+    return f"{group}: {option} is not one of {', '.join(known)}"
+
+
+def _is_bare(word: str) -> bool:
+    """Does an override give a group a number or null, which Hydra refuses without naming it?"""
+    return bool(re.fullmatch(r"\+?\w+=([\d,.]+|null)", word)) and (Path(CONF) / _key(word)).is_dir()
+
+
+def _not_an_option(word: str) -> str:
+    group, _, option = word.lstrip("+").partition("=")
+    return _no_such_option(group, option)
 
 
 _RENAMED = {
@@ -261,12 +281,16 @@ def no_such_key(key: str) -> str:
     renamed = _RENAMED.get(key, _RENAMED.get(group))
     if renamed:
         return f"{key}: no such key; since damian 0.2 it is {renamed}"
-    near = (
-        difflib.get_close_matches(key, map(str, _keys(OmegaConf.structured(schema))), n=1, cutoff=0.75)
-        for schema in _schemas
-    )
+    near = (difflib.get_close_matches(key, _keys_of(schema), n=1, cutoff=0.75) for schema in _schemas)
     nearest = next(filter(None, near), [])
     return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in nearest)
+
+
+def _keys_of(schema: type) -> list[str]:
+    """Every dotted key of a schema, with those of every learner."""
+    learners = LEARNERS.values() if schema is TrainConfig else ()
+    configs = [OmegaConf.structured(schema), *(OmegaConf.create({"learner": make()}) for make in learners)]
+    return list(dict.fromkeys(name for config in configs for name in _keys(config)))
 
 
 def _keys(config: DictConfig, path: str = "") -> Iterator[str]:

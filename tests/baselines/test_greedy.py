@@ -101,7 +101,7 @@ def test_a_source_just_lost_is_looked_for_around_the_silent_footprint_and_not_in
 
 @pytest.mark.parametrize("task", [SEARCH, COVER], ids=["search", "coverage"])
 def test_before_anything_is_heard_the_uavs_leave_for_fresh_ground_of_their_own(task):
-    env = field(task=task)
+    env = field(reward=task)
     shown = env.reset()
     start, end = told(shown).position[0], landing(env, shown)
     apart = torch.cdist(end, start)
@@ -181,7 +181,7 @@ def test_what_is_believed_of_a_place_is_what_one_uav_after_the_other_says_of_it(
 
 
 def test_the_uavs_fly_where_most_fresh_ground_is_seen_and_there_the_shortest_way():
-    scenario = everything(task=COVER, episode=EpisodeConfig(max_steps=9))
+    scenario = everything(reward=COVER, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 8, extras=["message"])
     policy, radius = Greedy(env.uav_env), env.uav_env.simulation.radius
     shown = env.rollout(4, random_policy(env))["next"][:, -1]
@@ -305,7 +305,7 @@ def test_any_number_of_uavs_is_flown_and_clearly_better_than_by_chance():
     torch.manual_seed(0)
     region = RegionConfig(min_area=60_000, max_area=90_000, pool=2, initial_conditions=16)
     for agents in (1, 3, 7):
-        scenario = ScenarioConfig(agents=agents, region=region, source=walking(), task=SEARCH)
+        scenario = ScenarioConfig(agents=agents, region=region, source=walking(), reward=SEARCH)
         env = make_env(scenario, 32, 5, extras=["message"])
         scores = []
         for policy in (greedy_policy(env), random_policy(env)):

@@ -27,25 +27,15 @@ from torchrl.envs.utils import check_env_specs
 from damian.delays.config import DelayConfig
 from damian.delays.laws import law_of
 from damian.envs.clocks import ClockConfig
-from damian.envs.pipeline import (
-    ACTION,
-    REWARD,
-    SEEN,
-    DelayedEnv,
-    chain,
-    hold_action,
-    make_env,
-    server_transforms,
-)
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import hold_action, make_env, make_transforms, server_transforms
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS, UavEnv
+from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED, REWARD
 from damian.server.termination import EpisodeConfig
 from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
 from damian.world.messages import Messages
 from damian.world.signal_source import SourceConfig
-
-READY, BROADCAST = ("agents", "ready"), ("agents", "global_observation")
-RECEIVED, MESSAGE, AGE = ("agents", "received"), ("agents", "message"), ("agents", "age")
 
 PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
 BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}
@@ -82,14 +72,14 @@ def over_time(shown: Sequence[TensorDictBase], key: Any) -> Tensor:
 def by_hand(scenario: ScenarioConfig, n_worlds: int) -> DelayedEnv:
     """The whole chain, although nothing is late."""
     env = UavEnv(scenario, n_worlds, extras=EXTRAS, messages_only=True)
-    keys = {"sent_key": "ready", "fresh_key": "action_valid"}
+    keys = {"sent_key": "ready", "valid_key": "action_valid"}
     chain = [
         ActionDelay(0, ACTION, default=hold_action(scenario.actions), **keys),
         *server_transforms(scenario, env.server, EXTRAS),
         RewardDelay(0, REWARD),
         CumulativeReward(1, 0.9, REWARD),
-        SampleAndHold(1, [SEEN, BROADCAST]),
-        SampleAndHold(1, [SEEN], ready_key=READY),
+        SampleAndHold(1, [OBSERVATION, GLOBAL_OBSERVATION]),
+        SampleAndHold(1, [OBSERVATION], ready_key=READY),
     ]
     chained = DelayedEnv(env, Compose(*chain))
     chained.set_seed(0)
@@ -201,7 +191,7 @@ def test_what_a_message_says_reaches_nobody_before_it_arrives(obs, order):
         if at[0][AGE][world, agent] == delay:
             believed += 1
             assert not at[0][RECEIVED][world, agent].equal(at[1][RECEIVED][world, agent])
-            assert not at[0][BROADCAST][world].equal(at[1][BROADCAST][world])
+            assert not at[0][GLOBAL_OBSERVATION][world].equal(at[1][GLOBAL_OBSERVATION][world])
     assert believed >= 1
 
 
@@ -369,8 +359,8 @@ def test_uavs_remember_how_far_east_and_north_they_chose_to_go():
     shown = play(env, actions)
     for t in range(2, 6):
         expected = torch.cat([table[actions[t - 1]], table[actions[t]]], -1)
-        seen = shown[2 * t + 1][SEEN]
-        assert seen.shape[-1] == plain.observation_spec[SEEN].shape[-1] + 4
+        seen = shown[2 * t + 1][OBSERVATION]
+        assert seen.shape[-1] == plain.observation_spec[OBSERVATION].shape[-1] + 4
         torch.testing.assert_close(seen[..., -4:], expected, rtol=0, atol=1e-6)
 
 
@@ -398,9 +388,9 @@ def test_between_two_ticks_of_their_clock_uavs_do_nothing():
             assert now.position.equal(world.position)
             assert now.sent.trail.equal(world.sent.trail)
             assert now.track.equal(world.track)
-            assert following[SEEN][..., -4:].equal(td[SEEN][..., -4:])  # the remembered actions
+            assert following[OBSERVATION][..., -4:].equal(td[OBSERVATION][..., -4:])  # the remembered actions
         if t % 3 < 2:
-            assert following[SEEN][..., :-4].equal(td[SEEN][..., :-4])
+            assert following[OBSERVATION][..., :-4].equal(td[OBSERVATION][..., :-4])
         moves += (now.position != world.position).any().item()
         td = following
     assert moves > 5
@@ -412,9 +402,9 @@ def test_between_two_ticks_of_the_servers_clock_nothing_new_is_seen():
     for t, td in enumerate(shown[2::2], 1):
         before = shown[2 * t - 2]
         if t % 4:
-            assert td[SEEN][..., :-4].equal(before[SEEN][..., :-4])
-            assert td[BROADCAST].equal(before[BROADCAST])
-        changes += (td[BROADCAST] != before[BROADCAST]).any().item()
+            assert td[OBSERVATION][..., :-4].equal(before[OBSERVATION][..., :-4])
+            assert td[GLOBAL_OBSERVATION].equal(before[GLOBAL_OBSERVATION])
+        changes += (td[GLOBAL_OBSERVATION] != before[GLOBAL_OBSERVATION]).any().item()
     assert changes > 5
 
 
@@ -423,8 +413,8 @@ def test_a_uav_sees_what_the_server_had_broadcast_by_its_own_tick():
     holds = torch.full((4, 3), hold_action(fast.scenario.actions))
     raw, shown = play(fast, lambda t: holds, 20), play(slowly, lambda t: holds, 20)
     for t in range(21):
-        assert shown[2 * t][BROADCAST].equal(raw[2 * (t - t % 2)][BROADCAST])
-        assert shown[2 * t][SEEN][..., :-4].equal(raw[2 * (t - t % 4)][SEEN][..., :-4])
+        assert shown[2 * t][GLOBAL_OBSERVATION].equal(raw[2 * (t - t % 2)][GLOBAL_OBSERVATION])
+        assert shown[2 * t][OBSERVATION][..., :-4].equal(raw[2 * (t - t % 4)][OBSERVATION][..., :-4])
 
 
 @pytest.mark.parametrize("act", [0, 2, {"law": "geometric", "mean": 2}], ids=["none", "2", "random"])
@@ -453,8 +443,8 @@ def test_an_action_chosen_while_not_ready_is_never_executed(act, motion, agents)
 def test_a_step_at_once_does_what_each_transform_does_by_itself(motion, changed):
     scenario = everything(motion, **changed)
     whole, graph = delayed(scenario), delayed(scenario).compile(backend="eager")
-    world = UavEnv(scenario, 4, extras=EXTRAS, serves=whole.base_env.messages_only)
-    plain = TransformedEnv(world, chain(scenario, world.server, EXTRAS))  # transform by transform
+    world = UavEnv(scenario, 4, extras=EXTRAS, messages_only=whole.base_env.messages_only)
+    plain = TransformedEnv(world, make_transforms(scenario, world.server, EXTRAS))  # transform by transform
     for number, transform in enumerate(plain.transform):
         transform.set_seed(7919 * (number + 1))
     for env in (plain, whole, graph):

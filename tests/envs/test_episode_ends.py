@@ -83,7 +83,7 @@ def test_empty_batteries_terminate_without_success():
     battery = BatteryConfig(enabled=True, capacity_kwh=0.02, charging_points=[[390.0, 10.0]])
     episode = EpisodeConfig(max_steps=None, discharged_share=1.0)
     task = RewardConfig(penalty=2.0)
-    env = fresh(one_uav(battery=battery, episode=episode, task=task))
+    env = fresh(one_uav(battery=battery, episode=episode, reward=task))
     env.state = env.state._replace(battery=torch.tensor([[1e-7]]))
     assert not go(env, HERE)["done"].item()
     env.state = env.state._replace(battery=torch.tensor([[0.0]]))
@@ -117,7 +117,7 @@ def test_success_pays_the_bonus_and_a_time_failure_costs_the_penalty(over_steps,
     source = SourceConfig(level_db=130.0, position=[160.0, 100.0])
     episode = EpisodeConfig(max_steps=3, success_share=1.0)
     task = RewardConfig(spotted=0.0, bonus=3.0, bonus_over_steps=over_steps, penalty=0.5)
-    env = fresh(one_uav(source=source, episode=episode, task=task))
+    env = fresh(one_uav(source=source, episode=episode, reward=task))
     assert go(env, HERE)["agents", "reward"].item() == 0.0
     assert go(env, EAST)["agents", "reward"].item() == bonus
     env.reset()

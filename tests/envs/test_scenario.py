@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from shared.launch import unknown_keys
 
 from damian.common.errors import InputError
-from damian.envs.scenario import ScenarioConfig, leftovers
+from damian.envs.scenario import ScenarioConfig
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
 
@@ -41,4 +42,4 @@ def test_a_pool_draws_that_many_different_regions_and_the_same_seed_the_same():
 
 def test_keys_that_no_field_takes_are_found_at_any_depth():
     written = {"agents": 3, "motion": {"kind": "instant", "wings": 2}, "delay": {"obs": 3, "foo": 1}}
-    assert sorted(leftovers(written, ScenarioConfig())) == ["delay.foo", "motion.wings"]
+    assert sorted(unknown_keys(written, ScenarioConfig())) == ["delay.foo", "motion.wings"]

@@ -40,7 +40,9 @@ def together(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
     sections = {
         "motion": MOTIONS[motion],
         "delay": delay,
-        "reward": RewardConfig(spotted=0.3, source_distance=0.2, bonus=2.0, bonus_over_steps=True, penalty=0.5),
+        "reward": RewardConfig(
+            spotted=0.3, source_distance=0.2, bonus=2.0, bonus_over_steps=True, penalty=0.5
+        ),
         "episode": EpisodeConfig(max_steps=20, success_share=0.6),
     }
     return square(**(sections | changed))

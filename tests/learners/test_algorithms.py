@@ -15,7 +15,6 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
-from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage
 
 AWARE = {
@@ -26,16 +25,20 @@ AWARE = {
 }
 
 
-def config(algo: str, rnn: str, kind: str, motion: str, aware: str) -> TrainConfig:
+LEARNERS = {
+    "mappo": MappoConfig(steps=12, epochs=1, minibatches=2),
+    "sac": SacConfig(steps=12, updates=2, batch_size=16, buffer_steps=400, warm_up=0),
+}
+
+
+def config(learner: str, rnn: str, kind: str, motion: str, aware: str) -> TrainConfig:
     """Two rounds of learning under delay."""
     asked = dict(AWARE[aware])
     late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 3}, history=asked.pop("history", 0))
     return TrainConfig(
         **vars(everything(motion, kind, delay=late)),
-        algo=algo,
+        learner=LEARNERS[learner],
         model=ModelConfig(hidden=[8], rnn=rnn),
-        mappo=MappoConfig(steps=12, epochs=1, minibatches=2),
-        sac=SacConfig(steps=12, updates=2, batch=16, memory=400, warm_up=0),
         logger=LoggerConfig(tensorboard=False),
         worlds=4,
         frames=96,
@@ -47,9 +50,9 @@ def config(algo: str, rnn: str, kind: str, motion: str, aware: str) -> TrainConf
 @pytest.mark.parametrize("aware", AWARE)
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
-@pytest.mark.parametrize(("algo", "rnn"), [("mappo", "none"), ("sac", "none"), ("mappo", "gru")])
-def test_every_combination_learns_and_is_evaluated(tmp_path, algo, rnn, kind, motion, aware):
-    train(config(algo, rnn, kind, motion, aware), tmp_path)
+@pytest.mark.parametrize(("learner", "rnn"), [("mappo", "none"), ("sac", "none"), ("mappo", "gru")])
+def test_every_combination_learns_and_is_evaluated(tmp_path, learner, rnn, kind, motion, aware):
+    train(config(learner, rnn, kind, motion, aware), tmp_path)
     with (tmp_path / "metrics.csv").open(newline="") as file:
         *_, last = csv.DictReader(file)
     losses = [float(value) for name, value in last.items() if name.startswith("loss")]
@@ -62,37 +65,38 @@ def test_every_combination_learns_and_is_evaluated(tmp_path, algo, rnn, kind, mo
 
 # What a learner is made of.
 
-both_algorithms = pytest.mark.parametrize("algo", ["mappo", "sac"])
+both_learners = pytest.mark.parametrize("name", LEARNERS)
 
 
-def made(algo: str, aware: str = "backupdate", **changed) -> tuple[Mappo | Sac, DelayedEnv]:
+def made(name: str, aware: str = "backupdate", **changed) -> tuple[Mappo | Sac, DelayedEnv]:
     """A learner and its environment, for messages up to 3 steps late."""
-    asked = replace(config(algo, "none", "discrete", "instant", aware), **changed)
+    asked = replace(config(name, "none", "discrete", "instant", aware), **changed)
     env = learning_env(asked)
-    return make_learner(asked, env, SystemClock(asked.clock, asked.update_steps)), env
+    return make_learner(asked, env), env
 
 
-@both_algorithms
+@both_learners
 @pytest.mark.parametrize("settle", [False, True])
-def test_a_learner_waits_for_the_longest_delay_if_it_is_to_settle(algo, settle):
-    learner, _ = made(algo, settle=settle)
-    assert learner.settle == (3 if settle else 0)
+def test_a_learner_waits_for_the_longest_delay_if_it_is_to_settle(name, settle):
+    learner, _ = made(name, settle=settle)
+    assert learner.setup.settle_steps == (3 if settle else 0)
 
 
-@both_algorithms
-def test_a_memory_corrects_if_it_should(algo):
-    corrects = {aware: made(algo, aware)[0].memory for aware in ("backupdate", "history")}
+@both_learners
+def test_a_memory_corrects_if_it_should(name):
+    corrects = {aware: made(name, aware)[0].buffer for aware in ("backupdate", "history")}
     assert isinstance(corrects["backupdate"].storage, BackupdateStorage)
     assert corrects["backupdate"].storage.longest == 3
     plain = corrects["history"]
-    assert plain is None if algo == "mappo" else not isinstance(plain.storage, BackupdateStorage)
+    assert plain is None if name == "mappo" else not isinstance(plain.storage, BackupdateStorage)
 
 
-@both_algorithms
-def test_a_memory_has_room_for_whole_steps_of_the_longest_batch_and_all_that_is_late(algo):
+@both_learners
+def test_a_memory_has_room_for_whole_steps_of_the_longest_batch_and_all_that_is_late(name):
     clock = ClockConfig(trigger="4s", longest="24s")
-    learner, env = made(algo, clock=clock, sac=SacConfig(steps=12, memory=123, warm_up=0))
-    assert learner.memory.storage.max_size == 4 * (24 + 2 * 3)
+    config = replace(LEARNERS[name], **{"buffer_steps": 123} if name == "sac" else {})
+    learner, env = made(name, clock=clock, learner=config)
+    assert learner.buffer.storage.max_size == 4 * (24 + 2 * 3)
     learner.learn(env.rollout(24, learner.actor, break_when_any_done=False))
 
 

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 import torch
-from helpers import both_kinds, both_motions, everything
+from helpers import both_kinds, both_motions, everything, learning
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -141,7 +141,7 @@ def test_objective_and_entropy_are_means_over_decisions():
     ready = batch["agents", "ready"]
     batch["agents", "advantage"] = torch.where(ready, 2.0, 5.0).unsqueeze(-1)
     assert not ready.all()
-    losses = minibatch_losses(batch.reshape(-1), mappo_loss(actor, critic, MappoConfig(entropy=0.1)))
+    losses = minibatch_losses(batch.reshape(-1), mappo_loss(actor, critic, MappoConfig(entropy_coeff=0.1)))
     assert losses["loss_objective"].item() == pytest.approx(-2, abs=1e-5)  # ratios of 1
     entropy = actor.get_dist(batch).entropy()[ready].mean().item()
     assert losses["loss_entropy"].item() == pytest.approx(-0.1 * entropy, rel=1e-5)
@@ -239,7 +239,7 @@ def collected_late(kind: str, recompute_actor: bool) -> tuple[Mappo, TensorDictB
     memory = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, view, longest=5))
     torch.manual_seed(2)
     config = MappoConfig(minibatches=1, epochs=1)
-    learner = Mappo(env, SMALL, config, memory, recompute_actor=recompute_actor)
+    learner = Mappo(env, config, learning(SMALL, recompute_actor=recompute_actor), memory)
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         return learner, env.rollout(30, learner.actor, break_when_any_done=False)
 
@@ -290,7 +290,8 @@ def test_an_observation_is_corrected_where_a_message_came_late_for_the_step_befo
 def test_what_has_settled_is_learnt_from_later_and_then_as_it_truly_was():
     learner, flight = collected_late("discrete", recompute_actor=False)
     short = everything(episode=EpisodeConfig(max_steps=9))
-    learner.settle, server = 5, make_env(short, 4, seed=1).server
+    learner.setup = learning(SMALL, 5)
+    server = make_env(short, 4, seed=1).server
     known = torch.cat([learner.backupdated_batch(flight[:, t : t + 10]) for t in (0, 10, 20)], 1)
     assert known.shape[1] == len(flight[0]) - 5  # the first batch comes short
     settled = flight[:, :25]
@@ -310,5 +311,5 @@ def test_what_was_corrected_is_reported_with_the_losses():
     losses = learner.learn(batch)
     assert losses["backupdated"] == share
     assert {"loss_objective", "loss_entropy", "loss_critic"} < set(losses)
-    learner.memory = None
+    learner.buffer = None
     assert "backupdated" not in learner.learn(batch)

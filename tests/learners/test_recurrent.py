@@ -10,7 +10,7 @@ import oracle
 import pytest
 import torch
 import train
-from helpers import check_refused, everything
+from helpers import check_refused, everything, learning
 from shared.launch import launch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Categorical, Composite, TensorDictReplayBuffer, Unbounded
@@ -22,9 +22,10 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.evaluation.metrics import evaluate
 from damian.evaluation.run_folder import CHECKPOINT
+from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, mappo_loss
 from damian.learners.networks import ModelConfig, make_actor
-from damian.learners.recurrent import BEFORE, HIDDEN, add_recurrent_state
+from damian.learners.recurrent import add_recurrent_state
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
@@ -74,7 +75,7 @@ def test_a_hidden_state_goes_on_from_step_to_step_and_begins_with_zeros(kind, mo
     assert begins.equal(collected["step_count"].squeeze(-1) == 0)
     assert begins[:, 1:].any()
     assert not begins[:, [7, 14]].all()  # some state is carried from one batch to the next
-    before, after = collected[BEFORE], collected[HIDDEN]
+    before, after = collected[HIDDEN_BEFORE], collected[HIDDEN]
     assert (before[begins] == 0).all()
     assert before[:, 1:][~begins[:, 1:]].equal(after[:, :-1][~begins[:, 1:]])
     assert (after != before).any(-1).all()
@@ -83,17 +84,17 @@ def test_a_hidden_state_goes_on_from_step_to_step_and_begins_with_zeros(kind, mo
 @both_kinds_and_motions
 def test_the_first_importance_ratios_are_one_in_every_batch(kind, motion):
     env = late_env(kind, motion)
-    learner = Mappo(env, GRU, MappoConfig())
+    learner = Mappo(env, MappoConfig(), learning(GRU))
     for batch in batches(env, learner.actor, 7, 3):
         assert (ratios(learner, batch) - 1).abs().max() < ROUNDING
         some = batch[torch.tensor([2, 0])]
         assert (ratios(learner, some) - 1).abs().max() < ROUNDING
 
 
-@pytest.mark.parametrize("spoilt", [BEFORE, "is_init"])
+@pytest.mark.parametrize("spoilt", [HIDDEN_BEFORE, "is_init"])
 def test_the_replay_needs_the_first_hidden_state_and_where_episodes_begin(spoilt):
     env = late_env()
-    learner = Mappo(env, GRU, MappoConfig())
+    learner = Mappo(env, MappoConfig(), learning(GRU))
     _, batch = batches(env, learner.actor, 14, 2)
     batch[spoilt] = torch.zeros_like(batch[spoilt])
     assert (ratios(learner, batch) - 1).abs().max() > 100 * ROUNDING
@@ -101,16 +102,16 @@ def test_the_replay_needs_the_first_hidden_state_and_where_episodes_begin(spoilt
 
 def test_nothing_but_the_first_hidden_state_of_a_batch_is_taken_from_the_flight():
     env = late_env()
-    learner = Mappo(env, GRU, MappoConfig())
+    learner = Mappo(env, MappoConfig(), learning(GRU))
     _, batch = batches(env, learner.actor, 14, 2)
     batch[HIDDEN].fill_(torch.nan)
-    batch[BEFORE][:, 1:] = torch.nan
+    batch[HIDDEN_BEFORE][:, 1:] = torch.nan
     assert (ratios(learner, batch) - 1).abs().max() < ROUNDING
 
 
 def test_an_update_learns_from_whole_sequences():
     env = late_env()
-    learner = Mappo(env, GRU, MappoConfig(epochs=1, minibatches=1))
+    learner = Mappo(env, MappoConfig(epochs=1, minibatches=1), learning(GRU))
     _, batch = batches(env, learner.actor, 14, 2)
     losses = learner.learn(batch)
     assert abs(losses["loss_objective"]) < ROUNDING  # ratios of 1, and advantages of mean 0
@@ -119,7 +120,9 @@ def test_an_update_learns_from_whole_sequences():
 
 def test_two_minibatches_are_two_halves_of_the_worlds():
     env = late_env()
-    learner = Mappo(env, GRU, MappoConfig(epochs=1, minibatches=2, lr=1e-12, normalize_advantage=False))
+    learner = Mappo(
+        env, MappoConfig(epochs=1, minibatches=2, lr=1e-12, normalize_advantage=False), learning(GRU)
+    )
     (batch,) = batches(env, learner.actor, 14, 1)
     losses = learner.learn(batch)
     ready = batch["agents", "ready"]
@@ -133,19 +136,19 @@ def test_a_batch_from_the_memory_begins_with_the_hidden_state_that_it_began_with
     env = late_env()
     view = server_recompute(env.server)
     memory = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, view, longest=5))
-    learner = Mappo(env, GRU, MappoConfig(), memory, settle)
+    learner = Mappo(env, MappoConfig(), learning(GRU, settle), memory)
     parts = [*batches(env, learner.actor, 10, 3)]
     flight, at = torch.cat(parts, 1), 0
     for batch in parts:
         known = learner.backupdated_batch(batch)
         there = flight[:, at : at + known.shape[1]]
-        assert known[BEFORE].equal(there[BEFORE])
+        assert known[HIDDEN_BEFORE].equal(there[HIDDEN_BEFORE])
         assert known[SEEN].equal(there[SEEN])
         assert (ratios(learner, known) - 1).abs().max() < ROUNDING
         at += known.shape[1]
     assert at == 30 - settle
     assert known["agents", "backupdated"].any()
-    assert (known[BEFORE][:, 0] != 0).any()
+    assert (known[HIDDEN_BEFORE][:, 0] != 0).any()
 
 
 def test_what_is_learnt_reaches_back_to_the_beginning_of_an_episode_and_no_further():
@@ -256,7 +259,7 @@ class Recall(EnvBase):
 def test_only_an_actor_that_remembers_learns_what_was_seen_before(rnn):
     env = TransformedEnv(Recall(64))
     config = MappoConfig(lr=1e-2, gamma=1.0, minibatches=2)
-    learner = Mappo(env, ModelConfig(hidden=[16], rnn=rnn), config)
+    learner = Mappo(env, config, learning(ModelConfig(hidden=[16], rnn=rnn)))
     for batch in batches(env, learner.actor, 6, 20):
         learner.learn(batch)
     add_recurrent_state(env, learner.actor)
@@ -313,7 +316,7 @@ def test_what_has_learnt_is_flown_by_more_uavs_and_by_the_oracle_and_goes_on(run
     [
         (["model.rnn=lstm"], "model.rnn: lstm is not one of none, gru"),
         (["model=gru", "model.hidden=[]"], "model.hidden: [] is no layer to be a gru"),
-        (["model=gru", "learner=sac"], "model.rnn: gru is for algo=mappo only"),
+        (["model=gru", "learner=sac"], "model.rnn: gru is for learner=mappo only"),
         (["model=gru", "worlds=3"], "learner.minibatches: 4 is not between 1 and 3"),
         (
             ["model=gru", "delay=paper", "backupdate=true", "recompute_actor=true"],

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from helpers import both_kinds, both_motions, everything
+from helpers import both_kinds, both_motions, everything, learning
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
@@ -14,7 +14,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
-from damian.envs.uav_env import PRIVILEGED, UavEnv
+from damian.envs.uav_env import UavEnv
+from damian.keys import OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import LOSSES, Sac, SacConfig
 from damian.replay.backupdate import BackupdateStorage
@@ -26,13 +27,13 @@ from damian.world.landing import ActionConfig
 from damian.world.messages import Messages
 
 SMALL = ModelConfig(hidden=[16])
-FAST = SacConfig(updates=2, batch=64, warm_up=0)
+FAST = SacConfig(updates=2, batch_size=64, warm_up=0)
 
 
 def learner_of(env, config=FAST, settle=0, steps=200) -> Sac:
     torch.manual_seed(0)
     memory = ReplayBuffer(storage=TimeStorage(steps * env.batch_size[0]))
-    return Sac(env, SMALL, config, memory, settle)
+    return Sac(env, config, learning(SMALL, settle), memory)
 
 
 def flown(env, actor, steps=24):
@@ -49,7 +50,9 @@ def test_a_round_of_learning_moves_actor_critics_and_temperature(kind, motion):
     losses = learner.learn(flown(env, learner.actor))
     assert set(losses) == set(LOSSES)
     assert all(torch.tensor([*losses.values()]).isfinite())
-    assert losses["alpha"] == pytest.approx(FAST.alpha, rel=0.01)  # a mean; in the first update as it began
+    assert losses["alpha"] == pytest.approx(
+        FAST.alpha_init, rel=0.01
+    )  # a mean; in the first update as it began
     moved = {name for name, value in learner.loss.state_dict().items() if not value.equal(before[name])}
     for part in ("actor_network", "target_qvalue_network", "qvalue_network", "log_alpha"):
         assert any(name.startswith(part) for name in moved), part
@@ -70,13 +73,13 @@ def test_the_target_of_a_decision_discounts_the_next_value_by_its_duration():
     env = UavEnv(everything("polynomial", kind="discrete"), 8)
     learner = learner_of(env, SacConfig(gamma=0.5, warm_up=0))
     batch = flown(env, learner.actor, 60)
-    learner.memory.extend(batch)
-    storage = learner.memory.storage
+    learner.buffer.extend(batch)
+    storage = learner.buffer.storage
     steps, order = storage.steps, storage.latest()
     ready, after = (steps[key][order] for key in (("agents", "ready"), ("next", "agents", "ready")))
     ends = (steps["next", key][order].squeeze(-1) for key in ("done", "terminated"))
     found = find_decisions(ready, after, *ends)
-    made = transitions(steps, order, found, 0.5, learner.seen)
+    made = transitions(steps, order, found, 0.5, learner.observed)
     duration = made["steps_to_next_obs"]
     assert duration.max() > 5
     target = learner.loss._compute_target(made)
@@ -91,7 +94,7 @@ def test_the_target_of_a_decision_discounts_the_next_value_by_its_duration():
 
 def test_the_temperature_rests_where_the_entropy_is_its_share_of_that_of_the_legal_actions():
     env = UavEnv(everything(kind="discrete"), 8)
-    learner = learner_of(env, SacConfig(entropy=0.5))
+    learner = learner_of(env, SacConfig(target_entropy=0.5))
     n_actions = env.full_action_spec_unbatched["agents", "action"].n
     mask = torch.zeros(2, n_actions, dtype=torch.bool)
     mask[0, :4], mask[1, :16] = True, True
@@ -126,7 +129,7 @@ def test_a_late_message_corrects_transitions_that_are_stored_already():
     env = late_env()
     view = server_recompute(env.server)
     memory = ReplayBuffer(storage=BackupdateStorage(60 * 4, view, longest=5))
-    learner = Sac(env, SMALL, FAST, memory, settle=5)
+    learner = Sac(env, FAST, learning(SMALL, 5), memory)
     batch = flown(env, learner.actor, 40)
     for part in batch.split(8, 1):
         learner.learn(part)
@@ -146,7 +149,7 @@ class Watched(Sac):
 
     drawn: tuple[TensorDictBase, ...] = ()
 
-    def improve(self, drawn: TensorDictBase) -> TensorDictBase:
+    def update(self, drawn: TensorDictBase) -> TensorDictBase:
         self.drawn = (*self.drawn, drawn.clone())
         return super().update(drawn)
 
@@ -174,13 +177,13 @@ def two_decisions(flight: TensorDictBase, world: int, begin: int, agent: int, la
     shown = [
         entries[key][world, when, agent]
         for entries, when in ((seen, begin), (after, t))
-        for key in ("observation", PRIVILEGED)
+        for key in ("observation", PRIVILEGED_OBSERVATION[-1])
     ]
     chosen = seen["action"][world, begin, agent].view(1)
     return torch.cat([*shown, chosen, earned, over, terminated, torch.tensor([t - begin + 1])])
 
 
-SHOWN = [("agents", name) for name in ("observation", PRIVILEGED)]
+SHOWN = [OBSERVATION, PRIVILEGED_OBSERVATION]
 ROW = [*SHOWN, *(("next", *key) for key in SHOWN), ("agents", "action"), ("next", "agents", "reward")]
 ROW += [("next", "done"), ("next", "terminated"), "steps_to_next_obs"]
 
@@ -188,9 +191,9 @@ ROW += [("next", "done"), ("next", "terminated"), "steps_to_next_obs"]
 def test_what_is_learnt_from_are_the_settled_decisions_that_the_memory_still_holds():
     scenario = everything("polynomial", episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["privileged"])
-    config = SacConfig(gamma=0.8, n_steps=2, updates=2, batch=600, warm_up=0)
+    config = SacConfig(gamma=0.8, n_steps=2, updates=2, batch_size=600, warm_up=0)
     memory = ReplayBuffer(storage=TimeStorage(24 * 4))
-    learner = Watched(env, SMALL, config, memory, settle=3, critic_sees=PRIVILEGED)
+    learner = Watched(env, config, learning(SMALL, 3, critic_key=PRIVILEGED_OBSERVATION), memory)
     flight = flown(env, learner.actor, 40)
     flight["next", "terminated"][::2] = flight["next", "done"][::2]  # every other world ends for good
     for part in flight.split(8, 1):  # the ring goes round
@@ -211,8 +214,8 @@ def test_what_is_learnt_from_are_the_settled_decisions_that_the_memory_still_hol
 def watched(**changed) -> Watched:
     """A learner that has made one update."""
     env = UavEnv(everything(kind="discrete"), 4)
-    config = SacConfig(**({"updates": 1, "batch": 64, "warm_up": 0} | changed))
-    learner = Watched(env, SMALL, config, ReplayBuffer(storage=TimeStorage(100)))
+    config = SacConfig(**({"updates": 1, "batch_size": 64, "warm_up": 0} | changed))
+    learner = Watched(env, config, learning(SMALL), ReplayBuffer(storage=TimeStorage(100)))
     learner.learn(flown(env, learner.actor, 8))
     return learner
 
@@ -227,7 +230,7 @@ def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_a_share_
     # Both have begun at the same place.
     begun = (target - 0.25 * learnt) / 0.75
     assert (learnt - begun).abs().max().item() == pytest.approx(1e-2, rel=1e-2)  # of Adam's first step
-    moved = loss.log_alpha.item() - math.log(learner.config.alpha)
+    moved = loss.log_alpha.item() - math.log(learner.config.alpha_init)
     assert abs(moved) == pytest.approx(0.3, rel=1e-2)  # at a rate of its own
 
 
@@ -260,7 +263,7 @@ def test_a_checkpoint_brings_what_was_learnt_and_not_the_discount():
 def test_it_learns_which_action_pays(kind):
     """Reward for choosing to the east, at once and with no future: a contextless bandit."""
     env = UavEnv(everything(kind=kind, actions=ActionConfig(kind=kind, mask=False)), 16)
-    learner = learner_of(env, SacConfig(updates=60, batch=128, gamma=0.0, warm_up=0, alpha=0.01))
+    learner = learner_of(env, SacConfig(updates=60, batch_size=128, gamma=0.0, warm_up=0, alpha_init=0.01))
     for _ in range(4):
         batch = flown(env, learner.actor, 16)
         action = batch["agents", "action"]

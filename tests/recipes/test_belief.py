@@ -138,7 +138,7 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
         (["delay.los=0.1"], "delay.los: no such key; did you mean delay.loss?"),
         (["+delay.foo=3"], "delay.foo: no such key"),
         (["delay.obs=soon"], "delay.obs: soon is neither whole steps"),
-        (["delay=sometimes"], "'delay/sometimes'"),
+        (["delay=sometimes"], "delay: sometimes is not one of burst, none, paper"),
         (["resume=runs/last"], "resume: a flight of the random policy has nothing to go on with"),
         (["region.id=Nope"], "Nope"),
     ],

@@ -3,7 +3,6 @@
 import importlib.util
 
 from bench_training import ARMS, HEADER, RIVAL, RIVALS, Seconds, arm_config, median, rows, training
-from train import backupdates
 
 from damian.envs.pipeline import has_message_delay
 
@@ -11,11 +10,11 @@ from damian.envs.pipeline import has_message_delay
 def test_arms_differ_in_delay_and_awareness_only():
     configs = [arm_config(words, worlds=8, steps=16) for words in ARMS]
     assert [has_message_delay(config) for config in configs] == [False, True, True, True]
-    assert [backupdates(config) for config in configs] == [False, False, True, True]
+    assert [config.backupdates for config in configs] == [False, False, True, True]
     assert [config.delay.history > 0 for config in configs] == [False, False, False, True]
     for config in configs:
         assert (config.agents, config.worlds, config.update_steps) == (3, 8, 16)
-        assert (config.mappo, config.model) == (configs[0].mappo, configs[0].model)
+        assert (config.learner, config.model) == (configs[0].learner, configs[0].model)
 
 
 def test_each_part_has_its_own_median():

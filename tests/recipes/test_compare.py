@@ -6,16 +6,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from compare import start
+from compare import CompareConfig, main
 from helpers import check_refused
+from shared.launch import launch
 from shared.settings import CONF
 
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison
 from damian.evaluation.report import markdown, plot_curves, plot_norms
 from damian.evaluation.statistics import interquartile_mean
 
-SMALL = ["frames=16", "worlds=2", "learner.steps=4", "learner.epochs=1", "eval_episodes=3", "model.hidden=[4]"]
-TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,unaware]", f"overrides=[{','.join(SMALL)}]"]
+SMALL = [
+    "frames=16",
+    "worlds=2",
+    "learner.steps=4",
+    "learner.epochs=1",
+    "eval_episodes=3",
+    "model.hidden=[4]",
+]
+
+
+def listed(*words: str) -> str:
+    """Overrides for every run."""
+    return f"overrides={list(words)}"
+
+
+TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,unaware]", listed(*SMALL)]
 ARMS = {
     "best": Arm(delayed=False),
     "blind": Arm(naive=True),
@@ -31,7 +46,7 @@ def compare(tmp_path, monkeypatch):
 
     def run_recipe(*overrides: str) -> Path:
         monkeypatch.setattr(sys, "argv", ["compare.py", *overrides])
-        start()
+        launch(main, CompareConfig)
         return tmp_path / "runs" / "usecase2"
 
     return run_recipe
@@ -113,11 +128,12 @@ def test_several_processes_do_the_same_as_one_and_a_failed_run_is_named(compare,
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
-        (["overrides=[framess=3]"], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
-        (["overrides=[delay=papers]"], "'delay/papers'"),
-        (["overrides=[agents=two]"], "agents: Value 'two'"),
-        (["overrides=[delay.loss=0.1,source.position=[1,2,3]]"], "source.position: [1, 2, 3] is not"),
-        (["overrides=[seed=3]"], "overrides: seed=3 is not for all runs alike"),
+        ([listed("framess=3")], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
+        ([listed("delay=papers")], "delay: papers is not one of burst, none, paper"),
+        ([listed("agents=two")], "agents: Value 'two'"),
+        ([listed("delay.loss=0.1", "source.position=[1,2,3]")], "source.position: [1, 2, 3] is not"),
+        (["overrides=[seed=3]"], "a value with = in it needs quotes"),
+        ([listed("seed=3")], "overrides: seed=3 is not for all runs alike"),
         (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not one of"),
         (["arms=[undelayed,awake]"], "arms: awake is not one of undelayed, unaware, deployed, history"),
         (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
@@ -140,7 +156,7 @@ def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(compare, capsys
 
 def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = SAMPLED) -> dict:
     """A row of which every measure is the value."""
-    where = {"reward": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
+    where = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
     names = ("true_return", "true_success_rate", "true_steps", "episode_return", "success_rate", "steps")
     return where | dict.fromkeys((*names, "age", "late", "lost", "episodes"), value)
 

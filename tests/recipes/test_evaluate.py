@@ -43,7 +43,7 @@ def fly(learnt, tmp_path, monkeypatch) -> Callable[..., Path]:
 
     def run_recipe(*overrides: str, of: Path | str | None = learnt, folder: str = "flown") -> Path:
         policy = [f"checkpoint={of}"] if of else []
-        monkeypatch.setattr(sys, "argv", ["evaluate.py", *policy, *overrides, f"hydra.run.dir={folder}"])
+        monkeypatch.setattr(sys, "argv", ["evaluate.py", *overrides, *policy, f"hydra.run.dir={folder}"])
         launch(main)
         return tmp_path / folder
 

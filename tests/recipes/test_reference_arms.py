@@ -36,11 +36,11 @@ from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
-from damian.envs.uav_env import EXTRAS, PRIVILEGED
+from damian.envs.uav_env import EXTRAS
+from damian.keys import GLOBAL_OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig, make_critic
-from damian.learners.sac import Sac
-from damian.learners.schedule import SystemClock
+from damian.learners.sac import Sac, SacConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 
@@ -53,7 +53,7 @@ LAWS: dict[str, Any] = {
 }
 """Laws that lose nothing, and the longest delay [steps] of each."""
 
-TRUTH = ("agents", PRIVILEGED)
+TRUTH = PRIVILEGED_OBSERVATION
 
 
 def actions_for(env: DelayedEnv, n_steps: int) -> list[Tensor]:
@@ -182,7 +182,7 @@ def test_only_a_privileged_critic_learns_of_a_source_that_moved_before_any_messa
     env = make_env(one_uav(), extras=["privileged"])
     here, there = moved([390.0, 100.0]), moved([390.0, 160.0])
     assert same(here.exclude(TRUTH), there.exclude(TRUTH))
-    for seen, differs in ((PRIVILEGED, True), ("global_observation", False)):
+    for seen, differs in ((TRUTH, True), (GLOBAL_OBSERVATION, False)):
         critic = make_critic(env, ModelConfig([16]), seen)
         one, other = (critic(td.clone())["agents", "state_value"] for td in (here, there))
         assert one.equal(other) is not differs
@@ -192,19 +192,19 @@ def settings(**changed: Any) -> TrainConfig:
     """A tiny run, a message in three late."""
     obs = PAPER | {"low": 1, "high": 3, "probability": 0.3}
     sections = vars(everything(delay=DelayConfig(obs=obs, history=2)))
-    tiny = {"worlds": 4, "mappo": MappoConfig(steps=12, minibatches=2), "model": ModelConfig([16])}
+    tiny = {"worlds": 4, "learner": MappoConfig(steps=12, minibatches=2), "model": ModelConfig([16])}
     return TrainConfig(**(sections | tiny | {"critic": "privileged"} | changed))
 
 
 def learner_of(config: TrainConfig) -> tuple[Mappo | Sac, DelayedEnv]:
     env = learning_env(config)
-    return make_learner(config, env, SystemClock(config.clock, config.update_steps)), env
+    return make_learner(config, env), env
 
 
 @both_kinds
-@pytest.mark.parametrize("algo", ["mappo", "sac"])
-def test_the_actor_of_a_privileged_critic_sees_no_truth(algo, kind):
-    learner, env = learner_of(settings(algo=algo, actions=ActionConfig(kind=kind)))
+@pytest.mark.parametrize("config", [MappoConfig(steps=12, minibatches=2), SacConfig()])
+def test_the_actor_of_a_privileged_critic_sees_no_truth(config, kind):
+    learner, env = learner_of(settings(learner=config, actions=ActionConfig(kind=kind)))
     assert TRUTH not in learner.actor.in_keys
     td = env.reset()
     other = td.clone()
@@ -217,10 +217,10 @@ def test_the_actor_of_a_privileged_critic_sees_no_truth(algo, kind):
 @pytest.mark.parametrize("critic", ["server", "privileged"])
 def test_the_critic_reads_what_was_asked_for(critic):
     learner, env = learner_of(settings(critic=critic))
-    seen = {"server": "global_observation", "privileged": PRIVILEGED}[critic]
-    assert learner.critic.in_keys == [("agents", seen)]
-    soft, _ = learner_of(settings(critic=critic, algo="sac"))
-    assert ("agents", seen) in soft.loss.qvalue_network.in_keys
+    seen = {"server": GLOBAL_OBSERVATION, "privileged": TRUTH}[critic]
+    assert learner.critic.in_keys == [seen]
+    soft, _ = learner_of(settings(critic=critic, learner=SacConfig()))
+    assert seen in soft.loss.qvalue_network.in_keys
     assert (TRUTH in env.observation_spec.keys(True, True)) == (critic == "privileged")
 
 
@@ -275,7 +275,7 @@ def test_a_reference_arm_is_trained_and_flown(train, overrides):
     ("override", "told"),
     [
         ("delay.hold=longest", "delay.hold: longest is not one of none, max"),
-        ("delay.hold=max", "delay.hold: max means nothing without late messages (delay.obs)"),
+        ("delay.hold=max", "delay.hold: max means nothing without delayed messages (delay.obs)"),
         ("critic=oracle", "critic: oracle is not one of server, privileged"),
     ],
 )

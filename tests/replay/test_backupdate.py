@@ -107,7 +107,7 @@ def buffer(
     scenario: ScenarioConfig, capacity: int, n_worlds: int = 4, actor: bool = False, **options
 ) -> TensorDictReplayBuffer:
     env = make_env(scenario, n_worlds)
-    view = server_recompute(env.base_env.server, terms=True, actor=actor)
+    view = server_recompute(env.base_env.server, reward_terms=True, actor=actor)
     storage = BackupdateStorage(capacity * n_worlds, view, LONGEST)
     return TensorDictReplayBuffer(storage=storage, batch_size=8, **options)
 
@@ -264,7 +264,7 @@ def test_a_success_that_was_learnt_of_late_ends_the_episode_where_it_happened():
         if true_ends[b, : len(steps)].any():
             assert ends[b, steps].tolist() == true_ends[b, : len(steps)].tolist()
     assert (~known["valid"]).any()
-    assert known["next", "done"][known["cut"]].all()
+    assert known["next", "done"][known["reset_after"]].all()
 
 
 def test_what_it_cannot_hold_is_refused():

@@ -15,9 +15,11 @@ from torchrl.envs.utils import check_env_specs
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
-from damian.envs.pipeline import ACTION, REWARD, DelayedEnv, make_env
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
+from damian.keys import ACTION, REWARD
 from damian.server.termination import EpisodeConfig
 from damian.transforms.skip_until_ready import SkipUntilReady
 from damian.world.landing import ActionConfig
@@ -236,7 +238,7 @@ def test_a_transform_with_an_impossible_discount_is_refused(gamma):
 
 def test_where_nothing_can_stand_still_there_is_no_skipping():
     env = TransformedEnv(UavEnv(square(), 2), SkipUntilReady())
-    with pytest.raises(RuntimeError, match="FastForward works only in a DelayedEnv"):
+    with pytest.raises(RuntimeError, match="SkipUntilReady works only in a DelayedEnv"):
         env.rollout(2)
 
 

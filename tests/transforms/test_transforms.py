@@ -134,7 +134,7 @@ def test_everyone_holds_the_message_that_a_loop_over_messages_says(law, order, l
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
 def test_everyone_executes_the_action_that_a_loop_over_choices_says(law, loss, sent_key):
     default = 5
-    options = {"loss": loss, "sent_key": sent_key, "fresh_key": "action_valid", "default": default}
+    options = {"loss": loss, "sent_key": sent_key, "valid_key": "action_valid", "default": default}
     transform, chosen = ActionDelay(law, ACTION, **options), choices()
     shown = play(delayed(transform), chosen)
     ready = before(shown, "agents", "ready")

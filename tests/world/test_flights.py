@@ -279,7 +279,9 @@ def test_a_uav_that_cannot_fly_there_keeps_nobody_else_from_a_point():
     bearing = torch.atan2(east, north) / math.tau % 1
     action = torch.stack([torch.hypot(east, north) / max(actions.distances), bearing], -1)
     state, goal = env.state, torch.tensor([pair])
-    cost = flight_drain(env.simulation.vehicles.vertical[0], torch.hypot(east, north)[0], env.scenario.battery).item()
+    cost = flight_drain(
+        env.simulation.vehicles.vertical[0], torch.hypot(east, north)[0], env.scenario.battery
+    ).item()
     for level, booked in ((100.0, [aim, None]), (0.99 * cost, [pair[0], aim]), (0.0, [pair[0], aim])):
         battery = torch.tensor([[level, 100.0]])
         env.state = state._replace(goal=goal, origin=goal, battery=battery)
