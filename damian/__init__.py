@@ -1,1 +1,75 @@
-"""DAMIAN: delay-aware multi-UAV reinforcement learning on TorchRL."""
+"""DAMIAN: delay-aware multi-UAV reinforcement learning on TorchRL.
+
+The names below are loaded when they are first used, because TorchRL takes seconds to import.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from damian.delays.config import DelayConfig
+    from damian.delays.laws import Burst, Constant, Geometric, Law, Trace, Uniform
+    from damian.envs.clocks import ClockConfig
+    from damian.envs.pipeline import make_env
+    from damian.envs.scenario import ScenarioConfig
+    from damian.envs.uav_env import UavEnv
+    from damian.replay.backupdate import BackupdateStorage
+    from damian.transforms import (
+        ActionDelay,
+        ActionHistory,
+        CumulativeReward,
+        ObservationDelay,
+        RewardDelay,
+        SampleAndHold,
+        ServerNode,
+    )
+
+__version__ = "0.2.0"
+
+_MODULES = {
+    "damian.delays.config": ["DelayConfig"],
+    "damian.delays.laws": ["Burst", "Constant", "Geometric", "Law", "Trace", "Uniform"],
+    "damian.envs.clocks": ["ClockConfig"],
+    "damian.envs.pipeline": ["make_env"],
+    "damian.envs.scenario": ["ScenarioConfig"],
+    "damian.envs.uav_env": ["UavEnv"],
+    "damian.replay.backupdate": ["BackupdateStorage"],
+    "damian.transforms": [
+        "ActionDelay",
+        "ActionHistory",
+        "CumulativeReward",
+        "ObservationDelay",
+        "RewardDelay",
+        "SampleAndHold",
+        "ServerNode",
+    ],
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [
+    "ActionDelay",
+    "ActionHistory",
+    "BackupdateStorage",
+    "Burst",
+    "ClockConfig",
+    "Constant",
+    "CumulativeReward",
+    "DelayConfig",
+    "Geometric",
+    "Law",
+    "ObservationDelay",
+    "RewardDelay",
+    "SampleAndHold",
+    "ScenarioConfig",
+    "ServerNode",
+    "Trace",
+    "UavEnv",
+    "Uniform",
+    "make_env",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module damian has no attribute {name}")
+    return getattr(import_module(_MODULE_OF[name]), name)

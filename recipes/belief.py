@@ -22,6 +22,7 @@ from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from damian import keys
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
@@ -40,32 +41,31 @@ def fly(config: TrainConfig) -> Beliefs:
         config.eval_scenario, 1, config.seed, config.device, extras=["message", "state", "reward_terms"]
     )
     flight = env.rollout(config.horizon, random_policy(env))[0].cpu()
-    keys = ["state", *(("agents", name) for name in ("message", "message_sent", "received", "delay"))]
-    parts = [part.select(*keys, strict=False) for part in (flight[:1], flight["next"])]
+    read = [keys.STATE, keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY]
+    parts = [part.select(*read, strict=False) for part in (flight[:1], flight["next"])]
     return beliefs(cast(TensorDictBase, torch.cat(parts)), env.uav_env)  # type: ignore[arg-type]
 
 
-def beliefs(shown: TensorDictBase, env: UavEnv) -> Beliefs:
-    """What was shown at each instant, [T + 1], by name; ``env`` is where the flight has left it."""
-    agents, state = cast(TensorDictBase, shown["agents"]), cast(Tensor, shown["state"])
-    message, message_sent = cast(Tensor, agents["message"]), cast(Tensor, agents["message_sent"]).clone()
-    message_sent[0] = False  # what is held after a reset
-    held = Messages.unpack(agents.get("received", message))
+def beliefs(outputs: TensorDictBase, env: UavEnv) -> Beliefs:
+    """The beliefs that follow from the outputs of a reset and of every step, [T + 1], of an environment."""
+    message, state = cast(Tensor, outputs[keys.MESSAGE]), cast(Tensor, outputs[keys.STATE])
+    sent = cast(Tensor, outputs[keys.MESSAGE_SENT]).clone()
+    sent[0] = False  # the server holds the first message from the reset on
+    delay = outputs.get(keys.DELAY, torch.zeros_like(sent[..., None], dtype=torch.long))
+    held = Messages.unpack(outputs.get(keys.RECEIVED, message))
     dt, steps = env.scenario.clock.dt, torch.arange(len(state), dtype=torch.float64)
     positions = state[:, : 3 * env.n_agents].unflatten(-1, (env.n_agents, 3))[..., :2]
     return Beliefs(
         time=np.asarray(steps * dt),
         true=np.asarray(positions),
         believed=np.asarray(held.position),
-        age=np.asarray((steps.unsqueeze(-1) - held.time / dt).round() * dt),  # times are float32
-        sent=np.asarray(message_sent),
-        delay=np.asarray(
-            agents.get("delay", torch.zeros_like(message_sent[..., None], dtype=torch.long))[..., 0]
-        ),
+        age=np.asarray((held.age(steps * dt) / dt).round() * dt),  # times in messages are float32
+        sent=np.asarray(sent),
+        delay=np.asarray(delay[..., 0]),
         source=np.asarray(state[:, -2:]),
         region=env.simulation.airspace.regions[int(env.state.region)].polygon,
         radius=env.simulation.radius,
-        jumps=env.simulation.vehicles.instant,
+        instant=env.simulation.vehicles.instant,
     )
 
 

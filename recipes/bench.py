@@ -27,6 +27,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
 from tqdm import tqdm
 
+from damian.common.markdown import markdown_table
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import make_env
@@ -112,7 +113,7 @@ def step_times(envs: Mapping[str, EnvBase], steps: int, repeats: int) -> dict[st
 
 
 def comparison(presets: Scenarios, sizes: Sizes) -> str:
-    """Steps of worlds per second beside VMAS, if that is installed."""
+    """Environment steps per second beside VMAS, if that is installed."""
     envs = rival(sizes)
     for name, scenario in presets.items():
         for shown, extras in (("bare", ()), ("all extras", EXTRAS)):
@@ -125,7 +126,7 @@ def comparison(presets: Scenarios, sizes: Sizes) -> str:
     ]
     return table(
         f"{sizes.worlds} worlds, 3 UAVs; median of {sizes.repeats} rollouts of {sizes.steps} steps",
-        ("environment", "ms/step", "steps of worlds/s", "times VMAS"),
+        ("environment", "ms/step", "environment steps/s", "times VMAS"),
         rows,
     )
 
@@ -233,7 +234,7 @@ def memory(presets: Scenarios) -> str:
 
 
 def training_speed(sizes: Sizes) -> str:
-    """Steps of worlds per second of training, and where the time goes."""
+    """Environment steps per second of training, and where the time goes."""
     worlds, steps = sizes.training_worlds, sizes.training_steps
     title = f"Training: {worlds} worlds, 3 UAVs, {steps} steps; median of {sizes.repeats} iterations"
     return table(title, HEADER, training(worlds, steps, sizes.repeats))
@@ -255,9 +256,8 @@ def tensors(tree: Any) -> Iterator[Tensor]:
 
 
 def table(title: str, header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    """A Markdown table."""
-    lines = [header, ("---", *["---:"] * (len(header) - 1)), *rows]
-    return "\n".join([f"## {title}\n", *("| " + " | ".join(map(str, x)) + " |" for x in lines), ""])
+    """A Markdown table under a heading."""
+    return f"## {title}\n\n{markdown_table(header, rows)}\n"
 
 
 def _costs(envs: Mapping[str, EnvBase], worlds: int, sizes: Sizes) -> list[str]:
@@ -266,7 +266,7 @@ def _costs(envs: Mapping[str, EnvBase], worlds: int, sizes: Sizes) -> list[str]:
 
 
 def _cost_header(what: str, presets: Scenarios) -> tuple[str, ...]:
-    costs = [f"{name}: {cost}" for name in presets for cost in ("ms/step", "steps of worlds/s")]
+    costs = [f"{name}: {cost}" for name in presets for cost in ("ms/step", "environment steps/s")]
     return (what, *costs)
 
 

@@ -19,14 +19,17 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from evaluate import fly
 from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig
-from shared.launch import COMPOSITION_ERRORS, checked, launch, one_line, reported
+from shared.composition_errors import COMPOSITION_ERRORS, one_line
+from shared.launch import checked, launch, reported
 from shared.parallel import LOG, Run, check_stored, perform_all
 from shared.settings import CONF
+from train import train
 
 from damian.common import checks
 from damian.common.errors import InputError
@@ -146,7 +149,8 @@ def _seeds(config: CompareConfig, folder: Path, words: list[str]) -> Iterator[Ru
             source = config.experiment.arms[how.policy_of]
             from_ = folder.parents[1] / (delay if source.delayed else NOT_LATE) / how.policy_of / last
             made = replace(made, checkpoint=str(from_))
-        yield Run(task, delay, arm, made, folder / last, trains=how.policy_of is None)
+        trains = how.policy_of is None
+        yield Run(task, delay, arm, made, folder / last, train if trains else fly, trains)
 
 
 def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:

@@ -19,6 +19,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import StepCounter
 
+from damian import keys
 from damian.common.errors import InputError
 from damian.envs.pipeline import has_message_delay
 from damian.evaluation.metrics import evaluate
@@ -64,13 +65,12 @@ def observe_with_timely_messages(server: Server, on_time: Tensor, fields: Sequen
         fields: of their messages.
     """
 
-    def see(received: Tensor, message: Tensor, shown: Tensor, steps: Tensor) -> Tensor:
-        known = server.observe_with_timely_messages(received, message, steps.squeeze(-1), on_time, fields)
-        return torch.cat([known, shown[..., known.shape[-1] :]], -1)  # what it remembers by itself stays
+    def observe(received: Tensor, sent: Tensor, observation: Tensor, steps: Tensor) -> Tensor:
+        timely = server.observe_with_timely_messages(received, sent, steps.squeeze(-1), on_time, fields)
+        return torch.cat([timely, observation[..., timely.shape[-1] :]], -1)  # its own past actions stay
 
-    names = ("received", "message", "observation")
-    keys = [*(("agents", name) for name in names), "step_count"]
-    return TensorDictModule(see, in_keys=keys, out_keys=[("agents", "observation")])
+    in_keys = [keys.RECEIVED, keys.MESSAGE, keys.OBSERVATION, keys.STEP_COUNT]
+    return TensorDictModule(observe, in_keys=in_keys, out_keys=[keys.OBSERVATION])
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

@@ -40,6 +40,8 @@ from tqdm import tqdm
 from damian import keys
 from damian.common import checks
 from damian.common.errors import InputError
+from damian.common.markdown import markdown_table
+from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
@@ -55,9 +57,9 @@ RANDOM_STEPS = 1000  # before learning begins
 EVALUATION_SEED = 1000  # of the first positions in every evaluation
 BATCH, LR, GAMMA, TAU = 256, 1e-3, 0.99, 0.005
 STORED = [
-    *(("agents", key) for key in ("observation", "action")),
-    *(("next", "agents", key) for key in ("observation", "reward")),
-    *(("next", key) for key in ("done", "terminated")),
+    keys.OBSERVATION,
+    keys.ACTION,
+    *map(next_key, (keys.OBSERVATION, keys.REWARD, keys.DONE, keys.TERMINATED)),
 ]
 
 
@@ -86,8 +88,8 @@ def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
     if history:
         transforms.append(ActionHistory(history, append_to="observation"))
     # The names that our learner knows; the only agent needs no dimension of its own.
-    shown, done = ["observation", "reward"], ["action"]
-    transforms.append(RenameTransform(shown, [("agents", k) for k in shown], done, [("agents", "action")]))
+    outputs = {"observation": keys.OBSERVATION, "reward": keys.REWARD}
+    transforms.append(RenameTransform([*outputs], [*outputs.values()], ["action"], [keys.ACTION]))
     return TransformedEnv(SerialEnv(worlds, one) if worlds else one(), Compose(transforms))
 
 
@@ -123,7 +125,7 @@ def evaluate_under(delay: int, history: int, actor: nn.Module, episodes: int) ->
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         flown = env.rollout(HORIZON, actor, break_when_any_done=False)
     env.close()
-    return flown["next", "agents", "reward"].sum(1).mean().item()
+    return flown[next_key(keys.REWARD)].sum(1).mean().item()
 
 
 def run_arm(run: Run, folder: Path, place: int) -> None:
@@ -183,9 +185,8 @@ def table(runs: Sequence[Run], folder: Path) -> str:
             rows.append([arm, delay, *numbers, str(REFERENCE.get((arm, int(delay)), ""))])
     with (folder / "results.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
-    rows.insert(1, ["---", *["---:"] * (len(rows[0]) - 1)])
-    title = f"# Pendulum-v1, SAC, {runs[0].steps} steps: return, mean of {runs[0].episodes} episodes\n"
-    told = "\n".join([title, *(f"| {' | '.join(row)} |" for row in rows), ""])
+    title = f"# Pendulum-v1, SAC, {runs[0].steps} steps: return, mean of {runs[0].episodes} episodes"
+    told = f"{title}\n\n{markdown_table(rows[0], rows[1:])}\n"
     (folder / "results.md").write_text(told)
     return told
 

@@ -4,16 +4,18 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, multinomial
 from torchrl.envs import EnvBase
 
+from damian import keys
+
 
 def random_policy(env: EnvBase) -> TensorDictModule:
     """Uniform over the legal actions; writes ``("agents", "action")``."""
-    spec = env.full_action_spec_unbatched["agents", "action"]
-    masked = ("agents", "action_mask") in env.observation_spec.keys(True, True)
+    spec = env.full_action_spec_unbatched[keys.ACTION]
+    masked = keys.ACTION_MASK in env.observation_spec.keys(True, True)
 
-    def sample(seen: Tensor) -> Tensor:
+    def sample(entry: Tensor) -> Tensor:
         if masked:
-            return multinomial(seen.flatten(0, -2).float(), 1).view(seen.shape[:-1])
-        return spec.rand(seen.shape[:1])
+            return multinomial(entry.flatten(0, -2).float(), 1).view(entry.shape[:-1])
+        return spec.rand(entry.shape[:1])
 
-    key = "action_mask" if masked else "observation"
-    return TensorDictModule(sample, in_keys=[("agents", key)], out_keys=[("agents", "action")])
+    in_key = keys.ACTION_MASK if masked else keys.OBSERVATION
+    return TensorDictModule(sample, in_keys=[in_key], out_keys=[keys.ACTION])

@@ -58,7 +58,7 @@ class Beliefs:
     """Where the UAVs fly."""
     radius: float
     """Within which a UAV hears the source [m]."""
-    jumps: bool
+    instant: bool
     """Is a UAV at its target as soon as a step ends."""
 
     @property
@@ -183,7 +183,7 @@ def _panel(axis: Axes, flight: Beliefs, uav: int) -> None:
     old, strip = flight.age[:-1, uav] > 0, axis.get_xaxis_transform()
     axis.stairs(old, time, fill=True, transform=strip, color=_OLD)
     axis.step(time, flight.believed[:, uav, 0], where="post", color=colour, linewidth=2.2)
-    style = "steps-post" if flight.jumps else "default"
+    style = "steps-post" if flight.instant else "default"
     axis.plot(time, flight.true[:, uav, 0], color="black", linewidth=0.8, drawstyle=style)
     for flags, mark, tint in ((flight.arrived, ".", colour), (flight.lost, "x", "black")):
         times = time[flags[:, uav]]

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from damian.common.markdown import markdown_table
 from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.comparison import NOT_LATE, RANDOM, SCRIPTED, SEEN, TRUE, Comparison, Line
 from damian.evaluation.statistics import Floats, bootstrap
@@ -42,20 +43,19 @@ def markdown(comparison: Comparison, notes: Sequence[str], tasks: Mapping[str, s
             parts += [f"## {task}, delay {delay}", tasks[task], _table(told, task in never)]
     overall = comparison.overall()
     if overall:
-        body = [f"| {arm} | {number} |" for arm, number in overall.items()]
-        head = ["| arm | interquartile mean of J_norm |", "|:--|--:|"]
-        parts += ["## All tasks and delays", "\n".join([*head, *body])]
+        table = markdown_table(("arm", "interquartile mean of J_norm"), overall.items())
+        parts += ["## All tasks and delays", table]
     return "\n\n".join(parts) + "\n"
 
 
 def _table(told: Sequence[Line], never: bool) -> str:
     left, right = ("arm", "regime", "policy"), (*HEADS, "J_norm", "recovery")
-    rows = [[*left, *right], [":--"] * len(left) + ["--:"] * len(right)]
+    rows = []
     for line in told:
         name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
         numbers = ["-" if never and "success" in key else str(line.measures[key]) for key in COLUMNS]
         rows.append([name, line.regime, line.policy, *numbers, str(line.j_norm), str(line.recovery)])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown_table([*left, *right], rows, left=len(left))
 
 
 def plot_curves(

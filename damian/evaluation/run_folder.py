@@ -10,6 +10,7 @@ import matplotlib
 from torch.utils.tensorboard import SummaryWriter
 
 from damian.common.errors import InputError
+from damian.common.markdown import markdown_table
 from damian.evaluation.metrics import Evaluation
 
 matplotlib.use("Agg")
@@ -114,7 +115,7 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
     figure, axes = plt.subplots(1, len(panels), figsize=(5 * len(panels), 3.4), squeeze=False)
     for axis, (name, label, level) in zip(axes[0], panels, strict=True):
         points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
-        axis.plot(*zip(*points, strict=True), color="tab:blue", label="MAPPO while training")
+        axis.plot(*zip(*points, strict=True), color="tab:blue", label="while training")
         axis.axhline(level, color="tab:gray", linestyle="--", label="random policy")
         axis.set_xlabel("environment steps, all worlds")
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -154,11 +155,10 @@ def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = F
         columns |= {f"true {title}": f"true_{field}" for title, field in wins.items()}
         columns |= {"true return": "true_return", "age": "age", "late": "late", "lost": "lost"}
     columns |= {"episodes": "episodes"}
-    lines = [["policy", *columns], [":--", *["--:"] * len(columns)]]
-    lines += [
+    lines = (
         [name, *(_number(getattr(row, field)) for field in columns.values())] for name, row in rows.items()
-    ]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    )
+    return markdown_table(["policy", *columns], lines)
 
 
 def _number(value: float) -> str:

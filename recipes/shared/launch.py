@@ -1,11 +1,9 @@
 """From a command line to a checked configuration, with errors that are one line."""
 
-import difflib
 import functools
 import os
-import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn, cast
@@ -16,7 +14,6 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 import torch
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -24,10 +21,11 @@ from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
-from shared.settings import CONF, LEARNERS, TrainConfig
+from shared.composition_errors import COMPOSITION_ERRORS, no_such_key, one_line, set_schema
+from shared.settings import LEARNERS, TrainConfig
 
-COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeError, OSError)
-"""What Hydra raises for overrides that it cannot compose."""
+Program = Callable[[TrainConfig, Path], None]
+"""Fills a run folder, as a configuration says."""
 
 
 def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
@@ -91,7 +89,7 @@ def _sets(given: str, key: str) -> bool:
     return key == given or key.startswith(f"{given}.")
 
 
-def perform(config: TrainConfig, folder: Path, program: Callable[[TrainConfig, Path], None]) -> None:
+def perform(config: TrainConfig, folder: Path, program: Program) -> None:
     """Run a program with its threads and its seed."""
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
@@ -190,13 +188,9 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
     return checked_main
 
 
-_schemas: list[type] = [TrainConfig]
-"""Whose keys the program knows, its own first."""
-
-
 def launch(main: Callable[[], Any], schema: type = TrainConfig) -> None:
     """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
-    _schemas[:] = dict.fromkeys([schema, TrainConfig])
+    set_schema(schema)
     _begun.clear()
     try:
         main()
@@ -222,81 +216,3 @@ def _drop_empty(folder: Path) -> None:
         _drop_empty(around)
     elif around.resolve() != Path.cwd() and not any(around.iterdir()):
         around.rmdir()
-
-
-def one_line(error: BaseException) -> str:
-    """What is wrong, from the deepest cause, without Hydra's lines of types, paths and hints."""
-    while isinstance(error.__cause__, OmegaConfBaseException):
-        error = error.__cause__
-    text, _, _ = str(error).partition("Config search path")
-    if re.search(r"mismatched input '='|no viable alternative at input '\[\w+='", text):
-        return "a value with = in it needs quotes, such as \"overrides=['frames=1000','worlds=8']\""
-    if option := re.search(r"Could not find '([\w-]+)/(\S+)'", text):
-        return _no_such_option(*option.groups())
-    if "Config group override must be a string" in text:
-        return next(map(_not_an_option, filter(_is_bare, sys.argv[1:])), text)
-    key = re.search(r"full_key: (\S+)", text)
-    if key and re.search(r"Key '.*' (is )?not in ", text):
-        return no_such_key(key[1])
-    tails = ("full_key", "reference_type", "object_type", "Set the env")
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    first, *more = [line for line in lines if not line.startswith(tails)] or [type(error).__name__]
-    message = " ".join([first, ", ".join(more).replace(":,", ":")]).strip()
-    return f"{key[1]}: {message}" if key else message
-
-
-def _no_such_option(group: str, option: str) -> str:
-    folder = Path(CONF) / group
-    known = sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
-    return f"{group}: {option} is not one of {', '.join(known)}"
-
-
-def _is_bare(word: str) -> bool:
-    """Does an override give a group a number or null, which Hydra refuses without naming it?"""
-    return bool(re.fullmatch(r"\+?\w+=([\d,.]+|null)", word)) and (Path(CONF) / _key(word)).is_dir()
-
-
-def _not_an_option(word: str) -> str:
-    group, _, option = word.lstrip("+").partition("=")
-    return _no_such_option(group, option)
-
-
-_RENAMED = {
-    "task": "reward",
-    "algo": "learner",
-    "mappo": "learner",
-    "sac": "learner",
-    "usecase": "scenario=paper/usecase1 or paper/usecase2, not usecase",
-    "delaybench": "scenario=delaybench/tracking and the like, not delaybench",
-    "region.situations": "region.initial_conditions",
-}
-"""Words of damian 0.1, and those that took their place."""
-
-
-def no_such_key(key: str) -> str:
-    """The message for an unknown key, with the nearest known one."""
-    if re.match(r"delay\.(obs|act|rew)\.", key):
-        return f"{key}: no setting of the law that is there already; write another law over delay=none"
-    group = key.partition(".")[0]
-    renamed = _RENAMED.get(key, _RENAMED.get(group))
-    if renamed:
-        return f"{key}: no such key; since damian 0.2 it is {renamed}"
-    near = (difflib.get_close_matches(key, _keys_of(schema), n=1, cutoff=0.75) for schema in _schemas)
-    nearest = next(filter(None, near), [])
-    return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in nearest)
-
-
-def _keys_of(schema: type) -> list[str]:
-    """Every dotted key of a schema, with those of every learner."""
-    learners = LEARNERS.values() if schema is TrainConfig else ()
-    configs = [OmegaConf.structured(schema), *(OmegaConf.create({"learner": make()}) for make in learners)]
-    return list(dict.fromkeys(name for config in configs for name in _keys(config)))
-
-
-def _keys(config: DictConfig, path: str = "") -> Iterator[str]:
-    """Every dotted key of a configuration."""
-    for name in config:
-        yield f"{path}{name}"
-        node = config._get_node(name)
-        if isinstance(node, DictConfig) and not node._is_missing():
-            yield from _keys(config[name], f"{path}{name}.")

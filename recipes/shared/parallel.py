@@ -16,14 +16,13 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
-from evaluate import fly
 from omegaconf import OmegaConf
 from tqdm import tqdm
-from train import train
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
-from shared.launch import one_line, perform, stored_config
+from shared.composition_errors import one_line
+from shared.launch import Program, perform, stored_config
 from shared.settings import TrainConfig
 
 LOG = "log.txt"
@@ -41,8 +40,10 @@ class Run:
     arm: str
     config: TrainConfig
     folder: Path
+    program: Program
+    """``train``, or ``fly`` for an arm that evaluates the policy of another one; importable by name."""
     trains: bool
-    """Else it flies what another one has learnt."""
+    """Does the program train, so that it leaves checkpoints and can be resumed."""
 
     @property
     def name(self) -> str:
@@ -180,7 +181,7 @@ def _perform(run: Run) -> None:
         try:
             begun = run.trains and (run.folder / CHECKPOINT).exists()
             config = replace(run.config, resume=str(run.folder)) if begun else run.config
-            perform(config, run.folder, train if run.trains else fly)
+            perform(config, run.folder, run.program)
         except SystemExit as interrupted:
             raise KeyboardInterrupt from interrupted
         except InputError as error:

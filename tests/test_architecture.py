@@ -1,0 +1,108 @@
+"""The file tree: which folder may import which, and how large files and functions may grow."""
+
+import ast
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import damian
+
+ROOT = Path(damian.__file__).parent
+RECIPES = ROOT.parent / "recipes"
+FLOORS = [
+    {"common", "keys"},
+    {"world", "delays"},
+    {"server"},
+    {"transforms"},
+    {"envs", "replay"},
+    {"learners"},
+    {"baselines"},
+    {"evaluation"},
+]
+"""Folders and modules of ``damian``; each may import only those on lower floors."""
+FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+LINES_PER_FILE, LINES_PER_FUNCTION, ROOMS = 400, 50, 14
+
+FILES = sorted(path for folder in (ROOT, RECIPES) for path in folder.rglob("*.py"))
+MODULES = {".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path for path in FILES}
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Every module, or name within one, that a file imports."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def room(module: str) -> str:
+    """Folder or module at the top of ``damian``."""
+    return module.split(".")[1]
+
+
+def test_every_room_has_a_floor_and_there_are_few():
+    rooms = {path.stem for path in ROOT.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert rooms - {"__init__"} == set(FLOOR)
+    assert len(rooms) <= ROOMS
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if m.startswith("damian.")])
+def test_a_module_imports_only_from_its_own_folder_and_lower_floors(module):
+    if module == "damian.__init__":
+        return  # the public names
+    own = room(module)
+    for name in imported(MODULES[module]):
+        if name.startswith("damian.") and room(name) != own:
+            assert FLOOR[room(name)] < FLOOR[own], f"{module} imports {name}"
+
+
+def test_the_package_never_imports_the_recipes():
+    programs = {path.stem for path in RECIPES.glob("*.py")} | {"shared", "recipes"}
+    for path in ROOT.rglob("*.py"):
+        assert not {name.split(".")[0] for name in imported(path)} & programs, path
+
+
+def test_what_the_recipes_share_imports_no_recipe():
+    programs = {path.stem for path in RECIPES.glob("*.py")}
+    for path in (RECIPES / "shared").glob("*.py"):
+        assert not {name.split(".")[0] for name in imported(path)} & programs, path
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    known = {m.removesuffix(".__init__"): set(imported(path)) for m, path in MODULES.items()}
+    edges = {
+        m: {
+            other
+            for other in known
+            if other != m and any(n == other or n.startswith(f"{other}.") for n in names)
+        }
+        for m, names in known.items()
+        if m.startswith("damian.")
+    }
+    edges = {
+        m: {o for o in others if o in edges and not m.startswith(f"{o}.")} for m, others in edges.items()
+    }
+    while leaves := {m for m, others in edges.items() if not others}:
+        edges = {m: others - leaves for m, others in edges.items() if m not in leaves}
+    assert edges == {}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT.parent)))
+def test_files_and_functions_stay_short_and_say_what_they_are_for(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= LINES_PER_FILE
+    tree = ast.parse(text)
+    assert ast.get_docstring(tree), "a file says in a sentence what it is for"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno < LINES_PER_FUNCTION, node.name
+
+
+def test_every_public_name_exists_and_is_loaded_on_demand():
+    assert sorted(itertools.chain(*damian._MODULES.values())) == sorted(damian.__all__)
+    assert all(getattr(damian, name).__name__ == name for name in damian.__all__)
+    with pytest.raises(AttributeError, match="no attribute nothing"):
+        _ = damian.nothing
