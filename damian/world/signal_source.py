@@ -204,7 +204,7 @@ def _profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tenso
     """Time of speeding up and of the whole leg [s], [*]."""
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration
-    return ramp, length / peak.clamp_min(_TINY) + ramp
+    return ramp, length / peak.clamp_min(torch.finfo(peak.dtype).tiny) + ramp
 
 
 def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tensor) -> Tensor:

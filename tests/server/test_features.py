@@ -6,7 +6,7 @@ import pytest
 import torch
 import twin
 from helpers import SCALE, TIME_SCALE, random_worlds, snapshot_of
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
@@ -31,7 +31,6 @@ def check(worlds, newest=False):
             assert ((ours[name] >= 0) & (ours[name] <= 1)).all(), name
 
 
-@settings(max_examples=200, deadline=None)
 @given(seed=seeds, n_agents=fleets, heard=shares, spots=shares, newest=st.booleans())
 def test_every_feature_equals_its_loop_and_lies_between_0_and_1(seed, n_agents, heard, spots, newest):
     check(random_worlds(seed, n_agents, heard, spots), newest)

@@ -7,7 +7,7 @@ import pytest
 import torch
 import twin
 from helpers import random_worlds, snapshot_of
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
@@ -37,7 +37,6 @@ def features(seed, n_agents, n_worlds=3):
     return {name: draw() for name in NAMES}, counters
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     seed=seeds,
     n_agents=st.integers(1, 5),
@@ -96,7 +95,6 @@ def test_spotting_is_worth_less_the_more_motions_it_took(motions, share):
     assert ours["spotted"].item() == ours["source_distance"].item() == share
 
 
-@settings(max_examples=200, deadline=None)
 @given(
     seed=seeds,
     n_agents=st.integers(1, 5),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Point, Polygon
@@ -104,7 +104,6 @@ def test_coverage_is_within_one_percent_of_the_exact_area(kind, spread):
         np.testing.assert_allclose(got, exact, rtol=0, atol=0.01)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kind=st.sampled_from(["convex", "concave", "hole", "parts"]),

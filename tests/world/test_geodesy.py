@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon, to_local, wrap_longitude
 
 ONE_DEGREE_M = EARTH_RADIUS_M * np.pi / 180
-reproducible = settings(derandomize=True, deadline=None)
 NEAR_M = st.floats(-35_000, 35_000)
 
 
@@ -52,14 +51,12 @@ def _slow_local(lat, lon, origin):
     return EARTH_RADIUS_M * angle * flat / np.linalg.norm(flat)
 
 
-@reproducible
 @given(st.floats(-89.4, 89.4), st.floats(-180, 180), NEAR_M, NEAR_M)
 def test_metres_survive_the_way_to_degrees_and_back_within_50_km(lat, lon, x, y):
     there = to_latlon(x, y, (lat, lon))
     np.testing.assert_allclose(to_local(*there, (lat, lon)), [x, y], atol=1e-6)
 
 
-@reproducible
 @given(st.floats(-89, 89), st.floats(-179.999, 179.999), st.floats(-0.4, 0.4), st.floats(-0.4, 0.4))
 def test_degrees_survive_the_way_to_metres_and_back(lat, lon, d_lat, d_lon):
     place = lat + d_lat, float(wrap_longitude(lon + d_lon))
@@ -69,7 +66,6 @@ def test_degrees_survive_the_way_to_metres_and_back(lat, lon, d_lat, d_lon):
     assert turn * np.cos(np.radians(place[0])) == pytest.approx(0, abs=1e-11)
 
 
-@reproducible
 @given(st.floats(-60, 60), st.floats(1, 50_000))
 def test_going_east_over_the_antimeridian_wraps_the_longitude_and_stays_near(lat, x):
     origin = (lat, 179.99999)
@@ -78,7 +74,6 @@ def test_going_east_over_the_antimeridian_wraps_the_longitude_and_stays_near(lat
     assert to_local(*there, origin)[0] == pytest.approx(x + 10, abs=1e-6)
 
 
-@reproducible
 @given(st.floats(-1e4, 1e4))
 def test_a_wrapped_longitude_is_in_one_turn_and_the_same_direction(lon):
     wrapped = float(wrap_longitude(lon))

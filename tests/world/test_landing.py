@@ -8,7 +8,7 @@ import shapely
 import torch
 import twin
 from helpers import heading
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Polygon
@@ -40,7 +40,6 @@ def booked(ranked, row, standing, ready, n_points):
     return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0), n_points)
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n_agents=st.integers(1, 12),
@@ -59,7 +58,6 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
     assert ours.tolist() == expected
 
 
-@settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(2, 12), spare=st.integers(0, 6))
 def test_uavs_on_different_points_never_book_the_same(seed, n_agents, spare):
     case = fleets(seed, 20, n_agents, n_agents + spare, False)
@@ -98,7 +96,6 @@ def test_from_a_common_start_one_may_stay_and_the_others_leave():
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_points=st.integers(1, 40), integer_grid=st.booleans())
-@settings(max_examples=100, deadline=None)
 def test_nearest_points_are_numpys_and_ties_go_to_the_lowest_id(seed, n_points, integer_grid):
     rng = np.random.default_rng(seed)
     points = rng.uniform(-200, 200, (n_points, 2)).astype(np.float32)

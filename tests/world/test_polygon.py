@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon
 
@@ -23,7 +23,6 @@ from damian.world.regions.polygon import (
 DATA = Path(__file__).parents[1] / "data"
 GOLDEN = json.loads((DATA / "motion_energy_coverage.json").read_text())
 EXAMPLES = GOLDEN["discretisation_examples"]
-reproducible = settings(max_examples=40, derandomize=True, deadline=None)
 SQUARE = Polygon([(0, 0), (100, 0), (100, 100), (0, 100)])
 ELL = Polygon([(0, 0), (300, 0), (300, 100), (100, 100), (100, 300), (0, 300)])
 LAKE = Polygon(SQUARE.buffer(100).exterior, [SQUARE.exterior])
@@ -88,7 +87,6 @@ def test_the_lattice_is_that_of_a_slow_loop_on_concave_holed_and_split_polygons(
     np.testing.assert_allclose(points, _slow_lattice(polygon, step, degrees), atol=1e-6)
 
 
-@reproducible
 @given(st.integers(0, 2**32 - 1), st.floats(10, 60), st.floats(5, 90))
 def test_landing_points_are_strictly_inside_distinct_and_ordered_by_direction(seed, step, degrees):
     polygon = random_polygon(np.random.default_rng(seed), 30_000, 60_000)
@@ -169,7 +167,6 @@ def test_random_polygons_have_the_original_statistics():
     assert areas.std() == pytest.approx(stats["area"]["std"], rel=0.25)
 
 
-@reproducible
 @given(st.integers(0, 2**32 - 1), st.floats(1, 1e10), st.floats(0, 1))
 def test_a_random_polygon_is_convex_and_between_its_areas(seed, max_area, share):
     min_area = max(max_area * share, max_area * 1e-6)
