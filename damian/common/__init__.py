@@ -1,1 +1,1 @@
-"""Checks, errors, random numbers and other helpers that know nothing of UAVs or of learning."""
+"""Checks, errors, random numbers and other helpers that depend on neither the UAV world nor learning."""

@@ -1,4 +1,4 @@
-"""Checks of written values; each failure is one line that names the key, the value and its unit."""
+"""Checks of settings; a failed check raises one line that names the key, the value and its unit."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -40,20 +40,24 @@ def above(key: str, value: float, low: float, unit: str = "") -> None:
 
 
 def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:
-    """Require membership."""
+    """Require that the value is one of the choices."""
     choices = list(choices)
     require(value in choices, key, value, f"is not one of {', '.join(map(str, choices))}")
 
 
 def place(key: str, value: Any) -> None:
-    """Require one ``[x, y]`` in metres."""
+    """Require a position ``[x, y]`` of two finite numbers [m]."""
     good = isinstance(value, Sequence) and len(value) == 2
     good = good and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
     require(good, key, value, "is not [x, y] in metres")
 
 
 def seconds(key: str, value: str | float) -> float:
-    """Read a time: ``"2s"``, ``"0.5m"``, ``"1h"``, or a bare number of seconds."""
+    """Convert a time to seconds: ``"2s"``, ``"0.5m"``, ``"1h"``, or a bare number of seconds.
+
+    Raises:
+        InputError: the value is no time, or not above 0 s.
+    """
     text = str(value).strip()
     number, unit = (text[:-1], text[-1]) if text[-1:] in _SECONDS else (text, "s")
     try:
@@ -65,7 +69,7 @@ def seconds(key: str, value: str | float) -> float:
 
 
 def device(key: str, value: str) -> None:
-    """Require the CPU or a CUDA device that this machine has."""
-    known = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
-    known += ["cuda"] * (len(known) > 1)
-    require(value in known, key, value, f"is not one of the devices here: {', '.join(known)}")
+    """Require ``cpu`` or a CUDA device of this machine."""
+    available = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+    available += ["cuda"] * (len(available) > 1)
+    require(value in available, key, value, f"is not one of the devices here: {', '.join(available)}")

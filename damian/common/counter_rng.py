@@ -1,6 +1,6 @@
 """Random numbers as a pure function of (world seed, counter): no generator, no hidden state.
 
-Each world has its own stream, so worlds stepped together draw what they draw alone, on any device and
+Each world has its own stream, so a world draws the same numbers in a batch as alone, on any device and
 under ``torch.compile``. The hash is the 32-bit finaliser "lowbias32" (C. Wellons, "Prospecting for hash
 functions", 2018) in int64 arithmetic: good enough for simulation, not for cryptography.
 """
@@ -19,7 +19,7 @@ def mix(x: Tensor) -> Tensor:
 
 
 def bits(seed: Tensor, *counters: Tensor) -> Tensor:
-    """Uniform integers in [0, 2^32), one per element of the broadcast shape of seed and counters."""
+    """Draw uniform integers in [0, 2^32), one per element of the broadcast shape of seed and counters."""
     value = seed
     for counter in counters:
         value = mix((value + 0x9E3779B9 * (counter + 1)) & _MASK)
@@ -27,11 +27,11 @@ def bits(seed: Tensor, *counters: Tensor) -> Tensor:
 
 
 def uniform(seed: Tensor, *counters: Tensor) -> Tensor:
-    """Uniform floats in [0, 1)."""
+    """Draw uniform floats in [0, 1), one per element of the broadcast shape of seed and counters."""
     return (bits(seed, *counters) >> 8).to(torch.float32) * 2.0**-24
 
 
 def world_seeds(seed: int, n_worlds: int, device: torch.device | None = None) -> Tensor:
-    """One well-separated seed per world, shape [B]; neighbouring seeds share no streams."""
+    """Derive one well-separated seed per world, [B]; neighbouring values of ``seed`` share no streams."""
     base = mix(torch.tensor(seed & _MASK, device=device))
     return bits(base, torch.arange(n_worlds, device=device))

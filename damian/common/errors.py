@@ -1,8 +1,8 @@
-"""The one error that means: what a person wrote is wrong."""
+"""The error raised for wrong input: a setting, a file or an argument."""
 
 
 class InputError(ValueError):
-    """Wrong input; ``str(error)`` is one line naming the place, the value, its unit and what would be right.
+    """Wrong input; ``str(error)`` is one line with the key or place, the value, its unit and the remedy.
 
-    A recipe prints that line and exits with code 2; everything else keeps its traceback.
+    A recipe prints that line and exits with code 2; any other error keeps its traceback.
     """

@@ -1,4 +1,4 @@
-"""Indexing and mapping of tensors that several folders need."""
+"""Helpers that index tensors and map functions over nested named tuples of tensors."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -10,17 +10,17 @@ Tree = TypeVar("Tree", bound=NamedTuple)
 
 
 def gather_rows(table: Tensor, index: Tensor) -> Tensor:
-    """``table[index]`` for a table [M, ...] and any shape of index; several times as fast on a CPU."""
+    """Compute ``table[index]`` [*, ...], several times as fast on a CPU; table [M, ...], index [*]."""
     return table.index_select(0, index.flatten()).view(*index.shape, *table.shape[1:])
 
 
 def expand_mask(mask: Tensor, like: Tensor) -> Tensor:
-    """A mask [*] with as many trailing dimensions of size 1 as ``like`` [*, ...] has."""
+    """Append dimensions of size 1 to a mask [*], so that it broadcasts against ``like`` [*, ...]."""
     return mask.view(*mask.shape, *[1] * (like.dim() - mask.dim()))
 
 
 def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
-    """Apply a function to the tensors of nested named tuples."""
+    """Apply a function to the corresponding tensors of nested named tuples."""
     values: list[Any] = [
         tree_map(function, *leaf) if hasattr(leaf[0], "_fields") else function(*leaf)
         for leaf in zip(tree, *others, strict=True)
@@ -29,5 +29,5 @@ def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree
 
 
 def tree_where(mask: Tensor, new: Tree, old: Tree) -> Tree:
-    """Choose between the tensors [*, ...] of nested named tuples, row by row, by a mask [*]."""
+    """Take the rows of ``new`` where the mask [*] is true and of ``old`` elsewhere; tensors are [*, ...]."""
     return tree_map(lambda a, b: torch.where(expand_mask(mask, a), a, b), new, old)

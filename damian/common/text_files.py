@@ -1,4 +1,4 @@
-"""Reading what people wrote: a whole file as text, and errors that say where on one line."""
+"""Reads input files as text, and helps to put the file, the place and a hint into one-line errors."""
 
 import difflib
 import os
@@ -11,11 +11,15 @@ from typing import Any
 from damian.common.errors import InputError
 
 MAX_BYTES = 50_000_000
-"""Larger files are refused unread."""
+"""Size limit [bytes]; larger files are refused without reading them."""
 
 
 def read_text(file: Path) -> str:
-    """A whole file as text, with or without a byte order mark."""
+    """Read a whole UTF-8 file as text, with or without a byte order mark.
+
+    Raises:
+        InputError: the file is missing, unreadable, too large, empty or not UTF-8.
+    """
     try:
         if not file.exists():
             raise InputError("no such file")
@@ -36,7 +40,7 @@ def read_text(file: Path) -> str:
 
 @contextmanager
 def named(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the file's name before every error, and each on one line that can be printed."""
+    """Put the file's name before every ``InputError`` raised inside, and make it one printable line."""
     try:
         yield
     except InputError as error:
@@ -44,24 +48,24 @@ def named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def one_line(text: str) -> str:
-    """Text without line breaks and without halves of characters, which JSON may hold."""
+    """Remove line breaks, and escape lone surrogates, which JSON may hold and which cannot be printed."""
     return " ".join(text.encode(errors="backslashreplace").decode().split())
 
 
 def show(value: Any) -> str:
-    """A value as written in Python, cut short."""
+    """Shorten a value to an abbreviated Python literal."""
     return reprlib.repr(value)
 
 
 def listed(items: Iterable[str]) -> str:
-    """The first eight items and how many more there are."""
+    """Join the first eight items, and say how many more there are."""
     items = list(items)
     more = [f"and {len(items) - 8} more"] if len(items) > 8 else []
     return ", ".join(items[:8] + more) or "none"
 
 
 def near(written: str, known: Iterable[str]) -> str:
-    """What may have been meant."""
+    """Suggest the known names closest to an unknown one, or list all of them if none is close."""
     lowered = {name.lower(): name for name in sorted(known)}
     close = difflib.get_close_matches(written.lower(), lowered, n=5)
     if close:

@@ -1,1 +1,1 @@
-"""How long messages take: delay laws, samplers that draw from them, and a line that holds messages back."""
+"""Delays of messages: delay laws, samplers that draw from them, and a delay line of messages in transit."""

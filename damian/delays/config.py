@@ -1,4 +1,4 @@
-"""Settings of everything that is delayed in a scenario, and of the action history."""
+"""Settings of the delays of a scenario, of its cumulative rewards and of the action history."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,28 +11,28 @@ from damian.delays.laws import LONGEST, LOSES, Held, Law, law_of
 
 @dataclass
 class DelayConfig:
-    """What arrives late, and what is done about it. A law is steps, a time, or a mapping (``law_of``)."""
+    """Delays and how they are handled. A law is a number of steps, a time, or a mapping (``law_of``)."""
 
     obs: Any = 0
-    """Delay of each UAV's messages to the server node."""
+    """Law of the delay of each UAV's messages to the server node (paper, section 3.4)."""
     act: Any = 0
-    """Delay between a UAV's choice and its execution; until the first arrives it holds."""
+    """Law of the delay of each action (section 3.3); a UAV holds its position until the first one arrives."""
     rew: Any = 0
-    """Delay of the rewards."""
+    """Law of the delay of the rewards, which must not lose any (section 3.5)."""
     loss: float = 0.0
-    """Probability that a message is lost."""
+    """Probability that a message to the server node is lost."""
     hold: str = "none"
-    """``max``: the server keeps every message back until the longest delay that ``obs`` allows has passed, so
-    that the delay is constant."""
+    """``max``: the server holds every message back until the longest delay of ``obs`` has passed, so that the
+    delay is constant."""
     order: str = "generation"
-    """The server believes the message that was generated last (``generation``, the age of what it knows
-    grows by at most a step each step) or that arrived last (``arrival``)."""
+    """Which received message the server holds: the one generated last (``generation``; the age of information
+    then grows by at most one step per step) or the one that arrived last (``arrival``)."""
     history: int = 0
-    """How many of its own latest actions a UAV sees."""
+    """Number of its own latest actions that a UAV observes (section 3.3)."""
     reward_window: int = 1
-    """Steps over which rewards are summed up (eq. 4)."""
+    """Number of steps over which rewards are summed (eq. 4)."""
     reward_discount: float = 0.9
-    """Gamma of eq. 4."""
+    """Discount factor gamma of that sum (eq. 4)."""
 
     def __post_init__(self) -> None:
         checks.in_range("delay.loss", self.loss, 0.0, 1.0)
@@ -45,15 +45,15 @@ class DelayConfig:
 
     @property
     def uplink(self) -> Law:
-        """The law that the messages to the server really follow."""
+        """Law of the messages to the server node, with ``hold`` applied."""
         law = law_of(self.obs, "delay.obs")
         return Held(law) if self.hold == "max" else law
 
     def check(self, dt: float) -> None:
-        """Make sure that the laws mean something at this length of a step [s].
+        """Check that every law is valid for steps of ``dt`` seconds.
 
         Raises:
-            InputError: names the one that does not.
+            InputError: a law is invalid, or the reward delay loses rewards.
         """
         samplers = {
             name: law_of(getattr(self, name), f"delay.{name}").sampler(dt, key=f"delay.{name}")

@@ -1,4 +1,4 @@
-"""Messages in transit: sent in each step, delivered some steps later, held until a newer one arrives."""
+"""A delay line: messages arrive some steps after they were sent, and are held until a newer one arrives."""
 
 from typing import NamedTuple
 
@@ -9,52 +9,54 @@ from damian.common.tensors import expand_mask
 from damian.delays.samplers import Sampler
 
 Memory = dict[str, Tensor]
-"""Everything that a delay line remembers, by name."""
+"""State of a delay line, by name."""
 
 ORDERS = ("generation", "arrival")
-"""Which message a receiver holds: the one generated last, or the one that arrived last."""
+"""Which received message a receiver holds: the one generated last, or the one that arrived last."""
 
 
 class Delivery(NamedTuple):
     """What M receivers hold after a step."""
 
     held: list[Tensor]
-    """The values of the held messages, [M, ...] each."""
+    """Values of the held messages, [M, ...] each."""
     age: Tensor
-    """Steps since the held message was generated, [M]."""
+    """Age of the held message: steps since it was generated, [M]."""
     fresh: Tensor
-    """Did the held message arrive in this step, [M]."""
+    """Whether the held message arrived in this step, [M] bool."""
     delay: Tensor
-    """Delay of the message sent in this step [steps], [M]; ``Sampler.lost`` if lost, or if none was sent."""
+    """Delay of the message sent in this step [steps], [M]; ``Sampler.lost`` if it is lost or none is sent."""
 
 
 class DelayLine:
-    """Delays rows of values by a law; each of M senders sends at most one message per step.
+    """Delays the messages of M senders, each of which sends at most one message per step.
 
     A message is written at once into the slot of the step at which it will arrive, where a later message
-    that arrives at the same step replaces it. Pure but for the slots, which are written in place. The memory:
+    that arrives at the same step replaces it. The slots form a ring. Steps and resets are pure functions of
+    the memory, except that a step writes the slots in place. The memory:
 
-    - ``clock``: steps so far, and ``slot``: the slot of this step, [M] each;
+    - ``clock``: number of steps so far, and ``slot``: the slot of the current step, [M] each;
     - ``streams``: random stream of each sender, [M], and ``channel``: state of its channel, [M];
-    - ``reset_at``: clock at its latest reset, [M], and ``generated_at``: clock at which the held message
-      was generated, [M];
+    - ``reset_at``: clock at the sender's latest reset, [M], and ``generated_at``: clock at which the held
+      message was generated, [M];
     - ``senders``: 0, 1, ..., M - 1;
-    - ``stamps``: clock at which the message in a slot was generated, [K + 1, M]: K slots for the steps to
-      come, and one for the messages that never arrive;
-    - ``slots_i``: the values of the messages, [K + 1, M, ...], and ``held_i``: of the held ones, [M, ...].
+    - ``stamps``: clock at which the message in a slot was generated, [K + 1, M]: K slots for the current and
+      the coming steps, and one for messages that never arrive;
+    - ``slots_i``: values of the messages in the slots, [K + 1, M, ...], and ``held_i``: values of the held
+      messages, [M, ...].
 
     Args:
-        sampler: of the delays.
+        sampler: draws the delays.
         order: one of ``ORDERS``.
     """
 
     def __init__(self, sampler: Sampler, order: str) -> None:
         self.sampler = sampler
-        self._newest_generated = order == "generation"
+        self._hold_last_generated = order == "generation"
 
     def init_memory(self, values: list[Tensor], streams: Tensor) -> Memory:
-        """The memory for messages of these values [M, ...] and senders of these random streams [M]."""
-        n_slots, zero = self.sampler.lost + 1, torch.zeros_like(streams)
+        """Create the memory for messages like ``values`` [M, ...] and senders with random ``streams`` [M]."""
+        n_rows, zero = self.sampler.lost + 1, torch.zeros_like(streams)
         memory = {
             "clock": zero,
             "slot": zero.clone(),
@@ -63,15 +65,15 @@ class DelayLine:
             "reset_at": zero.clone(),
             "generated_at": zero.clone(),
             "senders": torch.arange(len(streams), device=streams.device),
-            "stamps": zero.new_full((n_slots, len(streams)), -1),
+            "stamps": zero.new_full((n_rows, len(streams)), -1),
         }
         for i, value in enumerate(values):
-            memory[f"slots_{i}"] = value.new_zeros(n_slots, *value.shape)
+            memory[f"slots_{i}"] = value.new_zeros(n_rows, *value.shape)
             memory[f"held_{i}"] = value.clone()
         return memory
 
     def reset(self, memory: Memory, values: list[Tensor], mask: Tensor) -> tuple[Memory, Delivery]:
-        """Where the mask [M] is true, hold these values [M, ...] and forget all messages in transit."""
+        """Where the mask [M] is true, hold ``values`` [M, ...] and discard all messages in transit."""
         clock = memory["clock"]
         memory = memory | {n: torch.where(mask, clock, memory[n]) for n in ("reset_at", "generated_at")}
         for i, new in enumerate(values):
@@ -80,12 +82,15 @@ class DelayLine:
         return memory, Delivery(values, zero, zero == 0, zero)
 
     def step(self, memory: Memory, values: list[Tensor], sent: Tensor | None) -> tuple[Memory, Delivery]:
-        """Send these values [M, ...], and deliver the messages that arrive in this step.
+        """Send one message per sender, and deliver the messages that arrive in this step.
 
         Args:
-            memory: before the step.
-            values: of the messages.
-            sent: which of them are sent, [M]; all of them if not given.
+            memory: the memory before the step.
+            values: values of the messages, [M, ...] each.
+            sent: mask of the messages that are really sent, [M] bool; all of them if not given.
+
+        Returns:
+            The memory after the step, and what the receivers then hold.
         """
         clock, generated_at = memory["clock"] + 1, memory["generated_at"]
         n_slots, n_senders = self.sampler.lost, len(generated_at)
@@ -94,26 +99,26 @@ class DelayLine:
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
         arrival = torch.where(delay < n_slots, advance_slot(slot_now, delay, n_slots), n_slots)
-        row, here = (slot * n_senders + memory["senders"] for slot in (arrival, slot_now))
+        row_sent, row_now = (slot * n_senders + memory["senders"] for slot in (arrival, slot_now))
         stamps = memory["stamps"].view(-1)
-        stamp = stamps.index_copy_(0, row, clock).index_select(0, here)
-        if self._newest_generated:
-            oldest = generated_at
-        else:  # every message of this episode, but not what the slot held one round ago
-            oldest = torch.maximum(memory["reset_at"], clock - n_slots)
-        fresh = stamp > oldest
+        stamp = stamps.index_copy_(0, row_sent, clock).index_select(0, row_now)
+        if self._hold_last_generated:
+            generated_after = generated_at
+        else:  # any message sent since the reset, but none that the previous turn of the ring left behind
+            generated_after = torch.maximum(memory["reset_at"], clock - n_slots)
+        fresh = stamp > generated_after
         generated_at = torch.where(fresh, stamp, generated_at)
         memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "generated_at": generated_at}
         held = []
         for i, value in enumerate(values):
             slots, old = memory[f"slots_{i}"], memory[f"held_{i}"]
-            new = slots.flatten(0, 1).index_copy_(0, row, value).index_select(0, here)
+            new = slots.flatten(0, 1).index_copy_(0, row_sent, value).index_select(0, row_now)
             held.append(torch.where(expand_mask(fresh, old), new, old))
             memory[f"held_{i}"] = held[i]
         return memory, Delivery(held, clock - generated_at, fresh, delay)
 
 
 def advance_slot(slot: Tensor, steps: Tensor | int, n_slots: int) -> Tensor:
-    """The slot some steps later, for fewer steps than slots; a modulo would cost a division per element."""
+    """Slot that is ``steps`` < ``n_slots`` later in the ring; a modulo would cost a division per element."""
     later = slot + steps
     return torch.where(later < n_slots, later, later - n_slots)

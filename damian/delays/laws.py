@@ -1,7 +1,7 @@
-"""How late messages arrive: delay laws, in steps (``3``) or in time (``"3s"``, ``"0.5m"``).
+"""Delay laws: probability distributions of message delays, in steps (``3``) or time (``"3s"``, ``"0.5m"``).
 
-A law says how likely each delay is; ``sampler`` turns it into a table from which delays are drawn, one
-hash and one search per message. The transforms that hold messages back are in ``damian.transforms``.
+``Law.sampler`` turns a law into a table from which delays are drawn, with one hash and one search per
+message. The transforms that delay observations, actions and rewards are in ``damian.transforms``.
 """
 
 import csv
@@ -19,38 +19,38 @@ from damian.common.text_files import named, near, read_text, show
 from damian.delays.samplers import HeldSampler, Recorded, Sampler
 
 Delay = int | str
-"""Whole steps, or a time with its unit."""
+"""Whole steps (``3``), or a time with its unit (``"3s"``)."""
 
 LONGEST = 10_000
-"""Steps; longer delays are refused, as every message on its way takes memory."""
+"""Longest delay allowed [steps], because every message in transit takes memory."""
 
 LOSES = "loses messages, but no reward may be lost"
 
 LOST = "lost"
-"""What a trace writes for a message that never arrives."""
+"""Entry of a trace for a message that never arrives."""
 
 
 @dataclass(frozen=True)
 class Law(ABC):
-    """A delay per message, drawn independently of what the message says."""
+    """Distribution of message delays; the delay does not depend on the message's content."""
 
     @abstractmethod
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        """Something to draw from.
+        """Build the sampler that draws delays from this law.
 
         Args:
             dt: length of a step [s].
             loss: probability that a message is lost, whatever its delay.
-            key: what errors call the law.
+            key: config key of the law, for error messages.
 
         Raises:
-            InputError: a value is impossible.
+            InputError: a parameter of the law is invalid.
         """
 
 
 @dataclass(frozen=True)
 class Constant(Law):
-    """Every message takes as long."""
+    """Every message has the same delay."""
 
     delay: Delay = 0
 
@@ -60,10 +60,10 @@ class Constant(Law):
 
 @dataclass(frozen=True)
 class Uniform(Law):
-    """With a probability, a delay between ``low`` and ``high``; else none (the paper, section 5).
+    """With a probability, a uniform delay between ``low`` and ``high``; otherwise none (paper, section 5).
 
-    Whole steps are equally likely, both ends included. Times are continuous and rounded up to a whole
-    step, so that 3 to 7 s at a step of 1 s are 4, 5, 6 or 7 steps.
+    Delays in steps are equally likely whole numbers, both ends included. Delays in time are continuous and
+    rounded up to whole steps, so that 3 to 7 s are 4, 5, 6 or 7 steps of 1 s.
     """
 
     low: Delay = 0
@@ -73,27 +73,27 @@ class Uniform(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.in_range(f"{key}.probability", self.probability, 0.0, 1.0)
         low, high = in_steps(f"{key}.low", self.low, dt), in_steps(f"{key}.high", self.high, dt)
-        timed = isinstance(self.low, str), isinstance(self.high, str)
-        ordered = low <= high and timed[0] == timed[1]
-        if all(timed):
+        in_time = isinstance(self.low, str), isinstance(self.high, str)
+        ordered = low <= high and in_time[0] == in_time[1]
+        if all(in_time):
             ordered = seconds(f"{key}.low", self.low) <= seconds(f"{key}.high", self.high)
-        should = f"and high={self.high} are not two steps or two times in order"
-        checks.require(ordered, f"{key}.low", self.low, should)
-        if all(timed):
+        problem = f"and high={self.high} are not two steps or two times in order"
+        checks.require(ordered, f"{key}.low", self.low, problem)
+        if all(in_time):
             chances = _rounded_up(
                 seconds(f"{key}.low", self.low) / dt, seconds(f"{key}.high", self.high) / dt
             )
         else:
             chances = [float(low <= k) / (high - low + 1) for k in range(high + 1)]
-        late = [self.probability * chance for chance in chances]
-        return Sampler([[late[0] + 1 - self.probability, *late[1:]]], loss=loss)
+        weighted = [self.probability * chance for chance in chances]
+        return Sampler([[weighted[0] + 1 - self.probability, *weighted[1:]]], loss=loss)
 
 
 @dataclass(frozen=True)
 class Geometric(Law):
-    """A message arrives in each step with the same probability: retransmission until it gets through.
+    """A message arrives in each step with the same probability, as if it were retransmitted until received.
 
-    The mean is before the cut: what would take longer than ``longest`` takes just that.
+    Delays above ``longest`` are cut to ``longest``; ``mean`` is the mean before this cut.
     """
 
     mean: Delay = 1
@@ -103,27 +103,27 @@ class Geometric(Law):
         longest = in_steps(f"{key}.longest", self.longest, dt)
         mean = seconds(f"{key}.mean", self.mean) / dt if isinstance(self.mean, str) else self.mean
         checks.in_range(f"{key}.mean", mean, 0.0, unit="steps")
-        fails = mean / (1 + mean)
-        chances = [(1 - fails) * fails**k for k in range(longest)]
-        return Sampler([[*chances, fails**longest]], loss=loss)
+        failure = mean / (1 + mean)
+        chances = [(1 - failure) * failure**k for k in range(longest)]
+        return Sampler([[*chances, failure**longest]], loss=loss)
 
 
 @dataclass(frozen=True)
 class Burst(Law):
-    """A channel that is good or bad for a while (Gilbert 1960, Elliott 1963), one for each sender."""
+    """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state (1960, 1963)."""
 
     enter: float = 0.05
     """Probability that a good channel turns bad, per step."""
     leave: float = 0.25
     """Probability that a bad channel turns good, per step."""
     good: Any = 0
-    """Law of the delays while it is good; it must be memoryless."""
+    """Law of the delays while the channel is good; it must be memoryless."""
     bad: Any = 5
-    """Law of the delays while it is bad."""
+    """Law of the delays while the channel is bad; it must be memoryless."""
     good_loss: float = 0.0
-    """Probability that a message is lost while it is good."""
+    """Probability that a message is lost while the channel is good."""
     bad_loss: float = 0.5
-    """Probability that a message is lost while it is bad."""
+    """Probability that a message is lost while the channel is bad."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         for name in ("enter", "leave", "good_loss", "bad_loss"):
@@ -138,15 +138,15 @@ class Burst(Law):
             memoryless = len(inner.chances) == 1 and not isinstance(inner, Recorded)
             checks.require(memoryless, inner_key, show(getattr(self, name)), "is not a memoryless law")
             states.append(inner.chances[0].tolist()[:-1])
-        turns = [[1 - self.enter, self.enter], [self.leave, 1 - self.leave]]
-        return Sampler(states, turns, loss)
+        transitions = [[1 - self.enter, self.enter], [self.leave, 1 - self.leave]]
+        return Sampler(states, transitions, loss)
 
 
 @dataclass(frozen=True)
 class Trace(Law):
-    """Delays measured elsewhere, one per step in the order of a file; each sender begins anywhere in it.
+    """Recorded delays of a file, one per step in its order; each sender starts at a random row.
 
-    A CSV file with a column ``delay``: steps, times with their unit, or ``lost``.
+    The file is a CSV table with a column ``delay``: steps, times with their unit, or ``lost``.
     """
 
     path: str = ""
@@ -169,9 +169,9 @@ class Trace(Law):
 
 @dataclass(frozen=True)
 class Held(Law):
-    """Every message is held until the longest delay of another law has passed, so that all take as long.
+    """Every message is held until the longest delay of another law has passed, so that the delay is constant.
 
-    That is how methods for constant delays are used with random ones. The same messages are lost.
+    It lets methods for constant delays work with random ones. The same messages are lost.
     """
 
     law: Law
@@ -190,10 +190,10 @@ LAWS: dict[str, type[Law]] = {
 
 
 def law_of(written: Any, key: str = "delay") -> Law:
-    """A law as a person writes it: a law, steps, a time, or ``{law: uniform, low: 3s, high: 7s}``.
+    """Convert a setting to a law: a law, steps, a time, or a mapping ``{law: uniform, low: 3s, high: 7s}``.
 
     Raises:
-        InputError: it means nothing.
+        InputError: the law or one of its parameters does not exist.
     """
     if isinstance(written, Law):
         return written
@@ -202,34 +202,38 @@ def law_of(written: Any, key: str = "delay") -> Law:
     kind = written.get("law")
     checks.one_of(f"{key}.law", kind, LAWS)
     values = {k: str(v) if k == "path" else _number(v) for k, v in written.items() if k != "law"}
-    known = [field.name for field in fields(LAWS[str(kind)])]
+    names = [field.name for field in fields(LAWS[str(kind)])]
     for name, value in values.items():
-        should = f"is no setting of the law {kind}, which has {', '.join(known)}"
-        checks.require(name in known, f"{key}.{name}", value, should)
+        problem = f"is no setting of the law {kind}, which has {', '.join(names)}"
+        checks.require(name in names, f"{key}.{name}", value, problem)
     return LAWS[str(kind)](**values)
 
 
 def in_steps(key: str, delay: Delay, dt: float) -> int:
-    """Whole steps, a time being rounded up.
+    """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up.
 
     Raises:
-        InputError: neither steps nor a time, or too long.
+        InputError: the delay is neither steps nor a time, or longer than ``LONGEST``.
     """
     if isinstance(delay, str):
         steps = math.ceil(min(seconds(key, delay) / dt, LONGEST + 1) - 1e-9)
     else:
-        whole = isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
-        checks.require(whole, key, delay, "is neither whole steps such as 3 nor a time such as 3s or 0.5m")
+        is_steps = isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
+        checks.require(is_steps, key, delay, "is neither whole steps such as 3 nor a time such as 3s or 0.5m")
         steps = delay
     checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
     return steps
 
 
 def seconds(key: str, delay: Delay) -> float:
-    """A time with its unit [s]; ``0s`` is one."""
+    """Convert a time with its unit to seconds; unlike ``checks.seconds``, zero (``0s``) is allowed.
+
+    Raises:
+        InputError: the delay is no time.
+    """
     number, unit = str(delay)[:-1], str(delay)[-1:]
-    should = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
-    checks.require(unit in ("s", "m", "h"), key, delay, should)
+    problem = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
+    checks.require(unit in ("s", "m", "h"), key, delay, problem)
     return 0.0 if _is_zero(number) else checks.seconds(key, str(delay))
 
 
@@ -241,7 +245,7 @@ def _is_zero(text: str) -> bool:
 
 
 def _number(written: Any) -> Any:
-    """Digits as a number: Hydra and CSV files may hand over either."""
+    """Convert a string of digits to an int: Hydra and CSV files may pass whole steps as strings."""
     text = written.strip() if isinstance(written, str) else ""
     return int(text) if text.isdecimal() and len(text) < 10 else written
 
@@ -251,7 +255,7 @@ def _certain(steps: int) -> list[float]:
 
 
 def _rounded_up(low: float, high: float) -> list[float]:
-    """Chance of each whole number of steps, of a time uniform in [low, high] steps and rounded up."""
+    """Probabilities of 0, 1, ... steps for a time uniform in [low, high] steps and rounded up."""
     last = math.ceil(high - 1e-9)
     if high - low < 1e-9:
         return _certain(last)

@@ -1,4 +1,4 @@
-"""Draws delays, one per message: a hash and a search in a table, without a generator."""
+"""Samplers that draw one delay per message: a hash and a table search, without a random generator."""
 
 import torch
 from torch import Tensor, nn
@@ -7,13 +7,13 @@ from damian.common import checks, counter_rng
 
 
 class Sampler(nn.Module):
-    """Draws delays from a table of chances; pure, so that it compiles.
+    """Draws delays from a table of probabilities. Drawing is a pure function, so it can be compiled.
 
     Args:
-        states: chance of each delay 0, 1, ... [steps] in each state of the channel; what is missing to 1
-            is the chance of a loss.
-        turns: chances to pass from state to state in a step; a single state if not given.
-        loss: further probability of a loss.
+        states: for each of S channel states, the probabilities of the delays 0, 1, ... [steps]; if they sum
+            to less than 1, the rest is the probability that the message is lost.
+        turns: transition probabilities between the channel states per step, [S, S]; one state if not given.
+        loss: probability that a message is lost, whatever its delay.
     """
 
     chances: Tensor
@@ -31,52 +31,63 @@ class Sampler(nn.Module):
         chances = torch.cat([arrive, (1 - arrive.sum(-1, keepdim=True)).clamp(min=0)], -1)
         self.register_buffer("chances", chances, persistent=False)
         turn = torch.tensor(turns or [[1.0]], dtype=torch.float64)
-        joint = (turn.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)  # next state and delay at once
+        joint = (turn.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)  # of next state and delay, one draw
         boundaries = (joint.cumsum(-1)[:, :-1] * 2**32).round().long()
         self.register_buffer("_boundaries", boundaries, persistent=False)
-        self._bad = (turn[0, 1] / (turn[0, 1] + turn[1, 0])).item() if turns else 0.0
-        likely = int(chances[0].argmax())
-        self.certain = likely if len(states) == 1 and chances[0, likely] == 1 else None
-        """The only delay there is, if it is one."""
+        self._bad_share = (turn[0, 1] / (turn[0, 1] + turn[1, 0])).item() if turns else 0.0
+        likeliest = int(chances[0].argmax())
+        self.certain = likeliest if len(states) == 1 and chances[0, likeliest] == 1 else None
+        """The delay [steps] if it is always the same, else None."""
 
     @property
     def lost(self) -> int:
-        """The "delay" of a message that never arrives."""
+        """Delay value that marks a message that never arrives: ``longest + 1``."""
         return self.longest + 1
 
     @property
     def loses(self) -> bool:
-        """May a message never arrive."""
+        """Whether messages can be lost."""
         return bool((self.chances[:, -1] > 1e-9).any())
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        """State of each channel at first, from its stream of random numbers [M]."""
-        return (counter_rng.uniform(streams) < self._bad).long()
+        """Draw the initial state of each sender's channel [M] from its random stream [M]."""
+        return (counter_rng.uniform(streams) < self._bad_share).long()
 
     def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Delays [M] of the messages sent at ``clock``, and the channels' next states [M]."""
+        """Draw the delays [M] of the messages sent at ``clock``, and the channels' next states [M].
+
+        Args:
+            streams: random stream of each sender, [M].
+            clock: step, [M] or a scalar.
+            memory: state of each channel, [M].
+        """
         if self.certain is not None:
             return torch.full_like(streams, self.certain), memory
-        chance = counter_rng.bits(streams, clock)
+        draw = counter_rng.bits(streams, clock)
         if len(self.chances) == 1:
-            return torch.bucketize(chance, self._boundaries[0], right=True), memory
-        outcome = (chance.unsqueeze(-1) >= self._boundaries[memory]).sum(-1)
+            return torch.bucketize(draw, self._boundaries[0], right=True), memory
+        outcome = (draw.unsqueeze(-1) >= self._boundaries[memory]).sum(-1)
         n = self.longest + 2
         return outcome % n, outcome // n
 
 
 class Recorded(Sampler):
-    """Plays delays back [steps], -1 for lost; each sender from a place of its own."""
+    """Plays back recorded delays; each sender starts at a random position, which is its channel state.
+
+    Args:
+        delays: recorded delays [steps], -1 for a lost message.
+        loss: probability that a message is lost in addition.
+    """
 
     _delays: Tensor
 
     def __init__(self, delays: list[int], loss: float) -> None:
         longest = max(*delays, 0)
-        found = [delays.count(k) / len(delays) for k in range(longest + 1)]
-        super().__init__([found], loss=loss)
+        frequencies = [delays.count(k) / len(delays) for k in range(longest + 1)]
+        super().__init__([frequencies], loss=loss)
         self._loss = loss
-        code = [longest + 1 if delay < 0 else delay for delay in delays]
-        self.register_buffer("_delays", torch.tensor(code), persistent=False)
+        codes = [longest + 1 if delay < 0 else delay for delay in delays]
+        self.register_buffer("_delays", torch.tensor(codes), persistent=False)
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return counter_rng.bits(streams) % len(self._delays)
@@ -89,11 +100,15 @@ class Recorded(Sampler):
 
 
 class HeldSampler(Sampler):
-    """Draws what another sampler draws, and lets it take the longest."""
+    """Gives every message the longest delay of another sampler; the same messages are lost.
+
+    Args:
+        drawn: the other sampler.
+    """
 
     def __init__(self, drawn: Sampler) -> None:
-        arrive = (1 - drawn.chances[:, -1]).tolist()
-        super().__init__([[0.0] * drawn.longest + [chance] for chance in arrive])
+        arrival_chances = (1 - drawn.chances[:, -1]).tolist()
+        super().__init__([[0.0] * drawn.longest + [chance] for chance in arrival_chances])
         self.drawn = drawn
         self.certain = None if self.loses else self.longest
 

@@ -1,11 +1,11 @@
-"""Random numbers that are a function of (seed, counter)."""
+"""Random numbers as a function of seed and counter: the hash, uniformity, and separate streams."""
 
 import torch
 
 from damian.common import counter_rng
 
 
-def test_the_hash_agrees_with_a_plain_one():
+def test_the_hash_agrees_with_a_plain_python_implementation():
     def lowbias32(x: int) -> int:
         x ^= x >> 16
         x = x * 0x7FEB352D & 0xFFFFFFFF
@@ -17,20 +17,20 @@ def test_the_hash_agrees_with_a_plain_one():
     assert counter_rng.mix(numbers).tolist() == [lowbias32(x) for x in numbers.tolist()]
 
 
-def test_uniform_draws_fill_the_unit_interval_evenly_along_seeds_and_counters():
+def test_uniform_draws_fill_the_unit_interval_evenly_over_seeds_and_over_counters():
     seeds = counter_rng.world_seeds(0, 10_000)
     counter = torch.zeros_like(seeds)
-    for drawn in (
+    for draws in (
         counter_rng.uniform(seeds, counter),
         counter_rng.uniform(seeds[:1], torch.arange(10_000)),
         counter_rng.uniform(seeds[:1], torch.arange(10_000), torch.tensor(3)),
     ):
-        counts = torch.histc(drawn, bins=20, min=0, max=1)
+        counts = torch.histc(draws, bins=20, min=0, max=1)
         chi_square = ((counts - 500).square() / 500).sum()
-        assert chi_square < 50  # 19 degrees of freedom: exceeded once in 7000
+        assert chi_square < 50  # 19 degrees of freedom: exceeded with probability 1/7000
 
 
-def test_streams_of_other_worlds_and_seeds_are_others():
+def test_different_worlds_and_seeds_have_different_streams():
     seeds = torch.cat([counter_rng.world_seeds(seed, 4096) for seed in range(4)])
     assert len(seeds.unique()) == len(seeds)
     counters = torch.arange(100)

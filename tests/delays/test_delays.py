@@ -1,4 +1,4 @@
-"""Delay laws: the frequencies they promise, traces played back, and every way to write one wrong."""
+"""Delay laws: frequencies of delays and losses, playback of traces, and errors for invalid settings."""
 
 import math
 
@@ -16,16 +16,19 @@ from damian.envs.scenario import ScenarioConfig
 from damian.transforms import RewardDelay
 
 STREAMS, STEPS = 1000, 100
-"""10^5 messages."""
+"""Size of a sample: 10^5 messages."""
 
 
 def sample(sampler: Sampler, n_streams: int = STREAMS, n_steps: int = STEPS) -> Tensor:
-    """Delays of messages, [T, M]."""
+    """Draw the delays of one message per stream and step, [T, M]."""
     return drawn(sampler, counter_rng.world_seeds(5, n_streams), n_steps)
 
 
 def check_chances(sampler: Sampler, chances: dict[int, float], delays: Tensor) -> None:
-    """Frequencies against exact chances; what is missing to 1 is lost. Five deviations of chi-square."""
+    """Compare the frequencies of delays with exact probabilities, within five deviations of chi-square.
+
+    If the probabilities sum to less than 1, the rest is the probability of a loss.
+    """
     expected = torch.zeros(sampler.lost + 1, dtype=torch.float64)
     for delay, chance in chances.items():
         expected[delay] = chance
@@ -74,9 +77,9 @@ def test_delays_and_losses_are_as_frequent_as_the_law_says(name, loss):
     check_chances(sampler, {k: chance * (1 - loss) for k, chance in chances.items()}, sample(sampler))
 
 
-def test_a_law_tells_its_longest_delay_and_whether_there_is_a_single_one():
-    told = {name: (law.sampler(dt).longest, law.sampler(dt).certain) for name, (law, dt, _) in LAWS.items()}
-    assert told == {
+def test_a_sampler_knows_its_longest_delay_and_its_certain_delay_if_there_is_one():
+    samplers = {name: law.sampler(dt) for name, (law, dt, _) in LAWS.items()}
+    assert {name: (sampler.longest, sampler.certain) for name, sampler in samplers.items()} == {
         "none": (0, 0),
         "steps": (3, 3),
         "a time, rounded up": (2, 2),
@@ -106,7 +109,7 @@ def test_each_delay_is_independent_of_the_one_before(name):
     check_chances(sampler, chances, delays[:, :-1][delays[:, 1:] == max(chances)])
 
 
-def test_a_sender_draws_the_same_delays_among_others_as_alone():
+def test_a_sender_draws_the_same_delays_in_a_batch_as_alone():
     sampler = Burst(bad=PAPER).sampler()
     streams = counter_rng.world_seeds(5, 8)
     alone = [sampler(one, torch.tensor(9), torch.ones(1, dtype=torch.long))[0] for one in streams.split(1)]
@@ -114,48 +117,43 @@ def test_a_sender_draws_the_same_delays_among_others_as_alone():
     assert together.equal(torch.cat(alone))
 
 
-# Bursts.
-
-
 def within(found: float, exact: float, deviation: float) -> bool:
-    """Five standard deviations."""
+    """Is the sample mean within five standard deviations of the exact one?"""
     return abs(found - exact) <= 5 * deviation
 
 
 def share(flags: Tensor) -> tuple[float, int]:
-    """Mean and number of flags."""
+    """Mean of the flags, and their number."""
     return flags.double().mean().item(), flags.numel()
 
 
 BURST = Burst(enter=0.05, leave=0.2, good=0, bad=5, bad_loss=0.0)
 
 
-def test_a_channel_is_bad_as_often_as_in_the_long_run_from_the_first_step_on():
+def test_a_channel_starts_in_its_stationary_distribution():
     bad = sample(BURST.sampler(), 50_000, 2) == 5
     for step in bad:
         found, n = share(step)
         assert within(found, 0.05 / 0.25, math.sqrt(0.2 * 0.8 / n))
 
 
-def test_a_channel_turns_bad_and_good_again_with_its_chances_so_that_a_burst_lasts_1_over_leave():
+def test_a_channel_changes_state_with_its_probabilities_so_that_a_burst_lasts_1_over_leave_steps():
     bad = sample(BURST.sampler()) == 5
     before, after = bad[:-1], bad[1:]
-    for turned, chance in ((after[~before], 0.05), (~after[before], 0.2)):
-        found, n = share(turned)
+    for changed, chance in ((after[~before], 0.05), (~after[before], 0.2)):
+        found, n = share(changed)
         assert within(found, chance, math.sqrt(chance * (1 - chance) / n))
     n_bursts = (after & ~before).sum().item()
     mean_length = after.sum().item() / n_bursts
     assert within(mean_length, 5.0, math.sqrt(2 * 0.8) / 0.2 / math.sqrt(n_bursts))
 
 
-def test_a_bad_channel_has_its_own_losses_and_the_general_ones():
+def test_losses_of_the_channel_state_and_general_losses_combine():
     law = Burst(enter=0.5, leave=0.5, good=1, bad=PAPER, good_loss=0.1, bad_loss=0.5)
     sampler, kept = law.sampler(loss=0.2), 0.5 * 0.8
-    late = {0: 0.85 * 0.5 * kept, 1: 0.9 * kept} | dict.fromkeys((4, 5, 6, 7), 0.0375 * 0.5 * kept)
-    check_chances(sampler, late, sample(sampler))  # turning with 1/2 each way makes the steps independent
-
-
-# Traces.
+    chances = {0: 0.85 * 0.5 * kept, 1: 0.9 * kept} | dict.fromkeys((4, 5, 6, 7), 0.0375 * 0.5 * kept)
+    # Transition probabilities of 1/2 make the states of successive steps independent.
+    check_chances(sampler, chances, sample(sampler))
 
 
 def trace(tmp_path, *rows: str, header: str = "delay") -> Trace:
@@ -164,12 +162,12 @@ def trace(tmp_path, *rows: str, header: str = "delay") -> Trace:
     return Trace(str(file))
 
 
-def test_a_trace_is_played_in_its_order_from_anywhere_and_begins_again_at_its_end(tmp_path):
+def test_a_trace_is_played_in_order_from_a_random_start_and_wraps_around(tmp_path):
     recorded = [4, 0, 7, 1, 0, 2, 9]
     delays = sample(trace(tmp_path, *map(str, recorded)).sampler(), 300, 20).T.tolist()
-    starts = {tuple(row[:7]): row for row in delays}
-    turned = [recorded[k:] + recorded[:k] for k in range(7)]
-    assert sorted(starts) == sorted(map(tuple, turned))
+    first_rounds = {tuple(row[:7]) for row in delays}
+    rotations = [recorded[k:] + recorded[:k] for k in range(7)]
+    assert sorted(first_rounds) == sorted(map(tuple, rotations))
     assert all(row == (row[:7] * 3)[:20] for row in delays)
 
 
@@ -181,7 +179,7 @@ def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
     assert {tuple(row) for row in first} == {tuple(([2, 5, 3, 0, 4] * 2)[k : k + 5]) for k in range(5)}
 
 
-def test_a_trace_loses_further_messages_at_random(tmp_path):
+def test_general_losses_add_to_those_of_a_trace(tmp_path):
     sampler = trace(tmp_path, "1", "1", "2", "lost").sampler(loss=0.25)
     check_chances(sampler, {1: 0.375, 2: 0.1875}, sample(sampler, 4000, 25))
 
@@ -191,11 +189,8 @@ def test_a_trace_of_nothing_but_losses_delivers_nothing(tmp_path):
     assert (sample(sampler, 10, 10) == sampler.lost).all()
 
 
-# What a person writes.
-
-
 @pytest.mark.parametrize(
-    ("written", "law"),
+    ("setting", "law"),
     [
         (3, Constant(3)),
         ("3", Constant(3)),
@@ -208,8 +203,8 @@ def test_a_trace_of_nothing_but_losses_delivers_nothing(tmp_path):
         ({"law": "trace", "path": "a.csv"}, Trace("a.csv")),
     ],
 )
-def test_a_law_is_written_as_steps_a_time_or_a_mapping(written, law):
-    assert law_of(written) == law
+def test_a_law_is_given_as_steps_a_time_or_a_mapping(setting, law):
+    assert law_of(setting) == law
 
 
 @pytest.mark.parametrize(
@@ -233,8 +228,10 @@ def test_a_time_is_rounded_up_to_whole_steps(delay, dt, steps):
 
 STEPS_OR_TIME = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
 NO_TIME = "is not a time such as 2s, 0.5m or 1h"
+NOT_ORDERED = "are not two steps or two times"
+PROBABILITY = "delay.obs.probability:"
 
-WRONG = [
+INVALID_LAWS = [
     (-1, "delay.obs: -1 " + STEPS_OR_TIME),
     (1.5, "delay.obs: 1.5 " + STEPS_OR_TIME),
     (2.0, "delay.obs: 2.0 " + STEPS_OR_TIME),
@@ -261,29 +258,14 @@ WRONG = [
     ({"law": "uniform", "low": -1, "high": 2}, "delay.obs.low: -1 " + STEPS_OR_TIME),
     ({"law": "uniform", "low": 0.5, "high": 2}, "delay.obs.low: 0.5 " + STEPS_OR_TIME),
     ({"law": "uniform", "high": True}, "delay.obs.high: True " + STEPS_OR_TIME),
-    ({"law": "uniform", "low": 4, "high": 2}, "delay.obs.low: 4 and high=2 are not two steps or two times"),
+    ({"law": "uniform", "low": 4, "high": 2}, f"delay.obs.low: 4 and high=2 {NOT_ORDERED}"),
     ({"law": "uniform", "low": "4s", "high": "2s"}, "delay.obs.low: 4s and high=2s are not two steps or two"),
-    (
-        {"law": "uniform", "low": 2, "high": "4s"},
-        "delay.obs.low: 2 and high=4s are not two steps or two times",
-    ),
-    (
-        {"law": "uniform", "low": "2s", "high": 4},
-        "delay.obs.low: 2s and high=4 are not two steps or two times",
-    ),
-    ({"law": "uniform", "high": 2, "probability": 1.5}, "delay.obs.probability: 1.5 is not between 0 and 1"),
-    (
-        {"law": "uniform", "high": 2, "probability": -0.1},
-        "delay.obs.probability: -0.1 is not between 0 and 1",
-    ),
-    (
-        {"law": "uniform", "high": 2, "probability": math.nan},
-        "delay.obs.probability: nan is not between 0 and",
-    ),
-    (
-        {"law": "uniform", "high": 2, "probability": "often"},
-        "delay.obs.probability: often is not between 0 an",
-    ),
+    ({"law": "uniform", "low": 2, "high": "4s"}, f"delay.obs.low: 2 and high=4s {NOT_ORDERED}"),
+    ({"law": "uniform", "low": "2s", "high": 4}, f"delay.obs.low: 2s and high=4 {NOT_ORDERED}"),
+    ({"law": "uniform", "high": 2, "probability": 1.5}, f"{PROBABILITY} 1.5 is not between 0 and 1"),
+    ({"law": "uniform", "high": 2, "probability": -0.1}, f"{PROBABILITY} -0.1 is not between 0 and 1"),
+    ({"law": "uniform", "high": 2, "probability": math.nan}, f"{PROBABILITY} nan is not between 0 and"),
+    ({"law": "uniform", "high": 2, "probability": "often"}, f"{PROBABILITY} often is not between 0 an"),
     ({"law": "uniform", "high": "3h"}, f"delay.obs.high: 3h is more than {LONGEST} steps"),
     ({"law": "geometric", "mean": -1}, "delay.obs.mean: -1 steps is not at least 0 steps"),
     ({"law": "geometric", "mean": math.nan}, "delay.obs.mean: nan steps is not at least 0 steps"),
@@ -304,18 +286,18 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("written", "error"), WRONG, ids=lambda value: str(value)[:50])
+@pytest.mark.parametrize(("setting", "error"), INVALID_LAWS, ids=lambda value: str(value)[:50])
 @pytest.mark.parametrize("name", ["obs", "act", "rew"])
-def test_a_law_that_means_nothing_is_refused_on_one_line_that_names_its_key(name, written, error):
+def test_an_invalid_law_raises_one_line_that_names_its_key(name, setting, error):
     with pytest.raises(InputError) as caught:
-        ScenarioConfig(delay=DelayConfig(**{name: written}))
+        ScenarioConfig(delay=DelayConfig(**{name: setting}))
     message = str(caught.value)
     assert message.startswith(error.replace("delay.obs", f"delay.{name}"))
     assert "\n" not in message
 
 
 @pytest.mark.parametrize(
-    ("written", "error"),
+    ("settings", "error"),
     [
         ({"loss": -0.1}, "delay.loss: -0.1 is not between 0 and 1"),
         ({"loss": 2}, "delay.loss: 2 is not between 0 and 1"),
@@ -336,9 +318,9 @@ def test_a_law_that_means_nothing_is_refused_on_one_line_that_names_its_key(name
     ],
     ids=str,
 )
-def test_an_impossible_setting_of_the_delays_is_refused_by_name(written, error):
+def test_an_invalid_delay_setting_raises_an_error_that_names_its_key(settings, error):
     with pytest.raises(InputError) as caught:
-        DelayConfig(**written)
+        DelayConfig(**settings)
     assert str(caught.value) == error
 
 
@@ -358,7 +340,7 @@ def test_an_impossible_setting_of_the_delays_is_refused_by_name(written, error):
     ],
     ids=str,
 )
-def test_an_error_in_a_trace_names_the_file_and_the_line(tmp_path, text, error):
+def test_an_invalid_trace_raises_one_line_that_names_the_file_and_the_line(tmp_path, text, error):
     file = tmp_path / "trace.csv"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError) as caught:
@@ -368,34 +350,34 @@ def test_an_error_in_a_trace_names_the_file_and_the_line(tmp_path, text, error):
 
 
 @pytest.mark.parametrize(("name", "error"), [("none.csv", "no such file"), ("", "is not a file")])
-def test_a_trace_that_is_not_there_is_named(tmp_path, name, error):
+def test_a_missing_trace_raises_an_error_that_names_the_file(tmp_path, name, error):
     file = tmp_path / name
     with pytest.raises(InputError) as caught:
         DelayConfig(act={"law": "trace", "path": str(file)}).check(1.0)
     assert str(caught.value) == f"{file}: {error}"
 
 
-def test_a_burst_of_a_trace_is_refused_as_a_trace_has_a_memory(tmp_path):
+def test_a_trace_is_refused_as_a_law_of_a_burst_because_it_has_memory(tmp_path):
     with pytest.raises(InputError) as caught:
         Burst(good=trace(tmp_path, "1")).sampler(key="delay.obs")
     assert str(caught.value).startswith("delay.obs.good: Trace(path=")
 
 
-def test_a_loss_of_a_law_lies_between_0_and_1():
+def test_a_loss_probability_outside_0_and_1_is_refused():
     for loss in (-0.1, 2, math.nan):
         with pytest.raises(InputError, match=r"loss: .* is not between 0 and 1"):
             Constant(1).sampler(loss=loss)
 
 
 @pytest.mark.parametrize("longest", [24, 29, 31, 41, 50])
-def test_a_law_without_losses_loses_nothing_by_rounding(longest):
+def test_rounding_never_makes_a_law_without_losses_lose_messages(longest):
     sampler = Uniform(0, longest).sampler()
     assert not sampler.loses
     RewardDelay(Uniform(0, longest))
 
 
 @pytest.mark.parametrize(
-    ("written", "error"),
+    ("setting", "error"),
     [
         ("\u00b2", "delay.obs: \u00b2 is neither whole steps"),
         ("9" * 5000, "is neither whole steps"),
@@ -404,13 +386,13 @@ def test_a_law_without_losses_loses_nothing_by_rounding(longest):
         ({"law": "uniform", "low": "2.9s", "high": "2.1s"}, "are not two steps or two times in order"),
     ],
 )
-def test_what_looks_like_a_delay_but_is_none_is_refused_in_one_line(written, error):
+def test_a_setting_that_only_resembles_a_delay_raises_one_line(setting, error):
     with pytest.raises(InputError) as caught:
-        DelayConfig(obs=written).check(1.0)
+        DelayConfig(obs=setting).check(1.0)
     assert error in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_rewards_must_not_be_lost():
+def test_a_reward_delay_that_loses_rewards_is_refused():
     with pytest.raises(InputError, match="no reward may be lost"):
         DelayConfig(rew={"law": "burst"}).check(1.0)

@@ -1,4 +1,4 @@
-"""Operative polygons and landing points, against the original's and against slow loops."""
+"""Polygons and landing points, compared with those of the original simulator and with slow loops."""
 
 import json
 import math
@@ -24,17 +24,17 @@ DATA = Path(__file__).parents[1] / "data"
 GOLDEN = json.loads((DATA / "motion_energy_coverage.json").read_text())
 EXAMPLES = GOLDEN["discretisation_examples"]
 SQUARE = Polygon([(0, 0), (100, 0), (100, 100), (0, 100)])
-ELL = Polygon([(0, 0), (300, 0), (300, 100), (100, 100), (100, 300), (0, 300)])
-LAKE = Polygon(SQUARE.buffer(100).exterior, [SQUARE.exterior])
-ISLANDS = MultiPolygon([SQUARE, shapely.affinity.translate(SQUARE, 250, 40)])
-SHAPES = {"square": SQUARE, "ell": ELL, "lake": LAKE, "islands": ISLANDS}
+L_SHAPE = Polygon([(0, 0), (300, 0), (300, 100), (100, 100), (100, 300), (0, 300)])
+WITH_HOLE = Polygon(SQUARE.buffer(100).exterior, [SQUARE.exterior])
+TWO_PARTS = MultiPolygon([SQUARE, shapely.affinity.translate(SQUARE, 250, 40)])
+SHAPES = {"square": SQUARE, "L": L_SHAPE, "with a hole": WITH_HOLE, "two parts": TWO_PARTS}
 
 
 # --- landing points -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("case", [1, 2])
-def test_the_lattice_gives_the_use_cases_92_points_in_their_order(case):
+def test_the_lattice_has_the_92_landing_points_of_each_use_case_in_order(case):
     scenario = json.loads((DATA / f"usecase{case}.json").read_text())["scenario"]
     polygon = polygon_from_vertices(scenario["polygon_vertices_ring"], "usecase")
     points = landing_lattice(polygon, scenario["step_m"], scenario["deg"])
@@ -44,12 +44,12 @@ def test_the_lattice_gives_the_use_cases_92_points_in_their_order(case):
     assert distance == pytest.approx(scenario["max_distance_normaliser_m"], abs=1e-6)
 
 
-def test_there_are_golden_lattices_to_compare():
+def test_there_are_nine_lattices_of_the_original_to_compare_with():
     assert len(EXAMPLES) == 9
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
-def test_the_lattice_gives_the_original_points_of_other_polygons(example):
+def test_the_lattice_has_the_landing_points_of_the_original_for_other_polygons(example):
     n = None if example["n_landing_points"] == "all" else example["n_landing_points"]
     polygon = polygon_from_vertices(example["polygon"], "example")
     points = landing_lattice(polygon, example["step"], example["deg"], n)
@@ -57,7 +57,7 @@ def test_the_lattice_gives_the_original_points_of_other_polygons(example):
 
 
 def _slow_lattice(polygon, step, degrees):
-    """The rule of the original in words, a point at a time."""
+    """Lattice of the original simulator, one point at a time."""
     min_x, min_y, max_x, max_y = polygon.bounds
     slant, points, x, y, signed = math.radians(degrees), [], min_x, min_y, step
     while y <= max_y + 1e-9:
@@ -80,7 +80,7 @@ def _slow_lattice(polygon, step, degrees):
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 @pytest.mark.parametrize(("step", "degrees"), [(17.3, 45), (29.7, 30), (11.1, 80)])
-def test_the_lattice_is_that_of_a_slow_loop_on_concave_holed_and_split_polygons(shape, step, degrees):
+def test_the_lattice_agrees_with_a_slow_loop_on_concave_holed_and_multipart_polygons(shape, step, degrees):
     polygon = shapely.affinity.translate(shapely.affinity.rotate(shape, 7.7), 31.7, -11.3)
     points = landing_lattice(polygon, step, degrees)
     assert len(points) > 10
@@ -98,30 +98,30 @@ def test_landing_points_are_strictly_inside_distinct_and_ordered_by_direction(se
     assert (np.diff(angles) > -1e-9).all()
 
 
-def test_points_on_the_boundary_are_not_landing_points():
+def test_lattice_points_on_the_boundary_are_not_landing_points():
     points = landing_lattice(SQUARE, 25, 90)
     assert len(points) == 9
     assert {tuple(p) for p in points.round(9)} == {(x, y) for x in (25, 50, 75) for y in (25, 50, 75)}
 
 
-def test_the_points_kept_are_the_nearest_to_the_centroid_in_unchanged_order():
-    every = landing_lattice(ELL, 20, 45)
-    some = landing_lattice(ELL, 20, 45, 10)
-    away = np.linalg.norm(every - np.array(ELL.centroid.coords[0]), axis=1)
-    nearest = sorted(np.argsort(away)[:10])
-    np.testing.assert_array_equal(some, every[nearest])
-    np.testing.assert_array_equal(landing_lattice(ELL, 20, 45, len(every)), every)
+def test_n_points_keeps_those_nearest_to_the_centroid_in_unchanged_order():
+    points = landing_lattice(L_SHAPE, 20, 45)
+    kept = landing_lattice(L_SHAPE, 20, 45, 10)
+    distance = np.linalg.norm(points - np.array(L_SHAPE.centroid.coords[0]), axis=1)
+    nearest = sorted(np.argsort(distance)[:10])
+    np.testing.assert_array_equal(kept, points[nearest])
+    np.testing.assert_array_equal(landing_lattice(L_SHAPE, 20, 45, len(points)), points)
 
 
-def test_shifting_a_symmetric_polygon_keeps_the_order_of_its_points():
-    here = landing_lattice(SQUARE, 10, 90)
+def test_shifting_a_symmetric_polygon_keeps_the_order_of_its_landing_points():
+    original = landing_lattice(SQUARE, 10, 90)
     for shift in [(0.1, 0.7), (1e5 / 3, -2e4 / 7)]:
-        there = landing_lattice(shapely.affinity.translate(SQUARE, *shift), 10, 90)
-        np.testing.assert_allclose(there - shift, here, atol=1e-6)
+        shifted = landing_lattice(shapely.affinity.translate(SQUARE, *shift), 10, 90)
+        np.testing.assert_allclose(shifted - shift, original, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("step", "degrees", "n", "says"),
+    ("step", "degrees", "n", "message"),
     [
         (500, 45, None, "0 lie inside the polygon of 10000 m^2"),
         (30, 45, 50, "the 50 wanted"),
@@ -137,51 +137,51 @@ def test_shifting_a_symmetric_polygon_keeps_the_order_of_its_points():
         (30, 1e-300, None, "too fine"),
     ],
 )
-def test_a_lattice_that_cannot_be_laid_is_one_line(step, degrees, n, says):
+def test_an_impossible_lattice_raises_one_line(step, degrees, n, message):
     with pytest.raises(InputError) as error:
         landing_lattice(SQUARE, step, degrees, n)
-    assert says in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 # --- random polygons ----------------------------------------------------------------------------
 
 
-def test_random_polygons_have_the_original_statistics():
+def test_random_polygons_have_the_statistics_of_the_original():
     stats, rng = GOLDEN["random_polygon_stats"], np.random.default_rng(0)
     polygons = [random_polygon(rng, stats["min_area"], stats["max_area"]) for _ in range(1000)]
     areas = np.array([p.area for p in polygons])
     n_vertices = np.array([len(p.exterior.coords) - 1 for p in polygons])
     lattices = np.array([len(landing_lattice(p, 30, 45)) for p in polygons])
     diameters = np.array([largest_vertex_distance(p) for p in polygons])
-    golden = {
+    samples = {
         "area": areas,
         "n_vertices": n_vertices,
         "n_grid_points_inside": lattices,
         "diameter": diameters,
     }
-    for name, ours in golden.items():
-        # Both means are of a thousand: four standard errors of their difference.
-        error = 4 * ours.std() * math.sqrt(2 / 1000)
-        assert ours.mean() == pytest.approx(stats[name]["mean"], abs=error), name
+    for name, sample in samples.items():
+        # Four standard errors of the difference of two means over a thousand polygons each.
+        error = 4 * sample.std() * math.sqrt(2 / 1000)
+        assert sample.mean() == pytest.approx(stats[name]["mean"], abs=error), name
     assert areas.std() == pytest.approx(stats["area"]["std"], rel=0.25)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(1, 1e10), st.floats(0, 1))
-def test_a_random_polygon_is_convex_and_between_its_areas(seed, max_area, share):
+def test_a_random_polygon_is_convex_and_has_an_area_between_the_limits(seed, max_area, share):
     min_area = max(max_area * share, max_area * 1e-6)
     polygon = random_polygon(np.random.default_rng(seed), min_area, max_area)
     assert min_area * (1 - 1e-9) <= polygon.area <= max_area * (1 + 1e-9)
     assert polygon.area == pytest.approx(polygon.convex_hull.area)
 
 
-def test_one_seed_gives_one_polygon():
-    drawn = [random_polygon(np.random.default_rng(seed), 1e5, 2e5) for seed in (3, 3, 4)]
-    assert drawn[0] == drawn[1] != drawn[2]
+def test_the_same_seed_gives_the_same_polygon():
+    polygons = [random_polygon(np.random.default_rng(seed), 1e5, 2e5) for seed in (3, 3, 4)]
+    assert polygons[0] == polygons[1] != polygons[2]
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "says"),
+    ("low", "high", "message"),
     [
         (0, 1, "min_area: 0 m^2"),
         (-1, 1, "min_area: -1 m^2"),
@@ -190,23 +190,23 @@ def test_one_seed_gives_one_polygon():
         (math.nan, 1, "min_area: nan m^2"),
     ],
 )
-def test_areas_that_cannot_be_are_refused(low, high, says):
+def test_impossible_limits_of_the_area_are_refused(low, high, message):
     with pytest.raises(InputError) as error:
         random_polygon(np.random.default_rng(0), low, high)
-    assert str(error.value).startswith(says)
+    assert str(error.value).startswith(message)
 
 
-# --- polygons by hand ---------------------------------------------------------------------------
+# --- polygons from vertices ----------------------------------------------------------------------
 
 
-def test_a_concave_polygon_by_hand_stays_concave_open_or_closed():
-    corners = list(ELL.exterior.coords)
+def test_a_concave_polygon_stays_concave_whether_its_vertices_are_open_or_closed():
+    corners = list(L_SHAPE.exterior.coords)
     for given_corners in (corners, corners[:-1], corners[:1] + corners, corners[::-1]):
-        assert polygon_from_vertices(given_corners, "here").equals(ELL)
+        assert polygon_from_vertices(given_corners, "here").equals(L_SHAPE)
 
 
 @pytest.mark.parametrize(
-    ("vertices", "says"),
+    ("vertices", "message"),
     [
         ([], "not a list of [x, y]"),
         ([[0, 0], [1, 1]], "2 distinct points"),
@@ -224,19 +224,19 @@ def test_a_concave_polygon_by_hand_stays_concave_open_or_closed():
         ([0, 1, 2], "shape [3]"),
     ],
 )
-def test_vertices_that_make_no_polygon_are_one_line(vertices, says):
+def test_vertices_that_form_no_polygon_raise_one_line(vertices, message):
     with pytest.raises(InputError) as error:
         polygon_from_vertices(vertices, "region.vertices")
     assert str(error.value).startswith("region.vertices: ")
-    assert says in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_the_largest_vertex_distance_is_that_of_a_slow_loop(shape):
+def test_the_largest_vertex_distance_agrees_with_a_slow_loop(shape):
     corners = shapely.get_coordinates(shape)
-    slow = max(math.dist(a, b) for a in corners for b in corners)
-    assert largest_vertex_distance(shape) == pytest.approx(slow)
+    expected = max(math.dist(a, b) for a in corners for b in corners)
+    assert largest_vertex_distance(shape) == pytest.approx(expected)
 
 
 # --- points inside ------------------------------------------------------------------------------
@@ -257,16 +257,16 @@ def test_sampled_points_are_strictly_inside_and_uniform(shape):
             assert counts[i, j] == pytest.approx(4000 * share, abs=4.5 * spread + 1e-6)
 
 
-def test_a_sliver_is_sampled_as_fast_as_a_square():
-    sliver = Polygon([(0, 0), (1e5, 1e5), (1e5, 1e5 + 1e-3)])
-    points = sample_interior(sliver, 500, np.random.default_rng(0))
-    assert shapely.contains_xy(sliver, points).all()
+def test_points_are_drawn_in_a_very_narrow_polygon_too():
+    narrow = Polygon([(0, 0), (1e5, 1e5), (1e5, 1e5 + 1e-3)])
+    points = sample_interior(narrow, 500, np.random.default_rng(0))
+    assert shapely.contains_xy(narrow, points).all()
     assert len(np.unique(points, axis=0)) == 500
 
 
-def test_a_polygon_without_inside_gives_an_error_rather_than_no_end():
-    # The smallest triangle that numbers can hold: no number lies between its corners.
-    dust = Polygon([(1, 1), (1, np.nextafter(1, 2)), (np.nextafter(1, 2), 1)])
-    for nothing in (Polygon(), MultiPolygon(), dust):
+def test_a_polygon_without_interior_raises_an_error_instead_of_an_endless_loop():
+    # The smallest triangle of floating-point numbers: no number lies between its corners.
+    smallest = Polygon([(1, 1), (1, np.nextafter(1, 2)), (np.nextafter(1, 2), 1)])
+    for polygon in (Polygon(), MultiPolygon(), smallest):
         with pytest.raises(InputError, match="no inside"):
-            sample_interior(nothing, 5, np.random.default_rng(0))
+            sample_interior(polygon, 5, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""FIR tables and GeoJSON: what is read from good files, and the line that each bad one gives."""
+"""FIR tables and GeoJSON: regions of valid files, and the one-line error of each invalid file."""
 
 import json
 import os
@@ -25,12 +25,12 @@ DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 
 
 def _places(region: Region) -> np.ndarray:
-    """Corners as they were in the file, [V, 2] (latitude, longitude)."""
+    """Corners of a region converted back to degrees, [V, 2] (latitude, longitude)."""
     assert region.origin is not None
     return np.column_stack(to_latlon(*shapely.get_coordinates(region.polygon).T, region.origin))
 
 
-# --- good files ---------------------------------------------------------------------------------
+# --- valid files --------------------------------------------------------------------------------
 
 
 def test_the_shipped_table_holds_the_llanbedr_polygon():
@@ -41,13 +41,13 @@ def test_the_shipped_table_holds_the_llanbedr_polygon():
         np.array([[52.814992, -4.132176], [52.814502, -4.132138]]), abs=1e-9
     )
     assert len(region.polygon.exterior.coords) == 11
-    # The same by the shoelace formula on a flat map at the region's latitude.
+    # Expected area from the shoelace formula on a flat map at the region's latitude.
     flat = Polygon(_places(region)[:, ::-1]).area * DEGREE_M**2 * np.cos(np.radians(52.813))
     assert region.polygon.area == pytest.approx(flat, rel=1e-4)
     assert len(landing_lattice(region.polygon, 30, 45)) > 100
 
 
-def test_rows_of_a_table_are_taken_in_their_sequence():
+def test_rows_of_a_table_are_ordered_by_sequence_number():
     region = read_fir(FIR, "North Bay")
     assert region.levels == (10, 45.5)
     corners = [[52.8, -4.13], [52.8, -4.12], [52.81, -4.12], [52.81, -4.13], [52.8, -4.13]]
@@ -56,12 +56,12 @@ def test_rows_of_a_table_are_taken_in_their_sequence():
     assert region.polygon.area == pytest.approx(width * 0.01 * DEGREE_M, rel=1e-4)
 
 
-def test_local_metres_are_about_the_centroid():
+def test_the_origin_of_local_metres_is_the_centroid():
     for region in (read_fir(FIR, "North Bay"), read_geojson(ZONES, where="name:ell")):
         assert region.polygon.centroid.coords[0] == pytest.approx((0, 0), abs=1.0)
 
 
-def test_a_region_over_the_antimeridian_is_one_small_polygon():
+def test_a_region_across_the_antimeridian_is_one_small_polygon():
     region = read_fir(FIR, "Strait")
     assert abs(region.origin[1]) == pytest.approx(180)
     width = 0.2 * DEGREE_M * np.cos(np.radians(16.45))
@@ -78,8 +78,8 @@ def test_a_concave_polygon_stays_concave():
 def test_a_hole_stays_a_hole_and_heights_are_ignored():
     region = read_geojson(ZONES, where="name=lake")
     assert len(region.polygon.interiors) == 1
-    whole = Polygon(region.polygon.exterior).area
-    assert region.polygon.area == pytest.approx(whole * 8 / 9, rel=1e-3)
+    outer_area = Polygon(region.polygon.exterior).area
+    assert region.polygon.area == pytest.approx(outer_area * 8 / 9, rel=1e-3)
     assert not region.polygon.contains(region.polygon.centroid)
 
 
@@ -91,7 +91,7 @@ def test_a_multipolygon_keeps_its_parts():
 
 
 @pytest.mark.parametrize(("where", "name"), [("zone=1", "ell"), ("zone=2", "lake")])
-def test_a_feature_is_chosen_by_a_number_among_its_properties(where, name):
+def test_a_feature_can_be_chosen_by_a_numeric_property(where, name):
     assert read_geojson(ZONES, where=where).name == name
 
 
@@ -123,7 +123,9 @@ def _collection(*features):
     ids=["Polygon", "MultiPolygon", "Feature", "FeatureCollection", "beside a point"],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
-def test_each_kind_of_geojson_gives_its_only_area_with_and_without_bom(tmp_path, document, encoding):
+def test_each_kind_of_geojson_yields_its_only_area_with_and_without_a_byte_order_mark(
+    tmp_path, document, encoding
+):
     file = tmp_path / "square.geojson"
     file.write_text(json.dumps(document), encoding=encoding)
     region = read_geojson(file)
@@ -133,24 +135,24 @@ def test_each_kind_of_geojson_gives_its_only_area_with_and_without_bom(tmp_path,
     assert sorted(_places(region).round(9).tolist()) == sorted(corners)
 
 
-def test_a_name_can_be_printed_on_one_line_whatever_the_file_holds(tmp_path):
+def test_a_region_name_is_printable_and_one_line_for_any_text_in_the_file(tmp_path):
     file = tmp_path / "odd.geojson"
     file.write_text(json.dumps(_feature(_polygon(*SQUARE), name="north\n\ud800")))
     assert read_geojson(file).name == r"north \ud800"
 
 
-def test_a_string_may_name_the_file():
+def test_a_path_may_be_a_string():
     assert read_fir(str(FIR), "Strait") == read_fir(FIR, "Strait")
     assert read_geojson(str(ZONES), 0) == read_geojson(ZONES, 0)
 
 
-def test_a_table_may_have_a_bom_and_windows_line_ends(tmp_path):
+def test_a_table_may_have_a_byte_order_mark_and_windows_line_endings(tmp_path):
     file = tmp_path / "fir.csv"
     file.write_bytes(b"\xef\xbb\xbf" + FIR.read_bytes().replace(b"\n", b"\r\n"))
     assert read_fir(file, "North Bay") == read_fir(FIR, "North Bay")
 
 
-def test_parts_cut_at_the_antimeridian_become_one(tmp_path):
+def test_parts_cut_at_the_antimeridian_are_united(tmp_path):
     west = [[179.9, 1], [180, 1], [180, 1.1], [179.9, 1.1], [179.9, 1]]
     east = [[-180, 1], [-179.9, 1], [-179.9, 1.1], [-180, 1.1], [-180, 1]]
     file = tmp_path / "cut.geojson"
@@ -160,18 +162,18 @@ def test_parts_cut_at_the_antimeridian_become_one(tmp_path):
     assert region.polygon.area == pytest.approx(0.2 * 0.1 * DEGREE_M**2, rel=1e-3)
 
 
-# --- bad files ----------------------------------------------------------------------------------
+# --- invalid files ------------------------------------------------------------------------------
 
 HEADER = "Airspace ID,Min Flight Level,Max Flight Level,Sequence Number,Latitude,Longitude\n"
 ROWS = ("A,0,60,0,52.80,-4.13", "A,0,60,1,52.80,-4.12", "A,0,60,2,52.81,-4.12")
 
 
-def _table(*changed: str, header: str = HEADER) -> str:
-    """A good table with the last rows changed."""
-    return header + "\n".join([*ROWS[: len(ROWS) - len(changed)], *changed]) + "\n"
+def _table(*last_rows: str, header: str = HEADER) -> str:
+    """Valid table with its last rows replaced."""
+    return header + "\n".join([*ROWS[: len(ROWS) - len(last_rows)], *last_rows]) + "\n"
 
 
-BAD_TABLES = {
+INVALID_TABLES = {
     "empty": ("", "is empty"),
     "only blank": (" \n\n", "is empty"),
     "not UTF-8": (b"Airspace ID\xff", "byte 11 is not UTF-8"),
@@ -218,20 +220,20 @@ BAD_TABLES = {
 }
 
 
-@pytest.mark.parametrize(("text", "says"), BAD_TABLES.values(), ids=BAD_TABLES)
-def test_a_bad_table_is_one_line_that_names_the_file_and_the_fault(tmp_path, text, says):
+@pytest.mark.parametrize(("text", "message"), INVALID_TABLES.values(), ids=INVALID_TABLES)
+def test_an_invalid_table_raises_one_line_that_names_the_file_and_the_fault(tmp_path, text, message):
     file = tmp_path / "bad.csv"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
-    _assert_one_line(file, says, lambda: read_fir(file, "A"))
+    _assert_one_line_error(file, message, lambda: read_fir(file, "A"))
 
 
 LON_200 = [[8, 45], [200, 45], [8, 46], [8, 45]]
 LAT_95 = [[8, 45], [9, 95], [8, 46], [8, 45]]
 FAR_HOLE = [[18, 45], [18.01, 45], [18.01, 45.01], [18, 45]]
 RING = SQUARE[0]
-TWO = _collection(_feature(_polygon(RING), zone="a"), _feature(_polygon(RING), zone="b"))
+TWO_FEATURES = _collection(_feature(_polygon(RING), zone="a"), _feature(_polygon(RING), zone="b"))
 
-BAD_GEOJSON = {
+INVALID_GEOJSON = {
     "empty": ("", {}, "is empty"),
     "not UTF-8": (b'{"type": "\xff"}', {}, "byte 10 is not UTF-8"),
     "not JSON": ('{"type":\n oops}', {}, "line 2: not JSON"),
@@ -247,16 +249,16 @@ BAD_GEOJSON = {
     "features a dict": ({"type": "FeatureCollection", "features": {}}, {}, "features {} is not"),
     "not a feature": (_collection(3), {}, "features[0]: 3 is not a Feature"),
     "only points": (_collection(POINT, POINT), {}, "none of 2 features is a Polygon"),
-    "no choice": (TWO, {}, "choose one of 2 features by index or property=value: features[0] {'zo"),
-    "both choices": (TWO, {"index": 0, "where": "zone=a"}, "index 0 and where 'zone=a' both"),
-    "index 2 of 2": (TWO, {"index": 2}, "index 2 is not between 0 and 1"),
-    "index -1": (TWO, {"index": -1}, "index -1 is not between 0 and 1"),
+    "no choice": (TWO_FEATURES, {}, "choose one of 2 features by index or property=value: features[0] {'zo"),
+    "both choices": (TWO_FEATURES, {"index": 0, "where": "zone=a"}, "index 0 and where 'zone=a' both"),
+    "index 2 of 2": (TWO_FEATURES, {"index": 2}, "index 2 is not between 0 and 1"),
+    "index -1": (TWO_FEATURES, {"index": -1}, "index -1 is not between 0 and 1"),
     "index of a point": (_collection(POINT), {"index": 0}, "features[0].geometry: type 'Point'"),
-    "where without =": (TWO, {"where": "zone"}, "where 'zone' is not property=value"),
-    "where unknown": (TWO, {"where": "zome=a"}, "no feature has a property 'zome'; did you mean"),
-    "where no value": (TWO, {"where": "zone=c"}, "no feature has zone='c'; the file has 'a', 'b'"),
+    "where without =": (TWO_FEATURES, {"where": "zone"}, "where 'zone' is not property=value"),
+    "where unknown": (TWO_FEATURES, {"where": "zome=a"}, "no feature has a property 'zome'; did you mean"),
+    "where no value": (TWO_FEATURES, {"where": "zone=c"}, "no feature has zone='c'; the file has 'a', 'b'"),
     "where twice": (
-        _collection(*TWO["features"][:1] * 2),
+        _collection(*TWO_FEATURES["features"][:1] * 2),
         {"where": "zone=a"},
         "fits 2 features: features[0], features[1]",
     ),
@@ -291,13 +293,15 @@ BAD_GEOJSON = {
 }
 
 
-@pytest.mark.parametrize(("content", "choice", "says"), BAD_GEOJSON.values(), ids=BAD_GEOJSON)
-def test_a_bad_geojson_is_one_line_that_names_the_file_and_the_fault(tmp_path, content, choice, says):
+@pytest.mark.parametrize(("content", "choice", "message"), INVALID_GEOJSON.values(), ids=INVALID_GEOJSON)
+def test_an_invalid_geojson_raises_one_line_that_names_the_file_and_the_fault(
+    tmp_path, content, choice, message
+):
     file = tmp_path / "bad.geojson"
     if not isinstance(content, bytes):
         content = (content if isinstance(content, str) else json.dumps(content)).encode()
     file.write_bytes(content)
-    _assert_one_line(file, says, lambda: read_geojson(file, **choice))
+    _assert_one_line_error(file, message, lambda: read_geojson(file, **choice))
 
 
 def _missing(folder: Path) -> Path:
@@ -311,7 +315,7 @@ def _directory(folder: Path) -> Path:
 def _oversized(folder: Path) -> Path:
     file = folder / "huge.csv"
     file.touch()
-    os.truncate(file, 200_000_000)  # sparse: it takes no room
+    os.truncate(file, 200_000_000)  # a sparse file, which takes no disk space
     return file
 
 
@@ -326,7 +330,7 @@ def _long_name(folder: Path) -> Path:
 
 @pytest.mark.parametrize("read", [lambda f: read_fir(f, "A"), read_geojson], ids=["fir", "geojson"])
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [
         (_missing, "no such file"),
         (_directory, "is not a file"),
@@ -335,16 +339,16 @@ def _long_name(folder: Path) -> Path:
         (_long_name, "cannot be read"),
     ],
 )
-def test_what_is_no_readable_file_is_one_line_that_names_it(tmp_path, make, says, read):
+def test_an_unreadable_file_raises_one_line_that_names_it(tmp_path, make, message, read):
     file = make(tmp_path)
-    _assert_one_line(file, says, lambda: read(file))
+    _assert_one_line_error(file, message, lambda: read(file))
 
 
-def _assert_one_line(file: Path, says: str, read) -> None:
+def _assert_one_line_error(file: Path, message: str, read) -> None:
     with pytest.raises(InputError) as error:
         read()
-    message = str(error.value)
-    assert message.startswith(f"{file}: ")
-    assert says in message
-    assert len(message.splitlines()) == 1
-    message.encode()
+    line = str(error.value)
+    assert line.startswith(f"{file}: ")
+    assert message in line
+    assert len(line.splitlines()) == 1
+    line.encode()  # fails for text that cannot be printed

@@ -1,1 +1,1 @@
-"""Where UAVs fly: polygons drawn, written down, or read from FIR tables and GeoJSON files."""
+"""Regions that UAVs fly over: random polygons, given vertices, or areas of FIR tables and GeoJSON files."""

@@ -1,4 +1,4 @@
-"""Which region the UAVs fly over, its landing points, and where the UAVs start."""
+"""Settings of the region, of its landing points, and of the positions where the UAVs start."""
 
 from dataclasses import dataclass, field
 
@@ -13,38 +13,38 @@ from damian.world.regions.region import Region
 
 @dataclass
 class RegionConfig:
-    """Where the UAVs fly (SPEC 1)."""
+    """Region, landing points and start positions (paper, section 3.2)."""
 
     kind: str = "random"
-    """``random``, ``vertices``, ``fir`` (Eurocontrol table) or ``geojson``."""
+    """Origin of the region: ``random``, ``vertices``, ``fir`` (Eurocontrol table) or ``geojson``."""
     min_area: float = 100_000.0
-    """Smallest random region [m^2]."""
+    """Smallest area of a random region [m^2]."""
     max_area: float = 200_000.0
-    """Largest random region [m^2]."""
+    """Largest area of a random region [m^2]."""
     pool: int = 1
-    """Random regions drawn once per seed; every episode of every world takes one of them."""
+    """Number of random regions drawn once per seed; every episode of every world uses one of them."""
     vertices: list = field(default_factory=list)
-    """Corners [x, y] in metres, for ``vertices``."""
+    """Polygon corners [x, y] in metres, for ``kind=vertices``."""
     path: str = ""
-    """File, for ``fir`` and ``geojson``."""
+    """File to read, for ``kind=fir`` and ``kind=geojson``."""
     id: str = ""
-    """Airspace ID in a FIR table."""
+    """Airspace ID of the region in the FIR table."""
     index: int | None = None
-    """Which feature of a GeoJSON file."""
+    """Index of the feature in the GeoJSON file, counted from 0."""
     where: str | None = None
-    """Which feature of a GeoJSON file, as ``property:value``."""
+    """Property that selects the feature of the GeoJSON file, as ``property:value``."""
     lattice_step: float = 30.0
-    """Distance between landing points in a row [m]."""
+    """Distance between neighbouring landing points of a lattice row [m]."""
     lattice_angle: float = 45.0
-    """Slant of the lattice [deg]."""
+    """Slant of the landing-point lattice [deg], in (0, 90]."""
     n_landing_points: int | None = None
-    """Keep only the nearest to the centroid; all of them if not given."""
+    """Number of landing points kept, those nearest to the centroid; all if not given."""
     initial_conditions: int = 1024
-    """Beginnings (starts, source walk) drawn per seed and shared out among the regions."""
+    """Number of initial conditions (UAV starts and source walk) drawn per seed, divided among the regions."""
     start_positions: list | None = None
-    """Where each UAV starts, [x, y] in metres (its nearest landing point); drawn if not given."""
+    """One [x, y] in metres per UAV, which starts on the nearest landing point; drawn if not given."""
     start_together: bool = False
-    """Let all UAVs start on one drawn landing point."""
+    """Whether all UAVs start on the same drawn landing point."""
 
     def __post_init__(self) -> None:
         checks.one_of("region.kind", self.kind, ["random", "vertices", "fir", "geojson"])
@@ -63,18 +63,18 @@ class RegionConfig:
         checks.in_range("region.lattice_angle", self.lattice_angle, 0.0, 90.0, "deg")
         if self.n_landing_points is not None:
             checks.in_range("region.n_landing_points", self.n_landing_points, 1)
-        needs = {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}
-        for key in needs.get(self.kind, []):
-            should = f"is missing: region.kind={self.kind} needs it"
-            checks.require(bool(getattr(self, key)), f"region.{key}", "it", should)
+        required_keys = {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}
+        for key in required_keys.get(self.kind, []):
+            problem = f"is missing: region.kind={self.kind} needs it"
+            checks.require(bool(getattr(self, key)), f"region.{key}", "it", problem)
         for start in self.start_positions or []:
             checks.place("region.start_positions", start)
 
     def regions(self, rng: np.random.Generator) -> list[Region]:
-        """Read or draw the regions.
+        """Read the region from its file or vertices, or draw ``pool`` random regions.
 
         Raises:
-            InputError: a file or a polygon is wrong.
+            InputError: the file cannot be read, or the vertices form no valid polygon.
         """
         if self.kind == "fir":
             return [read_fir(self.path, self.id)]

@@ -1,4 +1,4 @@
-"""Eurocontrol FIR tables (CSV). Everything wrong in one is one `InputError` that says where."""
+"""Reads Eurocontrol FIR tables (CSV); any fault raises one `InputError` that says where in the file it is."""
 
 import csv
 import io
@@ -26,46 +26,46 @@ _BOUNDS = {
 
 
 class _Row(NamedTuple):
-    """One line of a FIR table."""
+    """One row of a FIR table: its line number in the file, and its cells by column name."""
 
     line: int
     cells: dict[str, str]
 
 
 def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
-    """Read one airspace of a FIR table.
+    """Read one airspace of a FIR table as a region in local metres.
 
-    Columns: ``Airspace ID, Min Flight Level, Max Flight Level, Sequence Number, Latitude,
-    Longitude``, any others beside them; rows in any order, their sequence numbers 0, 1, 2, ... go
-    round the polygon. Only the rows of the chosen airspace are checked.
+    The table needs the columns ``Airspace ID, Min Flight Level, Max Flight Level, Sequence Number,
+    Latitude, Longitude`` and may have others. Its rows may be in any order: the sequence numbers
+    0, 1, 2, ... number the corners around the polygon. Only the rows of the chosen airspace are checked.
 
     Raises:
-        InputError: the file, its table, or the chosen airspace is wrong.
+        InputError: the file cannot be read, its table is malformed, or the airspace is missing or invalid.
     """
     with named(path):
         table = _read_table(read_text(Path(path)))
         rows = [row for row in table if row.cells[_ID] == airspace_id]
         if not rows:
-            known = {row.cells[_ID] for row in table}
-            raise InputError(f"no {_ID} {show(airspace_id)}; {near(airspace_id, known)}")
+            known_ids = {row.cells[_ID] for row in table}
+            raise InputError(f"no {_ID} {show(airspace_id)}; {near(airspace_id, known_ids)}")
         rows, levels = _in_sequence(rows), _levels(rows)
         corners = [[_number(row, column) for column in (_LONGITUDE, _LATITUDE)] for row in rows]
         return local_region([[np.array(corners)]], airspace_id, levels, airspace_id)
 
 
 def _read_table(text: str) -> list[_Row]:
-    """Every line with its cells by column, stripped."""
+    """Parse all rows; cells are stripped and keyed by column."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except csv.Error as error:
         raise InputError(f"line {reader.line_num}: {error}; give comma-separated values") from None
     (first, header), *lines = [row for row in lines if any(row[1])] or [(1, [])]
-    wrong = [column for column in _COLUMNS if header.count(column) != 1]
-    if wrong:
+    not_unique = [column for column in _COLUMNS if header.count(column) != 1]
+    if not_unique:
         found = listed(map(show, header))
         raise InputError(
-            f"line {first}: column {', '.join(wrong)} missing or doubled; the columns are {found}"
+            f"line {first}: column {', '.join(not_unique)} missing or doubled; the columns are {found}"
         )
     for number, cells in lines:
         if len(cells) != len(header):
@@ -74,29 +74,28 @@ def _read_table(text: str) -> list[_Row]:
 
 
 def _in_sequence(rows: list[_Row]) -> list[_Row]:
-    """Rows ordered by their sequence numbers, which must be 0, 1, 2, ..."""
-    keyed = sorted((_number(row, _SEQUENCE), row) for row in rows)
-    for expected, (number, row) in enumerate(keyed):
+    """Sort the rows by their sequence numbers, which must be 0, 1, 2, ..."""
+    numbered = sorted((_number(row, _SEQUENCE), row) for row in rows)
+    for expected, (number, row) in enumerate(numbered):
         if number == expected:
             continue
         problem = f"line {row.line}: {_SEQUENCE} {row.cells[_SEQUENCE]}"
-        if expected and number == keyed[expected - 1][0]:
-            raise InputError(f"{problem} is on line {keyed[expected - 1][1].line} too")
+        if expected and number == numbered[expected - 1][0]:
+            raise InputError(f"{problem} is on line {numbered[expected - 1][1].line} too")
         raise InputError(f"{problem} where {expected} is next; number the points 0, 1, 2, ...")
-    return [row for _, row in keyed]
+    return [row for _, row in numbered]
 
 
 def _levels(rows: list[_Row]) -> tuple[float, float]:
-    """The lowest and highest flight level, the same in all rows."""
+    """Lowest and highest flight level, each of which must be the same in all rows."""
     first = min(rows)
-    low, high = (_common(rows, first, column) for column in (_LOWEST, _HIGHEST))
+    low, high = (_same_in_all_rows(rows, first, column) for column in (_LOWEST, _HIGHEST))
     if low > high:
         raise InputError(f"line {first.line}: {_LOWEST} {low:g} FL is above {_HIGHEST} {high:g} FL")
     return low, high
 
 
-def _common(rows: list[_Row], first: _Row, column: str) -> float:
-    """The number that a column has in every row."""
+def _same_in_all_rows(rows: list[_Row], first: _Row, column: str) -> float:
     level = _number(first, column)
     for row in rows:
         value = _number(row, column)
@@ -109,10 +108,10 @@ def _common(rows: list[_Row], first: _Row, column: str) -> float:
 
 
 def _number(row: _Row, column: str) -> float:
-    """A cell as a number within its column's bounds."""
+    """Read a cell as a number within its column's bounds."""
     text, (low, high, unit) = row.cells[column], _BOUNDS[column]
     try:
-        # Python would read 1_0 as ten.
+        # float() alone would accept underscores and read 1_0 as 10.
         value = float("_" if "_" in text else text)
     except ValueError:
         raise InputError(f"line {row.line}: {column} {show(text)} is not a number") from None

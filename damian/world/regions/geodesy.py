@@ -1,8 +1,9 @@
-"""Latitude and longitude to local metres and back, on a sphere.
+"""Converts latitude and longitude to local metres and back, on a sphere.
 
-Local metres are an azimuthal equidistant map about an origin: x east, y north, distance and bearing
-from the origin exact. Formulas: R. W. Sinnott, "Virtues of the Haversine" (1984), and the direct
-problem on a sphere. The sphere differs from the WGS 84 ellipsoid by up to 0.6 % of a distance.
+Local metres are an azimuthal equidistant projection about an origin: x points east, y points north, and
+distance and bearing from the origin are exact. Formulas: R. W. Sinnott, "Virtues of the Haversine" (1984),
+and the direct geodesic problem on a sphere. Distances on the sphere differ by up to 0.6 % from those on the
+WGS 84 ellipsoid.
 """
 
 import numpy as np
@@ -15,12 +16,12 @@ EARTH_RADIUS_M = 6_371_008.8
 
 
 def to_local(lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Local metres of places, by haversine distance d and initial bearing b from the origin.
+    """Convert latitude and longitude to local metres, by haversine distance d and initial bearing b.
 
     Args:
         lat_deg: latitudes, [*] degrees in [-90, 90].
-        lon_deg: longitudes, [*] degrees; any turn.
-        origin: (latitude, longitude) in degrees.
+        lon_deg: longitudes, [*] degrees; whole turns do not matter.
+        origin: (latitude, longitude) in degrees; d and b are measured from it.
 
     Returns:
         ``x = d sin b`` (east) and ``y = d cos b`` (north), each [*] metres. The bearing of the
@@ -31,14 +32,14 @@ def to_local(lat_deg: ArrayLike, lon_deg: ArrayLike, origin: tuple[float, float]
     haversine = np.sin((lat - lat_0) / 2) ** 2 + np.cos(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
     distance = 2 * EARTH_RADIUS_M * np.arcsin(np.sqrt(np.clip(haversine, 0, 1)))
     east = np.cos(lat) * np.sin(d_lon)
-    # cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(d_lon), without its cancellation nearby.
+    # Equals cos(lat_0) sin(lat) - sin(lat_0) cos(lat) cos(d_lon), without cancellation near the origin.
     north = np.sin(lat - lat_0) + 2 * np.sin(lat_0) * np.cos(lat) * np.sin(d_lon / 2) ** 2
     bearing = np.arctan2(east, north)
     return distance * np.sin(bearing), distance * np.cos(bearing)
 
 
 def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Places of local metres, where the great circle from the origin ends; inverts `to_local`.
+    """Convert local metres to latitude and longitude; inverts `to_local`.
 
     Args:
         x_m: metres east, [*].
@@ -51,8 +52,8 @@ def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tu
     x, y, lat_0 = np.asarray(x_m, float), np.asarray(y_m, float), np.radians(origin[0])
     arc, bearing = np.hypot(x, y) / EARTH_RADIUS_M, np.arctan2(x, y)
     east, north = np.sin(arc) * np.sin(bearing), np.sin(arc) * np.cos(bearing)
-    # Cartesian on the unit sphere, with the origin's meridian as the x-z plane. The arctangent of
-    # the latitude keeps its digits at the poles, where an arcsine loses half of them.
+    # Cartesian coordinates on the unit sphere, with the origin's meridian as the x-z plane. Near the
+    # poles an arcsine would lose half the digits of the latitude; the arctangent keeps them.
     out = np.cos(arc) * np.cos(lat_0) - north * np.sin(lat_0)
     up = np.cos(arc) * np.sin(lat_0) + north * np.cos(lat_0)
     lat = np.degrees(np.arctan2(up, np.hypot(out, east)))
@@ -60,6 +61,6 @@ def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tu
 
 
 def wrap_longitude(lon_deg: ArrayLike) -> Floats:
-    """Longitudes [*] in degrees, brought into [-180, 180)."""
+    """Wrap longitudes [*] in degrees into [-180, 180)."""
     lon = np.asarray(lon_deg, float)
     return lon - 360 * np.floor((lon + 180) / 360)

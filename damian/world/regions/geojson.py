@@ -1,4 +1,4 @@
-"""GeoJSON (RFC 7946): one area of a file. Everything wrong in one is one `InputError` that says where."""
+"""Reads one area of a GeoJSON file (RFC 7946); any fault raises one `InputError` that says where it is."""
 
 import json
 import os
@@ -14,11 +14,11 @@ from damian.world.regions.region import Region, local_region
 
 _SHAPES = ("Polygon", "MultiPolygon")
 _BOUNDS = (("longitude", -180.0, 180.0), ("latitude", -90.0, 90.0))
-"""Of the numbers of a position, in their order [deg]."""
+"""Bounds of the coordinates of a position [deg], in the order of GeoJSON."""
 
 
 class _Candidate(NamedTuple):
-    """One feature of a GeoJSON file; ``place`` is where it stands in there."""
+    """One feature of a GeoJSON file; ``place`` is its path in the document, such as ``features[2]``."""
 
     place: str
     properties: dict[str, Any]
@@ -26,20 +26,21 @@ class _Candidate(NamedTuple):
 
 
 def read_geojson(path: str | os.PathLike[str], index: int | None = None, where: str | None = None) -> Region:
-    """Read one Polygon or MultiPolygon of a GeoJSON file, bare or within features.
+    """Read one Polygon or MultiPolygon of a GeoJSON file, a bare geometry or that of a feature.
 
-    Positions are longitude, latitude; a height is ignored. Rings must be closed, as RFC 7946 asks
-    (an open one may be a file cut short). Parts of a MultiPolygon that touch or overlap are united.
+    Positions are longitude, latitude; a height is ignored. Rings must be closed, as RFC 7946 requires
+    (an open ring may come from a truncated file). Parts of a MultiPolygon that touch or overlap are united.
 
     Args:
         path: the file.
-        index: which feature, counted from 0 over all features of the file.
-        where: which feature, as ``property=value`` or, where = means something else already,
-            ``property:value``; needless, like ``index``, where only one
-            feature is an area.
+        index: the feature's index, counted from 0 over all features of the file.
+        where: a property that only the feature has, as ``property=value`` or ``property:value`` (the latter
+            for command lines that give ``=`` a meaning of their own). Neither ``index`` nor ``where`` is
+            needed if only one feature is an area.
 
     Raises:
-        InputError: the file or the chosen shape is wrong, or the choice is not of one feature.
+        InputError: the file cannot be read, the chosen geometry is invalid, or the choice does not single
+            out one feature.
     """
     with named(path):
         features = _candidates(_parse_json(read_text(Path(path))))
@@ -61,7 +62,7 @@ def _parse_json(text: str) -> Any:
 
 
 def _candidates(document: Any) -> list[_Candidate]:
-    """Every feature of a document; a bare geometry is one without properties."""
+    """List all features of a document; a bare geometry counts as a feature without properties."""
     kind = document.get("type") if isinstance(document, dict) else None
     if kind in _SHAPES:
         return [_Candidate("", {}, document)]
@@ -84,7 +85,7 @@ def _feature(place: str, feature: Any) -> _Candidate:
 
 
 def _choose(candidates: list[_Candidate], index: int | None, where: str | None) -> _Candidate:
-    """The one feature that is meant."""
+    """Find the feature chosen by ``index`` or ``where``, or else the only one that is an area."""
     if index is not None and where is not None:
         raise InputError(f"index {index} and where {show(where)} both choose; give one of them")
     if index is not None:
@@ -92,7 +93,7 @@ def _choose(candidates: list[_Candidate], index: int | None, where: str | None) 
             raise InputError(f"index {index} is not between 0 and {len(candidates) - 1}")
         return candidates[index]
     if where is not None:
-        return _where(candidates, where)
+        return _choose_by_property(candidates, where)
     areas = [c for c in candidates if _kind(c.geometry) in _SHAPES]
     if len(areas) == 1 or len(candidates) == 1:
         return (areas or candidates)[0]
@@ -102,34 +103,34 @@ def _choose(candidates: list[_Candidate], index: int | None, where: str | None) 
     raise InputError(f"choose one of {len(areas)} features by index or property=value: {choice}")
 
 
-def _where(candidates: list[_Candidate], where: str) -> _Candidate:
-    """The one feature whose property has that value, as written in Python or in JSON."""
+def _choose_by_property(candidates: list[_Candidate], where: str) -> _Candidate:
+    """Find the only feature with this property value, which may be written as in Python or as in JSON."""
     key, separator, value = where.partition("=" if "=" in where else ":")
     if not separator:
         raise InputError(f"where {show(where)} is not property=value")
-    having = [c for c in candidates if key in c.properties]
-    if not having:
-        known = {name for c in candidates for name in c.properties}
-        raise InputError(f"no feature has a property {show(key)}; {near(key, known)}")
-    found = [c for c in having if value in _spellings(c.properties[key])]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        places = listed(c.place for c in found)
-        raise InputError(f"where {show(where)} fits {len(found)} features: {places}")
-    known = {text for c in having for text in _spellings(c.properties[key])[:1]}
-    raise InputError(f"no feature has {key}={show(value)}; {near(value, known)}")
+    with_key = [c for c in candidates if key in c.properties]
+    if not with_key:
+        known_keys = {name for c in candidates for name in c.properties}
+        raise InputError(f"no feature has a property {show(key)}; {near(key, known_keys)}")
+    matching = [c for c in with_key if value in _spellings(c.properties[key])]
+    if len(matching) == 1:
+        return matching[0]
+    if matching:
+        places = listed(c.place for c in matching)
+        raise InputError(f"where {show(where)} fits {len(matching)} features: {places}")
+    known_values = {text for c in with_key for text in _spellings(c.properties[key])[:1]}
+    raise InputError(f"no feature has {key}={show(value)}; {near(value, known_values)}")
 
 
 def _spellings(value: Any) -> tuple[str, ...]:
-    """How a property may be written: ``north``, ``3``, ``true``; a nested one not at all."""
+    """List the ways to write a property value: ``north``, ``3``, ``true``; a nested value has none."""
     if isinstance(value, str):
         return (value,)
     return () if isinstance(value, dict | list) else (json.dumps(value), str(value))
 
 
 def _parts(chosen: _Candidate) -> list[list[Floats]]:
-    """Rings of every part, each [V, 2] degrees (longitude, latitude), closed."""
+    """Closed rings of each polygon part, each [V, 2] degrees (longitude, latitude)."""
     kind = _kind(chosen.geometry)
     place = f"{chosen.place}.geometry".lstrip(".")
     if kind not in _SHAPES:
@@ -138,17 +139,17 @@ def _parts(chosen: _Candidate) -> list[list[Floats]]:
     coordinates = chosen.geometry.get("coordinates")
     if kind == "Polygon":
         return [_rings(place, coordinates)]
-    parts = _filled(place, coordinates)
+    parts = _non_empty_list(place, coordinates)
     return [_rings(f"{place}[{i}]", part) for i, part in enumerate(parts)]
 
 
 def _rings(place: str, rings: Any) -> list[Floats]:
-    rings = _filled(place, rings)
+    rings = _non_empty_list(place, rings)
     return [_ring(f"{place}[{i}]", ring) for i, ring in enumerate(rings)]
 
 
 def _ring(place: str, ring: Any) -> Floats:
-    positions = _filled(place, ring)
+    positions = _non_empty_list(place, ring)
     corners = [_position(f"{place}[{i}]", p) for i, p in enumerate(positions)]
     if corners[0] != corners[-1]:
         raise InputError(f"{place}: not closed: its last position is not its first {corners[0]}")
@@ -160,15 +161,15 @@ def _position(place: str, position: Any) -> list[float]:
     if not isinstance(position, list) or len(position) < 2:
         raise InputError(f"{place}: {show(position)} is not [longitude, latitude]")
     for (name, low, high), value in zip(_BOUNDS, position, strict=False):
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (number and low <= value <= high):
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (is_number and low <= value <= high):
             raise InputError(
                 f"{place}: {name} {show(value)} is not a number between {low:g} and {high:g} deg"
             )
     return position[:2]
 
 
-def _filled(place: str, value: Any) -> list[Any]:
+def _non_empty_list(place: str, value: Any) -> list[Any]:
     if not isinstance(value, list) or not value:
         raise InputError(f"{place}: {show(value)} is not a list with something in it")
     return value

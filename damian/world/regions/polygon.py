@@ -1,6 +1,6 @@
-"""Operative polygons and the landing points in them, in local metres (SPEC section 1).
+"""Polygons of operative regions and the landing points in them, in local metres (paper, section 3.2).
 
-Everything here runs once, when a world is built. Polygons may be concave, have holes or come in
+These functions run once, when an environment is built. Polygons may be concave, have holes or consist of
 several parts.
 """
 
@@ -19,19 +19,21 @@ from damian.common.errors import InputError
 Floats = NDArray[np.float64]
 
 MAX_COORDINATE_M = 2.0e7
-"""Half way round the Earth: what lies further is no local coordinate."""
+"""Half the circumference of the Earth [m]; no local coordinate is larger."""
 MAX_CANDIDATES = 5_000_000
-"""Lattice points looked at before those outside the polygon are dropped."""
+"""Largest number of lattice points in the bounding box of a polygon."""
 _MAX_POINTS = 1000
+"""Points drawn for a random polygon."""
 _MAX_ROUNDS = 100
+"""Attempts to draw points inside a polygon."""
 
 
 def polygon_from_vertices(vertices: ArrayLike, source: str) -> Polygon:
-    """Polygon of given corners, concave or not, in the order in which they are given.
+    """Build a polygon, convex or concave, from its corners in order around it.
 
     Args:
         vertices: [V, 2] metres; the first may be repeated at the end.
-        source: what begins an error's line: a file, a line, a key.
+        source: prefix of error messages: a file, a line or a key.
 
     Raises:
         InputError: not [V, 2] finite metres, fewer than three distinct points, crossing edges, or
@@ -48,17 +50,17 @@ def polygon_from_vertices(vertices: ArrayLike, source: str) -> Polygon:
 
 
 def polygon_from_rings(rings: Sequence[ArrayLike], source: str, unit: str) -> Polygon:
-    """Polygon of a shell and its holes; only shapes without doubt are taken.
+    """Build a polygon from its shell and holes; refuse any that is not valid.
 
     Args:
         rings: the shell, then the holes; each [V, 2] in ``unit``.
-        source: what begins an error's line.
-        unit: what the coordinates are, for that line.
+        source: prefix of error messages.
+        unit: unit of the coordinates, for error messages.
 
     Raises:
-        InputError: a ring that is none, crossing edges, or a hole that is not inside the shell.
+        InputError: a ring without area, crossing edges, or a hole that is not inside the shell.
     """
-    shell, *holes = [_closed_shape(_corners(ring, source), source) for ring in rings]
+    shell, *holes = [_require_area(_corners(ring, source), source) for ring in rings]
     polygon = Polygon(shell, holes)
     if not polygon.is_valid:
         reason, _, place = shapely.is_valid_reason(polygon).rstrip("]").partition("[")
@@ -71,11 +73,11 @@ def polygon_from_rings(rings: Sequence[ArrayLike], source: str, unit: str) -> Po
 
 
 def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: float) -> Polygon:
-    """Random convex polygon: the hull of points uniform in the disc of area ``max_area_m2``.
+    """Draw a random convex polygon: the hull of points uniform in the disc of area ``max_area_m2``.
 
-    The hull grows a point at a time until its area reaches ``min_area_m2``. It cannot pass
-    ``max_area_m2``, since it lies in that disc. Where the two areas are so close that a thousand
-    points do not get there, the hull is scaled up to an area between them.
+    The hull grows by one point at a time until its area reaches ``min_area_m2``. It lies in the disc, so its
+    area cannot exceed ``max_area_m2``. If the two areas are so close that a thousand points do not suffice,
+    the hull is scaled up to the mean of the two areas.
 
     Raises:
         InputError: unless 0 < min_area_m2 <= max_area_m2.
@@ -90,37 +92,37 @@ def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: fl
         hull = _hull(np.vstack([shapely.get_coordinates(hull), point]))
     if hull.area >= min_area_m2:
         return hull
-    grow = np.sqrt((min_area_m2 + max_area_m2) / 2 / hull.area)
-    return _hull(grow * shapely.get_coordinates(hull))
+    scale = np.sqrt((min_area_m2 + max_area_m2) / 2 / hull.area)
+    return _hull(scale * shapely.get_coordinates(hull))
 
 
 def largest_vertex_distance(polygon: Polygon | MultiPolygon) -> float:
-    """Largest distance between two vertices [m]; what distances are divided by."""
+    """Largest distance between two vertices [m], by which features divide distances."""
     corners = shapely.get_coordinates(shapely.convex_hull(polygon))
-    # A row at a time: a hull of many corners would not fit in memory as one square.
+    # One corner at a time: the distance matrix of a hull with many corners may not fit in memory.
     return max(float(np.hypot(*(corners - corner).T).max()) for corner in corners)
 
 
 def landing_lattice(
     polygon: Polygon | MultiPolygon, step_m: float, degrees: float, n_points: int | None = None
 ) -> Floats:
-    """Landing points: a serpentine lattice laid over the polygon, of which the inside is kept.
+    """Lay a serpentine lattice over the polygon; its points inside the polygon are the landing points.
 
     Points are ``step_m`` apart in a row and rows ``step_m sin(degrees)`` apart, so no two points
-    coincide. A landing point's id is its place in the result: counter-clockwise about the centroid
-    from due west, due west itself last; where two lie in one direction, the nearer first.
+    coincide. A landing point's id is its row in the result. Points are ordered counter-clockwise about the
+    centroid from due west, with due west itself last; of two in one direction, the nearer comes first.
 
     Args:
-        polygon: local metres; its boundary is outside.
-        step_m: distance of neighbours in a row.
-        degrees: slant of the lattice, in (0, 90].
-        n_points: keep only that many, the nearest to the centroid; all if not given.
+        polygon: in local metres; points on its boundary count as outside.
+        step_m: distance between neighbours in a row [m].
+        degrees: slant of the lattice [deg], in (0, 90].
+        n_points: number of points kept, those nearest to the centroid; all if not given.
 
     Returns:
         [L, 2] metres.
 
     Raises:
-        InputError: a wrong step, slant or number; no point, or fewer than ``n_points``, inside.
+        InputError: an invalid step, slant or number of points; no point, or fewer than ``n_points``, inside.
     """
     checks.above("lattice step", step_m, 0.0, "m")
     checks.in_range("lattice step", step_m, 0.0, MAX_COORDINATE_M, "m")
@@ -129,30 +131,30 @@ def landing_lattice(
     lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
     shapely.prepare(polygon)
     inside = lattice[shapely.contains_xy(polygon, lattice)]
-    wanted = 1 if n_points is None else n_points
-    checks.in_range("landing points", wanted, 1)
+    n_required = 1 if n_points is None else n_points
+    checks.in_range("landing points", n_required, 1)
     checks.require(
-        len(inside) >= wanted,
+        len(inside) >= n_required,
         "landing points",
         len(inside),
-        f"lie inside the polygon of {polygon.area:g} m^2, fewer than the {wanted} wanted; take a "
+        f"lie inside the polygon of {polygon.area:g} m^2, fewer than the {n_required} wanted; take a "
         f"lattice step below {step_m:g} m",
     )
     return _by_direction(inside, shapely.get_coordinates(polygon.centroid)[0], n_points)
 
 
 def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Generator) -> Floats:
-    """Points uniform in the polygon, strictly inside.
+    """Draw points uniformly in the polygon, strictly inside.
 
-    A triangle of its constrained Delaunay triangulation is drawn by area, then a point in it (Osada
-    et al., "Shape Distributions", 2002, eq. 1). So a sliver takes no longer than a square, and only
+    First a triangle of its constrained Delaunay triangulation is drawn by area, then a point in it (Osada
+    et al., "Shape Distributions", 2002, eq. 1). So a narrow polygon takes no longer than a square, and only
     points that rounding has put on the boundary are drawn again.
 
     Returns:
         [n, 2] metres.
 
     Raises:
-        InputError: the polygon is thinner than rounding, or empty.
+        InputError: the polygon is empty, or so narrow that rounding leaves no point inside.
     """
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
@@ -171,7 +173,7 @@ def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Gene
 
 
 def _corners(vertices: ArrayLike, source: str) -> Floats:
-    """Corners as finite [V, 2]."""
+    """Convert corners to an array [V, 2] of finite numbers."""
     try:
         corners = np.asarray(vertices, dtype=np.float64)
     except (TypeError, ValueError):
@@ -184,58 +186,58 @@ def _corners(vertices: ArrayLike, source: str) -> Floats:
     return corners
 
 
-def _closed_shape(corners: Floats, source: str) -> Floats:
-    """Corners that span an area."""
+def _require_area(corners: Floats, source: str) -> Floats:
+    """Return the corners if they enclose an area."""
     n_distinct = len(np.unique(corners, axis=0))
     if n_distinct < 3:
         raise InputError(f"{source}: {n_distinct} distinct points; a polygon needs at least 3")
-    # The hull, not the shape itself: a bow tie of two equal halves has zero area and another fault.
+    # The hull, not the ring itself: a bow tie has zero area too, but its fault is that its edges cross.
     if _hull(corners).area <= 1e-12 * np.ptp(corners, axis=0).max() ** 2:
         raise InputError(f"{source}: no area: all {len(corners)} points lie on one line")
     return corners
 
 
 def _hull(corners: Floats) -> Polygon:
-    """Convex hull of points, [V, 2]; of no area where they lie on one line."""
+    """Convex hull of points [V, 2]; its area is zero if they lie on one line."""
     return cast(Polygon, MultiPoint(corners).convex_hull)
 
 
 def _disc(rng: np.random.Generator, area_m2: float, n: int) -> Floats:
-    """Points uniform in the disc of that area about (0, 0), [n, 2]."""
+    """Draw points [n, 2] uniformly in the disc of the given area about (0, 0)."""
     radius = np.sqrt(area_m2 / np.pi * rng.random(n))
     angle = 2 * np.pi * rng.random(n)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
 
 
 def _lattice(bounds: tuple[float, float, float, float], step: float, slant: float) -> Floats:
-    """Every lattice point of the bounding box and a margin, row by row, [P, 2].
+    """All lattice points in the bounding box and a margin around it, row by row, [P, 2].
 
-    Rows run right and left in turn, from where they start to the first point at or past the
-    opposite bound; each starts ``2 step cos(slant)`` past the last point of the one before.
+    Rows alternate between rightward and leftward. Each ends with the first point at or past the opposite
+    bound, and the next starts ``2 step cos(slant)`` past that point.
     """
     min_x, min_y, max_x, max_y = bounds
     width, height, rise = max_x - min_x, max_y - min_y, step * np.sin(slant)
-    # Multiplied out, since a tiny step must not overflow a quotient.
+    # Compared as products, since a quotient by a tiny step could overflow.
     if (width + 4 * step) * (height + rise) > MAX_CANDIDATES * step * rise:
         raise InputError(
             f"lattice step: {step:g} m is too fine for a polygon of {width:g} m x {height:g} m: "
             f"more than {MAX_CANDIDATES} points; take a longer one"
         )
     rows, start, ends = [], min_x, itertools.cycle([(max_x, 1), (min_x, -1)])
-    for y, (end, way) in zip(min_y + rise * np.arange(int(height / rise) + 1), ends, strict=False):
-        # A bound met but for rounding is met.
-        n_steps = int(np.ceil(way * (end - start) / step - 1e-9))
-        x = start + way * step * np.arange(n_steps + 1)
+    for y, (end, sign) in zip(min_y + rise * np.arange(int(height / rise) + 1), ends, strict=False):
+        # A bound missed by a rounding error counts as reached.
+        n_steps = int(np.ceil(sign * (end - start) / step - 1e-9))
+        x = start + sign * step * np.arange(n_steps + 1)
         rows.append(np.column_stack([x, np.full_like(x, y)]))
-        start = x[-1] + 2 * way * step * np.cos(slant)
+        start = x[-1] + 2 * sign * step * np.cos(slant)
     return np.concatenate(rows)
 
 
 def _by_direction(points: Floats, centre: Floats, n: int | None) -> Floats:
-    """The ``n`` points nearest the centre (all if not given), by direction, [n, 2].
+    """Select the ``n`` points nearest to the centre (all if not given), ordered by direction, [n, 2].
 
-    Counter-clockwise about it from due west. Rounded before ordering, so that ties are ties on
-    every machine (a negative zero included, which would turn due west by a full circle).
+    The order is counter-clockwise from due west. Coordinates are rounded first, so that ties are ties on
+    every machine; adding 0.0 removes negative zeros, which would move due west from last to first.
     """
     x, y = (np.round(points - centre, 9) + 0.0).T
     distance, angle = np.round(np.hypot(x, y), 6), np.round(np.arctan2(y, x), 12)

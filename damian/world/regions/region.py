@@ -1,4 +1,4 @@
-"""Operative regions, in local metres about their centroid."""
+"""Operative regions in local metres, with the centroid as origin."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from damian.world.regions.polygon import polygon_from_rings
 
 @dataclass(frozen=True)
 class Region:
-    """Where UAVs fly.
+    """Region that the UAVs fly over.
 
     Attributes:
-        polygon: local metres, x east and y north.
-        name: what the file calls it.
-        origin: (latitude, longitude) of (0, 0) in degrees; ``None`` where there is no place on
-            Earth.
-        levels: lowest and highest flight level [FL, hundreds of feet], as in the table.
+        polygon: in local metres, x east and y north.
+        name: its name in the file, or one made up from its kind.
+        origin: (latitude, longitude) of the local origin (0, 0) in degrees; ``None`` for a region without a
+            position on Earth.
+        levels: lowest and highest flight level [FL, hundreds of feet]; ``None`` if not known.
     """
 
     polygon: Polygon | MultiPolygon
@@ -38,12 +38,22 @@ def local_region(
     levels: tuple[float, float] | None,
     source: str,
 ) -> Region:
-    """A region in metres about its centroid; ``parts`` in degrees (longitude, latitude)."""
-    near = parts[0][0][0, 0]
-    turned = [[_turn_towards(ring, near) for ring in rings] for rings in parts]
+    """Build a region in metres about its centroid from polygon parts in degrees.
+
+    Args:
+        parts: for each part its rings, the shell first; each [V, 2] degrees (longitude, latitude).
+        name: of the region.
+        levels: lowest and highest flight level [FL], if known.
+        source: prefix of error messages.
+
+    Raises:
+        InputError: a ring is invalid, or the region is too large for a local map.
+    """
+    reference = parts[0][0][0, 0]
+    unwrapped = [[_unwrap_longitude(ring, reference) for ring in rings] for rings in parts]
     unit = "deg (longitude, latitude)"
-    polygons = [polygon_from_rings(rings, source, unit) for rings in turned]
-    # Parts cut apart at the antimeridian share an edge, which a MultiPolygon may not.
+    polygons = [polygon_from_rings(rings, source, unit) for rings in unwrapped]
+    # Parts that were cut at the antimeridian share an edge, which a valid MultiPolygon must not.
     shape = cast(Polygon | MultiPolygon, shapely.union_all(polygons))
     if shape.bounds[2] - shape.bounds[0] > 180:
         raise InputError(f"{source}: more than 180 deg of longitude wide; take a smaller region")
@@ -54,7 +64,7 @@ def local_region(
     return Region(local, one_line(name), origin, levels)
 
 
-def _turn_towards(ring: Floats, lon_deg: float) -> Floats:
-    """The ring by whole turns of longitude, each corner within half a turn of ``lon_deg``."""
+def _unwrap_longitude(ring: Floats, lon_deg: float) -> Floats:
+    """Shift each corner by whole turns of longitude to within 180 deg of ``lon_deg``."""
     turns = np.round((lon_deg - ring[:, 0]) / 360)
     return ring + np.column_stack([360 * turns, np.zeros_like(turns)])
