@@ -9,12 +9,13 @@ import io
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from damian.common import checks
 from damian.common.errors import InputError
+from damian.common.registry import Registry
 from damian.common.text_files import named, near, read_text, show
 from damian.delays.samplers import HeldSampler, Recorded, Sampler
 
@@ -48,6 +49,16 @@ class Law(ABC):
         """
 
 
+def _is_no_law(found: Any) -> str | None:
+    good = isinstance(found, type) and issubclass(found, Law) and is_dataclass(found)
+    return None if good else "is no dataclass derived from damian.Law"
+
+
+LAWS = Registry[type[Law]]("law", _is_no_law)
+"""Laws by name; ``law_of`` also takes one's own as ``package.module:Class``."""
+
+
+@LAWS.register("constant")
 @dataclass(frozen=True)
 class Constant(Law):
     """Every message has the same delay."""
@@ -58,6 +69,7 @@ class Constant(Law):
         return Sampler([_certain(in_steps(key, self.delay, dt))], loss=loss)
 
 
+@LAWS.register("uniform")
 @dataclass(frozen=True)
 class Uniform(Law):
     """With a probability, a uniform delay between ``low`` and ``high``; otherwise none (paper, section 5).
@@ -89,6 +101,7 @@ class Uniform(Law):
         return Sampler([[weighted[0] + 1 - self.probability, *weighted[1:]]], loss=loss)
 
 
+@LAWS.register("geometric")
 @dataclass(frozen=True)
 class Geometric(Law):
     """A message arrives in each step with the same probability, as if it were retransmitted until received.
@@ -108,6 +121,7 @@ class Geometric(Law):
         return Sampler([[*chances, failure**longest]], loss=loss)
 
 
+@LAWS.register("burst")
 @dataclass(frozen=True)
 class Burst(Law):
     """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state (1960, 1963)."""
@@ -142,6 +156,7 @@ class Burst(Law):
         return Sampler(states, transitions, loss)
 
 
+@LAWS.register("trace")
 @dataclass(frozen=True)
 class Trace(Law):
     """Recorded delays of a file, one per step in its order; each sender starts at a random row.
@@ -180,17 +195,12 @@ class Held(Law):
         return HeldSampler(self.law.sampler(dt, loss, key))
 
 
-LAWS: dict[str, type[Law]] = {
-    "constant": Constant,
-    "uniform": Uniform,
-    "geometric": Geometric,
-    "burst": Burst,
-    "trace": Trace,
-}
-
-
 def law_of(written: Any, key: str = "delay") -> Law:
-    """Convert a setting to a law: a law, steps, a time, or a mapping ``{law: uniform, low: 3s, high: 7s}``.
+    """Convert a setting to a law: a law, steps, a time, or a mapping.
+
+    ``{law: uniform, low: 3s, high: 7s}`` names a registered law and its settings; ``{law:
+    my_lab.delays:Satellite, mean: 2s}`` one of one's own, a frozen dataclass derived from ``Law`` in a module
+    that can be imported.
 
     Raises:
         InputError: the law or one of its parameters does not exist.
@@ -200,13 +210,13 @@ def law_of(written: Any, key: str = "delay") -> Law:
     if not isinstance(written, Mapping):
         return Constant(_number(written))
     kind = written.get("law")
-    checks.one_of(f"{key}.law", kind, LAWS)
+    law = LAWS.get(kind, f"{key}.law")
     values = {k: str(v) if k == "path" else _number(v) for k, v in written.items() if k != "law"}
-    names = [field.name for field in fields(LAWS[str(kind)])]
+    names = [field.name for field in fields(law)]
     for name, value in values.items():
         problem = f"is no setting of the law {kind}, which has {', '.join(names)}"
         checks.require(name in names, f"{key}.{name}", value, problem)
-    return LAWS[str(kind)](**values)
+    return law(**values)
 
 
 def in_steps(key: str, delay: Delay, dt: float) -> int:

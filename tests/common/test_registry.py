@@ -1,0 +1,63 @@
+"""Components are found by name or by path, and what cannot be found is said in one line."""
+
+import pytest
+
+from damian.common.errors import InputError
+from damian.common.registry import Registry
+
+
+def greetings() -> Registry:
+    registry = Registry("greeting", problem=lambda found: None if callable(found) else "is no function")
+
+    @registry.register("plain")
+    def plain() -> str:
+        return "hello"
+
+    return registry
+
+
+def test_a_registered_component_is_found_by_its_name():
+    registry = greetings()
+    assert registry.get("plain", "greeting")() == "hello"
+    assert list(registry) == ["plain"]
+    assert "plain" in registry
+    assert dict(registry.items()).keys() == {"plain"}
+
+
+def test_a_component_of_ones_own_is_found_by_its_path_in_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "polite_words.py").write_text("def formal():\n    return 'good day'\n")
+    assert greetings().get("polite_words:formal", "greeting")() == "good day"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("rude", "greeting: rude is not one of plain, nor a path such as package.module:Name"),
+        (3, "greeting: 3 is not one of plain"),
+        (
+            "nowhere_at_all:formal",
+            "greeting: nowhere_at_all:formal: No module named 'nowhere_at_all'; nowhere_at_all must",
+        ),
+        ("math:formal", "greeting: math:formal: the module math has no formal"),
+        ("math:pi", "greeting: math:pi is no function"),
+    ],
+)
+def test_what_cannot_be_found_is_said_in_one_line(name, message):
+    with pytest.raises(InputError) as error:
+        greetings().get(name, "greeting")
+    assert str(error.value).startswith(message)
+    assert "\n" not in str(error.value)
+
+
+def test_a_module_that_fails_says_so(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken_words.py").write_text("1 / 0\n")
+    with pytest.raises(InputError, match="importing it raised ZeroDivisionError: division by zero"):
+        greetings().get("broken_words:formal", "greeting")
+
+
+@pytest.mark.parametrize("name", ["plain", "a:path"])
+def test_a_name_is_given_once_and_is_no_path(name):
+    with pytest.raises(ValueError, match="the name is taken, or looks like a path"):
+        greetings().register(name)(print)
