@@ -1,4 +1,4 @@
-# make train | test | test-slow | bench | check        (each sets up what it needs)
+# make train | test | test-deep | test-slow | bench | check | format        (each sets up what it needs)
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -6,13 +6,17 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-slow bench check format clean
+.PHONY: train test test-deep test-slow bench check format clean
 
 train: $(VENV)/base
 	$(PY) recipes/train.py $(ARGS)
 
 test: $(VENV)/test
 	$(PY) -m pytest -n 2 $(ARGS)
+
+# Property tests with thousands of new random examples each.
+test-deep: $(VENV)/test
+	$(PY) -m pytest -n 2 -m "property and not slow" --hypothesis-profile=deep $(ARGS)
 
 test-slow: $(VENV)/test
 	$(PY) -m pytest -m slow $(ARGS)

@@ -1,11 +1,11 @@
-"""What the server believes of the UAVs, beside what is true: one flight of the random policy, drawn.
+"""Draw where the server believes the UAVs to be, and where they are, in one episode of the random policy.
 
     python recipes/belief.py
     python recipes/belief.py delay=paper scenario=tracking agents=2 seed=1
     python recipes/belief.py delay.obs=3 delay.loss=0.2 motion=polynomial
 
-Takes what recipes/train.py takes; a flight lasts as long as an episode. The run folder explains itself:
-config.yaml, belief.png, and belief.csv with a row for each instant and UAV.
+Every override of recipes/train.py may be given, except resume. The run folder gets config.yaml, belief.png (a
+map, the positions over time, the age of information) and belief.csv (a row for each time and UAV).
 """
 
 import csv
@@ -36,18 +36,23 @@ COLUMNS = ("time_s", "uav", *POSITIONS, "age_s", "arrived", "lost")
 
 
 def fly(config: TrainConfig) -> Beliefs:
-    """One episode of the random policy."""
+    """Fly one episode of the random policy."""
     env = make_env(
         config.eval_scenario, 1, config.seed, config.device, extras=["message", "state", "reward_terms"]
     )
-    flight = env.rollout(config.horizon, random_policy(env))[0].cpu()
-    read = [keys.STATE, keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY]
-    parts = [part.select(*read, strict=False) for part in (flight[:1], flight["next"])]
-    return beliefs(cast(TensorDictBase, torch.cat(parts)), env.uav_env)  # type: ignore[arg-type]
+    rollout = env.rollout(config.horizon, random_policy(env))[0].cpu()
+    needed = [keys.STATE, keys.MESSAGE, keys.MESSAGE_SENT, keys.RECEIVED, keys.DELAY]
+    outputs = [part.select(*needed, strict=False) for part in (rollout[:1], rollout["next"])]
+    return beliefs(cast(TensorDictBase, torch.cat(outputs)), env.uav_env)  # type: ignore[arg-type]
 
 
 def beliefs(outputs: TensorDictBase, env: UavEnv) -> Beliefs:
-    """The beliefs that follow from the outputs of a reset and of every step, [T + 1], of an environment."""
+    """True and believed positions, with the messages between them.
+
+    Args:
+        outputs: of the environment at the reset and after each step, [T + 1].
+        env: the environment without delays.
+    """
     message, state = cast(Tensor, outputs[keys.MESSAGE]), cast(Tensor, outputs[keys.STATE])
     sent = cast(Tensor, outputs[keys.MESSAGE_SENT]).clone()
     sent[0] = False  # the server holds the first message from the reset on
@@ -70,16 +75,16 @@ def beliefs(outputs: TensorDictBase, env: UavEnv) -> Beliefs:
 
 
 def rows(flight: Beliefs) -> Iterator[tuple[float | int, ...]]:
-    """The flight as a table, instant by instant."""
+    """Rows of the table under ``COLUMNS``: one for each time and UAV."""
     arrived, lost = flight.arrived.astype(int), flight.lost.astype(int)
     for step, uav in np.ndindex(flight.age.shape):
-        places = (*flight.true[step, uav].tolist(), *flight.believed[step, uav].tolist())
-        now, age = float(flight.time[step]), float(flight.age[step, uav])
-        yield (now, uav, *places, age, int(arrived[step, uav]), int(lost[step, uav]))
+        positions = (*flight.true[step, uav].tolist(), *flight.believed[step, uav].tolist())
+        time, age = float(flight.time[step]), float(flight.age[step, uav])
+        yield (time, uav, *positions, age, int(arrived[step, uav]), int(lost[step, uav]))
 
 
 def report(flight: Beliefs, folder: Path) -> None:
-    """Write table and figure, and say how old and how late things were."""
+    """Write table and figure; print the mean age of information, and the shares of late and lost messages."""
     with (folder / TABLE).open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
@@ -92,7 +97,7 @@ def report(flight: Beliefs, folder: Path) -> None:
 
 
 def show(config: TrainConfig, folder: Path) -> None:
-    """Fly, and fill the run folder."""
+    """Fly one episode and fill the run folder."""
     flight = fly(config)
     save_config(config, folder)
     report(flight, folder)
@@ -102,7 +107,9 @@ def show(config: TrainConfig, folder: Path) -> None:
 @reported
 def main(composed: DictConfig) -> None:
     if composed.resume is not None:
-        raise InputError("resume: a flight of the random policy has nothing to go on with")
+        raise InputError(
+            "resume: the random policy is not trained, so there is no run to resume; leave it out"
+        )
     perform(*prepare(composed), show)
 
 

@@ -1,11 +1,11 @@
-"""How fast the environment and training are beside VMAS, what delays cost, growth, and memory.
+"""Measure the speed of the environment and of training beside VMAS, the cost of delays, scaling, and memory.
 
     python recipes/bench.py            (a few minutes)
-    python recipes/bench.py --quick    (seconds: does it run?)
+    python recipes/bench.py --quick    (seconds; only checks that everything runs)
 
-One thread, random actions through TorchRL's ``rollout``; training is measured in ``bench_training.py``.
-Rivals take turns, so that a busy machine slows all of them, and medians are reported. The tables are also
-written to runs/bench.md.
+Everything runs on one CPU thread. Environments take random actions in TorchRL's ``rollout``; training is
+measured by ``bench_training.py``. The measured environments take turns, so that a busy machine slows all of
+them, and medians are reported. The tables are printed and written to runs/bench.md; there is no run folder.
 """
 
 import argparse
@@ -41,29 +41,32 @@ from damian.world.motion import MotionConfig
 
 RIVAL, BARE = "VMAS discovery", "bare"
 COMPILED_TOO = (BARE, "whole chain", "every transform")
-"""What is compiled of the delays; each takes ten seconds."""
+"""Names in ``delays()`` that are also measured compiled; compiling takes ten seconds each."""
 
 Scenarios = dict[str, ScenarioConfig]
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured."""
+    """Numbers of worlds, UAVs, steps and repetitions of the measurements."""
 
     worlds: int = 1024
-    """Worlds of the comparison and of the growth with UAVs."""
+    """Worlds in the comparison with VMAS, in the cost of delays, and in the growth with UAVs."""
     steps: int = 50
-    """Length of a rollout."""
+    """Steps of a rollout."""
     repeats: int = 5
-    """Rollouts of each environment."""
+    """Measured rollouts of each environment, and measured iterations of each training."""
     many_worlds: tuple[int, ...] = (1, 8, 64, 512, 1024, 2048, 4096, 8192)
+    """Numbers of worlds in the growth with worlds."""
     many_uavs: tuple[int, ...] = (1, 2, 3, 5, 10, 20, 50)
+    """Numbers of UAVs in the growth with UAVs."""
     growth_steps: int = 15
-    """Length of a rollout where only the growth is of interest."""
+    """Steps of a rollout in the measurements of growth."""
     modes: tuple[str, ...] = ("eager", "compiled")
     training_worlds: int = 256
+    """Worlds of a training batch."""
     training_steps: int = 32
-    """Steps of every world in a batch."""
+    """Steps of every world in a training batch."""
 
 
 QUICK = Sizes(
@@ -72,10 +75,10 @@ QUICK = Sizes(
 
 
 def scenarios() -> Scenarios:
-    """The paper's second use case as its scenario trains it, and the same place with everything on."""
+    """The paper's use case 2 (section 5.2), and the same region with every feature, reward and model on."""
     with initialize_config_dir(CONF, version_base=None):
-        written = compose("train", overrides=["scenario=paper/usecase2"])
-    paper = cast(TrainConfig, OmegaConf.to_object(written))
+        composed = compose("train", overrides=["scenario=paper/usecase2"])
+    paper = cast(TrainConfig, OmegaConf.to_object(composed))
     full = replace(
         paper,
         region=replace(paper.region, start_positions=None, initial_conditions=1024),
@@ -90,7 +93,7 @@ def scenarios() -> Scenarios:
 
 
 def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:
-    """The scenario with another number of UAVs, which start anywhere."""
+    """The scenario with another number of UAVs, which start at random landing points."""
     return replace(
         scenario,
         agents=agents,
@@ -100,9 +103,9 @@ def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:
 
 
 def step_times(envs: Mapping[str, EnvBase], steps: int, repeats: int) -> dict[str, float]:
-    """Median milliseconds per step of each environment, all of them timed in turn."""
+    """Median time per step of each environment [ms]; the environments take turns."""
     times: dict[str, list[float]] = {name: [] for name in envs}
-    for env in tqdm(envs.values(), "warming up", leave=False):  # and compiling
+    for env in tqdm(envs.values(), "warming up", leave=False):  # the first rollout also compiles
         env.rollout(steps, break_when_any_done=False)
     for _ in tqdm(range(repeats), "measuring", leave=False):
         for name, env in envs.items():
@@ -113,13 +116,13 @@ def step_times(envs: Mapping[str, EnvBase], steps: int, repeats: int) -> dict[st
 
 
 def comparison(presets: Scenarios, sizes: Sizes) -> str:
-    """Environment steps per second beside VMAS, if that is installed."""
+    """Environment steps per second, beside VMAS if it is installed."""
     envs = rival(sizes)
     for name, scenario in presets.items():
-        for shown, extras in (("bare", ()), ("all extras", EXTRAS)):
+        for outputs, extras in (("bare", ()), ("all extras", EXTRAS)):
             for mode in sizes.modes:
                 env = UavEnv(scenario, sizes.worlds, extras=extras)
-                envs[f"{name}, {shown}, {mode}"] = env.compile() if mode == "compiled" else env
+                envs[f"{name}, {outputs}, {mode}"] = env.compile() if mode == "compiled" else env
     times = step_times(envs, sizes.steps, sizes.repeats)
     rows = [
         (name, f"{ms:.2f}", f"{sizes.worlds / ms * 1e3:,.0f}", ratio(times, ms)) for name, ms in times.items()
@@ -132,7 +135,7 @@ def comparison(presets: Scenarios, sizes: Sizes) -> str:
 
 
 def rival(sizes: Sizes) -> dict[str, EnvBase]:
-    """VMAS with as many worlds, if it is installed."""
+    """VMAS's discovery task with as many worlds and three agents; nothing if VMAS is not installed."""
     if not importlib.util.find_spec("vmas"):
         print("VMAS is not installed, so there are no ratios: pip install -e '.[bench]'")
         return {}
@@ -141,7 +144,7 @@ def rival(sizes: Sizes) -> dict[str, EnvBase]:
 
 
 def ratio(times: Mapping[str, float], ms: float) -> str:
-    """How many times as fast as VMAS."""
+    """How many times as fast as VMAS a step of ``ms`` milliseconds is."""
     return f"{times[RIVAL] / ms:.1f}" if RIVAL in times else "-"
 
 
@@ -152,9 +155,9 @@ def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
         for mode in sizes.modes:
             times = step_times(rival(sizes) | delayed(scenario, mode, sizes), sizes.steps, sizes.repeats)
             rows += [
-                (f"{name}, {mode}: {what}", f"{ms:.2f}", f"{ms / times[BARE]:.2f}", ratio(times, ms))
-                for what, ms in times.items()
-                if what != RIVAL
+                (f"{name}, {mode}: {delay}", f"{ms:.2f}", f"{ms / times[BARE]:.2f}", ratio(times, ms))
+                for delay, ms in times.items()
+                if delay != RIVAL
             ]
     return table(
         f"What delays cost: {sizes.worlds} worlds, 3 UAVs",
@@ -164,19 +167,19 @@ def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
 
 
 def delayed(scenario: ScenarioConfig, mode: str, sizes: Sizes) -> dict[str, EnvBase]:
-    """The scenario with each kind of delay, by name."""
+    """Environments of the scenario with each kind of delay, by name."""
     envs: dict[str, EnvBase] = {}
-    for what, changed in delays().items():
-        if mode == "compiled" and what not in COMPILED_TOO:
+    for name, changes in delays().items():
+        if mode == "compiled" and name not in COMPILED_TOO:
             continue
-        env = make_env(replace(scenario, **changed), sizes.worlds)
-        bare = env if changed else env.worlds  # without any transforms
-        envs[what] = bare.compile() if mode == "compiled" else bare
+        pipeline = make_env(replace(scenario, **changes), sizes.worlds)
+        env = pipeline if changes else pipeline.uav_env  # the bare environment has no transforms
+        envs[name] = env.compile() if mode == "compiled" else env
     return envs
 
 
 def delays() -> dict[str, dict[str, Any]]:
-    """What is changed in a scenario, by name; "whole chain" is the paper's delay with four past actions."""
+    """Changes to a scenario by name; "whole chain" is the paper's delay with an action history of four."""
     paper = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
     everything = DelayConfig(obs=paper, act=1, rew=2, history=4, loss=0.1, reward_window=3)
     slow = ClockConfig(agents="2s", server="4s")
@@ -194,7 +197,7 @@ def delays() -> dict[str, dict[str, Any]]:
 
 
 def growth_with_worlds(presets: Scenarios, sizes: Sizes) -> str:
-    """Time of a step by the number of worlds, 3 UAVs, eager."""
+    """Time of a step for each number of worlds, with 3 UAVs, not compiled."""
     rows = []
     for worlds in tqdm(sizes.many_worlds, "worlds"):
         envs = {name: UavEnv(scenario, worlds, extras=()) for name, scenario in presets.items()}
@@ -203,7 +206,7 @@ def growth_with_worlds(presets: Scenarios, sizes: Sizes) -> str:
 
 
 def growth_with_uavs(presets: Scenarios, sizes: Sizes) -> str:
-    """Time of a step by the number of UAVs, eager."""
+    """Time of a step for each number of UAVs, not compiled."""
     rows = []
     for agents in tqdm(sizes.many_uavs, "UAVs"):
         fleets = {name: fleet(scenario, agents) for name, scenario in presets.items()}
@@ -214,27 +217,27 @@ def growth_with_uavs(presets: Scenarios, sizes: Sizes) -> str:
 
 
 def memory(presets: Scenarios) -> str:
-    """Bytes of each world and of what all worlds share, counted from the tensors."""
+    """Bytes of the state and of a step's output for each world, and of the tables that all worlds share."""
     rows = []
     for name, scenario in presets.items():
         env = UavEnv(scenario, 2, extras=EXTRAS)
         bare = UavEnv(scenario, 2, extras=())
         state = sum(x.nbytes for x in tensors(env.state)) // 2
-        shown = [
+        outputs = [
             sum(x.nbytes for x in tensors(e.rand_step(e.reset()).select("next").to_dict())) // 2
             for e in (bare, env)
         ]
         shared = {x.data_ptr(): x.nbytes for x in tensors([vars(bare.simulation), vars(bare.server)])}
-        rows.append((name, state, *shown, f"{sum(shared.values()) / 2**20:.1f} MiB"))
+        rows.append((name, state, *outputs, f"{sum(shared.values()) / 2**20:.1f} MiB"))
     return table(
         "Memory: bytes of a world with 3 UAVs",
-        ("scenario", "state", "shown, bare", "shown, all extras", "shared tables"),
+        ("scenario", "state", "output, bare", "output, all extras", "shared tables"),
         rows,
     )
 
 
 def training_speed(sizes: Sizes) -> str:
-    """Environment steps per second of training, and where the time goes."""
+    """Environment steps per second of training, and the time that each part of it takes."""
     worlds, steps = sizes.training_worlds, sizes.training_steps
     title = f"Training: {worlds} worlds, 3 UAVs, {steps} steps; median of {sizes.repeats} iterations"
     return table(title, HEADER, training(worlds, steps, sizes.repeats))
@@ -265,15 +268,15 @@ def _costs(envs: Mapping[str, EnvBase], worlds: int, sizes: Sizes) -> list[str]:
     return [text for ms in times.values() for text in (f"{ms:.2f}", f"{worlds / ms * 1e3:,.0f}")]
 
 
-def _cost_header(what: str, presets: Scenarios) -> tuple[str, ...]:
+def _cost_header(first: str, presets: Scenarios) -> tuple[str, ...]:
     costs = [f"{name}: {cost}" for name in presets for cost in ("ms/step", "environment steps/s")]
-    return (what, *costs)
+    return (first, *costs)
 
 
 def main() -> None:
-    """Measure, print and write."""
-    parser = argparse.ArgumentParser(description="How fast is the environment?")
-    parser.add_argument("--quick", action="store_true", help="only see whether it runs")
+    """Measure everything, print the tables and write them to runs/bench.md."""
+    parser = argparse.ArgumentParser(description="Measure the speed of the environment and of training.")
+    parser.add_argument("--quick", action="store_true", help="small sizes, only to check that it runs")
     sizes = QUICK if parser.parse_args().quick else Sizes()
     torch.set_num_threads(1)
     presets = scenarios()

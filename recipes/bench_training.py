@@ -1,8 +1,8 @@
-"""How fast training is: collecting, back-updating and optimising, beside TorchRL's MAPPO loop on VMAS.
+"""Time of collecting, back-updating and optimising in a training iteration, beside TorchRL's MAPPO on VMAS.
 
-The second part of ``recipes/bench.py``. Every arm takes batches of as many worlds and steps, makes as many
-passes over them and has networks of the same widths; they take turns, iteration by iteration, so that a busy
-machine slows all of them.
+This is the training part of ``recipes/bench.py``, which runs it; it has no command line of its own. All arms
+have the same batch size, number of epochs and layer widths. They take turns, iteration by iteration, so that
+a busy machine slows all of them.
 """
 
 import importlib.util
@@ -33,11 +33,11 @@ from damian.learners.schedule import SystemClock
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
-"""Does one value stand for all agents? Then the critic has a third of our critic's work, else as much."""
+"""Is one value computed for all agents? Then VMAS's critic has a third of our critic's work, else as much."""
 UNDELAYED = "scenario=paper/usecase2"
 PAPER = f"{UNDELAYED} delay=paper"
 ARMS = (UNDELAYED, PAPER, f"{PAPER} aware=backupdate", f"{PAPER} aware=both")
-"""What ``recipes/train.py`` is told."""
+"""Overrides of ``recipes/train.py``, separated by spaces."""
 HEADER = (
     "training",
     "frames/s",
@@ -48,19 +48,20 @@ HEADER = (
     "times TorchRL and VMAS",
 )
 WARM_UP = 2
-"""Iterations that do not count: the second is the first one that has a full memory to look back on."""
+"""Iterations that do not count: from the second on, back-updating has a full replay buffer."""
 
 
 class Seconds(NamedTuple):
-    """Of one training iteration."""
+    """Times of the parts of one training iteration [s]."""
 
     collecting: float
     backupdating: float
     optimising: float
+    """With the advantages."""
 
 
 def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
-    """Rows under ``HEADER``: medians of so many iterations of each arm, on batches [worlds, steps]."""
+    """Rows under ``HEADER``: medians of ``repeats`` iterations of each arm, with batches [worlds, steps]."""
     arms = {words: damian(arm_config(words, worlds, steps)) for words in ARMS}
     if importlib.util.find_spec("vmas"):
         arms |= {
@@ -75,14 +76,20 @@ def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
 
 
 def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
-    """What these overrides make, on larger batches."""
+    """The configuration of an arm.
+
+    Args:
+        words: overrides of ``recipes/train.py``, separated by spaces.
+        worlds: B of a batch.
+        steps: T of a batch.
+    """
     batch = [f"worlds={worlds}", f"learner.steps={steps}", "learner.epochs=4", "learner.minibatches=4"]
     with initialize_config_dir(CONF, version_base=None):
         return checked(compose("train", overrides=[*words.split(), *batch]))
 
 
 def damian(config: TrainConfig) -> Iterator[Seconds]:
-    """Train as ``recipes/train.py`` does; yields what each iteration took."""
+    """Train as ``recipes/train.py`` does; yields the times of each iteration."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     learner = cast(Mappo, make_learner(config, env))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
@@ -91,15 +98,18 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
         begin = time.perf_counter()
         batch = next(batches)
         collected = time.perf_counter()
-        known = learner.backupdated_batch(batch)
-        corrected = time.perf_counter()
-        add_advantages(known, learner.critic, learner.config)
-        learner.optimize(known)
-        yield Seconds(collected - begin, corrected - collected, time.perf_counter() - corrected)
+        batch = learner.backupdated_batch(batch)
+        backupdated = time.perf_counter()
+        add_advantages(batch, learner.critic, learner.config)
+        learner.optimize(batch)
+        yield Seconds(collected - begin, backupdated - collected, time.perf_counter() - backupdated)
 
 
 def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
-    """Train as TorchRL's users do: its own networks and loss, and a replay buffer for the minibatches."""
+    """Train on VMAS with TorchRL's own networks, loss and replay buffer; yields the times of each iteration.
+
+    ``together``: compute one value for all agents (MAPPO) instead of one for each (IPPO).
+    """
     worlds, steps, learner = config.worlds, config.update_steps, cast(MappoConfig, config.learner)
     env = vmas_env(worlds, config.agents)
     actor, critic = vmas_actor(env, config), vmas_critic(env, config, together)
@@ -120,20 +130,20 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
             loss.value_estimator(batch)
         memory.extend(batch.reshape(-1))
         for _ in range(learner.epochs):
-            for steps_of_worlds in memory:
-                descend(loss, optimizer, steps_of_worlds, learner.max_grad_norm)
+            for minibatch in memory:
+                descend(loss, optimizer, minibatch, learner.max_grad_norm)
         collector.update_policy_weights_()
         yield Seconds(collected - begin, 0.0, time.perf_counter() - collected)
 
 
 def vmas_env(worlds: int, agents: int) -> TransformedEnv:
-    """Three agents that look for their goals with lidars."""
+    """VMAS's navigation task, in which each agent looks for its own goal with a lidar."""
     env = VmasEnv("navigation", num_envs=worlds, n_agents=agents, max_steps=100, continuous_actions=True)
     return TransformedEnv(env, RewardSum([("agents", "reward")], [("agents", "episode_reward")]))
 
 
 def vmas_actor(env: TransformedEnv, config: TrainConfig) -> ProbabilisticActor:
-    """Tanh-normal actions of each agent, from what it sees."""
+    """A policy with tanh-normal actions of each agent, from its own observation."""
     spec = env.full_action_spec_unbatched["agents", "action"]
     network = vmas_network(env, config, n_out=2 * spec.shape[-1], centralised=False)
     return ProbabilisticActor(
@@ -152,7 +162,7 @@ def vmas_actor(env: TransformedEnv, config: TrainConfig) -> ProbabilisticActor:
 
 
 def vmas_critic(env: TransformedEnv, config: TrainConfig, together: bool) -> TensorDictModule:
-    """A value for each agent from what it sees, or one for all of them from what they see together."""
+    """A value for each agent from its own observation, or one for all agents from all observations."""
     network = vmas_network(env, config, n_out=1, centralised=together)
     return TensorDictModule(
         network, in_keys=[("agents", "observation")], out_keys=[("agents", "state_value")]
@@ -160,7 +170,7 @@ def vmas_critic(env: TransformedEnv, config: TrainConfig, together: bool) -> Ten
 
 
 def vmas_network(env: TransformedEnv, config: TrainConfig, n_out: int, centralised: bool) -> MultiAgentMLP:
-    """One network for all agents, as wide as ours."""
+    """One network for all agents, with the layer widths of ``config.model``."""
     return MultiAgentMLP(
         n_agent_inputs=env.observation_spec["agents", "observation"].shape[-1],
         n_agent_outputs=n_out,
@@ -173,7 +183,7 @@ def vmas_network(env: TransformedEnv, config: TrainConfig, n_out: int, centralis
 
 
 def vmas_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig) -> MAPPOLoss:
-    """TorchRL's loss under VMAS's names."""
+    """TorchRL's MAPPO loss with the TensorDict keys of VMAS."""
     loss = MAPPOLoss(actor, critic, clip_epsilon=config.clip_epsilon, entropy_coeff=config.entropy_coeff)
     loss.set_keys(reward=("agents", "reward"), value=("agents", "state_value"))
     loss.make_value_estimator(ValueEstimators.MAGAE, gamma=config.gamma, lmbda=config.lmbda)
@@ -183,7 +193,7 @@ def vmas_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: Mappo
 def descend(
     loss: MAPPOLoss, optimizer: torch.optim.Optimizer, steps: TensorDictBase, max_norm: float
 ) -> None:
-    """One step of the optimiser on a minibatch [M]."""
+    """One optimiser step on a minibatch [M] of environment steps."""
     losses = loss(steps)
     total = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
     optimizer.zero_grad()
@@ -193,12 +203,12 @@ def descend(
 
 
 def median(measured: list[Seconds]) -> Seconds:
-    """Of each part by itself."""
+    """The median of each part, taken by itself."""
     return Seconds(*map(statistics.median, zip(*measured, strict=True)))
 
 
 def rows(medians: dict[str, Seconds], frames: int) -> list[tuple[str, ...]]:
-    """What is shown of each arm, whose iterations take in so many steps of worlds."""
+    """Rows under ``HEADER``, from median times of iterations with ``frames`` environment steps each."""
     totals = {name: sum(parts) for name, parts in medians.items()}
     return [
         (

@@ -1,13 +1,15 @@
-"""Arms x seeds, over tasks and delays, by one command: who copes with late messages, and how well.
+"""Train and evaluate several arms with several seeds over tasks and delays, and compare their results.
 
     python recipes/compare.py experiment=usecase2 seeds=10 processes=2
     python recipes/compare.py experiment=delaybench "tasks=[tracking]" "arms=[undelayed,naive,both]"
     python recipes/compare.py experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
     python recipes/compare.py experiment=usecase2 report_only=true
 
-conf/experiment says what is compared. Runs lie in runs/EXPERIMENT/TASK/DELAY/ARM/seed_N and print into
-log.txt there; what is finished is not run again, so that the same command goes on after Ctrl-C. Beside them:
-results.csv (every run), table.md and table.csv (means with 95 % intervals, J_norm, recovery), figure.png.
+An experiment is a file of conf/experiment that lists tasks, delays and arms. An arm is one way to train or to
+fly: naive, with an action history, with back-updating, and so on. Each run has its own folder,
+runs/EXPERIMENT/TASK/DELAY/ARM/seed_N, with its output in log.txt. After Ctrl-C, the same command continues;
+finished runs are not repeated. runs/EXPERIMENT gets results.csv (every run), table.md and table.csv (means
+with 95 % intervals, J_norm, recovery) and figure.png.
 """
 
 import csv
@@ -39,28 +41,33 @@ from damian.evaluation.run_folder import read_metrics
 
 ALL_RESULTS, TABLE, MARKDOWN, FIGURE = "results.csv", "table.csv", "table.md", "figure.png"
 SEEDS, EPISODES = 10, 100
-"""At least so many for a number to be published (per seed and evaluation)."""
+"""A report with fewer seeds, or fewer episodes per evaluation, is marked as developing."""
 POLICIES = {"sampled": SAMPLED, "mode": MODE}
 
 
 @dataclass
 class Experiment:
-    """What is compared: a file of conf/experiment. The lists are overrides of ``recipes/train.py``."""
+    """Tasks, delays and arms to compare, as written in a file of conf/experiment."""
 
     tasks: dict[str, list[str]] = field(default_factory=dict)
+    """Overrides of ``recipes/train.py`` for each task."""
     delays: dict[str, list[str]] = field(default_factory=dict)
+    """Overrides of ``recipes/train.py`` for each delay."""
     arms: dict[str, Arm] = field(default_factory=dict)
+    """One of them, the reference, has ``delayed: false``."""
     first_seed: int = 0
+    """The seeds of every arm count from this one."""
     best: dict[str, float] = field(default_factory=dict)
-    """Dashed in the learning curves, by measure."""
+    """Best possible value of a measure: a dashed line in its learning curves."""
 
     def __post_init__(self) -> None:
         for kind in ("tasks", "delays", "arms"):
             for name in getattr(self, kind):
                 good = re.fullmatch(r"[\w.-]+", name) and name not in (NOT_LATE, *SCRIPTED)
-                checks.require(bool(good), f"experiment.{kind}", name, "is no name for a folder")
+                should = "cannot name a folder: use letters, digits, _ . - but not none, random or greedy"
+                checks.require(bool(good), f"experiment.{kind}", name, should)
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
-        should = "are not delayed: it must be one"
+        should = "are not delayed: exactly one arm must have delayed=false"
         checks.require(len(undelayed) == 1, "experiment.arms", undelayed, should)
         for name, arm in self.arms.items():
             checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))
@@ -70,27 +77,27 @@ class Experiment:
 
 @dataclass
 class CompareConfig:
-    """Everything that ``recipes/compare.py`` can be told."""
+    """All settings of ``recipes/compare.py``."""
 
     experiment: Experiment = MISSING
     seeds: int = SEEDS
-    """How many, from ``experiment.first_seed`` on."""
+    """Number of seeds, counted from ``experiment.first_seed``."""
     processes: int = 1
-    """Runs at the same time, each with one thread if not said otherwise."""
+    """Number of runs at the same time; each has one thread unless ``overrides`` sets ``threads``."""
     tasks: list[str] | None = None
-    """Only these."""
+    """Names of the tasks to run; all of the experiment's if not given."""
     delays: list[str] | None = None
-    """Only these."""
+    """Names of the delays to run; all of the experiment's if not given."""
     arms: list[str] | None = None
-    """Only these."""
+    """Names of the arms to run; all of the experiment's if not given."""
     overrides: list[str] = field(default_factory=list)
-    """Of ``recipes/train.py``, for every run."""
+    """Further overrides of ``recipes/train.py`` for every run."""
     score: str = "true_return"
-    """The J of J_norm and recovery."""
+    """The measure J that J_norm and recovery are computed from."""
     policy: str = "sampled"
-    """Whose score: sampled or mode."""
+    """The evaluation that J comes from: actions ``sampled`` from the policy, or its ``mode``."""
     report_only: bool = False
-    """Run nothing: tables and figure of what is there."""
+    """Train and fly nothing; write tables and figure from the finished runs."""
 
     def __post_init__(self) -> None:
         checks.whole("seeds", self.seeds, 1, 10_000)
@@ -99,7 +106,8 @@ class CompareConfig:
         checks.one_of("policy", self.policy, POLICIES)
         for word in self.overrides:
             ours = re.match(r"\+*(seed|resume|checkpoint|logger)\b", word)
-            checks.require(not ours, "overrides", word, "is not for all runs alike: the comparison sets it")
+            should = "cannot be the same for every run: the comparison sets it; leave it out"
+            checks.require(not ours, "overrides", word, should)
         for kind in ("tasks", "delays", "arms"):
             for name in getattr(self, kind) or ():
                 checks.one_of(kind, name, getattr(self.experiment, kind))
@@ -109,55 +117,60 @@ class CompareConfig:
                 checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, sources)
 
     def chosen(self, kind: str) -> dict[str, Any]:
-        """What the experiment names, or the part of it that is asked for."""
-        known, only = getattr(self.experiment, kind), getattr(self, kind)
-        return {name: known[name] for name in known if only is None or name in only}
+        """The experiment's tasks, delays or arms (``kind``) that are asked for, by name."""
+        every, only = getattr(self.experiment, kind), getattr(self, kind)
+        return {name: every[name] for name in every if only is None or name in only}
 
 
 ConfigStore.instance().store(name="compare_schema", node=CompareConfig)
 
 
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
-    """Every run, with its checked configuration; those that fly what others have learnt come last."""
+    """Every run with its checked configuration; arms that fly the policies of other arms come last."""
     delays = {NOT_LATE: [], **config.chosen("delays")}
     runs = [
         run
-        for task, words in config.chosen("tasks").items()
-        for delay, late in delays.items()
-        for arm, how in config.chosen("arms").items()
-        if how.delayed == (delay != NOT_LATE)
-        for run in _seeds(config, folder / task / delay / arm, [*words, *late])
+        for task, task_overrides in config.chosen("tasks").items()
+        for delay, delay_overrides in delays.items()
+        for name, arm in config.chosen("arms").items()
+        if arm.delayed == (delay != NOT_LATE)
+        for run in _seeds(config, folder / task / delay / name, [*task_overrides, *delay_overrides])
     ]
     return sorted(runs, key=lambda run: not run.trains)
 
 
-def _seeds(config: CompareConfig, folder: Path, words: list[str]) -> Iterator[Run]:
-    """The runs of one task, delay and arm."""
-    task, delay, arm = folder.parts[-3:]
-    how = config.experiment.arms[arm]
-    words = ["logger=csv", *words, *how.overrides, *config.overrides]
+def _seeds(config: CompareConfig, folder: Path, overrides: list[str]) -> Iterator[Run]:
+    """The runs of one task, delay and arm, which the folder names."""
+    task, delay, name = folder.parts[-3:]
+    arm = config.experiment.arms[name]
+    overrides = ["logger=csv", *overrides, *arm.overrides, *config.overrides]
     try:
-        first = checked(compose("train", words))
-        if how.policy_of is None:
-            first.check_learning()
+        unseeded = checked(compose("train", overrides))
+        if arm.policy_of is None:
+            unseeded.check_learning()
     except COMPOSITION_ERRORS as error:
-        raise InputError(f"{task}/{delay}/{arm}: {one_line(error)}") from error
+        raise InputError(f"{task}/{delay}/{name}: {one_line(error)}") from error
     for seed in range(config.experiment.first_seed, config.experiment.first_seed + config.seeds):
-        last = f"seed_{seed}"
-        made = replace(first, seed=seed, overrides=[*words, f"seed={seed}"])
-        if how.policy_of:
-            source = config.experiment.arms[how.policy_of]
-            from_ = folder.parents[1] / (delay if source.delayed else NOT_LATE) / how.policy_of / last
-            made = replace(made, checkpoint=str(from_))
-        trains = how.policy_of is None
-        yield Run(task, delay, arm, made, folder / last, train if trains else fly, trains)
+        seed_folder = f"seed_{seed}"
+        seeded = replace(unseeded, seed=seed, overrides=[*overrides, f"seed={seed}"])
+        if arm.policy_of:
+            source = config.experiment.arms[arm.policy_of]
+            source_delay = delay if source.delayed else NOT_LATE
+            policy = folder.parents[1] / source_delay / arm.policy_of / seed_folder
+            seeded = replace(seeded, checkpoint=str(policy))
+        trains = arm.policy_of is None
+        yield Run(task, delay, name, seeded, folder / seed_folder, train if trains else fly, trains)
 
 
 def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
-    """Write the tables and the figure of what is finished."""
+    """Write the tables and the figure of the finished runs.
+
+    Raises:
+        InputError: no run is finished.
+    """
     done = [run for run in runs if run.finished]
     if not done:
-        raise InputError(f"experiment: nothing of it is finished in {folder}")
+        raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")
     arms = config.chosen("arms")
     rows = [
         {
@@ -174,9 +187,9 @@ def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
     comparison = Comparison(rows, arms, config.score, POLICIES[config.policy])
     _write(folder / ALL_RESULTS, rows)
     _write(folder / TABLE, [line.cells() for line in comparison.lines])
-    never = {run.task for run in runs if run.config.episode.success_share is None}
-    lasted = {run.task: _lasted(run) for run in done}
-    (folder / MARKDOWN).write_text(markdown(comparison, _notes(config, runs, rows), lasted, never))
+    never = {run.task for run in runs if run.config.episode.success_share is None}  # tasks without success
+    lengths = {run.task: _training_length(run) for run in done}
+    (folder / MARKDOWN).write_text(markdown(comparison, _notes(config, runs, rows), lengths, never))
     if len(comparison.tasks()) > 1:
         plot_norms(comparison, folder / FIGURE)
     else:
@@ -194,23 +207,22 @@ def _write(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def _lasted(run: Run) -> str:
-    """How long the runs of a task have learnt."""
-    limit = f" or {run.config.episodes} episodes, whatever comes first" if run.config.episodes else ""
+def _training_length(run: Run) -> str:
+    limit = f" or {run.config.episodes} episodes, whichever comes first" if run.config.episodes else ""
     return f"Trained for {run.config.frames} frames{limit}."
 
 
 def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
-    """How the numbers were made."""
+    """Lines above the tables: the command, the number of seeds and episodes, what the columns mean."""
     seeds, episodes = sorted({row["seed"] for row in rows}), int(min(row["episodes"] for row in rows))
-    words = [word for word in HydraConfig.get().overrides.task if not word.startswith("report_only")]
-    words = [f'"{word}"' if re.search(r"[^\w=.,+/-]", word) else word for word in words]
+    overrides = [word for word in HydraConfig.get().overrides.task if not word.startswith("report_only")]
+    quoted = [f'"{word}"' if re.search(r"[^\w=.,+/-]", word) else word for word in overrides]
     missing = [run.name for run in runs if not run.finished]
     notes = [
-        f"`{' '.join(['python recipes/compare.py', *words])}`",
+        f"`{' '.join(['python recipes/compare.py', *quoted])}`",
         f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {episodes} episodes per evaluation",
         f"Mean over seeds [95 % interval: stratified bootstrap over seeds]; J: {config.score} of the "
-        f"{config.policy} policy; seen: as the server perceived it, else as it was; age in steps",
+        f"{config.policy} policy; seen: as the server perceived it, else as it truly was; age in steps",
         "J_norm: 0 random, 1 undelayed; recovery: 0 the stronger naive arm, 1 undelayed; not shown where "
         "the delay costs less than a tenth of undelayed - random",
     ]
@@ -223,7 +235,7 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
 @reported
 def main(composed: DictConfig) -> None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise InputError("-m: a comparison runs all its arms and seeds by itself; leave it out")
+        raise InputError("-m: a comparison runs all of its arms and seeds anyway; leave it out")
     config: CompareConfig = checked(composed)
     folder = Path(HydraConfig.get().runtime.output_dir)
     runs = plan(config, folder)
@@ -234,7 +246,7 @@ def main(composed: DictConfig) -> None:
         if not config.report_only:
             failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score))
     except KeyboardInterrupt:
-        sys.exit("interrupted; the same command goes on")
+        sys.exit("interrupted; run the same command again to continue")
     for run in failed:
         print(f"failed: {run.name}; see {run.folder / LOG}", file=sys.stderr)
     if failed and not any(run.finished for run in runs):

@@ -1,10 +1,12 @@
-"""Fly a trained policy: as it was trained, or with more UAVs, other delays, another region.
+"""Evaluate a trained policy: as it was trained, or with more UAVs, other delays or another region.
 
-    python recipes/evaluate.py checkpoint=runs/2026-01-31_12-00-00 agents=10 delay=paper
-    python recipes/evaluate.py -m checkpoint=runs/2026-01-31_12-00-00 delay.obs=0,2,4,8
+    python recipes/train.py hydra.run.dir=runs/first
+    python recipes/evaluate.py checkpoint=runs/first agents=10 delay=paper
+    python recipes/evaluate.py -m checkpoint=runs/first delay.obs=0,2,4,8
 
-Overrides of the training run hold where no others are given; what the actor sees must stay the same. The run
-folder gets config.yaml, result.csv and result.md.
+The overrides of the training run apply too, unless the command line gives others. The features of the actor's
+observation must stay the same. The run folder gets config.yaml, result.csv and result.md: success, steps and
+return of the trained policy beside the random and the greedy one.
 """
 
 from pathlib import Path
@@ -23,17 +25,17 @@ from damian.learners.networks import make_actor
 
 
 def fly(config: TrainConfig, folder: Path) -> None:
-    """Evaluate the policy of ``config.checkpoint``, and fill the folder."""
+    """Evaluate the policy of ``config.checkpoint`` and fill the run folder."""
     env, actor = stored(config)
     save_config(config, folder)
     report(config, folder, env, actor)
 
 
 def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
-    """Where to fly, and the policy of ``config.checkpoint``.
+    """The evaluation environment, and the actor of ``config.checkpoint``.
 
     Raises:
-        InputError: there is none, or one that sees or does something else.
+        InputError: no checkpoint is given, or its actor has other observations, actions or layers.
     """
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")

@@ -1,9 +1,12 @@
-"""Fly a trained policy under delay, but knowing some things on time: whose lateness costs what.
+"""Evaluate a trained policy under delay, with some messages known on time: which late messages cost how much.
 
-    python recipes/oracle.py checkpoint=runs/delaybench/tracking/none/undelayed/seed_8 delay=paper
+    python recipes/train.py scenario=tracking hydra.run.dir=runs/undelayed
+    python recipes/oracle.py checkpoint=runs/undelayed delay=paper
+    python recipes/oracle.py checkpoint=runs/undelayed delay.obs=4 agents=5
 
-What the policy acts on is more than it could know (regime R3 of a report). Overrides of the training run hold
-where no others are given. The run folder gets config.yaml, result.csv and result.md.
+The policy acts on messages that have not arrived yet, so its results are a reference that no real system can
+reach (regime R3). The overrides of the training run apply too, unless the command line gives others. The run
+folder gets config.yaml, result.csv and result.md: one row for each set of messages that a UAV knows on time.
 """
 
 from collections.abc import Sequence
@@ -29,18 +32,18 @@ from damian.world.messages import Messages
 
 ALL = Messages._fields
 PLACE = ("position", "target", "track", "trail")
-"""What a UAV can tell from its own past actions; what it has heard is not among it."""
+"""Fields of a message that a UAV can compute from its own past actions; its detections are not among them."""
 
 
 def foresee(config: TrainConfig, folder: Path) -> None:
-    """Evaluate with more and more that is known on time, and fill the folder."""
+    """Evaluate the policy with ever more messages known on time, and fill the run folder."""
     if not has_message_delay(config):
-        raise InputError("delay.obs: nothing is late: there is nothing to know earlier")
+        raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
     env, actor = stored(config)
     save_config(config, folder)
     env.append_transform(StepCounter())
     own = torch.eye(config.agents, dtype=torch.bool, device=env.device)
-    whose = {
+    known_on_time = {
         "nothing": (own & ~own, ALL),
         "where it is": (own, PLACE),
         "its own messages": (own, ALL),
@@ -48,26 +51,27 @@ def foresee(config: TrainConfig, folder: Path) -> None:
         "everything": (own | ~own, ALL),
     }
     rows = {}
-    for name, known in whose.items():
-        env.set_seed(config.eval_seed)  # the same episodes for everyone
-        policy = TensorDictSequential([observe_with_timely_messages(env.server, *known), actor])  # type: ignore[list-item]
+    for name, (on_time, message_fields) in known_on_time.items():
+        env.set_seed(config.eval_seed)  # the same episodes for every row
+        observe = observe_with_timely_messages(env.server, on_time, message_fields)
+        policy = TensorDictSequential([observe, actor])  # type: ignore[list-item]
         rows[name] = evaluate(env, policy, config.horizon)
     table = save_results(rows, folder, config.episode.success_share is not None, late=True)
     print(f"\nwhat a UAV knows on time:\n\n{table}")
 
 
 def observe_with_timely_messages(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDictModule:
-    """Shows each UAV what the server would tell it if it had known some things on time.
+    """A module that replaces the actor's observations by those with some messages known on time.
 
     Args:
-        server: of the environment.
-        on_time: from whom, by who is told and who has sent, [N, N] bool.
-        fields: of their messages.
+        server: the server of the environment.
+        on_time: row i, column j: does UAV i know UAV j's latest message at once, [N, N] bool.
+        fields: fields of the messages that are known at once.
     """
 
     def observe(received: Tensor, sent: Tensor, observation: Tensor, steps: Tensor) -> Tensor:
         timely = server.observe_with_timely_messages(received, sent, steps.squeeze(-1), on_time, fields)
-        return torch.cat([timely, observation[..., timely.shape[-1] :]], -1)  # its own past actions stay
+        return torch.cat([timely, observation[..., timely.shape[-1] :]], -1)  # keep the action history
 
     in_keys = [keys.RECEIVED, keys.MESSAGE, keys.OBSERVATION, keys.STEP_COUNT]
     return TensorDictModule(observe, in_keys=in_keys, out_keys=[keys.OBSERVATION])

@@ -1,11 +1,12 @@
-"""The delay transforms outside our own environment: SAC on Gymnasium's Pendulum-v1 with late observations.
+"""Apply the delay transforms to another environment: SAC on Gymnasium's Pendulum-v1 with late observations.
 
     python recipes/pendulum.py --jobs 2                  (a quarter of an hour on two free cores)
     python recipes/pendulum.py --seeds 0 --steps 10000 --delay 3 --out runs/pendulum3
 
-Three arms learn for each seed: undelayed; naive, which sees late observations and nothing else; and history,
-which sees its own latest actions beside them. The undelayed policy is also deployed under delays. What is
-finished stays in the run folder and is not done again; the table goes there as results.md and results.csv.
+Three arms are trained for each seed: undelayed; naive, whose observations are late; and history, which also
+observes the agent's latest actions. The undelayed policy is also evaluated under several delays. The run
+folder (runs/pendulum, unless --out names another one) gets the table of mean returns as results.md and
+results.csv, and a JSON file for each arm and seed; an arm and seed that has its file is not trained again.
 """
 
 import argparse
@@ -50,11 +51,11 @@ from damian.transforms import ActionHistory, ObservationDelay
 ARMS = ("undelayed", "naive", "history")
 DEPLOYED = {0: -145, 2: -153, 3: -324, 4: -757, 6: -777, 8: -977}
 REFERENCE = {("undelayed", d): r for d, r in DEPLOYED.items()} | {("naive", 6): -1154, ("history", 6): -155}
-"""Returns by arm and delay: one seed of an independent implementation, 20 000 steps; for orientation."""
+"""Returns by arm and delay: one seed of an independent implementation, 20 000 steps; for orientation only."""
 
 HORIZON = 200  # steps of an episode
-RANDOM_STEPS = 1000  # before learning begins
-EVALUATION_SEED = 1000  # of the first positions in every evaluation
+RANDOM_STEPS = 1000  # steps with random actions before the first update
+EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
 BATCH, LR, GAMMA, TAU = 256, 1e-3, 0.99, 0.005
 STORED = [
     keys.OBSERVATION,
@@ -74,27 +75,33 @@ class Run(NamedTuple):
     hidden: int
 
     def file(self, folder: Path) -> Path:
-        """Where the result is kept."""
+        """The file with the result of this run."""
         return folder / f"seed{self.seed}_{self.arm}.json"
 
 
 def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
-    """Pendulum, once or in a batch, with late observations and a memory of the last actions."""
+    """Pendulum-v1 with delayed observations and an action history.
 
-    def one() -> EnvBase:
+    Args:
+        delay: of the observations [steps].
+        history: number of latest actions that are appended to the observation.
+        worlds: batch size of a ``SerialEnv``; a single environment without a batch size if not given.
+    """
+
+    def pendulum() -> EnvBase:
         return GymEnv("Pendulum-v1")
 
     transforms: list[Transform] = [RewardSum(), ObservationDelay(delay, age_key=None)]
     if history:
         transforms.append(ActionHistory(history, append_to="observation"))
-    # The names that our learner knows; the only agent needs no dimension of its own.
+    # The learner expects these keys; a single agent needs no agent dimension.
     outputs = {"observation": keys.OBSERVATION, "reward": keys.REWARD}
     transforms.append(RenameTransform([*outputs], [*outputs.values()], ["action"], [keys.ACTION]))
-    return TransformedEnv(SerialEnv(worlds, one) if worlds else one(), Compose(transforms))
+    return TransformedEnv(SerialEnv(worlds, pendulum) if worlds else pendulum(), Compose(transforms))
 
 
 def make_learner(env: EnvBase, run: Run) -> Sac:
-    """The learner of our UAVs, on a memory that takes single steps."""
+    """The SAC learner that also trains the UAVs, with a replay buffer of single steps."""
     config = SacConfig(lr=LR, alpha_lr=LR, gamma=GAMMA, tau=TAU, alpha_init=1.0)
     buffer = ReplayBuffer(storage=LazyTensorStorage(run.steps), batch_size=BATCH)
     model = ModelConfig(hidden=[run.hidden, run.hidden], activation="relu")
@@ -103,33 +110,33 @@ def make_learner(env: EnvBase, run: Run) -> Sac:
 
 
 def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
-    """Learn for so many steps, with one update after each."""
-    seen = env.reset()
+    """Train for ``steps`` environment steps, with one update after each."""
+    td = env.reset()
     for step in range(steps):
         with torch.no_grad():
-            chosen = env.rand_action(seen) if step < RANDOM_STEPS else learner.actor(seen)
-            after, seen = env.step_and_maybe_reset(chosen)
-        learner.buffer.add(after.select(*STORED))
+            td = env.rand_action(td) if step < RANDOM_STEPS else learner.actor(td)
+            transition, td = env.step_and_maybe_reset(td)
+        learner.buffer.add(transition.select(*STORED))
         if step >= RANDOM_STEPS:
             learner.update(learner.buffer.sample())
         bar.update()
-        if after["next", "done"].item():
-            bar.set_postfix({"return": f"{after['next', 'episode_reward'].item():.0f}"})
+        if transition["next", "done"].item():
+            bar.set_postfix({"return": f"{transition['next', 'episode_reward'].item():.0f}"})
 
 
 @torch.no_grad()
 def evaluate_under(delay: int, history: int, actor: nn.Module, episodes: int) -> float:
-    """Mean return of the policy's mode; the episodes begin alike, whoever flies them."""
+    """Mean return of the policy's mode over episodes that have the same initial conditions at every call."""
     env = make_env(delay, history, episodes)
     env.set_seed(EVALUATION_SEED)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        flown = env.rollout(HORIZON, actor, break_when_any_done=False)
+        rollout = env.rollout(HORIZON, actor, break_when_any_done=False)
     env.close()
-    return flown[next_key(keys.REWARD)].sum(1).mean().item()
+    return rollout[next_key(keys.REWARD)].sum(1).mean().item()
 
 
 def run_arm(run: Run, folder: Path, place: int) -> None:
-    """Train, evaluate and keep the result; ``place`` is the line of the progress bar."""
+    """Train, evaluate and write the result; ``place`` is the line of the progress bar."""
     torch.set_num_threads(1)
     torch.manual_seed(run.seed)
     delay = 0 if run.arm == "undelayed" else run.delay
@@ -141,18 +148,18 @@ def run_arm(run: Run, folder: Path, place: int) -> None:
         train(env, learner, run.steps, bar)
     delays = sorted({*DEPLOYED, run.delay}) if run.arm == "undelayed" else [delay]
     returns = {d: evaluate_under(d, history, learner.actor, run.episodes) for d in delays}
-    partly = run.file(folder).with_suffix(".part")  # all of it or nothing
-    partly.write_text(json.dumps({**run._asdict(), "returns": returns}))
-    partly.replace(run.file(folder))
+    partial = run.file(folder).with_suffix(".part")  # an interrupt must not leave half a result
+    partial.write_text(json.dumps({**run._asdict(), "returns": returns}))
+    partial.replace(run.file(folder))
 
 
 def run_all(runs: Sequence[Run], folder: Path, jobs: int) -> None:
-    """Do what is not done yet, in so many processes."""
+    """Carry out the runs that are not finished, in ``jobs`` processes."""
     todo = [run for run in runs if returns_of(run, folder) is None]
     work = [(run, folder, place) for place, run in enumerate(todo)]
     if jobs == 1:
-        for one in work:
-            run_arm(*one)
+        for arguments in work:
+            run_arm(*arguments)
         return
     spawn = multiprocessing.get_context("spawn")
     tqdm.set_lock(spawn.RLock())
@@ -161,19 +168,23 @@ def run_all(runs: Sequence[Run], folder: Path, jobs: int) -> None:
 
 
 def returns_of(run: Run, folder: Path) -> dict[str, float] | None:
-    """Mean return by the delay of the evaluation; None if the run is not done."""
+    """Mean return by the delay of the evaluation; None if the run is not finished.
+
+    Raises:
+        InputError: the folder holds a result with other settings.
+    """
     file = run.file(folder)
     if not file.exists():
         return None
     saved = json.loads(file.read_text())
     for name, value in run._asdict().items():
-        should = f"is not the {saved[name]} of {file}; choose another --out"
+        should = f"is not the {saved[name]} of {file}; choose another folder with --out"
         checks.require(saved[name] == value, f"--{name}", value, should)
     return saved["returns"]
 
 
 def table(runs: Sequence[Run], folder: Path) -> str:
-    """Write the results as CSV and as Markdown, which is returned."""
+    """Write the results as results.csv and results.md; returns the latter's text."""
     rows = [
         ["arm", "delay", "mean", *(f"seed {run.seed}" for run in runs if run.arm == ARMS[0]), "reference"]
     ]
@@ -186,42 +197,46 @@ def table(runs: Sequence[Run], folder: Path) -> str:
     with (folder / "results.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
     title = f"# Pendulum-v1, SAC, {runs[0].steps} steps: return, mean of {runs[0].episodes} episodes"
-    told = f"{title}\n\n{markdown_table(rows[0], rows[1:])}\n"
-    (folder / "results.md").write_text(told)
-    return told
+    text = f"{title}\n\n{markdown_table(rows[0], rows[1:])}\n"
+    (folder / "results.md").write_text(text)
+    return text
 
 
 class Parser(argparse.ArgumentParser):
-    """Refuses in one line."""
+    """Raises an ``InputError`` instead of printing its usage."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(message)
 
 
 def parse(words: Sequence[str] | None) -> tuple[list[Run], Path, int]:
-    """The runs that the command line asks for, their folder, and in how many processes."""
+    """The runs that the command line asks for, their folder, and the number of processes.
+
+    Raises:
+        InputError: an option is unknown, or its value is impossible.
+    """
     parser = Parser(description="SAC on Pendulum-v1 with late observations.")
-    parser.add_argument("--seeds", default="0,1,2", help="such as 0,1,2")
-    parser.add_argument("--steps", type=int, default=20_000, help="of training, each arm")
-    parser.add_argument("--delay", type=int, default=6, help="of the observations [steps]")
-    parser.add_argument("--episodes", type=int, default=20, help="of each evaluation")
+    parser.add_argument("--seeds", default="0,1,2", help="seeds of each arm, such as 0,1,2")
+    parser.add_argument("--steps", type=int, default=20_000, help="training steps of each arm")
+    parser.add_argument("--delay", type=int, default=6, help="delay of the observations [steps]")
+    parser.add_argument("--episodes", type=int, default=20, help="episodes of each evaluation")
     parser.add_argument("--hidden", type=int, default=128, help="units in each of two hidden layers")
     parser.add_argument("--out", type=Path, default=Path("runs/pendulum"), help="run folder")
-    parser.add_argument("--jobs", type=int, default=1, help="processes, a thread each")
-    asked = parser.parse_args(words)
-    seeds = asked.seeds.split(",")
-    known = all(seed.isdecimal() for seed in seeds) and len({*map(int, seeds)}) == len(seeds)
-    checks.require(known, "--seeds", asked.seeds, "is not a list of different whole numbers such as 0,1,2")
-    checks.above("--steps", asked.steps, RANDOM_STEPS)
-    checks.in_range("--delay", asked.delay, 1, HORIZON, "steps")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes, each with one thread")
+    args = parser.parse_args(words)
+    seeds = args.seeds.split(",")
+    valid = all(seed.isdecimal() for seed in seeds) and len({*map(int, seeds)}) == len(seeds)
+    checks.require(valid, "--seeds", args.seeds, "is not a list of different whole numbers such as 0,1,2")
+    checks.above("--steps", args.steps, RANDOM_STEPS)
+    checks.in_range("--delay", args.delay, 1, HORIZON, "steps")
     for name in ("episodes", "hidden", "jobs"):
-        checks.in_range(f"--{name}", getattr(asked, name), 1)
-    settings = asked.steps, asked.delay, asked.episodes, asked.hidden
-    return [Run(arm, int(seed), *settings) for seed in seeds for arm in ARMS], asked.out, asked.jobs
+        checks.in_range(f"--{name}", getattr(args, name), 1)
+    settings = args.steps, args.delay, args.episodes, args.hidden
+    return [Run(arm, int(seed), *settings) for seed in seeds for arm in ARMS], args.out, args.jobs
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Train, evaluate and tell; what a person got wrong is one line and exit code 2."""
+    """Train, evaluate and print the table; wrong input ends with one line on stderr and exit code 2."""
     try:
         runs, folder, jobs = parse(words)
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,13 +1,15 @@
-"""Train UAVs with MAPPO or SAC, and show what they have learnt beside a random policy.
+"""Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a greedy (scripted) one.
 
     python recipes/train.py agents=3 scenario=spotting motion=polynomial seed=1
     python recipes/train.py scenario=paper/usecase2 delay=paper aware=both
     python recipes/train.py learner=sac scenario=tracking actions=continuous
     python recipes/train.py -m seed=0,1,2 agents=3,5
-    python recipes/train.py resume=runs/2026-01-31_12-00-00
+    python recipes/train.py hydra.run.dir=runs/first
+    python recipes/train.py resume=runs/first frames=600000
 
-The run folder explains itself: config.yaml, metrics.csv, TensorBoard events, checkpoint,
-learning_curve.png, result.csv, result.md.
+``--help`` lists the groups of settings, ``--cfg job`` all keys. The run folder, runs/DATE_TIME unless
+hydra.run.dir names another one, gets config.yaml, metrics.csv (a row for each update), TensorBoard events,
+checkpoint, learning_curve.png, and the evaluation as result.csv and result.md.
 """
 
 import sys
@@ -58,10 +60,12 @@ from damian.world.messages import Messages
 
 @dataclass
 class Progress:
-    """How far a run has come; part of its checkpoint."""
+    """How far the training of a run has come; part of its checkpoint."""
 
     frames: int = 0
+    """Environment steps, over all worlds."""
     updates: int = 0
+    """Batches that the learner has learnt from."""
 
     def state_dict(self) -> dict[str, int]:
         return {"frames": self.frames, "updates": self.updates}
@@ -71,7 +75,7 @@ class Progress:
 
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
-    """The environment that policies are trained in."""
+    """The environment of the training, [B], with what the learner and the logs need."""
     messages = config.backupdates or config.clock.trigger is not None
     privileged = config.critic == "privileged"
     extras = ["reward_terms", *["message"] * messages, *["privileged"] * privileged]
@@ -84,7 +88,7 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
 
 
 def make_learner(config: TrainConfig, env: DelayedEnv) -> Learner:
-    """The learner, on a replay buffer in which late messages correct the steps if they should."""
+    """The learner, with a replay buffer (back-updating or not) if it needs one."""
     setup = config.learning_setup
     size = config.learner.buffer_size(setup)
     buffer = None if size is None else make_buffer(config, env.server, size)
@@ -92,7 +96,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv) -> Learner:
 
 
 def make_buffer(config: TrainConfig, server: Server, size: int) -> ReplayBuffer:
-    """A replay buffer of the latest steps, so many over all worlds."""
+    """A replay buffer of ``size`` environment steps; with ``backupdate``, late messages correct them."""
     if not config.backupdates:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
     recompute = server_recompute(server, actor=config.recompute_actor)
@@ -101,7 +105,7 @@ def make_buffer(config: TrainConfig, server: Server, size: int) -> ReplayBuffer:
 
 
 def make_collector(env: TransformedEnv, actor: torch.nn.Module, frames: int) -> Collector:
-    """Collects batches of so many steps, without end."""
+    """An endless collector of batches of ``frames`` environment steps."""
     add_recurrent_state(env, actor)
     return Collector(
         env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
@@ -109,7 +113,7 @@ def make_collector(env: TransformedEnv, actor: torch.nn.Module, frames: int) -> 
 
 
 def ticks(collector: Collector, clock: SystemClock) -> Iterator[TensorDictBase]:
-    """What was collected between two ticks of the system clock, [B, T]."""
+    """Batches [B, T], each collected between two ticks of the system clock (paper, section 3.6)."""
     parts: list[TensorDictBase] = []
     for part in collector:
         parts.append(part)
@@ -123,16 +127,16 @@ def ticks(collector: Collector, clock: SystemClock) -> Iterator[TensorDictBase]:
 
 
 def spotting(batch: TensorDictBase) -> torch.Tensor:
-    """Which UAVs spot the source after a batch [B, T], as the server knows, [B, N]."""
+    """Which UAVs spot the source at the end of a batch [B, T], by what the server holds, [B, N] bool."""
     after = cast(TensorDictBase, batch["next"][:, -1])
     return Messages.unpack(after.get(keys.RECEIVED, after[keys.MESSAGE])).spotted
 
 
 def train(config: TrainConfig, folder: Path) -> None:
-    """Learn, then evaluate and fill the run folder.
+    """Train, evaluate, and fill the run folder.
 
     Raises:
-        InputError: it cannot be learnt like this, or what there is cannot be loaded.
+        InputError: the settings do not allow training, or the checkpoint cannot be loaded.
     """
     config.check_learning()
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
@@ -142,7 +146,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     checkpoint = Checkpoint(**learner.components(), **state)
     if config.resume:
         load(checkpoint, folder, "resume")
-        env.set_seed(config.seed + 1_000_003 * progress.updates)  # not the first episodes once more
+        env.set_seed(config.seed + 1_000_003 * progress.updates)  # do not repeat the first episodes
     elif config.checkpoint:
         load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", *["critic"] * same_learner(config)])
     save_config(config, folder)
@@ -159,14 +163,14 @@ def train(config: TrainConfig, folder: Path) -> None:
             log.add(progress.frames, {**means, **mean_terms(batch), **losses})
             bar.set_postfix({name: f"{mean:.2f}" for name, mean in episodes.means().items()})
             bar.update((episodes.finished if config.episodes else progress.frames) - bar.n)
-            over = enough(config, progress, episodes) or interrupt.asked
-            if over or progress.updates % config.checkpoint_every == 0:
+            last = enough(config, progress, episodes) or interrupt.asked
+            if last or progress.updates % config.checkpoint_every == 0:
                 checkpoint.save(folder / CHECKPOINT)
-            if over:
+            if last:
                 break
     collector.shutdown()
     if interrupt.asked:
-        sys.exit(f"interrupted; go on with resume={folder}")
+        sys.exit(f"interrupted; continue with resume={folder}")
     random = report(config, folder, make_eval_env(config), learner.actor)
     plot_learning_curve(
         log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {config.learner.name.upper()}"
@@ -175,7 +179,7 @@ def train(config: TrainConfig, folder: Path) -> None:
 
 
 def same_learner(config: TrainConfig) -> bool:
-    """Has the same learner trained the policy to begin with, so that its critic fits?"""
+    """Was ``config.checkpoint`` trained by the same learner, so that its critic can be loaded too?"""
     folder = Path(str(config.checkpoint))
     if not (folder / CONFIG).is_file():
         return True
@@ -183,33 +187,33 @@ def same_learner(config: TrainConfig) -> bool:
 
 
 def progress_bar(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> tqdm:
-    """Counts what the run is measured in."""
+    """A progress bar that counts episodes if ``config.episodes`` limits the run, else environment steps."""
     if config.episodes:
         return tqdm(total=config.episodes, initial=episodes.finished, unit=" episodes")
     return tqdm(total=config.frames, initial=progress.frames, unit=" steps", unit_scale=True)
 
 
 def enough(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> bool:
-    """Has the run lasted as long as it should?"""
+    """Has the run reached ``config.frames`` or ``config.episodes``?"""
     return progress.frames >= config.frames or episodes.finished >= (config.episodes or torch.inf)
 
 
 def mean_terms(batch: TensorDictBase) -> dict[str, float]:
-    """Mean of each weighted reward term, over steps, worlds and UAVs."""
+    """Mean of each weighted reward term (eq. 5-8) over the steps, worlds and UAVs of a batch [B, T]."""
     terms = cast(TensorDictBase, batch[next_key(keys.REWARD_TERMS)])
     return {f"reward/{name}": term.mean().item() for name, term in terms.items()}
 
 
 def make_eval_env(config: TrainConfig) -> DelayedEnv:
-    """An environment of situations that were not trained on, a world for each episode of an evaluation."""
+    """The environment of an evaluation, a world for each episode; its initial conditions are new."""
     return make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, ["message"])
 
 
 def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module) -> Evaluation:
-    """Evaluate an actor; results into the folder, and a table to read.
+    """Evaluate an actor, write the results into the run folder and print them.
 
     Returns:
-        what a random policy comes to.
+        The evaluation of the random policy in the same episodes.
     """
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:

@@ -1,4 +1,4 @@
-"""Shared builders: the use cases without Hydra, small worlds of every kind, and playing them."""
+"""Shared test helpers: the paper's use cases without Hydra, small scenarios, and functions that step them."""
 
 import json
 import math
@@ -34,10 +34,10 @@ DATA = Path(__file__).parent / "data"
 GOLDEN = {case: json.loads((DATA / f"usecase{case}.json").read_text()) for case in (1, 2)}
 
 SCALE, TIME_SCALE = 250.0, 60.0
-"""Of random worlds: what distances [m] and times [s] are divided by."""
+"""In random worlds, distances [m] and times [s] are divided by these."""
 
 SQUARE = [[0.0, 0.0], [200.0, 0.0], [200.0, 200.0], [0.0, 200.0]]
-"""Corners of a region of 200 m by 200 m [m]."""
+"""Corners of a square region of 200 m by 200 m, [x, y] in metres."""
 
 
 def usecase(case: int, **changed: Any) -> ScenarioConfig:
@@ -80,7 +80,7 @@ def usecase(case: int, **changed: Any) -> ScenarioConfig:
 
 
 def square(**changed: Any) -> ScenarioConfig:
-    """Three UAVs start side by side in a small square, the source in its middle."""
+    """Three UAVs that start on different points of a small square, with the source in its middle."""
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=8)
     sections = {
         "region": region,
@@ -91,7 +91,7 @@ def square(**changed: Any) -> ScenarioConfig:
 
 
 def everything(motion: str = "instant", kind: str = "discrete", **changed: Any) -> ScenarioConfig:
-    """Every feature, every reward term, a walking source that is heard now and then, batteries."""
+    """A scenario with every feature, every reward term, a walking intermittent source and batteries."""
     sections = {
         "region": RegionConfig(min_area=20_000, max_area=60_000, pool=3, initial_conditions=12),
         "motion": MotionConfig(kind=motion, max_speed=20.0, max_acceleration=10.0),
@@ -112,7 +112,7 @@ def walking(**changed: Any) -> SourceConfig:
 
 
 def tracking(emission: str) -> dict[str, Any]:
-    """Sections of a tracking task."""
+    """Scenario sections of a task in which UAVs track a walking source."""
     return {
         "source": walking(emission=emission),
         "reward": RewardConfig(spotted=0.0, spotting_agents=0.5, source_drift=0.5, source_time=0.5),
@@ -139,7 +139,7 @@ KINDS: dict[str, dict[str, Any]] = {
         for name in ("source", "battery", "observation", "reward", "episode")
     },
 }
-"""Sections of each kind of scenario."""
+"""Scenario sections of each kind of task."""
 
 REGIONS = {
     "fixed": RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0, initial_conditions=4),
@@ -148,7 +148,7 @@ REGIONS = {
 
 
 def random_actions(env: UavEnv, generator: torch.Generator) -> Tensor:
-    """Uniform actions from a generator of the test's own, as the environment takes them."""
+    """Uniform random actions, [B, N] discrete or [B, N, 2] continuous, from the test's own generator."""
     shape = (*env.batch_size, env.n_agents)
     if env.scenario.actions.kind == "continuous":
         return torch.rand(*shape, 2, generator=generator)
@@ -156,7 +156,7 @@ def random_actions(env: UavEnv, generator: torch.Generator) -> Tensor:
 
 
 def act(env: UavEnv, action: Tensor) -> TensorDictBase:
-    """One step without resets: what stands under ``next``."""
+    """Step once without resets, and return the ``next`` entry."""
     td = TensorDict({"agents": {"action": action}}, env.batch_size)
     return env.step(td)["next"]
 
@@ -164,7 +164,7 @@ def act(env: UavEnv, action: Tensor) -> TensorDictBase:
 def play(
     env: UavEnv, choose: Sequence[Tensor] | Callable[[int], Tensor], n_steps: int | None = None
 ) -> list[TensorDictBase]:
-    """Step through episodes, resetting what is done: what every step and every reset showed."""
+    """Step through episodes, resetting worlds that are done; return the output of every step and reset."""
     td = env.reset()
     shown = [td.clone()]
     for t in range(len(choose) if n_steps is None else n_steps):
@@ -176,44 +176,44 @@ def play(
 
 
 def told(shown: TensorDictBase) -> Messages:
-    """The messages that the UAVs sent last, field by field."""
+    """The messages in an environment's output, unpacked into their fields."""
     return Messages.unpack(shown["agents", "message"])
 
 
 def same(one: TensorDictBase, other: TensorDictBase) -> bool:
-    """Equal keys, and equal bit for bit."""
+    """Whether both have the same keys and bit-for-bit equal values."""
     keys = set(one.keys(True, True))
     return keys == set(other.keys(True, True)) and all(one[k].equal(other[k]) for k in keys)
 
 
 def all_same(some: Sequence[TensorDictBase], others: Sequence[TensorDictBase]) -> bool:
-    """Equal step by step."""
+    """Whether both sequences are equal at every step, bit for bit."""
     return len(some) == len(others) and all(map(same, some, others))
 
 
 def heading(degrees: float) -> float:
-    """A continuous action's heading for a bearing clockwise from north."""
+    """Heading in [0, 1] of a continuous action, for a bearing clockwise from north [deg]."""
     return (degrees % 360) / 360
 
 
 def clock(period: str) -> ClockConfig:
-    """A clock whose simulation step is ``period``."""
+    """A clock with a simulation step of ``period``."""
     return ClockConfig(simulation=period)
 
 
 def nearest(points: Sequence[Sequence[float]], place: Sequence[float]) -> int:
-    """Index of the point nearest a place, the lowest of several."""
+    """Index of the point nearest a place; of several, the lowest index."""
     return min(range(len(points)), key=lambda i: math.dist(points[i], place))
 
 
 def random_worlds(
     seed: int, n_agents: int, heard: float, spots: float, n_worlds: int = 4
 ) -> list[tuple[float, list[Uav]]]:
-    """Times and UAVs as the twin holds them; who never heard the source cannot spot it."""
+    """Random times and UAVs of the twin; a UAV without any detection does not spot the source either."""
     rng = np.random.default_rng(seed)
     worlds = []
     for _ in range(n_worlds):
-        now = float(rng.uniform(0, 100))  # Sometimes past the time scale.
+        now = float(rng.uniform(0, 100))  # sometimes longer than the time scale
         uavs = []
         for _ in range(n_agents):
             place = tuple(rng.uniform(-150, 150, 2).astype(np.float32).tolist())
@@ -230,7 +230,7 @@ def random_worlds(
 
 
 def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, ServerContext]:
-    """The same worlds in the package's own form, [B, N]."""
+    """The messages [B, N] and the server context of the twin's worlds."""
 
     def column(read: Callable[[Uav], Any], dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.tensor([[read(uav) for uav in uavs] for _, uavs in worlds], dtype=dtype)
@@ -272,12 +272,12 @@ both_kinds = pytest.mark.parametrize("kind", ["discrete", "continuous"])
 
 
 def fields(state: State) -> dict[str, torch.Tensor]:
-    """Every tensor of a state by name."""
+    """Every tensor of a state by name, those of the messages as ``sent.<field>``."""
     return state._asdict() | {f"sent.{k}": v for k, v in state.sent._asdict().items()} | {"sent": 0}
 
 
 def check_equal(one: State, other: State, rows=slice(None)):
-    """Equal bit for bit in some worlds."""
+    """Assert that two states are equal bit for bit in the worlds ``rows``."""
     pairs = {name: (value, fields(other)[name]) for name, value in fields(one).items()}
     for name, (a, b) in pairs.items():
         if name != "sent":
@@ -285,7 +285,7 @@ def check_equal(one: State, other: State, rows=slice(None)):
 
 
 def one_uav(**changed) -> ScenarioConfig:
-    """One UAV in the square, at (100, 100) at first, the source 300 m away and not heard."""
+    """One UAV that starts near (60, 100) in a rectangle, too far to hear the source at (390, 100)."""
     region = RegionConfig(
         kind="vertices",
         vertices=[[0.0, 0.0], [400.0, 0.0], [400.0, 200.0], [0.0, 200.0]],
@@ -308,31 +308,32 @@ EAST, WEST = [[1.0, heading(90)]], [[1.0, heading(270)]]
 
 
 def go(env: UavEnv, *actions):
-    """Step with each action in every world; what the last step showed."""
+    """Step through the actions, the same in every world; return the output of the last step."""
     for action in actions:
         after = act(env, torch.tensor(action).expand(*env.batch_size, env.n_agents, 2))
     return after
 
 
 def fresh(scenario: ScenarioConfig, num_worlds: int = 1, **options) -> UavEnv:
+    """A new environment after its first reset."""
     env = UavEnv(scenario, num_worlds=num_worlds, **options)
     env.reset()
     return env
 
 
 def flight(env: UavEnv) -> float:
-    """Duration of the flight that has just begun [s]."""
+    """Duration of the flight of the only UAV that has just begun [s]."""
     return (2 * env.state.vertical + env.state.cruise).item()
 
 
 def learning(model: ModelConfig, settle: int = 0, **changed: Any) -> LearningSetup:
-    """What a learner must know of a run, which waits so many steps before it learns from a step."""
+    """Setup of a learner that postpones learning from a step by ``settle`` steps."""
     setup = LearningSetup(model, 1, 1, 1, longest_delay=settle, settle=settle > 0)
     return setup._replace(**changed)
 
 
 def check_refused(recipe: Callable[[], Any], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """What a person got wrong is one line on stderr, and exit code 2."""
+    """Assert that a recipe ends with exit code 2 and one error line on stderr that contains ``told``."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as stopped:
         recipe()

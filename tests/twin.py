@@ -1,4 +1,4 @@
-"""The slow, obvious twin: one world, one UAV at a time, in plain Python."""
+"""The slow reference implementation (twin): one world, one UAV at a time, in plain Python."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from damian.server.termination import EpisodeConfig
 
 @dataclass
 class Uav:
-    """What the server holds of one UAV: metres, seconds, radians clockwise from north."""
+    """The message that the server holds of one UAV: metres, seconds, radians clockwise from north."""
 
     place: tuple[float, float]
     point: int = 0
@@ -20,9 +20,9 @@ class Uav:
     battery: float = 100.0
     spots: bool = False
     motions: int = 0
-    """Since it last spotted, before this message."""
+    """Motions since the latest detection before this message."""
     moved: int = 0
-    """Since it last spotted, after this message."""
+    """Motions since the latest detection, this message included."""
     heard_at: float | None = None
     heard_from: tuple[float, float] = (0.0, 0.0)
 
@@ -35,14 +35,14 @@ def features(
     resolution: float = 5.0,
     newest: bool = False,
 ) -> dict[str, list]:
-    """Table 2 but for the coverage, a value for each UAV."""
+    """The features of the paper's Table 2 except the coverage: a list with one value for each UAV."""
     heard = [uav for uav in uavs if uav.heard_at is not None]
     source = None
     if heard:
         last = max(uav.heard_at for uav in heard)
-        told = [uav for uav in heard if uav.heard_at == last or not newest]
-        source = tuple(sum(uav.heard_from[axis] for uav in told) / len(told) for axis in (0, 1))
-    found: dict[str, list] = {}
+        used = [uav for uav in heard if uav.heard_at == last or not newest]
+        source = tuple(sum(uav.heard_from[axis] for uav in used) / len(used) for axis in (0, 1))
+    table: dict[str, list] = {}
     for uav in uavs:
         others = [other for other in uavs if other is not uav]
         row = {
@@ -56,7 +56,7 @@ def features(
             "spotting_agents": sum(other.spots for other in uavs) / len(uavs),
         }
         if source is not None:
-            bearing = 0.0  # As of a UAV that stands there.
+            bearing = 0.0  # of a UAV that stands at the estimate
             if math.dist(source, uav.place) > 1e-3:
                 bearing = math.atan2(source[0] - uav.place[0], source[1] - uav.place[1])
             row["source_distance"] = near(uav.place, source, scale)
@@ -64,35 +64,36 @@ def features(
             row["source_drift"] = (bearing - uav.track + math.pi) % (2 * math.pi) / (2 * math.pi)
             row["source_time"] = min((now - last) / time_scale, 1.0)
         row["mean_distance"] = mean([math.dist(uav.place, u.place) / scale for u in others])
-        silent = [u for u in others if not u.spots and not uav.spots]
-        row["mean_distance_not_spotting"] = mean([math.dist(uav.place, u.place) / scale for u in silent])
+        both_silent = [u for u in others if not u.spots and not uav.spots]
+        row["mean_distance_not_spotting"] = mean([math.dist(uav.place, u.place) / scale for u in both_silent])
         row["mean_distance_spotting"] = mean([math.dist(u.place, source) / scale for u in uavs if u.spots])
         for name, value in row.items():
-            found.setdefault(name, []).append(value)
-    return found
+            table.setdefault(name, []).append(value)
+    return table
 
 
 def near(one: tuple[float, float], other: tuple[float, float], scale: float) -> float:
+    """Distance over the scale, at most 1."""
     return min(math.dist(one, other) / scale, 1.0)
 
 
 def mean(values: list[float]) -> float:
-    """At most 1; 0 of nothing."""
+    """Mean, at most 1; 0 for an empty list."""
     return min(sum(values) / len(values), 1.0) if values else 0.0
 
 
 def terms(values: dict[str, float], motions: int, task: RewardConfig) -> dict[str, float]:
-    """Eq. 6 and 7 for one UAV: every term with its weight of eq. 8."""
-    found = {}
+    """The reward terms of one UAV (paper, eq. 6 and 7), times their weights (eq. 8)."""
+    weighted = {}
     for name, value in values.items():
         weight = getattr(task, name) * (task.individual if name in INDIVIDUAL else task.system)
         if weight != 0:
-            found[name] = weight * term(name, value, max(motions, 1), task)
-    return found
+            weighted[name] = weight * term(name, value, max(motions, 1), task)
+    return weighted
 
 
 def term(name: str, value: float, motions: int, task: RewardConfig) -> float:
-    """One term before its weight."""
+    """One reward term before its weight (paper, eq. 6 and 7)."""
     desired = {
         "spotting_agents": task.desired_spotting,
         "mean_distance": task.desired_distance,
@@ -117,27 +118,27 @@ def term(name: str, value: float, motions: int, task: RewardConfig) -> float:
 def end(
     uavs: Sequence[Uav], steps: int, now: float, dt: float, episode: EpisodeConfig
 ) -> tuple[bool, bool, bool]:
-    """Success, terminated, truncated."""
+    """Whether the episode ends: success, terminated, truncated."""
 
     def enough(share: float, flags: list[bool]) -> bool:
         return sum(flags) >= max(share * len(flags), 1) - 1e-9
 
-    success = failure = late = False
+    success = failure = timeout = False
     if episode.success_share is not None:
         success = enough(episode.success_share, [u.spots for u in uavs])
     if episode.discharged_share is not None:
         failure = enough(episode.discharged_share, [u.battery <= 0 for u in uavs])
     if episode.max_steps is not None:
-        waited = steps
+        counted = steps
         if episode.since_detection:
-            waited = (now - max([0.0, *[u.heard_at for u in uavs if u.heard_at is not None]])) / dt
-        late = waited > episode.max_steps - 1e-3
+            counted = (now - max([0.0, *[u.heard_at for u in uavs if u.heard_at is not None]])) / dt
+        timeout = counted > episode.max_steps - 1e-3
     ended = success or failure
-    return success, ended, late and not ended
+    return success, ended, timeout and not ended
 
 
 def final(ended: tuple[bool, bool, bool], steps: int, task: RewardConfig) -> float:
-    """Bonus or penalty."""
+    """Bonus or penalty at the end of an episode; 0 before."""
     success, terminated, truncated = ended
     if success:
         return task.bonus / steps if task.bonus_over_steps else task.bonus
@@ -147,12 +148,12 @@ def final(ended: tuple[bool, bool, bool], steps: int, task: RewardConfig) -> flo
 def assign_landing_points(
     preferences: Sequence[Sequence[int]], standing: Sequence[int], ready: Sequence[bool]
 ) -> list[int]:
-    """Points by preference, in index order; what others stand on or have booked is not free."""
+    """Book points by preference, in index order; points that others hold or have booked are not free."""
     booked: list[int] = []
-    for i, wanted in enumerate(preferences):
+    for i, preferred in enumerate(preferences):
         busy = {*booked, *standing[:i], *standing[i + 1 :]}
         own = standing[i]
-        booked.append(next((p for p in wanted if p == own or p not in busy), own))
+        booked.append(next((p for p in preferred if p == own or p not in busy), own))
         if not ready[i]:
             booked[i] = own
     return booked
@@ -160,7 +161,7 @@ def assign_landing_points(
 
 @dataclass
 class World:
-    """A world of instant motion, with a static source and without batteries."""
+    """A world with instant motion and a static source, without batteries."""
 
     polygon: shapely.Geometry
     points: list
@@ -177,35 +178,36 @@ class World:
     ended: tuple[bool, bool, bool] = field(default=(False, False, False))
 
     def begin(self) -> None:
-        """Listen at time 0."""
+        """Let every UAV listen for the source at time 0."""
         for uav in self.uavs:
             self._listen(uav)
 
     def step(self, moves: Sequence[tuple[float, float]]) -> list[float]:
-        """Fly (distance [m], heading [rad]) and return each UAV's reward."""
-        wanted = [self._preferences(*pair) for pair in zip(self.uavs, moves, strict=True)]
+        """Fly each UAV's (distance [m], heading [rad]) and return each UAV's reward."""
+        preferences = [self._preferences(*pair) for pair in zip(self.uavs, moves, strict=True)]
         standing = [uav.point for uav in self.uavs]
         self.steps += 1
         for uav, point in zip(
-            self.uavs, assign_landing_points(wanted, standing, [True] * len(standing)), strict=True
+            self.uavs, assign_landing_points(preferences, standing, [True] * len(standing)), strict=True
         ):
             self._move(uav, point)
             self._listen(uav)
         now = self.steps * self.dt
         self.ended = end(self.uavs, self.steps, now, self.dt, self.episode)
-        seen = self.observe()
-        extra = final(self.ended, self.steps, self.task)
+        observation = self.observe()
+        end_reward = final(self.ended, self.steps, self.task)
         rewards = []
         for i, uav in enumerate(self.uavs):
-            own = {name: values[i] for name, values in seen.items() if name != "agent_distances"}
-            rewards.append(sum(terms(own, uav.motions, self.task).values()) + extra)
+            own = {name: values[i] for name, values in observation.items() if name != "agent_distances"}
+            rewards.append(sum(terms(own, uav.motions, self.task).values()) + end_reward)
         return rewards
 
     def observe(self) -> dict[str, list]:
+        """The features of all UAVs now."""
         return features(self.uavs, self.steps * self.dt, self.scale, self.time_scale, newest=self.newest)
 
     def _preferences(self, uav: Uav, move: tuple[float, float]) -> list[int]:
-        """Landing points, nearest the target first; only the own one if the target is outside."""
+        """Landing points, nearest the target first; only the UAV's own point if the target is outside."""
         distance, heading = move
         target = (
             uav.place[0] + distance * math.sin(heading),

@@ -1,1 +1,1 @@
-"""Policies that learn nothing, to compare learners with: a random one and a scripted one."""
+"""Policies that do not learn, as baselines for learners: a random one and a scripted one."""

@@ -1,8 +1,9 @@
-"""A scripted policy that learns nothing: fly to where the source is believed, else over fresh ground.
+"""A scripted policy: fly to where the source probably is, else over ground not covered recently.
 
-Every UAV flies where its footprint holds most of what it wants: while a detection is recent, ground on which
-the source is likely to be; else its own ground (nearer to it than to the others), not just covered. If there
-is none of it within reach, it flies as near as it can.
+Every UAV weights all landing points and flies to the one whose footprint contains the largest total weight.
+While a detection is recent, a landing point's weight is how likely the source is there. Otherwise weight lies
+on the UAV's own ground (the landing points nearer to it than to other UAVs) outside its latest footprints. If
+no landing point within reach gains anything, the UAV flies as near to the best one as it can.
 """
 
 import math
@@ -19,32 +20,32 @@ from damian.envs.uav_env import UavEnv
 from damian.world.messages import Messages
 
 BLUR_M = 5.0
-"""How uncertain a place just told is: landing points stand for the ground around them."""
+"""Standard deviation of a detection's place [m]: landing points stand for the ground around them."""
 TRUST = 0.9
-"""How sure it is that a footprint in which nothing is heard holds no source."""
+"""Confidence, in [0, 1], that there is no source in a footprint in which a UAV hears nothing."""
 RECENT = 3.0
-"""Footprint radii that the source may go before it must be searched for anew."""
-_NEARER = 1e-6
-"""Landing points that a metre less to fly is worth: of equally good places the nearest."""
-_NOTHING = 1e-3
-"""Landing points: if no choice gains more, what is wanted lies further away."""
+"""A detection is recent until the source can have moved by this many footprint radii."""
+_FLIGHT_COST = 1e-6
+"""Cost of a flight [weight per metre]: it only decides between equally good places, for the nearest."""
+_LEAST_GAIN = 1e-3
+"""If no choice gains more weight than this, all weight lies out of reach."""
 
 
 def greedy_policy(env: DelayedEnv) -> TensorDictModule:
-    """What a careful engineer would script; reads what the server knows (regime R0) and the action mask.
+    """Build the scripted policy, which reads the messages that the server holds and the action mask.
 
-    Stateless and deterministic: equal messages, equal actions. Writes ``("agents", "action")`` [B, N], or
-    [B, N, 2] if actions are continuous. The environment must have ``message`` among its extras.
+    It is stateless and deterministic: equal messages give equal actions. It writes ``("agents", "action")``
+    [B, N], or [B, N, 2] if actions are continuous. The environment must have ``message`` among its extras.
     """
     available = env.observation_spec.keys(True, True)
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
-    wanted = {"message": message, "age": keys.AGE, "mask": keys.ACTION_MASK}
-    in_keys: dict[str, NestedKey] = {name: key for name, key in wanted.items() if key in available}
+    arguments = {"message": message, "age": keys.AGE, "mask": keys.ACTION_MASK}
+    in_keys: dict[str, NestedKey] = {name: key for name, key in arguments.items() if key in available}
     return TensorDictModule(Greedy(env.uav_env), in_keys, [keys.ACTION])
 
 
 class Greedy:
-    """Messages to actions, for the regions, the source and the UAVs of an environment."""
+    """Function from messages to actions, for the regions, the source and the UAVs of an environment."""
 
     def __init__(self, worlds: UavEnv) -> None:
         scenario, simulation = worlds.scenario, worlds.simulation
@@ -56,89 +57,130 @@ class Greedy:
         self.seeks = bool(terms) or scenario.episode.success_share is not None
         self.real = simulation.airspace.points[..., 0].isfinite()
         self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
-        near = _apart(self.points, self.points) <= self.radius
-        # Row: ground; column: where it is seen from.
+        near = _distances(self.points, self.points) <= self.radius
+        # A row is a landing point to cover, a column the one in whose footprint it lies.
         self.near = (near & self.real.unsqueeze(-1)).float()
 
     def __call__(self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
-        """Actions for messages [B, N, M] of these ages [steps], [B, N, 1], under a mask [B, N, A]."""
+        """Choose actions, [B, N] or, if continuous, [B, N, 2].
+
+        Args:
+            message: packed messages that the server holds, [B, N, M].
+            age: their age [steps], [B, N, 1]; 0 if not given.
+            mask: legal discrete actions, [B, N, A]; all if not given.
+        """
         held = Messages.unpack(message)
         region = held.trail[:, 0, 0] // self.points.shape[1]
         ground = self.points[region]
-        wanted = self.fresh(held, ground)
+        weight = self.fresh(held, ground)
         if self.seeks:
             time = held.time if age is None else held.time + age.squeeze(-1) * self.dt
             likely, recent = self.believe(held, ground, time.amax(-1, keepdim=True))
-            wanted = torch.where(recent, likely, wanted * likely)
-        gain = wanted @ (self.near if len(self.near) == 1 else self.near[region])
+            weight = torch.where(recent, likely, weight * likely)
+        gain = weight @ (self.near if len(self.near) == 1 else self.near[region])
         gain = gain.where(self.real[region].unsqueeze(1), -torch.inf)
-        flown = _apart(held.target, ground)
-        goal = (gain - _NEARER * flown).argmax(-1)
-        left = _apart(_pick(ground, goal), ground)
+        flown = _distances(held.target, ground)
+        goal = (gain - _FLIGHT_COST * flown).argmax(-1)
+        left = _distances(_places_at(ground, goal), ground)
         if self.actions.kind == "discrete":
             return self.best_action(held, gain, left, mask)
         return self.best_move(held, gain, flown, left, ground)
 
     def fresh(self, held: Messages, ground: Tensor) -> Tensor:
-        """1 where ground [B, L, 2] is the UAV's own and not in its latest footprints, else 0, [B, N, L]."""
-        apart = _apart(held.target, ground)
-        own = apart <= apart.amin(1, keepdim=True)
-        been = _apart(gather_rows(self.points.flatten(0, 1), held.trail), ground.unsqueeze(1))
-        return (own & (been > self.radius).all(-2)).float()
+        """Which landing points are nearest to the UAV and outside its latest footprints.
+
+        Args:
+            held: messages [B, N].
+            ground: landing points of each world's region, east, north [m], [B, L, 2].
+
+        Returns:
+            1 where both hold, else 0, [B, N, L].
+        """
+        distance = _distances(held.target, ground)
+        own = distance <= distance.amin(1, keepdim=True)
+        from_trail = _distances(gather_rows(self.points.flatten(0, 1), held.trail), ground.unsqueeze(1))
+        return (own & (from_trail > self.radius).all(-2)).float()
 
     def believe(self, held: Messages, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-        """How likely the source is on ground [B, L, 2], up to 1, [B, 1, L]; is that recent, [B, 1, 1].
+        """How likely the source is at each landing point.
 
-        Heard within a footprint, the source has gone on since: two deviations at its full speed. A footprint
-        that is silent now speaks against it, less so if the source may just not have emitted.
+        The place of a detection grows uncertain with its age: the way of the source at full speed counts as
+        two standard deviations. A footprint in which a UAV hears nothing now makes the source less likely
+        there, but by less if the source may be there without emitting.
+
+        Args:
+            held: messages [B, N].
+            ground: landing points of each world's region, east, north [m], [B, L, 2].
+            now: current time, as far as the messages tell it [s], [B, 1].
+
+        Returns:
+            Likelihood relative to the best landing point, in [0, 1], [B, 1, L]; whether the latest detection
+            is recent, [B, 1, 1].
         """
-        known = held.detected_time >= 0
-        since = torch.where(known, now - held.detected_time, torch.inf).unsqueeze(-1)
-        outside = (_apart(held.detected_position, ground) - self.radius).clamp(min=0)
-        heard = -(outside / (BLUR_M + self.speed * since / 2)).square() / 2
-        heard = torch.where(known.unsqueeze(-1), heard, 0.0).sum(1, keepdim=True)
+        has_detection = held.detected_time >= 0
+        since = torch.where(has_detection, now - held.detected_time, torch.inf).unsqueeze(-1)
+        outside = (_distances(held.detected_position, ground) - self.radius).clamp(min=0)
+        log_detected = -(outside / (BLUR_M + self.speed * since / 2)).square() / 2
+        log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0).sum(1, keepdim=True)
         silent = ~held.spotted & (held.time > now - self.dt / 2)
-        passed = (_apart(held.position, ground) <= self.radius) & silent.unsqueeze(-1)
+        covered = (_distances(held.position, ground) <= self.radius) & silent.unsqueeze(-1)
         latest = since.amin(1, keepdim=True)
-        sure = TRUST * torch.where(latest < self.dt / 2, 1.0, self.emits)
-        log = heard + torch.log1p(-sure * passed.any(1, keepdim=True))
-        gone = torch.where(latest.isfinite(), latest * self.speed, torch.inf)
-        return (log - log.amax(-1, keepdim=True)).exp(), gone <= RECENT * self.radius
+        confidence = TRUST * torch.where(latest < self.dt / 2, 1.0, self.emits)
+        log = log_detected + torch.log1p(-confidence * covered.any(1, keepdim=True))
+        moved = torch.where(latest.isfinite(), latest * self.speed, torch.inf)
+        return (log - log.amax(-1, keepdim=True)).exp(), moved <= RECENT * self.radius
 
     def best_action(self, held: Messages, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
-        """The best legal action, [B, N]; by landing point: its gain, and how far the goal is, [B, N, L]."""
+        """The best legal discrete action, [B, N].
+
+        Args:
+            held: messages [B, N].
+            gain: weight in the footprint of each landing point, [B, N, L].
+            left: distance from each landing point to the best one [m], [B, N, L].
+            mask: legal actions, [B, N, A]; all if not given.
+        """
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = held.trail[..., :1] * len(action) + action
         point, flown = (gather_rows(table[:, 0], row) for table in self.candidates.ranking)
-        gain, left = (numbers.gather(-1, point.long()) for numbers in (gain, left))
+        gain, left = (values.gather(-1, point.long()) for values in (gain, left))
         return _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)
 
     def best_move(self, held: Messages, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor) -> Tensor:
-        """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2]."""
+        """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2].
+
+        Args:
+            held: messages [B, N].
+            gain: weight in the footprint of each landing point, [B, N, L].
+            flown: distance to each landing point [m], [B, N, L].
+            left: distance from each landing point to the best one [m], [B, N, L].
+            ground: landing points of each world's region, east, north [m], [B, L, 2].
+        """
         best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
-        east, north = (_pick(ground, best) - held.target).unbind(-1)
-        turn = torch.remainder(torch.atan2(east, north) / (2 * math.pi), 1.0)
-        far = flown.gather(-1, best.unsqueeze(-1)).squeeze(-1) / self.candidates.max_distance
-        return torch.stack([far, turn], -1)
+        east, north = (_places_at(ground, best) - held.target).unbind(-1)
+        heading = torch.remainder(torch.atan2(east, north) / (2 * math.pi), 1.0)
+        distance = flown.gather(-1, best.unsqueeze(-1)).squeeze(-1) / self.candidates.max_distance
+        return torch.stack([distance, heading], -1)
 
 
 def _best(gain: Tensor, flown: Tensor, left: Tensor) -> Tensor:
-    """Where most is gained, of equals the nearest; if nothing is, where least is left to the goal, [B, N].
+    """Index of the choice with the largest gain, the nearest of equals, [B, N].
+
+    If no choice gains anything, it is the choice that leaves the shortest distance to the goal.
 
     Args:
-        gain: of each choice, -inf if it must not be made, [B, N, C].
-        flown: to get there [m], [B, N, C].
-        left: from there to where most is gained of all [m], [B, N, C].
+        gain: weight that each choice gains, -inf if the choice is not allowed, [B, N, C].
+        flown: distance to each choice [m], [B, N, C].
+        left: distance from each choice to the goal, the best landing point of all [m], [B, N, C].
     """
-    some = gain.amax(-1, keepdim=True) > _NOTHING
-    return torch.where(some, gain - _NEARER * flown, -left.where(gain.isfinite(), torch.inf)).argmax(-1)
+    gains = gain.amax(-1, keepdim=True) > _LEAST_GAIN
+    return torch.where(gains, gain - _FLIGHT_COST * flown, -left.where(gain.isfinite(), torch.inf)).argmax(-1)
 
 
-def _pick(ground: Tensor, chosen: Tensor) -> Tensor:
-    """Places [B, N, 2] by index [B, N] among [B, L, 2]."""
-    return ground.gather(1, chosen.unsqueeze(-1).expand(*chosen.shape, 2))
+def _places_at(ground: Tensor, index: Tensor) -> Tensor:
+    """Landing points [B, N, 2] of these indices [B, N] among ``ground`` [B, L, 2]."""
+    return ground.gather(1, index.unsqueeze(-1).expand(*index.shape, 2))
 
 
-def _apart(places: Tensor, others: Tensor) -> Tensor:
-    """Distances [*, P, Q] between places [*, P, 2] and others [*, Q, 2], exact also for small ones."""
+def _distances(places: Tensor, others: Tensor) -> Tensor:
+    """Distances [*, P, Q] between places [*, P, 2] and others [*, Q, 2], exact also for small distances."""
     return torch.cdist(places, others, compute_mode="donot_use_mm_for_euclid_dist")

@@ -1,4 +1,4 @@
-"""A policy that chooses among the legal actions by chance: what every result is compared with."""
+"""A policy that draws its actions at random, the baseline for every result."""
 
 from tensordict.nn import TensorDictModule
 from torch import Tensor, multinomial
@@ -8,7 +8,10 @@ from damian import keys
 
 
 def random_policy(env: EnvBase) -> TensorDictModule:
-    """Uniform over the legal actions; writes ``("agents", "action")``."""
+    """Build a policy that draws uniformly from the legal actions.
+
+    It writes ``("agents", "action")`` [B, N], or [B, N, 2] if actions are continuous.
+    """
     spec = env.full_action_spec_unbatched[keys.ACTION]
     masked = keys.ACTION_MASK in env.observation_spec.keys(True, True)
 

@@ -14,10 +14,9 @@ T = TypeVar("T")
 class Registry(Generic[T]):
     """Components of one kind.
 
-    With ``LAWS = Registry[type[Law]]("law")``, ``@LAWS.register("uniform")`` adds a class,
-    ``LAWS.get("uniform", key)`` returns it, and ``LAWS.get("my_lab.delays:Satellite", key)`` imports one that is
-    not registered. Modules are also looked for in the current folder, so that a file of one's own needs no
-    installation.
+    With ``LAWS = Registry[type[Law]]("law")``, ``@LAWS.register("uniform")`` adds a class and
+    ``LAWS.get("uniform", key)`` returns it. ``LAWS.get("my_lab.delays:Satellite", key)`` imports a class that
+    is not registered, also from the current folder, so that a file of one's own needs no installation.
 
     Args:
         kind: what a component is called in errors, such as ``law``.

@@ -1,1 +1,1 @@
-"""TorchRL environments: the UAVs without delays, and the whole pipeline of a scenario."""
+"""TorchRL environments: ``UavEnv`` without delays, and the pipeline that adds delays and clocks."""

@@ -1,4 +1,4 @@
-"""A scenario's environment with its delays, losses and clocks: the one place that knows their order."""
+"""Builds a scenario's environment: the one place that decides the order of its delays, losses and clocks."""
 
 from collections.abc import Collection
 from typing import Any
@@ -34,21 +34,22 @@ def make_env(
     device: torch.device | str = "cpu",
     extras: Collection[str] = (),
 ) -> DelayedEnv:
-    """The environment of a scenario with all of its delays.
+    """Build the environment of a scenario with all of its delays.
 
     Args:
-        scenario: with its ``delay`` and ``clock``.
-        num_worlds: B.
-        seed: of the worlds, and of the delays.
+        scenario: all settings, ``delay`` and ``clock`` included.
+        num_worlds: number of parallel environments, B.
+        seed: of the worlds and of the delays.
         device: of all tensors.
-        extras: as in ``UavEnv``; with ``message`` also ``received`` (the messages that the server holds),
-            their ``age`` [steps], and the ``delay`` of the messages sent, under ``"agents"``.
+        extras: as in ``UavEnv``; if messages are delayed, ``message`` also outputs ``received`` (the messages
+            that the server holds), their ``age`` [steps], and the ``delay`` [steps] of the messages sent, all
+            under ``"agents"``.
 
     Raises:
-        InputError: the scenario asks for something impossible, or for the messages of skipped steps.
+        InputError: the scenario asks for something impossible, or combines ``clock.skip`` with ``message``.
     """
-    should = "skips steps, but back-updating and evaluation need the messages of every one"
-    checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, should)
+    problem = "skips steps, but back-updating and evaluation need the messages of every step"
+    checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
     delayed = has_message_delay(scenario)
     simulation = make_simulation(scenario, seed)
     server = make_server(scenario, simulation)
@@ -68,7 +69,7 @@ def make_env(
 
 
 def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> Compose:
-    """The transforms of a scenario in their order; a policy's action passes them backwards."""
+    """All transforms of a scenario in order: outputs pass them forwards, a policy's actions backwards."""
     transforms = [
         *action_transforms(scenario),
         *(server_transforms(scenario, server, extras) if has_message_delay(scenario) else []),
@@ -80,7 +81,7 @@ def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
 
 
 def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
-    """The delay of actions; a UAV that was not ready when it chose sends none."""
+    """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not sent."""
     delay, clock = scenario.delay, scenario.clock
     if not has_delay(delay.act, clock.dt) and clock.steps("agents") == 1:
         return []
@@ -93,8 +94,8 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
 
 
 def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
-    """The delay of messages to the server node, and its outputs for those that have arrived."""
-    delay, read = scenario.delay, "message" in extras
+    """The message delay (paper, section 3.4), and the server node, which uses the arrived messages."""
+    delay, output_messages = scenario.delay, "message" in extras
     uplink = ObservationDelay(
         delay.uplink,
         [keys.MESSAGE],
@@ -103,15 +104,15 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         order=delay.order,
         dt=scenario.clock.dt,
         sent_key=keys.MESSAGE_SENT,
-        age_key=keys.AGE if read or history_since_message(scenario) else None,
-        delay_key=keys.DELAY if read else None,
+        age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
+        delay_key=keys.DELAY if output_messages else None,
     )
-    unread = [] if read else [keys.MESSAGE, keys.RECEIVED, keys.MESSAGE_SENT]
-    return [uplink, ServerNode(server, dropped_keys=unread, reward_terms="reward_terms" in extras)]
+    dropped = [] if output_messages else [keys.MESSAGE, keys.RECEIVED, keys.MESSAGE_SENT]
+    return [uplink, ServerNode(server, dropped_keys=dropped, reward_terms="reward_terms" in extras)]
 
 
 def reward_transforms(scenario: ScenarioConfig) -> list[Transform]:
-    """The delay of rewards, and their discounted sum."""
+    """The reward delay, and the discounted sum of the latest rewards (paper, section 3.5, eq. 4)."""
     delay, dt = scenario.delay, scenario.clock.dt
     transforms: list[Transform] = []
     if has_delay(delay.rew, dt):
@@ -122,7 +123,7 @@ def reward_transforms(scenario: ScenarioConfig) -> list[Transform]:
 
 
 def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
-    """The clocks of the server and of the UAVs, and the UAVs' action history."""
+    """The clocks of server and UAVs (paper, section 3.6), and the UAVs' action history (section 3.3)."""
     clock, n_actions = scenario.clock, scenario.delay.history
     transforms: list[Transform] = []
     if clock.steps("server") > 1:
@@ -145,7 +146,7 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
 
 
 def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
-    """Steps that last until some UAV can choose."""
+    """The transform that lets a step last until some UAV can choose again, if ``clock.skip`` is set."""
     if not scenario.clock.skip:
         return []
     names = scenario.reward.terms if "reward_terms" in extras else []
@@ -154,40 +155,42 @@ def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[T
 
 
 def history_since_message(scenario: ScenarioConfig) -> bool:
-    """Does a UAV's action history hold only the actions that the server's answer cannot reflect yet?
+    """Whether a UAV's action history holds only actions newer than its message that the server holds.
 
-    With delayed actions or slow clocks a UAV cannot tell which these are, and a UAV that knows its own
-    messages needs no such choice: then the history holds all of the latest actions.
+    The server's observation cannot reflect these actions yet. With delayed actions or slow clocks a UAV
+    cannot tell which actions are newer, and with ``observation.own`` it knows its own latest message anyway:
+    in these cases the history holds all of its latest actions.
     """
     delay, clock = scenario.delay, scenario.clock
-    prompt = not has_delay(delay.act, clock.dt) and clock.steps("server") == clock.steps("agents") == 1
-    return delay.history > 0 and not scenario.observation.own and prompt and has_message_delay(scenario)
+    immediate = not has_delay(delay.act, clock.dt) and clock.steps("server") == clock.steps("agents") == 1
+    return delay.history > 0 and not scenario.observation.own and immediate and has_message_delay(scenario)
 
 
 def has_message_delay(scenario: ScenarioConfig) -> bool:
-    """May the server hold another message of a UAV than the one that it sent in this step?"""
+    """Whether the server may hold an older message of a UAV than the one that the UAV sent in this step."""
     return scenario.delay.loss > 0 or has_delay(scenario.delay.uplink, scenario.clock.dt)
 
 
 def has_delay(law: Any, dt: float) -> bool:
-    """Does a law, as a person writes it, ever delay anything?"""
+    """Whether a delay law, as written in the settings, ever delays anything."""
     return law_of(law).sampler(dt).certain != 0
 
 
 def hold_action(actions: ActionConfig) -> int:
-    """The discrete action that holds the position, or the first one if there is none; 0 if continuous."""
+    """Index of the first discrete action that holds the position; 0 if there is none, or if continuous."""
     discrete = actions.kind == "discrete" and 0.0 in actions.distances
     return actions.distances.index(0.0) * len(actions.headings) if discrete else 0
 
 
 def action_codes(actions: ActionConfig) -> Tensor | None:
-    """Discrete actions as an actor sees its past ones: displacement east and north, each in [0, 1], [A, 2].
+    """Codes of the discrete actions in the action history: displacement east and north in [0, 1], [A, 2].
 
-    Displacements rather than distance and heading, because their sum tells where a UAV must be by now. None
-    for continuous actions, which are shown as they are.
+    They are displacements rather than distances and headings, because the sum of displacements tells where a
+    UAV must be by now. None for continuous actions, which the history holds unchanged.
     """
     if actions.kind == "continuous":
         return None
     distance, heading = actions.table().unbind(-1)
-    there = torch.stack([heading.sin(), heading.cos()], -1) * (distance / distance.max()).unsqueeze(-1)
-    return (there + 1) / 2
+    direction = torch.stack([heading.sin(), heading.cos()], -1)
+    displacement = direction * (distance / distance.max()).unsqueeze(-1)
+    return (displacement + 1) / 2

@@ -1,4 +1,4 @@
-"""All settings of an environment, and the parts that are built from them."""
+"""All settings of an environment, and the simulation and server node that are built from them."""
 
 from dataclasses import dataclass, field
 
@@ -15,7 +15,7 @@ from damian.world.simulation import Simulation
 
 @dataclass
 class ScenarioConfig(WorldConfig):
-    """A whole scenario: ``make_env(ScenarioConfig(agents=5), num_worlds=64)``."""
+    """Settings of a whole scenario, as in ``make_env(ScenarioConfig(agents=5), num_worlds=64)``."""
 
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -27,14 +27,15 @@ class ScenarioConfig(WorldConfig):
         super().__post_init__()
         self.delay.check(self.clock.dt)
         self._check_ends()
-        held = self.observation.own and self.clock.steps("server") > 1
-        should = "does not go with clock.server: between two broadcasts no observation changes"
-        checks.require(not held, "observation.own", True, should)
-        alone = self.agents == 1 and self.observation.actor == ["agent_distances"]
-        checks.require(not alone, "observation", "agent_distances", "is the only feature of a single UAV")
+        conflict = self.observation.own and self.clock.steps("server") > 1
+        problem = "does not go with clock.server: between two broadcasts no observation changes"
+        checks.require(not conflict, "observation.own", True, problem)
+        empty = self.agents == 1 and self.observation.actor == ["agent_distances"]
+        problem = "is empty for a single UAV: add another feature"
+        checks.require(not empty, "observation", "agent_distances", problem)
 
     def _check_ends(self) -> None:
-        """Refuse ends of an episode that can never come."""
+        """Refuse end conditions of an episode that can never be met (paper, section 4.1)."""
         checks.require(
             self.episode.discharged_share is None or self.battery.enabled,
             "episode.discharged_share",
@@ -50,13 +51,17 @@ class ScenarioConfig(WorldConfig):
 
     @property
     def time_scale(self) -> float:
-        """What times are divided by [s]: the setting, else the time limit, else an hour."""
+        """Time by which time features are divided [s]: the setting, else the time limit, else one hour."""
         limit = None if self.episode.max_steps is None else self.episode.max_steps * self.clock.dt
         return self.observation.time_scale or limit or 3600.0
 
 
 def make_simulation(scenario: ScenarioConfig, seed: int) -> Simulation:
-    """The physics of a scenario; ``seed`` is that of the regions, starts and walks.
+    """Build the physics of a scenario.
+
+    Args:
+        scenario: all settings.
+        seed: of the regions, the start positions and the source's walks.
 
     Raises:
         InputError: the scenario asks for something impossible.
@@ -65,10 +70,10 @@ def make_simulation(scenario: ScenarioConfig, seed: int) -> Simulation:
 
 
 def make_server(scenario: ScenarioConfig, simulation: Simulation) -> Server:
-    """The server node of a scenario, for the regions of a simulation.
+    """Build the server node of a scenario for the regions of a simulation.
 
     Raises:
-        InputError: more landing points than a message can number.
+        InputError: there are more landing points than a message can number.
     """
     return Server(
         scenario.observation,

@@ -1,4 +1,4 @@
-"""``UavEnv``: the simulation as a TorchRL environment."""
+"""``UavEnv``: the simulation and the server node as a TorchRL environment without delays."""
 
 import os
 from collections.abc import Collection
@@ -23,47 +23,48 @@ from damian.world.simulation import Simulation
 from damian.world.state import INITIAL_CONDITION, PackedState, State
 
 Outputs = dict[NestedKey, Tensor]
-"""Entries of a step or a reset, by key."""
+"""Entries that a step or a reset outputs, by key."""
 
 EXTRAS = ("message", "state", "reward_terms")
-"""Optional outputs; ``privileged`` is another one, for reference arms."""
+"""Default optional outputs; a further one, ``privileged``, is only for reference experiments."""
 
 _DONE = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
 
 
 class UavEnv(EnvBase):
-    """B worlds in which N UAVs search for, track and cover things, without any delay.
+    """B worlds, in each of which N UAVs search for and track a source or cover a region, without any delay.
 
     ``damian.envs.pipeline.make_env`` adds the delays and slower clocks of a scenario as transforms.
 
-    Batch size ``[B]``. Entries of the UAVs lie under ``"agents"``, batch size ``[B, N]``:
+    The batch size is ``[B]``. Entries of the UAVs lie under ``"agents"``, with batch size ``[B, N]``:
 
     - ``action``: discrete [B, N], or continuous [B, N, 2] in [0, 1]: distance and heading (paper, section
-    3.3);
-    - ``action_mask``: discrete actions that would do something, [B, N, A] (if ``actions.mask``);
-    - ``ready``: may the UAV choose now, [B, N];
-    - ``observation``, ``global_observation``: features of the actor [B, N, F], of the critic [B, N, G];
+      4.2);
+    - ``action_mask``: legal discrete actions, [B, N, A] (if ``actions.mask``);
+    - ``ready``: whether the UAV can choose an action now, [B, N];
+    - ``observation``, ``global_observation``: features of the actor [B, N, F] and of the critic [B, N, G];
     - ``message``: the latest message of each UAV, [B, N, M] (``Messages.unpack`` names its fields), and
-      ``message_sent``: was it sent in this step, [B, N];
+      ``message_sent``: whether it was sent in this step, [B, N];
     - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, and the true
-    offset
-      from the UAV to the source (east, north, over the region's size, in [-1, 1]); [B, N, G + 2];
-    - ``reward``: eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
+      offset from the UAV to the source (east, north, over the region's size, in [-1, 1]), [B, N, G + 2];
+    - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
-    At the root lie ``state`` (the simulator's truth: for drawing and reference arms, never for an actor),
-    ``success``, and TorchRL's ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also
-    ``source_over``. A step reads, beside the action, the flag ``("agents", "action_valid")`` [B, N] if it
-    exists: a UAV whose flag is false does not act, as if it were not ready.
+    At the root lie ``state`` (the simulator's truth, for drawing and reference experiments, never for an
+    actor), ``success``, and TorchRL's ``done``, ``terminated``, ``truncated``; with
+    ``episode.end_with_source`` also ``source_over``. Besides the action, a step reads the flag
+    ``("agents", "action_valid")`` [B, N] if it exists: a UAV with a false flag does not act, as if it were
+    not ready.
 
     Args:
         scenario: all settings; the defaults if not given.
-        num_worlds: B.
+        num_worlds: number of parallel environments, B.
         seed: of the regions and initial conditions drawn at construction, and of the worlds' random streams.
         device: of all tensors.
-        extras: which of ``message``, ``state``, ``reward_terms`` and (reference arms only) ``privileged`` are
-            output; each costs time. Delays need ``message``.
+        extras: which of ``message``, ``state``, ``reward_terms`` and (reference experiments only)
+            ``privileged`` are output; each costs time. Delays need ``message``.
         simulation: the physics; built from the scenario and the seed if not given.
-        server: computes observations, rewards and ends from messages; likewise.
+        server: computes observations, rewards and ends of episodes from messages; built from the scenario and
+            the simulation if not given.
         messages_only: a step outputs no observation, reward or end, because a ``ServerNode`` transform
             computes them from the messages that have arrived.
 
@@ -101,9 +102,12 @@ class UavEnv(EnvBase):
         """Compile the computation of a step as one graph.
 
         Args:
-            options: for ``torch.compile``, instead of those that suit a CPU.
+            options: for ``torch.compile``, instead of the default ones, which suit a CPU.
+
+        Returns:
+            The environment itself.
         """
-        # Two graphs, because the guards that are kept do not check whether there are flags.
+        # A step has two graphs, because no guard checks whether ``action_valid`` is given.
         self._step_fn = compiled(self.step_fn, **options)
         self._masked_step_fn = compiled(self.step_fn, **options)
         self._reset_fn = compiled(self.reset_fn, **options)
@@ -123,12 +127,12 @@ class UavEnv(EnvBase):
 
     @property
     def n_agents(self) -> int:
-        """N."""
+        """Number of UAVs in each world, N."""
         return self.scenario.agents
 
     @property
     def state(self) -> State:
-        """Everything that changes; assign it to put the worlds into another state."""
+        """Everything in the worlds that changes; assign it to put them into another state."""
         return self.simulation.layout.unpack(self.worlds)
 
     @state.setter
@@ -136,7 +140,11 @@ class UavEnv(EnvBase):
         self.worlds = self.simulation.layout.pack(state)
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world its own random stream, [B] integers; the next reset begins its first episode."""
+        """Give every world its own random stream; the next reset begins its first episode.
+
+        Args:
+            seeds: integers, one for each world, [B].
+        """
         row = torch.zeros_like(seeds)
         first = tree_map(lambda table: table.index_select(0, row), self.simulation.initial)
         self.state = first._replace(seed=seeds)
@@ -144,7 +152,7 @@ class UavEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.seed_worlds(counter_rng.world_seeds(seed or 0, self.batch_size[0], self.device))
 
-    # TorchRL's hooks.
+    # Methods that TorchRL calls.
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -165,12 +173,15 @@ class UavEnv(EnvBase):
         self.worlds, outputs = self._reset_fn(self.worlds, mask.view(-1))
         return self.to_tensordict(outputs)  # TorchRL keeps the entries of the other worlds
 
-    # Pure functions of the state, which compile.
+    # Pure functions of the state, which can be compiled.
 
     def reset_fn(self, worlds: PackedState, mask: Tensor) -> tuple[PackedState, Outputs]:
-        """New episodes in the worlds of the mask [B], and the outputs with which each world's episode
-        begins."""
-        if torch.compiler.is_compiling():  # no shapes that depend on data
+        """Begin new episodes in the worlds of the mask [B].
+
+        Returns:
+            The worlds, and the outputs with which the current episode of every world began.
+        """
+        if torch.compiler.is_compiling():  # a graph allows no shapes that depend on data
             fresh = self.simulation.next_episode(worlds)
             worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
         else:
@@ -181,7 +192,13 @@ class UavEnv(EnvBase):
     def step_fn(
         self, worlds: PackedState, action: Tensor, valid: Tensor | None = None
     ) -> tuple[PackedState, Outputs]:
-        """One step: the physics, then the server's outputs for the messages."""
+        """One step of the physics, then the server's outputs for the messages.
+
+        Args:
+            worlds: their state before the step.
+            action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
+            valid: which UAVs act, [B, N] bool; all of them if not given.
+        """
         state = self.simulation.step(self.simulation.layout.unpack(worlds), action, valid)
         packed = self.simulation.layout.pack(state)
         if self.messages_only:
@@ -195,7 +212,7 @@ class UavEnv(EnvBase):
         return packed, outputs | result.status.entries()
 
     def _state_outputs(self, state: State, features: Features | None = None) -> Outputs:
-        """The outputs that follow from a state, and from the features of its messages if these are given."""
+        """The outputs that depend on a state and, if given, on the features of its messages."""
         outputs: Outputs = {keys.READY: self.simulation.ready(state)}
         if features is not None:
             observation, global_observation = self.server.observations(features)
@@ -214,14 +231,16 @@ class UavEnv(EnvBase):
         return outputs
 
     def _privileged(self, state: State, features: Features | None) -> Tensor:
-        """Observation of a critic that knows the simulator's truth, [B, N, G + 2]."""
-        _, known = self.server.observations(features or self.server.features(state.sent, state.steps))
+        """Observation of a critic that knows the simulator's true state, [B, N, G + 2]."""
+        _, global_observation = self.server.observations(
+            features or self.server.features(state.sent, state.steps)
+        )
         scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
-        toward = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
-        return torch.cat([known, toward.clamp(-1, 1)], -1)
+        to_source = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
+        return torch.cat([global_observation, to_source.clamp(-1, 1)], -1)
 
     def _outputs_at_reset(self, initial: State) -> Outputs:
-        """What a reset to each of the Q initial conditions outputs, [Q, ...] each."""
+        """Outputs of a reset to each of the Q initial conditions, tables [Q, ...] by key."""
         outputs = self._state_outputs(initial, self.server.features(initial.sent, initial.steps))
         if "reward_terms" in self.extras:
             zero = torch.zeros_like(initial.track)
@@ -232,7 +251,7 @@ class UavEnv(EnvBase):
     # TensorDicts and specs.
 
     def to_tensordict(self, outputs: Outputs) -> TensorDict:
-        """Outputs as a TensorDict with batch sizes."""
+        """Outputs as a TensorDict of batch size [B], with ``"agents"`` of batch size [B, N]."""
         shape = (*self.batch_size, self.n_agents)
         levels = _levels(outputs)
         root, agents = dict(levels.pop((), {})), dict(levels.pop((keys.AGENTS,), {}))
@@ -244,8 +263,8 @@ class UavEnv(EnvBase):
     def _make_specs(self) -> None:
         worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
         ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in _DONE}
-        others: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}
-        self.observation_spec = self._specs_of(others)
+        observations: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}
+        self.observation_spec = self._specs_of(observations)
         config = self.scenario.actions
         if config.kind == "discrete":
             action = Categorical(config.n_actions, shape=agents, device=self.device)
@@ -261,7 +280,7 @@ class UavEnv(EnvBase):
         self.done_spec = self._specs_of(ends)
 
     def _specs_of(self, tables: Outputs) -> Composite:
-        """Specs of outputs, read off examples with any number of worlds."""
+        """Specs of outputs, derived from examples with any number of rows."""
         shape = torch.Size((*self.batch_size, self.n_agents))
         levels = _levels({key: self._spec_of(key, table) for key, table in tables.items()})
         root, agents = levels.pop((), {}), levels.pop((keys.AGENTS,), {})
@@ -282,7 +301,7 @@ class UavEnv(EnvBase):
 
 
 def _levels(entries: dict[NestedKey, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
-    """Entries by the path of their TensorDict, and there by name."""
+    """Entries grouped by the path of the TensorDict that holds them, and by name within it."""
     levels: dict[tuple[str, ...], dict[str, Any]] = {}
     for key, value in entries.items():
         *path, name = (key,) if isinstance(key, str) else cast(tuple[str, ...], key)

@@ -1,1 +1,1 @@
-"""What runs come to: metrics, statistics, comparisons, and the files and figures of a run folder."""
+"""Evaluation of runs: metrics, statistics, comparisons, and the files and figures of a run folder."""

@@ -1,4 +1,4 @@
-"""What the server believed of the UAVs during a flight, drawn beside what was true."""
+"""Figure of one flight: where the server believed the UAVs to be, beside where they truly were."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,20 +16,21 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Told apart by the colour-blind too (Okabe and Ito, 2008)."""
+"""Colours that colour-blind readers can also tell apart (Okabe and Ito, 2008)."""
 DASHES = ("-", "--", ":", "-.")
 MOST_PANELS = len(COLOURS)
-"""UAVs with a panel of their own; of a larger fleet the others are on the map only."""
+"""Largest number of UAVs with a panel of their own; in a larger fleet the others are only on the map."""
 _OTHERS = "0.6"
+"""Grey of the UAVs without a panel."""
 
 _WIDTH = 7.0
-"""Of the figure [inches]: that of a page's text."""
-_WIDE = 1.5
-"""Width of the map over its height."""
+"""Width of the figure [inches], that of a page's text."""
+_ASPECT = 1.5
+"""Width of the map divided by its height."""
 _OLD = "0.9"
-"""Grey behind a belief that is older than the step."""
-_BESIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "frameon": False}
-"""Where a legend stands."""
+"""Grey background of the steps at which the message that the server holds is old (age above 0)."""
+_RIGHT_OF_AXES: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "frameon": False}
+"""Placement of a legend."""
 
 Floats = NDArray[np.floating]
 Flags = NDArray[np.bool_]
@@ -38,66 +39,71 @@ Integers = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class Beliefs:
-    """One flight of N UAVs over T steps, and T + 1 instants."""
+    """One flight of N UAVs over T steps: the truth, and what the server believed, at T + 1 instants.
+
+    The first instant is that of the reset; each later one is the end of a step.
+    """
 
     time: Floats
-    """[s], [T + 1]."""
+    """Time of each instant [s], [T + 1]."""
     true: Floats
-    """East, north [m], [T + 1, N, 2]."""
+    """True positions, east and north [m], [T + 1, N, 2]."""
     believed: Floats
-    """East, north [m], [T + 1, N, 2]."""
+    """Positions in the messages that the server held, east and north [m], [T + 1, N, 2]."""
     age: Floats
-    """Of what is believed [s], [T + 1, N]."""
+    """Age of the messages that the server held [s], [T + 1, N]."""
     sent: Flags
-    """Was a message given to the channel just now, [T + 1, N]; the first of all needs none."""
+    """Whether the UAV sent a message in the step, [T + 1, N]; False at the reset, whose message needs no
+    channel."""
     delay: Integers
-    """Of that message [steps], [T + 1, N]; negative if it never arrives."""
+    """Delay of that message [steps], [T + 1, N]; negative if it never arrives."""
     source: Floats
-    """East, north [m], [T + 1, 2]."""
+    """Position of the source, east and north [m], [T + 1, 2]."""
     region: shapely.Polygon | shapely.MultiPolygon
-    """Where the UAVs fly."""
+    """Region in which the UAVs fly."""
     radius: float
-    """Within which a UAV hears the source [m]."""
+    """Radius of the footprint, within which a UAV hears the source [m]."""
     instant: bool
-    """Is a UAV at its target as soon as a step ends."""
+    """Whether a UAV reaches its target by the end of the step (motion ``instant``)."""
 
     @property
     def lost(self) -> Flags:
-        """Was a message sent just now that never arrives, [T + 1, N]."""
+        """Whether the UAV sent a message in the step that never arrives, [T + 1, N]."""
         return self.sent & (self.delay < 0)
 
     @property
     def late(self) -> Flags:
-        """Was a message sent just now that arrives at a later step, [T + 1, N]."""
+        """Whether the UAV sent a message in the step that arrives at a later one, [T + 1, N]."""
         return self.sent & (self.delay > 0)
 
     @property
     def arrived(self) -> Flags:
-        """Did a message arrive just now, newer than what is believed or not, [T + 1, N]."""
+        """Whether a message arrived in the step, even one older than the message held, [T + 1, N]."""
         step, uav = np.nonzero(self.sent & (self.delay >= 0))
-        at = step + self.delay[step, uav]
+        arrival = step + self.delay[step, uav]
         arrived = np.zeros_like(self.sent)
-        arrived[at[at < len(arrived)], uav[at < len(arrived)]] = True
+        arrived[arrival[arrival < len(arrived)], uav[arrival < len(arrived)]] = True
         arrived[0] = True
         return arrived
 
 
 def plot_beliefs(flight: Beliefs, path: Path) -> None:
-    """Draw a map, the east coordinate of each UAV, and the ages."""
-    instant = _most_mistaken(flight)
+    """Draw a map, the east coordinate of each UAV and the ages of information, and save the figure."""
+    instant = _instant_of_largest_error(flight)
     with matplotlib.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
-        figure, (chart, *below) = _layout(min(flight.true.shape[1], MOST_PANELS))
-        _map(chart, flight, instant)
-        for uav, axis in enumerate(below[:-1]):
-            _panel(axis, flight, uav)
-        _legend_of_panels(below[0])
-        _ages(below[-1], flight)
-        _share_time(figure, below, float(flight.time[instant]))
+        figure, (map_axis, *time_axes) = _layout(min(flight.true.shape[1], MOST_PANELS))
+        _draw_map(map_axis, flight, instant)
+        for uav, axis in enumerate(time_axes[:-1]):
+            _draw_panel(axis, flight, uav)
+        _add_panel_legend(time_axes[0])
+        _draw_ages(time_axes[-1], flight)
+        _share_time_axis(figure, time_axes, float(flight.time[instant]))
         figure.savefig(path, dpi=200)
 
 
 def _layout(n_panels: int) -> tuple[Figure, list[Axes]]:
-    """A map, panels and ages below each other, with room for legends at their right."""
+    """Axes of map, panels and ages from top to bottom, with room for legends on the right."""
+    # Height of each axes, and of the gap below it [inches].
     heights = [
         3.2,
         0.55,
@@ -105,9 +111,9 @@ def _layout(n_panels: int) -> tuple[Figure, list[Axes]]:
         0.8,
         0.45,
         0.8,
-    ]  # of each and of the gap below it [inches]
-    above, under = 0.3, 0.45
-    height = above + sum(heights) + under
+    ]
+    margin_above, margin_below = 0.3, 0.45
+    height = margin_above + sum(heights) + margin_below
     figure = Figure(figsize=(_WIDTH, height))
     grid = figure.add_gridspec(
         len(heights),
@@ -115,20 +121,20 @@ def _layout(n_panels: int) -> tuple[Figure, list[Axes]]:
         hspace=0,
         left=0.12,
         right=0.79,
-        top=1 - above / height,
-        bottom=under / height,
+        top=1 - margin_above / height,
+        bottom=margin_below / height,
     )
     return figure, [figure.add_subplot(grid[row]) for row in range(0, len(heights), 2)]
 
 
-def _most_mistaken(flight: Beliefs) -> int:
-    """The latest instant at which true and believed positions are furthest apart."""
+def _instant_of_largest_error(flight: Beliefs) -> int:
+    """Latest instant at which true and believed positions, summed over the UAVs, are furthest apart."""
     error = np.linalg.norm(flight.true - flight.believed, axis=-1).sum(-1)
     return int(np.flatnonzero(error == error.max())[-1])
 
 
-def _map(axis: Axes, flight: Beliefs, instant: int) -> None:
-    """True paths; at one instant, where the UAVs are and where they are believed."""
+def _draw_map(axis: Axes, flight: Beliefs, instant: int) -> None:
+    """Draw the true paths and, at one instant, true and believed positions of the UAVs."""
     for ring in shapely.get_rings(shapely.get_parts(flight.region)):
         axis.plot(*shapely.get_coordinates(ring).T, "--", color="0.4", linewidth=0.8)
     for uav, colour in enumerate(_colours(flight)):
@@ -141,72 +147,73 @@ def _map(axis: Axes, flight: Beliefs, instant: int) -> None:
     axis.plot(*flight.source.T, color="black", linewidth=0.8, linestyle=":")
     axis.plot(*flight.source[instant], "*", color="black", markersize=10, zorder=5)
     _zoom(axis, np.concatenate([flight.true.reshape(-1, 2), flight.source]), flight.radius)
-    wrong = not np.array_equal(flight.true[instant], flight.believed[instant])
-    when = ", when the server is most mistaken" if wrong else ""
-    axis.set_title(f"paths, and the UAVs at {flight.time[instant]:g} s{when}", fontsize="medium")
-    _legend_of_map(axis, flight)
+    has_error = not np.array_equal(flight.true[instant], flight.believed[instant])
+    reason = ", when the server is most mistaken" if has_error else ""
+    axis.set_title(f"paths, and the UAVs at {flight.time[instant]:g} s{reason}", fontsize="medium")
+    _add_map_legend(axis, flight)
 
 
-def _zoom(axis: Axes, places: Floats, margin: float) -> None:
-    """Show these places [P, 2] and a margin [m], with a metre as long either way."""
-    low, high = places.min(0) - margin, places.max(0) + margin
+def _zoom(axis: Axes, positions: Floats, margin: float) -> None:
+    """Fit the axes around positions [P, 2] and a margin [m], with equal scales in both directions."""
+    low, high = positions.min(0) - margin, positions.max(0) + margin
     middle, size = (low + high) / 2, high - low
-    half = np.array([_WIDE, 1.0]) * max(size[0] / _WIDE, size[1]) / 2
+    half = np.array([_ASPECT, 1.0]) * max(size[0] / _ASPECT, size[1]) / 2
     (west, south), (east, north) = middle - half, middle + half
     axis.set(xlim=(west, east), ylim=(south, north), xlabel="east [m]", ylabel="north [m]")
     axis.set_aspect("equal")
 
 
-def _legend_of_map(axis: Axes, flight: Beliefs) -> None:
-    """UAVs by colour, and what the marks mean."""
+def _add_map_legend(axis: Axes, flight: Beliefs) -> None:
+    """Explain the colours of the UAVs, and the marks."""
     colours = _colours(flight)
-    uavs = [_key(f"UAV {uav}", color=colour) for uav, colour in enumerate(colours[:MOST_PANELS])]
-    uavs += [_key("other UAVs", color=_OTHERS)] if len(colours) > MOST_PANELS else []
+    uavs = [_legend_entry(f"UAV {uav}", color=colour) for uav, colour in enumerate(colours[:MOST_PANELS])]
+    uavs += [_legend_entry("other UAVs", color=_OTHERS)] if len(colours) > MOST_PANELS else []
     marks = [
-        _key("true", marker="o", linestyle="", markersize=4.5),
-        _key("believed", marker="o", linestyle="", markersize=9, markerfacecolor="none"),
-        _key("source", marker="*", linestyle="", color="black", markersize=8),
+        _legend_entry("true", marker="o", linestyle="", markersize=4.5),
+        _legend_entry("believed", marker="o", linestyle="", markersize=9, markerfacecolor="none"),
+        _legend_entry("source", marker="*", linestyle="", color="black", markersize=8),
         Patch(color="0.3", alpha=0.15, linewidth=0, label=f"footprint ({flight.radius:.0f} m)"),
-        _key("border", color="0.4", linewidth=0.8, linestyle="--"),
+        _legend_entry("border", color="0.4", linewidth=0.8, linestyle="--"),
     ]
-    axis.legend(handles=uavs + marks, **_BESIDE)
+    axis.legend(handles=uavs + marks, **_RIGHT_OF_AXES)
 
 
-def _key(label: str, color: str = "0.3", **look: Any) -> Line2D:
-    """An entry of a legend."""
-    return Line2D([], [], label=label, color=color, **look)
+def _legend_entry(label: str, color: str = "0.3", **style: Any) -> Line2D:
+    return Line2D([], [], label=label, color=color, **style)
 
 
-def _panel(axis: Axes, flight: Beliefs, uav: int) -> None:
-    """East coordinate of a UAV, true and believed, and what became of its messages."""
+def _draw_panel(axis: Axes, flight: Beliefs, uav: int) -> None:
+    """Draw the true and believed east coordinates of a UAV, with its arrived and lost messages."""
     time, colour = flight.time, _colours(flight)[uav]
-    old, strip = flight.age[:-1, uav] > 0, axis.get_xaxis_transform()
-    axis.stairs(old, time, fill=True, transform=strip, color=_OLD)
+    is_old, time_by_height = flight.age[:-1, uav] > 0, axis.get_xaxis_transform()
+    axis.stairs(is_old, time, fill=True, transform=time_by_height, color=_OLD)
     axis.step(time, flight.believed[:, uav, 0], where="post", color=colour, linewidth=2.2)
     style = "steps-post" if flight.instant else "default"
     axis.plot(time, flight.true[:, uav, 0], color="black", linewidth=0.8, drawstyle=style)
-    for flags, mark, tint in ((flight.arrived, ".", colour), (flight.lost, "x", "black")):
+    for flags, mark, mark_colour in ((flight.arrived, ".", colour), (flight.lost, "x", "black")):
         times = time[flags[:, uav]]
         height = np.full_like(times, -0.08)
-        axis.plot(times, height, mark, color=tint, markersize=3.5, transform=strip, clip_on=False)
+        axis.plot(
+            times, height, mark, color=mark_colour, markersize=3.5, transform=time_by_height, clip_on=False
+        )
     axis.set_ylabel(f"UAV {uav}\neast [m]")
     axis.yaxis.set_major_locator(MaxNLocator(3))
 
 
-def _legend_of_panels(axis: Axes) -> None:
-    """What the lines and marks over time mean."""
+def _add_panel_legend(axis: Axes) -> None:
+    """Explain the lines and marks of the panels."""
     handles = [
-        _key("true", color="black", linewidth=0.8),
-        _key("believed", linewidth=2.2),
+        _legend_entry("true", color="black", linewidth=0.8),
+        _legend_entry("believed", linewidth=2.2),
         Patch(color=_OLD, linewidth=0, label="belief is old"),
-        _key("message arrives", marker=".", linestyle=""),
-        _key("message is lost", marker="x", linestyle="", color="black", markersize=3.5),
+        _legend_entry("message arrives", marker=".", linestyle=""),
+        _legend_entry("message is lost", marker="x", linestyle="", color="black", markersize=3.5),
     ]
-    axis.legend(handles=handles, **_BESIDE)
+    axis.legend(handles=handles, **_RIGHT_OF_AXES)
 
 
-def _ages(axis: Axes, flight: Beliefs) -> None:
-    """Age of information of the UAVs with a panel."""
+def _draw_ages(axis: Axes, flight: Beliefs) -> None:
+    """Draw the age of information of the UAVs with a panel."""
     for uav, colour in enumerate(_colours(flight)[:MOST_PANELS]):
         dashes = DASHES[uav % len(DASHES)]
         axis.step(flight.time, flight.age[:, uav], dashes, where="post", color=colour, linewidth=1.2)
@@ -216,16 +223,16 @@ def _ages(axis: Axes, flight: Beliefs) -> None:
     axis.set_title(f"mean age {flight.age.mean():.2f} s", fontsize="medium")
 
 
-def _share_time(figure: Figure, below: Sequence[Axes], instant: float) -> None:
-    """One time axis for everything under the map, with the instant [s] that the map shows."""
-    for axis in below:
+def _share_time_axis(figure: Figure, time_axes: Sequence[Axes], instant: float) -> None:
+    """Label the time axis of the lowest axes only, and mark the instant [s] that the map shows in all."""
+    for axis in time_axes:
         axis.axvline(instant, color="0.2", linewidth=0.8, linestyle=":")
-        axis.tick_params(labelbottom=axis is below[-1])
+        axis.tick_params(labelbottom=axis is time_axes[-1])
         axis.margins(x=0.01)
-    below[-1].set_xlabel("time [s]")
-    figure.align_ylabels(below)
+    time_axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels(time_axes)
 
 
 def _colours(flight: Beliefs) -> list[str]:
-    """One for each UAV; those without a panel are grey."""
+    """Colour of each UAV; those without a panel are grey."""
     return [*COLOURS, *[_OTHERS] * flight.true.shape[1]][: flight.true.shape[1]]

@@ -1,4 +1,4 @@
-"""Arms beside each other over tasks, delays and seeds: means, J_norm and recovery, with their intervals."""
+"""Comparison of arms over tasks, delays and seeds: means, J_norm and recovery, with 95 % intervals."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,37 +18,42 @@ from damian.evaluation.statistics import (
 
 SAMPLED, MODE, RANDOM, GREEDY = "trained, sampled", "trained, mode", "random", "greedy"
 SCRIPTED = (RANDOM, GREEDY)
-"""Fly the same episodes beside each arm, and learn nothing."""
+"""Policies that fly the same episodes beside each arm, and learn nothing."""
 NOT_LATE = "none"
-"""The delay of what is not delayed."""
+"""Name that stands for the delay of an undelayed arm."""
 TRUE = ("true_return", "true_success_rate", "true_steps")
+"""Measures of an ``Evaluation`` from messages without delay."""
 SEEN = ("episode_return", "success_rate", "steps")
+"""The same measures as the server perceived them."""
 MEASURES = (*TRUE, *SEEN, "age", "late", "lost")
 SCORES = (*TRUE, *SEEN)
+"""Measures by which arms can be compared."""
 LESS_IS_BETTER = ("true_steps", "steps")
+"""Scores for which lower values are better."""
 
 Row = Mapping[str, Any]
-"""task, delay, arm, regime, seed, policy, and a number for each measure."""
+"""Evaluation of one policy: task, delay, arm, regime, seed, policy, and a number for each measure."""
 
 
 @dataclass
 class Arm:
-    """One way to learn, or to fly, a task."""
+    """One way to train policies for a task, or to fly those of another arm."""
 
     overrides: list[str] = field(default_factory=list)
-    """Of ``recipes/train.py``."""
+    """Overrides of the settings of ``recipes/train.py``."""
     delayed: bool = True
-    """One arm is not: the reference, run once for each task."""
+    """Whether the arm has delays. Exactly one arm has none: the reference, run once for each task."""
     naive: bool = False
-    """Does not know of the delay; the stronger of such arms is what recovery counts from."""
+    """Whether the arm ignores the delay; recovery 0 is the score of the best such arm."""
     policy_of: str | None = None
-    """Trains nothing: flies the policies of that arm."""
+    """Arm whose policies this one flies, without any training of its own; None: this arm trains."""
     regime: str = "R0"
-    """What it may know: R0, R1, R2 or R3."""
+    """Information that the arm uses: R0: messages that have arrived; R1: the truth, for the critic; R2: no
+    delay in training; R3: no delay at all."""
 
 
 class Estimate(NamedTuple):
-    """A number and its 95 % interval."""
+    """A value and the ends of its 95 % interval."""
 
     value: float
     low: float
@@ -61,6 +66,7 @@ class Estimate(NamedTuple):
 
 
 UNKNOWN = Estimate(np.nan, np.nan, np.nan)
+"""Stands for an estimate that cannot be made, or has no meaning."""
 
 
 def _short(number: float) -> str:
@@ -68,7 +74,7 @@ def _short(number: float) -> str:
 
 
 def _estimates(statistic: Any, scores: Floats) -> list[Estimate]:
-    """Of a statistic that leaves one dimension of ``scores``, [strata, ..., seeds] to [K]."""
+    """Estimates, K in number, of a statistic that maps ``scores`` [strata, ..., seeds] to [K]."""
     low, high = bootstrap(statistic, scores)
     ends = (np.ravel(statistic(scores)), np.ravel(low), np.ravel(high))
     return [Estimate(*map(float, numbers)) for numbers in zip(*ends, strict=True)]
@@ -76,51 +82,55 @@ def _estimates(statistic: Any, scores: Floats) -> list[Estimate]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All rows of all runs, and what they mean."""
+    """The rows of all runs, and the statistics that follow from them."""
 
     rows: Sequence[Row]
     arms: Mapping[str, Arm]
     score: str = "true_return"
+    """Measure that is the J of J_norm and recovery."""
     policy: str = SAMPLED
-    """Whose score is compared."""
+    """Policy with which the arms are compared, ``SAMPLED`` or ``MODE``."""
 
     @cached_property
     def lines(self) -> list["Line"]:
-        """The table: bootstrapped once, whoever reads it."""
+        """Lines of the table; cached, because the bootstrap takes time."""
         return list(_lines(self))
 
     @property
     def undelayed(self) -> str:
-        """The arm without delay."""
+        """Name of the arm without delay."""
         return next(name for name, arm in self.arms.items() if not arm.delayed)
 
     def tasks(self) -> list[str]:
-        """Those with a finished run."""
+        """Tasks with a finished run."""
         return list(dict.fromkeys(row["task"] for row in self.rows))
 
     def delays(self, task: str) -> list[str]:
-        """Those with a finished run."""
+        """Delays of a task with a finished run, without ``NOT_LATE``."""
         found = (row["delay"] for row in self.rows if row["task"] == task)
         return [name for name in dict.fromkeys(found) if name != NOT_LATE]
 
     def present(self, task: str, delay: str) -> list[str]:
-        """Arms with a finished run."""
+        """Arms with a finished run of a task under a delay."""
         found = {row["arm"] for row in self.rows if (row["task"], row["delay"]) == (task, delay)}
         return [name for name in self.arms if name in found]
 
     def values(self, task: str, delay: str, arm: str, policy: str, measure: str) -> dict[int, float]:
-        """One number for each seed."""
-        place = (task, delay, arm, policy)
+        """Values of a measure by seed."""
+        wanted = (task, delay, arm, policy)
         keys = ("task", "delay", "arm", "policy")
-        return {r["seed"]: r[measure] for r in self.rows if tuple(r[key] for key in keys) == place}
+        return {r["seed"]: r[measure] for r in self.rows if tuple(r[key] for key in keys) == wanted}
 
     def scores(self, task: str, delay: str) -> dict[str, dict[int, float]]:
-        """By arm, more is better: undelayed and the random policy (both without delay) first."""
+        """Scores by arm and seed, with the sign that makes higher ones better.
+
+        First come the undelayed arm and the random policy, both without delay.
+        """
         sign = -1 if self.score in LESS_IS_BETTER else 1
-        wanted = {self.undelayed: (NOT_LATE, self.undelayed, self.policy)}
-        wanted[RANDOM] = (NOT_LATE, self.undelayed, RANDOM)
-        wanted |= {arm: (delay, arm, self.policy) for arm in self.present(task, delay)}
-        found = {name: self.values(task, *place, self.score) for name, place in wanted.items()}
+        sources = {self.undelayed: (NOT_LATE, self.undelayed, self.policy)}
+        sources[RANDOM] = (NOT_LATE, self.undelayed, RANDOM)
+        sources |= {arm: (delay, arm, self.policy) for arm in self.present(task, delay)}
+        found = {name: self.values(task, *source, self.score) for name, source in sources.items()}
         return {name: {seed: sign * x for seed, x in runs.items()} for name, runs in found.items()}
 
     def compared(self, task: str, delay: str) -> dict[str, tuple[Estimate, Estimate]]:
@@ -132,22 +142,23 @@ class Comparison:
             return {}
         array = np.array([[[runs[seed] for seed in seeds] for runs in scores.values()]])
         norms = _estimates(_norms, array)
-        naive = [place for place, name in enumerate(names, 2) if self.arms[name].naive]
-        gains = _recoveries(array, naive) if naive else [UNKNOWN] * len(names)
+        naive = [index for index, name in enumerate(names, 2) if self.arms[name].naive]
+        recoveries = _recoveries(array, naive) if naive else [UNKNOWN] * len(names)
         return {
-            name: (norm, UNKNOWN if self.arms[name].naive else gain)
-            for name, norm, gain in zip(names, norms, gains, strict=True)
+            name: (norm, UNKNOWN if self.arms[name].naive else recovered)
+            for name, norm, recovered in zip(names, norms, recoveries, strict=True)
         }
 
     def overall(self) -> dict[str, Estimate]:
-        """Interquartile mean of the J_norm of all runs, over tasks, delays and seeds.
+        """Interquartile mean of J_norm by delayed arm, over all tasks, delays and seeds.
 
-        Of the arms, delays and seeds that every task has; none unless there are several places to average.
-        Resampled within each task, whose delays share the undelayed arm.
+        Only the arms, delays and seeds that every task has count. The result is empty if these leave fewer
+        than two combinations of task and delay. Seeds are resampled within each task, because the delays of
+        a task share the undelayed arm.
         """
-        places = {task: self.delays(task) for task in self.tasks()}
-        delays = [d for d in next(iter(places.values()), []) if all(d in ds for ds in places.values())]
-        cells = [[self.scores(task, delay) for delay in delays] for task in places]
+        by_task = {task: self.delays(task) for task in self.tasks()}
+        delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
+        cells = [[self.scores(task, delay) for delay in delays] for task in by_task]
         flat = [cell for row in cells for cell in row]
         if len(flat) < 2:
             return {}
@@ -160,13 +171,13 @@ class Comparison:
 
 
 def _norms(scores: Floats) -> Floats:
-    """J_norm of means, [*, 1, arms, seeds] to [*, arms - 2]; the first two are undelayed and random."""
+    """J_norm of mean scores, [*, 1, arms, seeds] to [*, arms - 2]; first come undelayed and random."""
     means = scores.mean(-1)[..., 0, :]
     return normalised(means[..., 2:], means[..., :1], means[..., 1:2])
 
 
 def _interquartile_norms(scores: Floats) -> Floats:
-    """[*, tasks, delays, arms, seeds] to [*, arms - 2]."""
+    """Interquartile means of J_norm, [*, tasks, delays, arms, seeds] to [*, arms - 2]."""
     means = scores.mean(-1, keepdims=True)
     norms = normalised(scores[..., 2:, :], means[..., :1, :], means[..., 1:2, :])
     by_arm = np.moveaxis(norms, -2, -4)
@@ -174,21 +185,21 @@ def _interquartile_norms(scores: Floats) -> Floats:
 
 
 def _recoveries(scores: Floats, naive: list[int]) -> list[Estimate]:
-    """Of all arms but the first two, [1, arms, seeds]; ``naive``: places of the naive ones."""
+    """Recovery of all arms but the first two, from scores [1, arms, seeds] and indices of the naive arms."""
 
     def statistic(scores: Floats, least: float = 0.0) -> Floats:
         means = scores.mean(-1)[..., 0, :]
         strongest = means[..., naive].max(-1, keepdims=True)
         return recovery(means[..., 2:], strongest, means[..., :1], means[..., 1:2], least)
 
-    shown = ~np.isnan(statistic(scores, LEAST_GAP))
+    reported = ~np.isnan(statistic(scores, LEAST_GAP))
     estimates = _estimates(statistic, scores)
-    return [each if show else UNKNOWN for each, show in zip(estimates, shown, strict=True)]
+    return [estimate if report else UNKNOWN for estimate, report in zip(estimates, reported, strict=True)]
 
 
 @dataclass(frozen=True)
 class Line:
-    """Of a table: one arm, flown by one policy, over its seeds."""
+    """Line of the table: one policy of one arm, over its seeds."""
 
     task: str
     delay: str
@@ -201,19 +212,19 @@ class Line:
     recovery: Estimate = UNKNOWN
 
     def cells(self) -> dict[str, Any]:
-        """The columns of ``table.csv``; what is not known is empty."""
+        """Columns of ``table.csv`` by name; unknown numbers are empty."""
         numbers = {**self.measures, "J_norm": self.j_norm, "recovery": self.recovery}
         cells: dict[str, Any] = {k: getattr(self, k) for k in ("task", "delay", "arm", "regime", "policy")}
         cells["seeds"] = len(self.seeds)
         for name, number in numbers.items():
-            known = [float("nan")] * 3 if np.isnan(number.value) else number
-            for end, value in zip(("", "_low", "_high"), known, strict=True):
-                cells[name + end] = "" if np.isnan(value) else value
+            parts = [float("nan")] * 3 if np.isnan(number.value) else number
+            for suffix, value in zip(("", "_low", "_high"), parts, strict=True):
+                cells[name + suffix] = "" if np.isnan(value) else value
         return cells
 
 
 def _lines(comparison: Comparison) -> Iterator[Line]:
-    """Every arm and policy, task by task and delay by delay; the undelayed arm first."""
+    """Lines of every arm and policy, task by task and delay by delay; the undelayed arm comes first."""
     for task in comparison.tasks():
         for delay in (NOT_LATE, *comparison.delays(task)):
             arms = comparison.present(task, delay)
@@ -221,11 +232,12 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
             for arm in arms:
                 for policy in (SAMPLED, MODE):
                     line = _line(comparison, task, delay, arm, policy)
-                    told = compared.get(arm) if policy == comparison.policy else None
-                    yield replace(line, j_norm=told[0], recovery=told[1]) if told else line
+                    found = compared.get(arm) if policy == comparison.policy else None
+                    yield replace(line, j_norm=found[0], recovery=found[1]) if found else line
             for arm in arms[:1]:
                 for policy in SCRIPTED:
-                    if comparison.values(task, delay, arm, policy, comparison.score):  # older runs lack some
+                    # Older runs have not flown every scripted policy.
+                    if comparison.values(task, delay, arm, policy, comparison.score):
                         yield replace(_line(comparison, task, delay, arm, policy), arm=policy, regime="")
 
 

@@ -1,4 +1,4 @@
-"""What is measured of episodes, while training and in an evaluation."""
+"""Measures of episodes, in training and in evaluations."""
 
 import math
 from dataclasses import dataclass
@@ -18,26 +18,28 @@ from damian.world.messages import Messages
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Means over episodes, as the server saw them and (``true_``) as one would have that hears at once."""
+    """Means over episodes: as the server perceived them and (``true_``) from messages without delay."""
 
     episodes: int
+    """Number of episodes."""
     success_rate: float
+    """Share of the episodes that ended with success."""
     steps: float
-    """Of an episode; where success is possible, one without it counts the horizon."""
+    """Length of an episode; where success is possible, an episode without it counts the horizon."""
     episode_return: float
-    """Sum of rewards of an episode, mean over the UAVs."""
+    """Sum of the rewards of an episode, as a mean over the UAVs."""
     true_success_rate: float
-    """Some time, all the UAVs that it takes really spotted at once."""
+    """Share of the episodes in which as many UAVs as required truly spotted the source at the same time."""
     true_steps: float
-    """Until then; without it, the horizon."""
+    """Length of an episode up to its true end, counted as ``steps``."""
     true_return: float
-    """Likewise until then."""
+    """Sum of the undelayed rewards up to the true end, as a mean over the UAVs."""
     age: float
-    """Of what the server knows of a UAV [steps]."""
+    """Age of information: age of the message of a UAV that the server holds [steps]."""
     late: float
-    """Share of the messages."""
+    """Share of the messages that arrive late."""
     lost: float
-    """Share of the messages."""
+    """Share of the messages that never arrive."""
 
 
 @torch.no_grad()
@@ -45,10 +47,10 @@ def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = Tr
     """Fly one episode in every world, for at most ``horizon`` steps.
 
     Args:
-        env: batch [B], with ``message`` among its extras.
+        env: environment of B worlds, with ``message`` among its extras.
         policy: chooses the actions.
-        horizon: steps after which an episode without an end is cut.
-        sample: draw actions from the policy; else take its mode.
+        horizon: number of steps after which an episode that has not ended is cut.
+        sample: whether to draw actions from the policy's distribution; else its mode is taken.
     """
     add_recurrent_state(env, policy)
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
@@ -59,51 +61,51 @@ def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = Tr
 
 def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
     """Measures of the first episode of each world in a rollout [B, T]."""
-    horizon, after = rollout.shape[1], cast(TensorDictBase, rollout["next"])
+    horizon, next_step = rollout.shape[1], cast(TensorDictBase, rollout["next"])
     elapsed = torch.arange(1, horizon + 1, device=rollout.device).expand(rollout.shape)
-    message = after[keys.MESSAGE]
-    truth = server(Messages.unpack(message), elapsed, after.get(keys.SOURCE_OVER, None))
-    perceived = _until(after[keys.DONE].squeeze(-1))
-    true = perceived & _until(truth.status.terminated)
+    message = next_step[keys.MESSAGE]
+    truth = server(Messages.unpack(message), elapsed, next_step.get(keys.SOURCE_OVER, None))
+    in_episode = _up_to_first_end(next_step[keys.DONE].squeeze(-1))
+    in_true_episode = in_episode & _up_to_first_end(truth.status.terminated)
     success, true_success = (
-        _ever(after[keys.SUCCESS].squeeze(-1), perceived),
-        _ever(truth.status.success, true),
+        _ever(next_step[keys.SUCCESS].squeeze(-1), in_episode),
+        _ever(truth.status.success, in_true_episode),
     )
     can_succeed = server.episode.success_share is not None
     steps, true_steps = (
-        torch.where(ever | (not can_succeed), until.sum(-1), horizon)
-        for ever, until in ((success, perceived), (true_success, true))
+        torch.where(succeeded | (not can_succeed), counted.sum(-1), horizon)
+        for succeeded, counted in ((success, in_episode), (true_success, in_true_episode))
     )
-    held = Messages.unpack(after.get(keys.RECEIVED, message))
+    held = Messages.unpack(next_step.get(keys.RECEIVED, message))
     age = held.age(elapsed * server.dt) / server.dt
-    late, lost = _message_shares(after, perceived)
+    late, lost = _message_shares(next_step, in_episode)
     return Evaluation(
-        episodes=len(perceived),
+        episodes=len(in_episode),
         success_rate=_mean(success),
         steps=_mean(steps),
-        episode_return=_mean((after[keys.REWARD].squeeze(-1).mean(-1) * perceived).sum(-1)),
+        episode_return=_mean((next_step[keys.REWARD].squeeze(-1).mean(-1) * in_episode).sum(-1)),
         true_success_rate=_mean(true_success),
         true_steps=_mean(true_steps),
-        true_return=_mean((truth.reward.mean(-1) * true).sum(-1)),
-        age=_mean(age[perceived]),
+        true_return=_mean((truth.reward.mean(-1) * in_true_episode).sum(-1)),
+        age=_mean(age[in_episode]),
         late=late,
         lost=lost,
     )
 
 
-def _until(ended: Tensor) -> Tensor:
-    """Up to and including the first end, [B, T] bool."""
+def _up_to_first_end(ended: Tensor) -> Tensor:
+    """Mask of the steps up to and including the first end, [B, T] bool."""
     return ended.int().cumsum(-1) - ended.int() == 0
 
 
-def _ever(flag: Tensor, among: Tensor) -> Tensor:
-    return (flag & among).any(-1)
+def _ever(flag: Tensor, counted: Tensor) -> Tensor:
+    return (flag & counted).any(-1)
 
 
-def _message_shares(after: TensorDictBase, counted: Tensor) -> tuple[float, float]:
-    """Shares of late and of lost ones among the messages sent in the counted steps [B, T]."""
-    sent = cast(Tensor, after[keys.MESSAGE_SENT])[counted]
-    delay = after.get(keys.DELAY, None)
+def _message_shares(next_step: TensorDictBase, counted: Tensor) -> tuple[float, float]:
+    """Shares of late and of lost messages among those sent in the counted steps [B, T]."""
+    sent = cast(Tensor, next_step[keys.MESSAGE_SENT])[counted]
+    delay = next_step.get(keys.DELAY, None)
     if delay is None or not sent.any():
         return 0.0, 0.0
     delay = delay.squeeze(-1)[counted][sent]
@@ -115,10 +117,11 @@ def _mean(numbers: Tensor) -> float:
 
 
 class EpisodeLog:
-    """Ended episodes of the training batches, as exponential means over them.
+    """Exponential means over the episodes that ended in the training batches.
 
     Args:
-        factor: weight of what was before; 0.991 is what the paper's Figures 5 and 6 are smoothed with.
+        factor: smoothing factor, by which each new episode multiplies the weight of all earlier ones; 0.991
+            in the paper's Figures 5 and 6.
     """
 
     NAMES = ("episode_return", "success_rate", "steps")
@@ -128,27 +131,27 @@ class EpisodeLog:
         self._weight, self._sums = 0.0, [0.0] * len(self.NAMES)
 
     def add(self, batch: TensorDictBase) -> None:
-        """Take the episodes that end in a batch [B, T] with ``RewardSum`` and ``StepCounter``."""
-        by_time = cast(TensorDictBase, batch["next"]).transpose(0, 1)
-        done = by_time[keys.DONE].squeeze(-1)
+        """Add the episodes that end in a batch [B, T], with ``RewardSum`` and ``StepCounter`` entries."""
+        steps = cast(TensorDictBase, batch["next"]).transpose(0, 1)  # in order of time, as the mean needs
+        done = steps[keys.DONE].squeeze(-1)
         measured = (keys.EPISODE_REWARD, keys.SUCCESS, keys.STEP_COUNT)
-        ended = [cast(Tensor, by_time[key])[done].float().flatten(1).mean(1) for key in measured]
+        ended = [cast(Tensor, steps[key])[done].float().flatten(1).mean(1) for key in measured]
         for row in torch.stack(ended, -1).tolist():
             self._weight = self.factor * self._weight + 1
             self._sums = [self.factor * old + new for old, new in zip(self._sums, row, strict=True)]
             self.finished += 1
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """Return the state that a checkpoint stores."""
         return {"finished": self.finished, "weight": self._weight, "sums": list(self._sums)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """From a checkpoint."""
+        """Restore the state that a checkpoint has stored."""
         self.finished, self._weight = int(state["finished"]), float(state["weight"])
         self._sums = [float(total) for total in state["sums"]]
 
     def means(self) -> dict[str, float]:
-        """Episode return, success rate and steps; nan before the first end."""
+        """Mean episode return, success rate and steps; nan before the first episode has ended."""
         if not self.finished:
             return dict.fromkeys(self.NAMES, math.nan)
         return {name: total / self._weight for name, total in zip(self.NAMES, self._sums, strict=True)}

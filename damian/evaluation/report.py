@@ -1,4 +1,4 @@
-"""A comparison as a person reads it: a Markdown table, learning curves, bars of J_norm."""
+"""Report of a comparison: a Markdown table, learning curves, and J_norm of each arm."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,31 +16,32 @@ from damian.evaluation.comparison import NOT_LATE, RANDOM, SCRIPTED, SEEN, TRUE,
 from damian.evaluation.statistics import Floats, bootstrap
 
 Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
-"""By task, delay and arm: for each seed the rows of its ``metrics.csv``."""
+"""Rows of ``metrics.csv`` of each seed, by task, delay and arm."""
 
 LABELS = {"episode_return": "return", "success_rate": "success rate", "steps": "steps per episode"}
-"""Of measures while training, all as the server perceived them."""
+"""Axis labels of the measures in training, all as the server perceived them."""
 COLUMNS = (*TRUE, *SEEN, "age", "late", "lost")
 HEADS = ("return", "success", "steps", "seen return", "seen success", "seen steps", "age", "late", "lost")
+"""Headings of ``COLUMNS`` in the Markdown table."""
 _STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
 _POINTS = 200
-"""Of a learning curve."""
+"""Number of points of a learning curve."""
 
 
 def markdown(comparison: Comparison, notes: Sequence[str], tasks: Mapping[str, str], never: set[str]) -> str:
-    """The whole comparison.
+    """Return the whole comparison as Markdown.
 
     Args:
-        comparison: what is told.
-        notes: lines for the top.
-        tasks: how each was trained, for below its heading.
-        never: tasks in which there is no success.
+        comparison: comparison to report.
+        notes: lines at the top.
+        tasks: by task, a line below its heading that says how long it was trained.
+        never: tasks that have no success to report.
     """
-    every, parts = comparison.lines, ["\n".join(f"- {note}" for note in notes)]
+    all_lines, parts = comparison.lines, ["\n".join(f"- {note}" for note in notes)]
     for task in comparison.tasks():
         for delay in comparison.delays(task) or [NOT_LATE]:
-            told = [line for line in every if line.task == task and line.delay in (NOT_LATE, delay)]
-            parts += [f"## {task}, delay {delay}", tasks[task], _table(told, task in never)]
+            lines = [line for line in all_lines if line.task == task and line.delay in (NOT_LATE, delay)]
+            parts += [f"## {task}, delay {delay}", tasks[task], _table(lines, task in never)]
     overall = comparison.overall()
     if overall:
         table = markdown_table(("arm", "interquartile mean of J_norm"), overall.items())
@@ -48,10 +49,10 @@ def markdown(comparison: Comparison, notes: Sequence[str], tasks: Mapping[str, s
     return "\n\n".join(parts) + "\n"
 
 
-def _table(told: Sequence[Line], never: bool) -> str:
+def _table(lines: Sequence[Line], never: bool) -> str:
     left, right = ("arm", "regime", "policy"), (*HEADS, "J_norm", "recovery")
     rows = []
-    for line in told:
+    for line in lines:
         name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
         numbers = ["-" if never and "success" in key else str(line.measures[key]) for key in COLUMNS]
         rows.append([name, line.regime, line.policy, *numbers, str(line.j_norm), str(line.recovery)])
@@ -61,20 +62,27 @@ def _table(told: Sequence[Line], never: bool) -> str:
 def plot_curves(
     comparison: Comparison, curves: Curves, best: Mapping[str, float], never: set[str], path: Path
 ) -> None:
-    """Learning curves over episodes, a row of panels for each delay (the paper's Figures 5 and 6).
+    """Draw learning curves over episodes, a row of panels for each delay (the paper's Figures 5 and 6).
 
-    Mean over seeds of what the runs have smoothed, with its 95 % band; dashed: the random policy and,
-    where known (``best``, by measure), the best possible; dotted: an arm that trains nothing.
+    A curve is the mean over seeds of the smoothed measures of the runs, with its 95 % band. Dashed lines: the
+    random policy and, where known, the best possible value; dotted lines: arms that train nothing.
+
+    Args:
+        comparison: comparison to draw; its first task is drawn.
+        curves: measures of the runs in training.
+        best: best possible values, by measure.
+        never: tasks that have no success to draw.
+        path: image file.
     """
     task = comparison.tasks()[0]
     delays = comparison.delays(task) or [NOT_LATE]
-    shown = [name for name in LABELS if not (name == "success_rate" and task in never)]
+    measures = [name for name in LABELS if not (name == "success_rate" and task in never)]
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(3.2 * len(shown) + 1.2, 2.6 * len(delays)), layout="constrained")
-        axes = figure.subplots(len(delays), len(shown), squeeze=False)
+        figure = Figure(figsize=(3.2 * len(measures) + 1.2, 2.6 * len(delays)), layout="constrained")
+        axes = figure.subplots(len(delays), len(measures), squeeze=False)
         for row, delay in zip(axes, delays, strict=True):
-            for axis, name in zip(row, shown, strict=True):
-                _panel(axis, comparison, curves, (task, delay, name))
+            for axis, name in zip(row, measures, strict=True):
+                _curve_panel(axis, comparison, curves, (task, delay, name))
                 if name in best:
                     axis.axhline(
                         best[name], color="0.2", linestyle="--", linewidth=0.8, label="best possible"
@@ -86,37 +94,40 @@ def plot_curves(
         figure.savefig(path, dpi=150)
 
 
-def _panel(axis: Axes, comparison: Comparison, curves: Curves, place: tuple[str, str, str]) -> None:
-    """All arms of a task and delay, by one measure."""
-    task, delay, name = place
-    for colour, (arm, how) in zip(_colours(comparison), comparison.arms.items(), strict=True):
-        where = (task, delay if how.delayed else NOT_LATE, arm)
-        if where in curves:
-            episodes, mean, low, high = _band(curves[where], name)
-            axis.plot(episodes, mean, color=colour, linewidth=1.2, label=arm)
+def _curve_panel(axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str]) -> None:
+    """Draw all arms of a task under a delay, by one measure; ``content`` names these three."""
+    task, delay, measure = content
+    for colour, (name, arm) in zip(_colours(comparison), comparison.arms.items(), strict=True):
+        run = (task, delay if arm.delayed else NOT_LATE, name)
+        if run in curves:
+            episodes, mean, low, high = _band(curves[run], measure)
+            axis.plot(episodes, mean, color=colour, linewidth=1.2, label=name)
             axis.fill_between(episodes, low, high, color=colour, alpha=0.2, linewidth=0)
-        elif runs := comparison.values(*where, comparison.policy, name):
-            axis.axhline(fmean(runs.values()), color=colour, linestyle=":", label=arm)
-    random = comparison.values(task, NOT_LATE, comparison.undelayed, RANDOM, name)
+        elif values := comparison.values(*run, comparison.policy, measure):
+            axis.axhline(fmean(values.values()), color=colour, linestyle=":", label=name)
+    random = comparison.values(task, NOT_LATE, comparison.undelayed, RANDOM, measure)
     if random:
         axis.axhline(fmean(random.values()), color="0.5", linestyle="--", linewidth=0.8, label=RANDOM)
 
 
 def _band(runs: Sequence[Sequence[Mapping[str, float]]], name: str) -> tuple[Floats, Floats, Floats, Floats]:
-    """Episodes that all seeds have reached; mean over seeds, with its 95 % interval, each [_POINTS]."""
-    known = [np.array([(r["episodes"], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
-    known = [run for run in known if len(run)]
-    if not known:
-        nothing = np.full(_POINTS, np.nan)
-        return nothing, nothing, nothing, nothing
-    episodes = np.linspace(max(run[0, 0] for run in known), min(run[-1, 0] for run in known), _POINTS)
-    values = np.stack([np.interp(episodes, *run.T) for run in known], -1)
+    """Numbers of episodes that all seeds reached, mean over seeds, and the ends of its 95 % interval.
+
+    Each is [_POINTS]; ``name`` is the measure.
+    """
+    points = [np.array([(r["episodes"], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
+    points = [run for run in points if len(run)]
+    if not points:
+        unknown = np.full(_POINTS, np.nan)
+        return unknown, unknown, unknown, unknown
+    episodes = np.linspace(max(run[0, 0] for run in points), min(run[-1, 0] for run in points), _POINTS)
+    values = np.stack([np.interp(episodes, *run.T) for run in points], -1)
     low, high = bootstrap(lambda scores: scores.mean(-1), values[None], draws=500)
     return episodes, values.mean(-1), low[0], high[0]
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
-    """J_norm of each arm under each delay, with its 95 % interval; a panel for each task."""
+    """Draw J_norm of each arm under each delay, with its 95 % interval; a panel for each task."""
     tasks = comparison.tasks()
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(3.0 * len(tasks) + 1.2, 3.0), layout="constrained")
@@ -132,13 +143,13 @@ def _norm_panel(axis: Axes, comparison: Comparison, task: str) -> None:
     delays, arms = comparison.delays(task), [name for name, arm in comparison.arms.items() if arm.delayed]
     compared = [comparison.compared(task, delay) for delay in delays]
     colours = dict(zip(comparison.arms, _colours(comparison), strict=True))
-    for number, arm in enumerate(arms):
-        there = [(x, told[arm][0]) for x, told in enumerate(compared) if arm in told]
-        place = [x + 0.7 * ((number + 0.5) / len(arms) - 0.5) for x, _ in there]
-        ends = [(x.value - x.low, x.high - x.value) for _, x in there]
-        values = [x.value for _, x in there]
-        bars = np.array(ends).T if ends else None
-        axis.errorbar(place, values, yerr=bars, fmt="o", color=colours[arm], markersize=4, label=arm)
+    for index, arm in enumerate(arms):
+        norms = [(x, estimates[arm][0]) for x, estimates in enumerate(compared) if arm in estimates]
+        positions = [x + 0.7 * ((index + 0.5) / len(arms) - 0.5) for x, _ in norms]
+        errors = [(norm.value - norm.low, norm.high - norm.value) for _, norm in norms]
+        values = [norm.value for _, norm in norms]
+        bars = np.array(errors).T if errors else None
+        axis.errorbar(positions, values, yerr=bars, fmt="o", color=colours[arm], markersize=4, label=arm)
     for level in (0, 1):
         axis.axhline(level, color="0.5", linestyle="--", linewidth=0.8)
     axis.set_xticks(range(len(delays)), delays)
@@ -146,5 +157,5 @@ def _norm_panel(axis: Axes, comparison: Comparison, task: str) -> None:
 
 
 def _colours(comparison: Comparison) -> list[str]:
-    """One for each arm."""
-    return [COLOURS[place % len(COLOURS)] for place in range(len(comparison.arms))]
+    """Colour of each arm."""
+    return [COLOURS[index % len(COLOURS)] for index in range(len(comparison.arms))]

@@ -1,4 +1,4 @@
-"""A run folder that explains itself: metrics, learning curve, table of results."""
+"""Files of a run folder: metrics, learning curve, table of results."""
 
 import csv
 import math
@@ -24,13 +24,14 @@ TABLE = "result.md"
 
 
 class MetricsLog:
-    """Rows of named numbers, to ``metrics.csv`` and TensorBoard; a resumed run goes on below its rows.
+    """Writes rows of named numbers to ``metrics.csv`` and TensorBoard; a resumed run appends to its old rows.
 
     Args:
         folder: the run folder.
-        tensorboard: write TensorBoard events too.
-        to_csv: write ``metrics.csv``.
-        frames: rows from here on are dropped first (they lie after the checkpoint).
+        tensorboard: whether to write TensorBoard events.
+        to_csv: whether to write ``metrics.csv``.
+        frames: environment steps, over all worlds, at the checkpoint from which the run resumes; rows of
+            later steps are dropped.
     """
 
     def __init__(self, folder: Path, tensorboard: bool, to_csv: bool, frames: int = 0) -> None:
@@ -44,7 +45,7 @@ class MetricsLog:
                 self._append(row)
 
     def add(self, frames: int, numbers: dict[str, float]) -> None:
-        """Log numbers at a count of frames."""
+        """Log numbers by name, after so many environment steps over all worlds."""
         row = {"frames": float(frames), **numbers}
         self.rows.append(row)
         self._append(row)
@@ -53,7 +54,7 @@ class MetricsLog:
                 self._writer.add_scalar(name, number, frames)
 
     def close(self) -> None:
-        """Write out what TensorBoard still holds."""
+        """Write the pending TensorBoard events."""
         if self._writer:
             self._writer.close()
 
@@ -69,7 +70,7 @@ class MetricsLog:
 
 
 class Interrupt:
-    """While entered, the first Ctrl-C only asks to stop at the next good moment; a second one stops."""
+    """Context in which the first Ctrl-C only sets ``asked``; a second one interrupts the run at once."""
 
     def __enter__(self) -> "Interrupt":
         self.asked = False
@@ -85,10 +86,10 @@ class Interrupt:
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """The rows of a run's ``metrics.csv``; none if it has none.
+    """Read the rows of a run's ``metrics.csv``; an empty list if the file does not exist.
 
     Raises:
-        InputError: the file is not what a run has written.
+        InputError: the file has no column ``frames``, or a row that is not all numbers.
     """
     path = folder / METRICS
     if not path.exists():
@@ -105,7 +106,7 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
 
 
 def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: Path, title: str) -> None:
-    """Draw return and success rate over frames, with the random policy as a dashed line."""
+    """Draw return and success rate over environment steps, with the random policy as a dashed line."""
     from matplotlib import pyplot as plt  # noqa: PLC0415 (slow to import, needed once)
     from matplotlib.ticker import EngFormatter  # noqa: PLC0415
 
@@ -129,30 +130,36 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
 
 
 def save_results(rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool) -> str:
-    """Write evaluations to ``result.csv`` and, as the table that is returned, to ``result.md``."""
+    """Write evaluations by policy to ``result.csv`` and, as a Markdown table, to ``result.md``.
+
+    Returns:
+        the table; for the arguments see ``results_table``.
+    """
     table = results_table(rows, can_succeed, late)
     (folder / TABLE).write_text(table + "\n")
-    half = folder / f"{RESULTS}.part"  # a run with results is finished: all of them, or none
-    with half.open("w", newline="") as file:
+    # A run with a ``result.csv`` counts as finished, so that the file must appear complete or not at all.
+    unfinished = folder / f"{RESULTS}.part"
+    with unfinished.open("w", newline="") as file:
         writer = csv.DictWriter(file, ["policy", *(field.name for field in fields(Evaluation))])
         writer.writeheader()
         writer.writerows({"policy": name, **asdict(row)} for name, row in rows.items())
-    half.replace(folder / RESULTS)
+    unfinished.replace(folder / RESULTS)
     return table
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
-    """Evaluations beside each other, as a Markdown table.
+    """Evaluations of several policies as a Markdown table.
 
     Args:
-        rows: by policy.
-        can_succeed: show success, and the steps that it takes.
-        late: what the server perceived is not what happened: show both, and the messages.
+        rows: evaluations by name of the policy.
+        can_succeed: whether the task can succeed; if so, success rate and steps are shown.
+        late: whether messages are delayed; if so, true measures are shown beside those that the server
+            perceived, with the age of information and the shares of late and lost messages.
     """
-    wins = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
-    columns = wins | {"return": "episode_return"}
+    success = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
+    columns = success | {"return": "episode_return"}
     if late:
-        columns |= {f"true {title}": f"true_{field}" for title, field in wins.items()}
+        columns |= {f"true {title}": f"true_{field}" for title, field in success.items()}
         columns |= {"true return": "true_return", "age": "age", "late": "late", "lost": "lost"}
     columns |= {"episodes": "episodes"}
     lines = (

@@ -1,8 +1,8 @@
-"""How runs are summed up: recovery, normalised scores, interquartile mean, and their bootstrap intervals.
+"""Statistics of runs: normalised scores, recovery, interquartile mean, and their bootstrap intervals.
 
-Everything is vectorised over leading dimensions ``*``, so that a statistic takes one sample or all
-resamples at once. Scores: higher is better. Source: Agarwal et al. 2021, arXiv 2108.13264, for the
-stratified bootstrap and the interquartile mean.
+All functions are vectorised over leading dimensions ``*``, so that a statistic takes one sample or all
+resamples at once. Higher scores are better. Source of the stratified bootstrap and of the interquartile
+mean: Agarwal et al. 2021, arXiv 2108.13264.
 """
 
 from collections.abc import Callable
@@ -15,13 +15,13 @@ from damian.common import checks
 Floats = NDArray[np.floating]
 
 LEAST_GAP = 0.1
-"""Of undelayed - random: with a smaller cost of the delay there is nothing to recover."""
+"""Smallest cost of the delay, as a share of undelayed - random, for which a recovery is reported."""
 
 
 def normalised(score: Floats, undelayed: Floats, random: Floats) -> Floats:
-    """``(J - J_random) / (J_undelayed - J_random)``; nan where the undelayed arm does not beat random.
+    """Normalised score (J_norm), ``(J - J_random) / (J_undelayed - J_random)``.
 
-    All arguments broadcast against each other.
+    It is nan where the undelayed arm does not beat random. All arguments broadcast against each other.
     """
     span = np.asarray(undelayed - random, dtype=float)
     return (score - random) / np.where(span > 0, span, np.nan)
@@ -30,17 +30,20 @@ def normalised(score: Floats, undelayed: Floats, random: Floats) -> Floats:
 def recovery(
     aware: Floats, naive: Floats, undelayed: Floats, random: Floats, least: float = LEAST_GAP
 ) -> Floats:
-    """``(aware - naive) / (undelayed - naive)`` of means over seeds, all broadcast against each other.
+    """Share of the delay's cost that a method wins back, ``(aware - naive) / (undelayed - naive)``.
+
+    All scores are means over seeds, and broadcast against each other.
 
     Args:
-        aware: of the method that knows of the delay.
-        naive: of the stronger arm that does not.
-        undelayed: of the arm without delay.
-        random: of the random policy without delay.
-        least: smallest ``(undelayed - naive) / (undelayed - random)`` to make sense of.
+        aware: score of the method that takes the delay into account.
+        naive: score of the best arm that does not.
+        undelayed: score of the arm without delay.
+        random: score of the random policy without delay.
+        least: smallest ``(undelayed - naive) / (undelayed - random)`` for which there is a recovery.
 
     Returns:
-        nan where the gap is not positive or smaller than that, or where random beats undelayed.
+        the recovery; nan where undelayed - naive is not positive or smaller than ``least`` allows, or where
+        undelayed does not beat random.
     """
     gap = np.asarray(undelayed - naive, dtype=float)
     enough = (gap > 0) & (undelayed > random) & (gap >= least * (undelayed - random))
@@ -48,29 +51,29 @@ def recovery(
 
 
 def interquartile_mean(values: Floats) -> Floats:
-    """Mean of the middle half of the last dimension, [*, K] to [*].
+    """Mean of the middle half of the values in the last dimension, [*, K] to [*].
 
-    With K not a multiple of four, the two outermost values that stay count in part, so that always K / 2
+    If K is not a multiple of four, the two outermost values that remain count in part, so that always K / 2
     values are averaged (some libraries round instead).
     """
     n_values = values.shape[-1]
     cut, kept = n_values / 4, n_values / 2
-    place = np.arange(n_values)
-    weight = np.clip(np.minimum(place + 1, n_values - place) - cut, 0, 1)
-    weight *= kept / weight.sum()  # of a single value, all of it
+    rank = np.arange(n_values)
+    weight = np.clip(np.minimum(rank + 1, n_values - rank) - cut, 0, 1)
+    weight *= kept / weight.sum()  # the sum differs from ``kept`` for a single value only
     return (np.sort(values, -1) * weight).sum(-1) / kept
 
 
 def resampled(scores: Floats, draws: int, seed: int = 0) -> Floats:
-    """Draw seeds with replacement, in each stratum by itself; all arms of a stratum get the same ones.
+    """Draw seeds with replacement, in each stratum separately; all arms of a stratum get the same draws.
 
     Args:
-        scores: [strata, *, seeds]; a stratum is what shares its seeds: a task, with all its arms.
-        draws: resamples.
-        seed: of the draws.
+        scores: scores by seed, [strata, *, seeds]; a stratum is a task with all its arms.
+        draws: number of resamples.
+        seed: seed of the random draws.
 
     Returns:
-        [draws, strata, *, seeds].
+        the resampled scores, [draws, strata, *, seeds].
     """
     checks.whole("draws", draws, 1)
     strata, n_seeds = scores.shape[0], scores.shape[-1]
@@ -80,10 +83,10 @@ def resampled(scores: Floats, draws: int, seed: int = 0) -> Floats:
 
 
 def interval(values: Floats, level: float = 0.95) -> tuple[Floats, Floats]:
-    """Percentile interval of resampled statistics, [draws, *] to two [*].
+    """Percentile interval of resampled statistics, [draws, *]: its low and high ends, [*] each.
 
-    A nan (there a ratio has no meaning) counts as lowest and as highest: an end that falls on one is
-    infinite.
+    A nan (a ratio without meaning) counts both as the lowest and as the highest value: an end of the interval
+    that falls on a nan is infinite.
     """
     unknown, tail = np.isnan(values), (1 - level) / 2
     low = np.quantile(np.where(unknown, -np.inf, values), tail, 0, method="inverted_cdf")
@@ -98,13 +101,13 @@ def bootstrap(
     level: float = 0.95,
     seed: int = 0,
 ) -> tuple[Floats, Floats]:
-    """Stratified bootstrap interval over seeds of what ``statistic`` makes of ``[*, strata, ..., seeds]``.
+    """Stratified bootstrap interval of a statistic over seeds: its low and high ends.
 
     Args:
-        statistic: from any leading dimensions * to the same, [*, ...].
-        scores: [strata, ..., seeds].
-        draws: resamples.
-        level: share of the resamples inside.
-        seed: of the draws.
+        statistic: function from scores [*, strata, ..., seeds] to [*, ...], for any leading dimensions *.
+        scores: scores by seed, [strata, ..., seeds].
+        draws: number of resamples.
+        level: share of the resampled statistics inside the interval.
+        seed: seed of the random draws.
     """
     return interval(statistic(resampled(scores, draws, seed)), level)

@@ -1,1 +1,1 @@
-"""Algorithms that learn a policy: MAPPO and SAC, their networks, and when they learn."""
+"""Learners of a policy: MAPPO and SAC, their networks, and the system clock that times their updates."""

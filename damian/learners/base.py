@@ -1,4 +1,4 @@
-"""What a learner is: a configuration that checks and builds it, an actor to fly, and updates from batches."""
+"""The interface of a learner: its settings, its actor, and its updates from collected batches."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -14,59 +14,59 @@ from damian.learners.networks import ModelConfig
 
 
 class Learner(Protocol):
-    """Takes batches as they are collected, and improves its actor."""
+    """A learner updates its actor from batches as they are collected."""
 
     actor: ProbabilisticActor
-    """The policy that collects and that an evaluation flies."""
+    """The policy that the collector and the evaluations use."""
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from a batch [B, T] of consecutive steps; returns named numbers for the log."""
+        """Update from a batch [B, T] of consecutive steps; returns the numbers to log, by name."""
         ...
 
     def components(self) -> dict[str, Any]:
-        """Networks and optimisers that a checkpoint keeps, by name; ``actor`` among them."""
+        """Networks and optimisers that a checkpoint stores, by name; one of them is ``actor``."""
         ...
 
 
 class LearningSetup(NamedTuple):
-    """What a learner must know of a run beside its own settings."""
+    """Properties of a run that a learner needs beside its own settings."""
 
     model: ModelConfig
-    """Of actor and critic."""
+    """Networks of actor and critic."""
     worlds: int
-    """B."""
+    """Number of parallel environments, B."""
     shortest_period: int
-    """Fewest steps of every world between two updates."""
+    """Smallest number of steps per world between two updates."""
     longest_period: int
-    """Most steps of every world between two updates."""
+    """Largest number of steps per world between two updates."""
     longest_delay: int = 0
-    """Of a message [steps]."""
+    """Longest delay of a message [steps]."""
     backupdate: bool = False
-    """Does the replay buffer correct steps as late messages arrive."""
+    """Whether the replay buffer corrects stored steps as late messages arrive (paper, section 3.4)."""
     settle: bool = False
-    """Learn from a step only when none of its messages can be in transit any more."""
+    """Whether to learn from a step only when none of its messages can be in transit any more."""
     recompute_actor: bool = False
-    """Late messages also replace what the actor saw (the original authors' variant)."""
+    """Whether late messages also replace the actor's observations (the original authors' variant)."""
     critic_key: NestedKey = keys.GLOBAL_OBSERVATION
-    """What the critic sees of each UAV."""
+    """Key of the critic's observation."""
 
     @property
     def settle_steps(self) -> int:
-        """How many steps later a step is learnt from."""
+        """Number of steps by which learning from a step is postponed."""
         return self.longest_delay if self.settle else 0
 
 
 @dataclass
 class LearnerConfig:
-    """Settings that all learners share; ``name`` chooses the learner."""
+    """Settings that all learners share; ``name`` selects the learner."""
 
     name: str = ""
     lr: float = 3e-4
     """Learning rate of Adam."""
     gamma: float = 0.95
-    """Discount factor of a step."""
+    """Discount factor per step."""
     steps: int = 32
-    """Steps of every world between two updates, unless ``clock.system`` says otherwise."""
+    """Steps per world between two updates, unless ``clock.system`` sets the period."""
 
     def __post_init__(self) -> None:
         checks.above("learner.lr", self.lr, 0.0)
@@ -74,16 +74,16 @@ class LearnerConfig:
         checks.in_range("learner.steps", self.steps, 1)
 
     def check(self, setup: LearningSetup) -> None:
-        """Refuse what this learner cannot do.
+        """Check that this learner can learn in such a run.
 
         Raises:
-            InputError: names the key that does not fit.
+            InputError: a setting does not fit; the message names its key.
         """
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
-        """Steps, over all worlds, that a replay buffer must hold; None if the learner needs no buffer."""
+        """Environment steps, over all worlds, that the replay buffer must hold; None if none is needed."""
         raise NotImplementedError
 
     def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> Learner:
-        """The learner for an environment."""
+        """Build the learner for an environment."""
         raise NotImplementedError

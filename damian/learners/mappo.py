@@ -1,4 +1,4 @@
-"""MAPPO made from TorchRL's loss, on what the server knows by the time of learning."""
+"""MAPPO on TorchRL's loss, from batches that late messages may have corrected (paper, section 4.3)."""
 
 from dataclasses import dataclass
 from typing import Any, cast
@@ -30,7 +30,7 @@ LOSS_KEYS: list[NestedKey] = [
     keys.VALUE_TARGET,
     keys.READY,
 ]
-"""Entries of a step that the loss reads, beside what the critic sees."""
+"""Entries of a step that the loss reads, beside the critic's observation."""
 
 
 @dataclass
@@ -47,13 +47,13 @@ class MappoConfig(LearnerConfig):
     critic_coeff: float = 0.5
     """Weight of the critic's loss."""
     max_grad_norm: float = 0.5
-    """The gradient's norm is clipped to this."""
+    """The gradient is scaled down to this norm if its norm is larger."""
     epochs: int = 4
-    """Passes over the collected steps in an update."""
+    """Passes over the batch per update."""
     minibatches: int = 4
-    """Parts into which a pass is split."""
+    """Minibatches per pass."""
     normalize_advantage: bool = True
-    """Scale the advantages of a batch to mean 0 and deviation 1."""
+    """Whether to scale the advantages of a batch to mean 0 and standard deviation 1."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,11 +66,11 @@ class MappoConfig(LearnerConfig):
 
     def check(self, setup: LearningSetup) -> None:
         recurrent, shortest, longest = setup.model.recurrent, setup.shortest_period, setup.longest_delay
-        most = setup.worlds if recurrent else setup.worlds * shortest
-        checks.in_range("learner.minibatches", self.minibatches, 1, most)
-        should = f"needs more than {longest} steps, the longest delay, between two updates: {shortest}"
+        most_minibatches = setup.worlds if recurrent else setup.worlds * shortest
+        checks.in_range("learner.minibatches", self.minibatches, 1, most_minibatches)
+        should = f"needs more than {longest} steps (the longest delay) between two updates, not {shortest}"
         checks.require(not setup.settle or longest < shortest, "settle", True, should)
-        should = "does not go with model.rnn: the hidden states of a UAV are not recomputed"
+        should = "does not go with model.rnn: hidden states are not recomputed from corrected observations"
         checks.require(not (recurrent and setup.recompute_actor), "recompute_actor", True, should)
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
@@ -83,14 +83,14 @@ class MappoConfig(LearnerConfig):
 
 
 class Mappo:
-    """Learns from each batch once, as soon as it is collected.
+    """Multi-agent PPO: learns from each batch once, as soon as it is collected.
 
     Args:
-        env: for its specs.
-        config: how to learn.
-        setup: of the run.
-        buffer: replay buffer on a ``BackupdateStorage``: the learner takes its corrected batches. None:
-            batches as they were collected.
+        env: its specs give the sizes of the networks.
+        config: settings of the learner.
+        setup: properties of the run.
+        buffer: replay buffer on a ``BackupdateStorage``, from which the learner reads the corrected batches.
+            None: the learner uses batches as they were collected.
     """
 
     def __init__(
@@ -103,11 +103,11 @@ class Mappo:
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr)
 
     def components(self) -> dict[str, Any]:
-        """Networks and optimiser that a checkpoint keeps."""
+        """Networks and optimiser that a checkpoint stores."""
         return {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """One update from a batch [B, T]; returns the mean losses, and the share of back-updated messages."""
+        """Make one update from a batch [B, T]; returns mean losses and the share of back-updated messages."""
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
         losses = self.optimize(corrected)
@@ -117,10 +117,11 @@ class Mappo:
 
     @torch.no_grad()
     def backupdated_batch(self, batch: TensorDictBase) -> TensorDictBase:
-        """A batch [B, T] as the server knows it by now, or an earlier one that has settled meanwhile.
+        """Store a batch [B, T], and return it as corrected by all messages that have arrived by now, [B, T].
 
-        Steps after an end that the server learnt of late stay in it: until the server does, a UAV must not
-        undo the success.
+        With ``settle`` the returned steps are earlier ones: they end ``settle_steps`` before the latest step
+        (the first batch is shorter). Steps between the end of an episode and the time at which the server
+        learnt of it stay in the batch: until then a UAV must not undo the success.
         """
         if self.buffer is None:
             return batch
@@ -133,40 +134,40 @@ class Mappo:
         return batch
 
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
-        """Some passes over a batch [B, T] with advantages; returns the mean losses.
+        """Make ``epochs`` passes over a batch [B, T] with advantages; returns the mean losses.
 
         Minibatches are drawn over steps; for a recurrent actor, over worlds with their whole sequences.
         """
         recurrent = self.setup.model.recurrent
-        read = [*LOSS_KEYS, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
-        batch = batch.select(*read, strict=False)  # each entry costs time at every minibatch
-        steps = batch if recurrent else batch.reshape(-1)
+        needed_keys = [*LOSS_KEYS, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
+        batch = batch.select(*needed_keys, strict=False)  # each entry costs time at every minibatch
+        samples = batch if recurrent else batch.reshape(-1)
         sums: dict[str, float] = {}
-        n_parts = min(self.config.minibatches, len(steps))
+        n_minibatches = min(self.config.minibatches, len(samples))
         for _ in range(self.config.epochs):
-            for index in torch.randperm(len(steps), device=steps.device).tensor_split(n_parts):
-                losses = minibatch_losses(steps[index], self.loss)
+            for index in torch.randperm(len(samples), device=samples.device).tensor_split(n_minibatches):
+                losses = minibatch_losses(samples[index], self.loss)
                 self.optimizer.zero_grad()
                 torch.stack([*losses.values()]).sum().backward()
                 torch.nn.utils.clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
                 self.optimizer.step()
                 for name, value in losses.items():
                     sums[name] = sums.get(name, 0.0) + value.item()
-        n_updates = self.config.epochs * n_parts
+        n_updates = self.config.epochs * n_minibatches
         return {name: total / n_updates for name, total in sums.items()}
 
 
 def mappo_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig) -> MAPPOLoss:
-    """Clipped PPO objective with a centralised critic, on the keys of ``UavEnv``."""
+    """Clipped PPO objective with a centralised critic, with the TensorDict keys of ``UavEnv``."""
     loss = MAPPOLoss(
         actor,
         critic,
         clip_epsilon=config.clip_epsilon,
         entropy_coeff=config.entropy_coeff,
         critic_coeff=config.critic_coeff,
-        normalize_advantage=False,  # done in ``add_advantages``, over decisions only
-        reduction="none",  # likewise, in ``minibatch_losses``
-        log_explained_variance=False,  # which costs time
+        normalize_advantage=False,  # ``add_advantages`` normalises, over decisions only
+        reduction="none",  # ``minibatch_losses`` averages, over decisions only where needed
+        log_explained_variance=False,  # it costs time
     )
     loss.set_keys(
         reward=keys.REWARD,
@@ -183,22 +184,21 @@ def mappo_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: Mapp
 def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: MappoConfig) -> None:
     """Write values, advantages and value targets into a batch [B, T], in place.
 
-    The return of a decision is all that is earned until the next one, k steps later, discounted by gamma^k (a
-    semi-Markov decision process; Sutton, Precup and Singh 1999): in between no value is estimated, so that
-    there the lambda of the generalised advantage estimate (Schulman et al. 2016) is 1. A step at which the
-    UAV was not ready is no decision: its advantage is 0.
+    The return of a decision sums the rewards until the UAV's next decision, k steps later, whose value is
+    discounted by gamma^k (a semi-Markov decision process; Sutton, Precup and Singh 1999). Values at the steps
+    between two decisions are not used: there lambda of the generalised advantage estimate (Schulman et al.
+    2016) is 1. A step at which the UAV was not ready is no decision, and its advantage is 0.
     """
     critic(batch)
-    following = critic(batch["next"])
-    value, after = batch[keys.STATE_VALUE], cast(TensorDictBase, following[keys.AGENTS])
-    ends = [following[key] for key in (keys.DONE, keys.TERMINATED)]
-    durations = following.get(
-        keys.DURATION, torch.ones_like(ends[0], dtype=torch.long)
-    )  # with ``clock.skip``
+    next_step = critic(batch["next"])
+    value, next_agents = batch[keys.STATE_VALUE], cast(TensorDictBase, next_step[keys.AGENTS])
+    ends = [next_step[key] for key in (keys.DONE, keys.TERMINATED)]
+    # Only with ``clock.skip`` do steps have durations other than 1.
+    durations = next_step.get(keys.DURATION, torch.ones_like(ends[0], dtype=torch.long))
     gamma, done, terminated = (x.unsqueeze(-2).expand_as(value) for x in (config.gamma**durations, *ends))
-    lmbda = torch.where(after["ready"].unsqueeze(-1), config.lmbda, 1.0)
+    lmbda = torch.where(next_agents["ready"].unsqueeze(-1), config.lmbda, 1.0)
     advantage, batch[keys.VALUE_TARGET] = vec_generalized_advantage_estimate(
-        gamma, lmbda, value, after["state_value"], after["reward"], done, terminated, time_dim=-3
+        gamma, lmbda, value, next_agents["state_value"], next_agents["reward"], done, terminated, time_dim=-3
     )
     ready = batch[keys.READY].unsqueeze(-1)
     if config.normalize_advantage:
@@ -208,18 +208,18 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
 
 
 def minibatch_losses(batch: TensorDictBase, loss: MAPPOLoss) -> dict[str, Tensor]:
-    """The terms of the loss on a batch [*]: actor and entropy over decisions only, the critic over all steps.
+    """Mean terms of the loss on a batch [*]: actor and entropy over decisions, the critic over all steps.
 
-    The policy also outputs an action for a UAV in flight, but that action has no effect.
+    The policy also outputs actions for UAVs in flight, but these have no effect.
     """
     terms = loss(batch)
     ready = batch[keys.READY].float()
 
-    def over_decisions(term: Tensor) -> Tensor:
+    def mean_over_decisions(term: Tensor) -> Tensor:
         return (term.view_as(ready) * ready).sum() / ready.sum().clamp(min=1)
 
     return {
-        "loss_objective": over_decisions(terms["loss_objective"]),
-        "loss_entropy": over_decisions(terms["loss_entropy"]),
+        "loss_objective": mean_over_decisions(terms["loss_objective"]),
+        "loss_entropy": mean_over_decisions(terms["loss_entropy"]),
         "loss_critic": terms["loss_critic"].mean(),
     }

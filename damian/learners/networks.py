@@ -1,4 +1,4 @@
-"""Actors and critics: one network shared by all UAVs, so that a policy can fly any number of them."""
+"""Actors and critics: all UAVs share one network, so that a policy works with any number of UAVs."""
 
 from dataclasses import dataclass, field
 from typing import cast
@@ -21,51 +21,61 @@ _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU
 
 @dataclass
 class ModelConfig:
-    """A multilayer perceptron each for actor and critic."""
+    """Networks of actor and critic, one multilayer perceptron each."""
 
     hidden: list[int] = field(default_factory=lambda: [256, 256])
     """Width of each hidden layer."""
     activation: str = "tanh"
-    """tanh, relu, elu or silu."""
+    """Activation function: tanh, relu, elu or silu."""
     rnn: str = "none"
-    """none or gru: the actor's last hidden layer is a gated recurrent unit, so that a UAV remembers what it
-    has seen in an episode."""
+    """none or gru. With gru the actor's last hidden layer is a gated recurrent unit, so that a UAV remembers
+    its observations of the episode."""
 
     def __post_init__(self) -> None:
         checks.one_of("model.activation", self.activation, _ACTIVATIONS)
         checks.one_of("model.rnn", self.rnn, ["none", "gru"])
-        checks.require(not self.recurrent or bool(self.hidden), "model.hidden", [], "is no layer to be a gru")
+        checks.require(
+            not self.recurrent or bool(self.hidden),
+            "model.hidden",
+            [],
+            "needs at least one layer for model.rnn=gru",
+        )
         for width in self.hidden:
             checks.in_range("model.hidden", width, 1, 16384)
 
     @property
     def recurrent(self) -> bool:
-        """Does the actor remember anything."""
+        """Whether the actor has a recurrent layer."""
         return self.rnn != "none"
 
     def network(self, n_in: int, n_out: int, device: torch.device | None) -> MLP:
-        """Features [*, n_in] to outputs [*, n_out]."""
+        """Make a multilayer perceptron from features [*, n_in] to outputs [*, n_out]."""
         activation = _ACTIVATIONS[self.activation]
         return MLP(n_in, n_out, num_cells=self.hidden, activation_class=activation, device=device)
 
     def gru(self, n_in: int, device: torch.device | None) -> AgentGRU:
-        """All hidden layers, the last one recurrent, for features [*, n_in]."""
+        """Make all hidden layers for features [*, n_in]; the last one is recurrent."""
         *widths, n_hidden = self.hidden
         if not widths:
             return AgentGRU(nn.Identity(), n_in, n_hidden, device)
-        *cells, n_out = widths
+        *inner_widths, n_out = widths
         activation = _ACTIVATIONS[self.activation]
         encoder = MLP(
-            n_in, n_out, num_cells=cells, activation_class=activation, activate_last_layer=True, device=device
+            n_in,
+            n_out,
+            num_cells=inner_widths,
+            activation_class=activation,
+            activate_last_layer=True,
+            device=device,
         )
         return AgentGRU(encoder, n_out, n_hidden, device)
 
 
 def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
-    """Policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``.
+    """Make the policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``.
 
-    Discrete actions: a categorical distribution over the legal ones. Continuous actions: a tanh-normal
-    on their bounds.
+    Discrete actions [*, N] have a categorical distribution over the legal actions. Continuous actions
+    [*, N, 2] have a tanh-normal distribution within their bounds.
     """
     spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
@@ -94,7 +104,7 @@ def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
 
 
 def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: NestedKey) -> TensorDictModule:
-    """From observations to the parameters of a distribution: logits, or location and scale."""
+    """Network from observations to the parameters of the actions' distribution, under ``out_keys``."""
     n_features = env.observation_spec[keys.OBSERVATION].shape[-1]
 
     def head(network: nn.Module, in_key: NestedKey) -> TensorDictModule:
@@ -112,7 +122,7 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
 def make_critic(
     env: EnvBase, config: ModelConfig, critic_key: NestedKey = keys.GLOBAL_OBSERVATION
 ) -> TensorDictModule:
-    """Values ``("agents", "state_value")`` [*, N, 1] from what the critic sees."""
+    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1]."""
     n_features = env.observation_spec[critic_key].shape[-1]
     network = config.network(n_features, 1, env.device)
     return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
@@ -121,13 +131,14 @@ def make_critic(
 def make_action_value(
     env: EnvBase, config: ModelConfig, critic_key: NestedKey = keys.GLOBAL_OBSERVATION
 ) -> TensorDictModule:
-    """Values of actions, from what the critic sees and what the actor sees.
+    """Make a critic of actions (Q-function), which reads the observations of both critic and actor.
 
-    Without the actor's observation, which holds its past actions, the actor could not learn what these tell.
+    Only the actor's observation holds the UAV's past actions: if the critic did not read them, the actor
+    could not learn to use them.
 
     Returns:
-        discrete: ``action_value`` [*, A], of each action; continuous: ``state_action_value`` [*, 1], of
-        ``("agents", "action")``.
+        with discrete actions, a module that writes ``action_value`` [*, A], the value of each action; with
+        continuous ones, ``state_action_value`` [*, 1], the value of ``("agents", "action")``.
     """
     in_keys: list[NestedKey] = list(dict.fromkeys((critic_key, keys.OBSERVATION)))
     n_features = sum(env.observation_spec[key].shape[-1] for key in in_keys)

@@ -1,4 +1,4 @@
-"""Actors that remember: a gated recurrent unit for each UAV, with weights shared by all of them."""
+"""Recurrent actors: a gated recurrent unit for each UAV, with weights that all UAVs share."""
 
 from typing import cast
 
@@ -13,22 +13,23 @@ from torchrl.modules import recurrent_mode
 from damian import keys
 
 RECURRENT_KEYS: list[NestedKey] = [keys.HIDDEN_BEFORE, keys.IS_INIT]
-"""Entries that the replay of a sequence reads, beside observations."""
+"""Entries, beside observations, that ``AgentGRU`` reads in recurrent mode."""
 
 
 class AgentGRU(TensorDictModuleBase):
-    """Hidden states from what is seen (Cho et al. 2014).
+    """Gated recurrent unit from observations to hidden states, for each UAV by itself (Cho et al. 2014).
 
-    Step by step, batch [B]: reads ``("agents", "observation")`` [B, N, F] and ``("agents", "hidden")``
-    [B, N, H]; writes the latter anew, and as ``("agents", "hidden_before")`` what it was. In TorchRL's
-    recurrent mode, which its losses switch on, whole sequences [B, T]: from the first ``hidden_before``, and
-    from zeros wherever ``is_init`` [B, T, 1] says that an episode begins.
+    A single step, batch [B]: reads ``("agents", "observation")`` [B, N, F] and the previous hidden state
+    ``("agents", "hidden")`` [B, N, H]; writes the next one under the same key, and the previous one as
+    ``("agents", "hidden_before")``. A whole sequence [B, T], in TorchRL's recurrent mode, which the losses
+    switch on: starts from the first ``hidden_before``, and from zeros where ``is_init`` [B, T, 1] marks a new
+    episode.
 
     Args:
-        encoder: observations [*, F] to features [*, E].
-        n_features: E.
-        n_hidden: H.
-        device: of the cell.
+        encoder: network from observations [*, F] to features [*, E].
+        n_features: number of features, E.
+        n_hidden: size of the hidden state, H.
+        device: device of the recurrent cell.
     """
 
     def __init__(
@@ -47,28 +48,31 @@ class AgentGRU(TensorDictModuleBase):
         return tensordict.set(keys.HIDDEN_BEFORE, before).set(keys.HIDDEN, self.step(features, before))
 
     def step(self, features: Tensor, hidden: Tensor) -> Tensor:
-        """The hidden state after [*, N, H] from features [*, N, E] and the one before [*, N, H]."""
+        """Return the next hidden state from features [*, N, E] and the previous hidden state [*, N, H]."""
         return self.cell(features.flatten(0, -2), hidden.flatten(0, -2)).view_as(hidden)
 
     def replay(self, features: Tensor, hidden: Tensor, begins: Tensor) -> Tensor:
-        """Hidden states after every step [B, T, N, H].
+        """Recompute the hidden states after every step of a sequence, [B, T, N, H].
 
         Args:
-            features: [B, T, N, E].
-            hidden: before the first step, [B, N, H].
-            begins: does an episode begin with a step, [B, T, 1] bool.
+            features: features of the observations, [B, T, N, E].
+            hidden: hidden state before the first step, [B, N, H].
+            begins: whether an episode begins with the step, [B, T, 1] bool.
         """
-        after: list[Tensor] = []
-        # As fast as nn.GRU, which knows no beginnings; TorchRL's GRUModule pads episodes, at twice the time.
+        states: list[Tensor] = []
+        # This loop is as fast as nn.GRU, which cannot restart within a sequence. TorchRL's GRUModule can,
+        # but pads episodes and takes twice the time.
         for feature, begin in zip(features.unbind(1), begins.unbind(1), strict=True):
             hidden = self.step(feature, hidden.masked_fill(begin.unsqueeze(-1), 0.0))
-            after.append(hidden)
-        return torch.stack(after, 1)
+            states.append(hidden)
+        return torch.stack(states, 1)
 
 
 def add_recurrent_state(env: TransformedEnv, policy: nn.Module) -> None:
-    """Let an environment carry the hidden states of a policy, zeros at a reset; once, and only if it has
-    any."""
+    """Make an environment carry the hidden states of a policy, with zeros at a reset.
+
+    The environment stays as it is if the policy is not recurrent, or if hidden states are there already.
+    """
     cells = [module.cell for module in policy.modules() if isinstance(module, AgentGRU)]
     if not cells or keys.HIDDEN in env.observation_spec.keys(True, True):
         return

@@ -1,4 +1,4 @@
-"""Soft actor-critic made from TorchRL's losses, on single decisions drawn from a replay buffer."""
+"""Soft actor-critic on TorchRL's losses, from single decisions drawn from a replay buffer."""
 
 import math
 from dataclasses import dataclass
@@ -22,6 +22,7 @@ from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
 
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha")
+"""Numbers that a round of updates logs, by their names in TorchRL's losses."""
 
 
 @dataclass
@@ -32,26 +33,27 @@ class SacConfig(LearnerConfig):
     lr: float = 1e-3
     """Learning rate of Adam."""
     steps: int = 4
-    """Steps of every world between two rounds of updates, unless ``clock.system`` says otherwise."""
+    """Steps per world between two rounds of updates, unless ``clock.system`` sets the period."""
     alpha_lr: float = 1e-2
-    """Learning rate of the temperature's logarithm, which has to find the scale of the rewards first."""
+    """Learning rate of the temperature's logarithm; high, since the temperature must first find the scale of
+    the rewards."""
     alpha_init: float = 0.01
-    """Temperature to begin with: weight of the entropy."""
+    """Initial temperature (weight of the entropy)."""
     tau: float = 0.01
-    """How far the target networks move towards the trained ones at each update."""
+    """Share by which the target networks move towards the trained networks in each update."""
     target_entropy: float = 0.5
-    """Entropy that the temperature aims at (discrete actions): share of that of a uniform choice among the
-    legal actions of each UAV. Continuous actions aim at minus their dimensions, on [-1, 1]."""
+    """Target entropy for discrete actions, as a share of the entropy of a uniform choice among the UAV's
+    legal actions. For continuous actions it is minus the number of their dimensions, on [-1, 1]."""
     n_steps: int = 1
-    """Decisions whose rewards are summed before a value is estimated (n-step returns)."""
+    """Number of decisions over which rewards are summed before a value is estimated (n-step returns)."""
     updates: int = 4
-    """Updates in a round."""
+    """Updates per round."""
     batch_size: int = 512
-    """Decisions in an update."""
+    """Decisions per update."""
     buffer_steps: int = 200_000
-    """Size of the replay buffer: latest steps, over all worlds."""
+    """Capacity of the replay buffer [environment steps over all worlds]."""
     warm_up: int = 5_000
-    """Steps, over all worlds, before learning begins."""
+    """Environment steps, over all worlds, before learning begins."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,8 +70,10 @@ class SacConfig(LearnerConfig):
         checks.require(not setup.model.recurrent, "model.rnn", setup.model.rnn, should)
         should = "is for learner=mappo only: SAC has no importance ratios"
         checks.require(not setup.recompute_actor, "recompute_actor", True, should)
-        least = setup.longest_period + 2 * setup.longest_delay
-        checks.in_range("learner.buffer_steps", self.buffer_steps, setup.worlds * least, unit="steps")
+        steps_per_world = setup.longest_period + 2 * setup.longest_delay
+        checks.in_range(
+            "learner.buffer_steps", self.buffer_steps, setup.worlds * steps_per_world, unit="steps"
+        )
         checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")
 
     def buffer_size(self, setup: LearningSetup) -> int:
@@ -82,17 +86,17 @@ class SacConfig(LearnerConfig):
 
 
 class Sac:
-    """Stores steps as they are collected, and learns from decisions drawn from all of them.
+    """Soft actor-critic: stores steps as they are collected, and learns from decisions drawn from these.
 
-    A decision of one UAV is a sample of the one policy that all share, so that steps at which a UAV is not
-    ready never enter a loss.
+    Each decision of a UAV is one sample for the policy that all UAVs share; steps at which a UAV is not ready
+    never enter a loss.
 
     Args:
-        env: for its specs.
-        config: how to learn.
-        setup: of the run.
-        buffer: replay buffer on a ``TimeStorage``; on a ``BackupdateStorage``, late messages correct its
-            steps.
+        env: its specs give the sizes of the networks.
+        config: settings of the learner.
+        setup: properties of the run.
+        buffer: replay buffer on a ``TimeStorage``; on a ``BackupdateStorage``, late messages correct the
+            stored steps.
     """
 
     def __init__(self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer) -> None:
@@ -100,7 +104,7 @@ class Sac:
         self.actor = make_actor(env, setup.model)
         action_value = make_action_value(env, setup.model, setup.critic_key)
         self.loss = sac_loss(self.actor, action_value, env, config)
-        # A checkpoint restores the networks, but not the discount: that of this run counts.
+        # A checkpoint also holds the discount of its run, which must not replace this run's.
         self.loss.register_load_state_dict_post_hook(
             lambda loss, _: loss.make_value_estimator(gamma=config.gamma)
         )
@@ -112,14 +116,14 @@ class Sac:
         self.observed = ["observation", setup.critic_key[-1], *["action_mask"] * masked]
 
     def components(self) -> dict[str, Any]:
-        """Networks and optimiser that a checkpoint keeps; the replay buffer fills anew."""
+        """Networks and optimiser that a checkpoint stores; a resumed run fills a new replay buffer."""
         return {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Store a batch [B, T], and do a round of updates.
+        """Store a batch [B, T], and make a round of updates.
 
         Returns:
-            the mean losses, nan before learning begins.
+            the mean losses; nan before learning begins.
         """
         self.buffer.extend(batch.exclude(*_UNREAD))
         storage = cast(TimeStorage, self.buffer.storage)
@@ -138,7 +142,7 @@ class Sac:
         return {name: total / self.config.updates for name, total in sums.items()}
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
-        """One update from transitions [K]; returns the losses."""
+        """Make one update from transitions [K]; returns the losses."""
         losses = self.loss(batch)
         self.optimizer.zero_grad()
         (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
@@ -162,13 +166,13 @@ _UNREAD: list[NestedKey] = [
     next_key(keys.REWARD_TERMS),
     next_key(keys.EPISODE_REWARD),
 ]
-"""Entries of a step that nothing here reads: a replay buffer is large."""
+"""Entries that SAC never reads; they are not stored, to save memory."""
 
 
 def sac_loss(
     actor: ProbabilisticActor, action_value: TensorDictModule, env: EnvBase, config: SacConfig
 ) -> SACLoss | DiscreteSACLoss:
-    """Two critics and a learnt temperature, on single decisions [K] under the keys of ``UavEnv``."""
+    """Loss with two critics and a learnt temperature, on single decisions [K] with the keys of ``UavEnv``."""
     spec = env.full_action_spec_unbatched[keys.ACTION]
     # A loop over two critics is faster on a CPU than vmap.
     options: dict[str, Any] = {
@@ -179,7 +183,7 @@ def sac_loss(
     if isinstance(spec, Categorical):
         loss = MaskedDiscreteSACLoss(actor, action_value, spec.n, config.target_entropy, **options)
     else:
-        # The target of one UAV, whose actions lie in bounds of their own instead of [-1, 1].
+        # Target entropy of one UAV: minus its action dimensions on [-1, 1], shifted to its actions' bounds.
         bounds = cast(Bounded, spec)
         width = (bounds.high - bounds.low).reshape(-1, spec.shape[-1])[0]
         target = ((width / 2).log() - 1).sum().item()
@@ -190,9 +194,10 @@ def sac_loss(
 
 
 class MaskedDiscreteSACLoss(DiscreteSACLoss):
-    """Aims at a share of the entropy of a uniform choice among the actions that are legal in each state.
+    """Discrete SAC loss with a target entropy for each state, relative to the number of its legal actions.
 
-    One target for all states, as in TorchRL, would lie above what there is wherever few actions are legal.
+    The target is a share of the entropy of a uniform choice among the legal actions. TorchRL's single target
+    for all states would exceed the largest possible entropy where few actions are legal.
     """
 
     def __init__(
@@ -205,8 +210,11 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
         self.share, self.n_actions = share, n
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """TorchRL's loss; the temperature's loss gets by how much each state's entropy misses its target."""
-        loss, seen = super().actor_loss(tensordict)
+        """Return TorchRL's actor loss, with a log-probability to which each state's target entropy is added.
+
+        The temperature's loss thereby measures by how much each state's entropy misses its own target.
+        """
+        loss, metadata = super().actor_loss(tensordict)
         mask = tensordict.get(keys.ACTION_MASK, None)
         legal = torch.tensor(self.n_actions) if mask is None else mask.sum(-1)
-        return loss, {"log_prob": seen["log_prob"] + self.share * legal.log()}
+        return loss, {"log_prob": metadata["log_prob"] + self.share * legal.log()}

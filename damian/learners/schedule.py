@@ -1,4 +1,4 @@
-"""When the learner takes what has been collected (paper, section 3.6)."""
+"""The system clock: how many steps are collected between two updates (paper, section 3.6)."""
 
 import math
 from typing import Any
@@ -10,14 +10,14 @@ from damian.envs.clocks import ClockConfig
 
 
 class SystemClock:
-    """When the learner takes what has been collected: fixed, or triggered (paper, section 3.6).
+    """Period between two updates of the learner [steps], fixed or triggered (paper, sections 3.6 and 4.3).
 
     Args:
-        config: of the clocks.
-        period: the first one [steps].
+        config: settings of the clocks.
+        period: the first period [steps].
 
     Raises:
-        InputError: the first period is out of the bounds.
+        InputError: the first period is out of its bounds.
     """
 
     def __init__(self, config: ClockConfig, period: int) -> None:
@@ -33,19 +33,23 @@ class SystemClock:
 
     @property
     def unit(self) -> int:
-        """Steps that every period is a multiple of."""
+        """Largest number of steps that divides every possible period."""
         return math.gcd(self.period, self.change, self.shortest, self.longest)
 
     def tick(self, spotting: Tensor) -> None:
-        """The next period follows from which UAVs spot the source, as the server knows, [B, N] bool."""
-        often = spotting.any(-1).float().mean() >= 0.5
-        changed = self.period - self.change if often else self.period + self.change
+        """Set the next period: shorter if a UAV spots the source in half of the worlds or more, else longer.
+
+        Args:
+            spotting: whether each UAV spots the source, as the server knows, [B, N] bool.
+        """
+        in_half_of_worlds = spotting.any(-1).float().mean() >= 0.5
+        changed = self.period - self.change if in_half_of_worlds else self.period + self.change
         self.period = min(max(changed, self.shortest), self.longest)
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """Return the state that a checkpoint stores."""
         return {"period": self.period}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """From a checkpoint."""
+        """Restore the state that a checkpoint has stored."""
         self.period = int(state["period"])

@@ -1,1 +1,1 @@
-"""Stored steps: back-updating with late messages, and decisions as semi-Markov transitions."""
+"""Replay storages: back-updating of stored steps with late messages, and semi-Markov transitions."""

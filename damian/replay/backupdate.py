@@ -14,35 +14,36 @@ from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
 from damian.replay.time_storage import TimeStorage
 
 Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
-"""From steps [T, B] and the newest messages known of each, [T, B, N, M]: entries after the step, by key.
+"""Function from steps [T, B], and the newest messages that the server can hold after each step, [T, B, N, M],
+to the entries after the steps, by key.
 
 ``("next", "done")``, ``("next", "terminated")`` and ``("next", "truncated")`` [T, B, 1] must be among them.
 """
 
 OBSERVATIONS = ("observation", "global_observation")
-"""Entries of the agents that are output after a step and read before the next."""
+"""Entries of the agents that a step outputs and the next step reads."""
 
 
 class BackupdateStorage(TimeStorage):
     """Keeps steps in order of time, and corrects them as late messages arrive.
 
-    Whenever steps are written, these and the earlier ones to which a message may still belong are recomputed
-    from all messages that have arrived by the last step: the entries that ``recompute`` returns replace the
-    stored ones, and observations among them also replace those before the next step of the same episode.
-    Other entries, such as what the actor saw, its action and its log-probability, stay.
+    Whenever steps are written, the storage recomputes them, and the earlier steps that a late message may
+    still concern, from all messages that have arrived by the last step. The entries that ``recompute``
+    returns replace the stored ones; recomputed observations also replace those before the next step of the
+    same episode. All other entries stay, such as the actor's observation, action and log-probability.
 
-    Entries are added: ``valid`` [T, B, 1], false where the episode had ended already, as the server knows
-    now; ``reset_after`` [T, B, 1], true where the environment was reset (if it was, but the task had not
-    ended after all, the step is truncated); ``(group, "backupdated")`` [T, B, N, 1], true where a late
+    The storage adds three entries: ``valid`` [T, B, 1], false where the episode had ended already, as the
+    server knows now; ``reset_after`` [T, B, 1], true where the environment was reset (such a step is
+    truncated if the task had not ended after all); ``(group, "backupdated")`` [T, B, N, 1], true where a late
     message replaced the one that the server held.
 
     Args:
-        max_size: T times B; T must be at least a batch's steps and twice ``longest``.
-        recompute: entries that follow from messages (for UAVs ``server_recompute``).
+        max_size: T times B; T must be at least the steps of a batch plus twice ``longest``.
+        recompute: computes the entries that depend on messages (for UAVs ``server_recompute``).
         longest: longest delay of a message [steps].
         group: the TensorDict of the agents, which has ``message``, ``received``, ``delay``, ``age`` and,
             before and after the step, the observations that ``recompute`` returns.
-        step_count_key: steps of the episode so far, [T, B, 1] (``StepCounter``); 0 where it begins.
+        step_count_key: earlier steps of the episode, [T, B, 1] (``StepCounter``); 0 where it begins.
         options: of ``LazyTensorStorage``.
     """
 
@@ -63,7 +64,11 @@ class BackupdateStorage(TimeStorage):
     def set(  # type: ignore[override]
         self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True
     ) -> None:
-        """Write steps [T, B] at these indices of the first dimension, and back-update."""
+        """Write steps [T, B] at the indices ``cursor`` of the first dimension, and back-update.
+
+        Raises:
+            ValueError: the storage is too small for the batch, or a message is later than ``longest``.
+        """
         self._check(data)
         done = data[next_key(keys.DONE)]
         data = data.copy().update({keys.VALID: torch.ones_like(done), keys.RESET_AFTER: done.clone()})
@@ -77,28 +82,30 @@ class BackupdateStorage(TimeStorage):
         if self.max_size < needs * n_worlds:
             raise ValueError(
                 f"max_size: {self.max_size} is too little for batches of {len(data)} steps and delays of "
-                f"up to {self.longest}: {needs} steps of {n_worlds} worlds are {needs * n_worlds}"
+                f"up to {self.longest} steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}"
             )
         longest = int(data["next", self.group, "delay"].max())
         if longest > self.longest:
-            raise ValueError(f"longest: a message takes {longest} steps, more than {self.longest}")
+            raise ValueError(f"longest: a message takes {longest} steps, more than {self.longest} steps")
 
     def receive(self, world: Tensor, agent: Tensor, steps_ago: Tensor, message: Tensor) -> None:
-        """Take messages from elsewhere, such as real UAVs, that have arrived after the latest step.
+        """Add messages from outside the environment, such as those of real UAVs, and back-update.
+
+        The messages count as arriving after the latest stored step.
 
         Args:
-            world: of the senders, [K].
-            agent: likewise, [K].
-            steps_ago: when each was generated, in steps before the latest, [K].
-            message: packed, [K, M].
+            world: index of each sender's world, [K].
+            agent: index of each sender in its world, [K].
+            steps_ago: steps from the generation of each message to the latest stored step, [K].
+            message: packed messages, [K, M].
 
         Raises:
             ValueError: a message is older than the longest delay, or than the stored steps.
         """
-        oldest, least = int(steps_ago.max()), int(steps_ago.min())
+        oldest, newest = int(steps_ago.max()), int(steps_ago.min())
         reach = min(self.longest, cast(int, self._len_along_dim0) - 1)
-        if least < 0 or oldest > reach:
-            raise ValueError(f"steps_ago: {least} to {oldest} is not between 0 and {reach}")
+        if newest < 0 or oldest > reach:
+            raise ValueError(f"steps_ago: {newest} to {oldest} is not between 0 and {reach} steps")
         index = self.latest(oldest + 1).flip(0)[steps_ago]
         after = cast(TensorDictBase, self._storage["next", self.group])
         after["message"][index, world, agent] = message
@@ -106,8 +113,9 @@ class BackupdateStorage(TimeStorage):
         self.backupdate(oldest + 1)
 
     def backupdate(self, n_steps: int) -> None:
-        """Correct the latest steps with all messages that have arrived by the last one."""
-        index = self.latest(n_steps + self.longest)  # messages sent before them may belong to them
+        """Correct the latest ``n_steps`` steps with all messages that have arrived by the last step."""
+        # Earlier steps too, whose messages may be the newest ones of the steps to correct.
+        index = self.latest(n_steps + self.longest)
         recomputed = self.recomputed(self._storage[index])
         rows = index[-n_steps:]
         for key, value in recomputed.items():
@@ -115,7 +123,7 @@ class BackupdateStorage(TimeStorage):
         self._bump_mutation_revision()
 
     def recomputed(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
-        """The corrected entries of consecutive steps [T, B], as known after the last of them."""
+        """The corrected entries of consecutive steps [T, B], as the server knows after the last step."""
         group, begins = self.group, steps[self.step_count_key].squeeze(-1) == 0
         agents = cast(TensorDictBase, steps["next", group])
         log = MessageLog(
@@ -124,27 +132,27 @@ class BackupdateStorage(TimeStorage):
             held=agents["received"],
             age=agents["age"].squeeze(-1).long(),
         )
-        known = latest_arrived(log)
-        after = self.recompute(steps, known)
+        latest = latest_arrived(log)
+        after = self.recompute(steps, latest)
         done, terminated, truncated = map(next_key, (keys.DONE, keys.TERMINATED, keys.TRUNCATED))
         reset = steps[keys.RESET_AFTER]
         after[truncated] = after[truncated] | (reset & ~after[terminated])
         after[done] = after[done] | reset
-        already = ~steps[keys.VALID][0].squeeze(-1) & ~begins[0]
-        over = ended_before(after[done].squeeze(-1), begins, already)
-        first = begins.clone()
-        first[0] = True  # the step before it is not among these
+        already_ended = ~steps[keys.VALID][0].squeeze(-1) & ~begins[0]
+        over = ended_before(after[done].squeeze(-1), begins, already_ended)
+        no_previous = begins.clone()
+        no_previous[0] = True  # the step before the first one is not among these steps
         before = {
-            (group, name): _shift(after["next", group, name], steps[group, name], first)
+            (group, name): _shift(after["next", group, name], steps[group, name], no_previous)
             for name in OBSERVATIONS
             if ("next", group, name) in after
         }
-        replaced = (known != log.held).any(-1, keepdim=True)
+        replaced = (latest != log.held).any(-1, keepdim=True)
         return {**after, **before, (group, "backupdated"): replaced, keys.VALID: ~over.unsqueeze(-1)}
 
 
-def _shift(after: Tensor, before: Tensor, first: Tensor) -> Tensor:
-    """Observations before each step [T, B, ...]: those after the previous step, but not where ``first`` [T,
-    B]."""
+def _shift(after: Tensor, before: Tensor, no_previous: Tensor) -> Tensor:
+    """Observations before each step [T, B, ...]: those after the previous step, or, where the mask
+    ``no_previous`` [T, B] is true, ``before``."""
     previous = torch.cat([after[:1], after[:-1]])
-    return torch.where(expand_mask(first, before), before, previous)
+    return torch.where(expand_mask(no_previous, before), before, previous)

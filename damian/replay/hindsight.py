@@ -1,7 +1,7 @@
-"""Which messages the server can know of at past steps, once late ones have arrived (back-updating).
+"""Finds the newest message that the server can use for each past step (back-updating; paper, section 3.4).
 
-Pure functions over time: T steps, with any batch dimensions behind them. A message that is generated at step
-g and takes d steps is known from step g + d on, even if its episode has ended meanwhile.
+Pure functions of T consecutive steps, with any batch dimensions behind them. A message that is generated at
+step g with a delay of d steps is available from step g + d on, even if its episode has ended meanwhile.
 """
 
 from typing import NamedTuple
@@ -11,49 +11,50 @@ from torch import Tensor
 
 
 class MessageLog(NamedTuple):
-    """Messages of T consecutive steps."""
+    """Messages sent and held at T consecutive steps."""
 
     sent: Tensor
-    """The message sent after each step, [T, *, M]; arbitrary numbers if there was none."""
+    """The message sent after each step, [T, *, M]; arbitrary numbers if none was sent."""
     delay: Tensor
-    """Its delay [steps], [T, *]; -1 if it never arrives, or if there is none."""
+    """Delay of the message sent [steps], [T, *]; -1 if it never arrives, or if none was sent."""
     held: Tensor
     """The message that the server held after each step, [T, *, M]."""
     age: Tensor
-    """Steps since that one was generated, [T, *]."""
+    """Age of the message held [steps], [T, *]."""
 
 
 def latest_arrived(log: MessageLog, now: int | None = None) -> Tensor:
-    """For each step, the newest message of its episode up to it that has arrived by ``now``, [T, *, M].
+    """For each step, the newest message sent in its episode by then that has arrived by ``now``, [T, *, M].
 
-    The messages that have arrived are those held at some step, and those sent within these steps: to miss
-    none, the log must begin a longest delay before the first step of interest.
+    The function finds messages that were held at some step of the log, and messages sent within it. To miss
+    none, the log must begin earlier than the first step of interest, by the longest delay.
 
     Args:
         log: messages sent and held.
-        now: a step, the last one if not given; no message that arrives later is used.
+        now: index of a step, the last one if not given; no message that arrives later is used.
     """
     steps = _steps(log.delay)
     arrived = (log.delay >= 0) & (steps + log.delay <= (len(steps) - 1 if now is None else now))
     newest = torch.where(arrived, steps, -1).cummax(0).values
-    # With ``order=arrival`` the server may have held a newer message before.
-    held, held_at = (steps - log.age).cummax(0)
-    late = newest > held  # never a message of an earlier episode: none is newer than the held one
-    return torch.where(late.unsqueeze(-1), _at(log.sent, newest.clamp(min=0)), _at(log.held, held_at))
+    # With ``order=arrival`` the server may have held a newer message at an earlier step.
+    newest_held, held_at = (steps - log.age).cummax(0)
+    # A message of an earlier episode is never newer than the held one.
+    came_late = newest > newest_held
+    return torch.where(came_late.unsqueeze(-1), _at(log.sent, newest.clamp(min=0)), _at(log.held, held_at))
 
 
 def episode_starts(begins: Tensor) -> Tensor:
-    """The step with which each step's episode begins, [T, *]; 0 if it began before these steps."""
+    """Index of the first step of each step's episode, [T, *]; 0 if the episode began before these steps."""
     return torch.where(begins, _steps(begins), 0).cummax(0).values
 
 
 def ended_before(ended: Tensor, begins: Tensor, already: Tensor) -> Tensor:
-    """Had the episode of each step ended before it, [T, *] bool.
+    """Whether the episode of each step had ended at an earlier step, [T, *] bool.
 
     Args:
-        ended: does the episode end with this step, as the server knows now, [T, *].
-        begins: is this step the first after a reset, [T, *].
-        already: had the episode of the first step ended before it, [*].
+        ended: whether the episode ends with this step, as the server knows now, [T, *].
+        begins: whether this step is the first after a reset, [T, *].
+        already: whether the episode of the first step had ended before that step, [*].
     """
     ends = torch.where(ended, _steps(ended), -1)
     before = torch.cat([already.unsqueeze(0).long() - 1, ends[:-1]]).cummax(0).values
@@ -61,7 +62,7 @@ def ended_before(ended: Tensor, begins: Tensor, already: Tensor) -> Tensor:
 
 
 def _steps(like: Tensor) -> Tensor:
-    """0, 1, ..., T - 1 in the shape [T, *]."""
+    """Index of each step, 0, 1, ..., T - 1, expanded to [T, *]."""
     steps = torch.arange(len(like), device=like.device)
     return steps.view(-1, *[1] * (like.dim() - 1)).expand(like.shape)
 

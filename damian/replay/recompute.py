@@ -1,4 +1,4 @@
-"""The recomputation that a ``BackupdateStorage`` uses for UAVs: the server node once more."""
+"""Recomputes stored steps of UAVs with the server node, for ``BackupdateStorage``."""
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -12,16 +12,16 @@ from damian.world.messages import Messages
 
 
 def server_recompute(server: Server, reward_terms: bool = False, actor: bool = False) -> Recompute:
-    """What the server would have output at stored steps, had it held other messages.
+    """A function that computes what the server would have output at stored steps, had it held other messages.
 
     Args:
-        server: of the environment.
+        server: server node of the environment.
         reward_terms: recompute ``reward_terms`` too.
-        actor: and the features that the server sends the actors, which come first in their observations; what
-            an actor remembers by itself, such as its past actions, stays.
+        actor: recompute the actors' observations too. Only their first features change, which come from the
+            server; an actor's own memory behind them, such as its past actions, stays.
 
     Returns:
-        for ``BackupdateStorage(recompute=...)``.
+        The function, for ``BackupdateStorage(recompute=...)``.
     """
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
@@ -34,12 +34,12 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
             **outputs.status.entries(),
         }
         if actor:
-            sent, before = steps[next_key(keys.MESSAGE)], steps[next_key(keys.OBSERVATION)]
+            sent, stored = steps[next_key(keys.MESSAGE)], steps[next_key(keys.OBSERVATION)]
             own = server.observation.own
             features = (
                 server.observe_with_timely_messages(messages, sent, elapsed) if own else outputs.observation
             )
-            entries[keys.OBSERVATION] = torch.cat([features, before[..., features.shape[-1] :]], -1)
+            entries[keys.OBSERVATION] = torch.cat([features, stored[..., features.shape[-1] :]], -1)
         if reward_terms:
             entries |= {(*keys.REWARD_TERMS, name): term for name, term in outputs.terms.items()}
         return {next_key(key): value for key, value in entries.items()}

@@ -11,10 +11,10 @@ from torchrl.data import LazyTensorStorage
 class TimeStorage(LazyTensorStorage):
     """Keeps the latest steps of B worlds in order of time, [T, B].
 
-    The writer must be a round robin (TorchRL's default) over steps of the same worlds.
+    The writer must be a round robin (TorchRL's default), and all batches must have the same B worlds.
 
     Args:
-        max_size: T times B.
+        max_size: number of environment steps, T times B.
         options: of ``LazyTensorStorage``.
     """
 
@@ -23,11 +23,11 @@ class TimeStorage(LazyTensorStorage):
 
     @property
     def steps(self) -> TensorDictBase:
-        """The whole storage, [T, B], as a ring: ``latest`` gives the order of time."""
+        """All stored steps, [T, B], as a ring: ``latest`` gives their order in time."""
         return cast(TensorDictBase, self._storage)
 
     def latest(self, n_steps: int | None = None) -> Tensor:
-        """Indices of the latest steps, or of all, in order of time, [min(n_steps, T)]."""
+        """Indices of the latest ``n_steps`` steps (all if not given) in order of time, [min(n_steps, T)]."""
         stored = cast(int, self._len_along_dim0)
         n_steps = stored if n_steps is None else min(n_steps, stored)
         last = int(torch.as_tensor(self._last_cursor).view(-1)[-1])

@@ -1,4 +1,4 @@
-"""The physical world: pure functions and frozen data in metres, seconds and radians.
+"""The physical world: UAV motion, batteries, the signal source and messages, in metres, seconds and radians.
 
-Bearings and tracks are clockwise from north (y). Nothing here knows reinforcement learning.
+Bearings and tracks are measured clockwise from north (the y axis). Modules here do not depend on TorchRL.
 """

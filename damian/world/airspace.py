@@ -1,4 +1,4 @@
-"""Operative regions as padded tensors: polygons, landing points, nearest points, inside tests."""
+"""Operative regions as padded tensors, with tests for inside a polygon and searches for landing points."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -22,8 +22,8 @@ class Airspace:
         points: landing points, [R, L, 2] metres.
         n_points: number of real landing points, [R].
         edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres.
-        scale: largest distance between two vertices, [R] metres; what distances are divided by.
-        regions: where the polygons came from.
+        scale: largest distance between two vertices, [R] metres; features divide distances by it.
+        regions: the R regions, with their polygons and names.
     """
 
     points: Tensor
@@ -34,9 +34,11 @@ class Airspace:
 
     @property
     def max_points(self) -> int:
+        """Largest number of landing points in a region (L)."""
         return self.points.shape[1]
 
     def to(self, device: torch.device) -> "Airspace":
+        """Copy of the airspace on another device."""
         moved = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "regions"}
         return replace(self, **{name: tensor.to(device) for name, tensor in moved.items()})
 
@@ -44,10 +46,17 @@ class Airspace:
 def build_airspace(
     regions: list[Region], step_m: float, degrees: float, n_points: int | None, n_agents: int
 ) -> Airspace:
-    """Lay the landing lattice over each region.
+    """Lay the lattice of landing points over each region.
+
+    Args:
+        regions: operative regions.
+        step_m: distance between neighbouring points of a row [m].
+        degrees: slant of the lattice [deg].
+        n_points: number of landing points to keep in each region, nearest its centroid; all if None.
+        n_agents: number of UAVs.
 
     Raises:
-        InputError: fewer landing points than UAVs in some region.
+        InputError: a region has fewer landing points than there are UAVs.
     """
     lattices = [landing_lattice(r.polygon, step_m, degrees, n_points) for r in regions]
     for region, lattice in zip(regions, lattices, strict=True):
@@ -60,7 +69,7 @@ def build_airspace(
     return Airspace(
         points=_padded(lattices, torch.inf),
         n_points=torch.tensor([len(lattice) for lattice in lattices]),
-        # A padded edge has no height, so no ray crosses it.
+        # A padded edge has zero length, so the inside test never counts it.
         edges=_padded(edges, 0.0),
         scale=torch.tensor([largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32),
         regions=tuple(regions),
@@ -68,10 +77,10 @@ def build_airspace(
 
 
 def inside(edges: Tensor, target: Tensor) -> Tensor:
-    """Even-odd test: does each target lie inside its polygon? Concave polygons and holes included.
+    """Whether each target lies inside its polygon (even-odd rule); concave polygons and holes are allowed.
 
     Args:
-        edges: [*, E, 4] metres.
+        edges: polygon edges ``x1, y1, x2, y2``, [*, E, 4] metres.
         target: [*, 2] metres.
 
     Returns:
@@ -80,23 +89,23 @@ def inside(edges: Tensor, target: Tensor) -> Tensor:
     x1, y1, x2, y2 = edges.unbind(-1)
     x, y = target[..., :1], target[..., 1:]
     straddles = (y1 > y) != (y2 > y)
-    # Where a horizontal edge divides by zero it does not straddle either.
+    # A horizontal edge divides by zero here, but it never straddles, so the result is not used.
     crossing = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
     return ((straddles & (x < crossing)).sum(-1) % 2).bool()
 
 
 def nearest_points(points: Tensor, target: Tensor, n: int) -> Tensor:
-    """The ``n`` landing points nearest each target, nearest first, equal distances by lowest id.
+    """The ``n`` landing points nearest each target, nearest first; of equal distances, the lowest id first.
 
     Args:
-        points: [*, L, 2] metres; padded ones infinitely far.
+        points: [*, L, 2] metres; padded points lie infinitely far away.
         target: [*, 2] metres.
 
     Returns:
         Point ids, [*, n].
     """
     east, north = (points[..., i].double() - target[..., i : i + 1].double() for i in (0, 1))
-    # Far below any real difference of squared distances, so it only orders ties.
+    # This term is far below any real difference of squared distances, so it only breaks ties.
     order = 1e-9 * torch.arange(points.shape[-2], device=points.device, dtype=torch.float64)
     return (east.square() + north.square() + order).topk(n, dim=-1, largest=False).indices
 

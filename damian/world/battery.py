@@ -1,7 +1,7 @@
-"""Battery: what flying drains and standing charges, in percent of the capacity (SPEC 1, Battery).
+"""Battery model (paper, section 3.2): drain of a flight and gain of charging, in percent of the capacity.
 
-The cruise drain's rate is proportional to the speed, so the drain of any piece of a cruise is
-proportional to its length: exact whatever the time step and the speed profile.
+The cruise power is proportional to the speed, so the drain of any part of a cruise is exactly
+proportional to its length, whatever the time step and the speed profile.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from torch import Tensor
 from damian.common import checks
 
 _VERTICAL_FACTOR = 0.9
-"""Takeoff and landing: the base that the engine's power is divided by shrinks by 10 %."""
+"""In takeoff and landing, the drain at full engine power is divided by this factor."""
 
 
 @dataclass
 class BatteryConfig:
-    """The UAVs' batteries and where they charge."""
+    """Batteries of the UAVs, and the places where they charge."""
 
     enabled: bool = False
-    """Do flights drain the battery? If not, it stays full."""
+    """Whether flights drain the battery; if not, it stays full."""
     engine_power_kw: float = 10.0
     """Engine power at the reference speed, and in takeoff and landing [kW]."""
     reference_speed: float = 20.0
@@ -28,13 +28,13 @@ class BatteryConfig:
     capacity_kwh: float = 9.0
     """Energy of a full battery [kWh]."""
     efficiency: float = 12.0
-    """Efficiency factor of the consumption (``eff`` in SPEC 1)."""
+    """Efficiency factor; the consumption is divided by it."""
     charging_power_kw: float = 4.0
     """Power with which a landed UAV charges [kW]."""
     resolution: float = 5.0
-    """Step in which a battery level is observed [%]."""
+    """Observed battery levels are rounded down to a multiple of this [%]."""
     charging_points: list | None = None
-    """Places [x, y] in metres where UAVs charge; anywhere if not given."""
+    """Places [x, y] in metres; UAVs charge at the landing point nearest each, or anywhere if not given."""
 
     def __post_init__(self) -> None:
         checks.above("battery.engine_power_kw", self.engine_power_kw, 0.0, "kW")
@@ -55,28 +55,28 @@ class BatteryConfig:
 
 
 def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:
-    """Drain of cruising a distance: [*] metres to [*] percent."""
+    """Battery drain of cruising a distance: [*] metres to [*] percent."""
     percent_per_hour = _full_power_drain(battery)
     return distance * (percent_per_hour / (3600 * battery.reference_speed))
 
 
 def cruise_range(level: Tensor, battery: BatteryConfig) -> Tensor:
-    """How far a level lasts, the inverse of ``cruise_drain``: [*] percent to [*] metres."""
+    """Longest cruise on a battery level, the inverse of ``cruise_drain``: [*] percent to [*] metres."""
     return level * (3600 * battery.reference_speed / _full_power_drain(battery))
 
 
 def vertical_drain(seconds: Tensor, battery: BatteryConfig) -> Tensor:
-    """Drain of taking off or landing for a time: [*] seconds to [*] percent."""
+    """Battery drain of a takeoff or landing: [*] seconds to [*] percent."""
     return seconds * (_full_power_drain(battery) / (3600 * _VERTICAL_FACTOR))
 
 
 def flight_drain(vertical: Tensor, distance: Tensor, battery: BatteryConfig) -> Tensor:
-    """Drain of a whole flight: takeoff, cruise and landing.
+    """Battery drain of a whole flight: takeoff, cruise and landing.
 
     Args:
         vertical: duration of the takeoff, the same as of the landing, [*] seconds.
         distance: length of the cruise, [*] metres.
-        battery: its figures.
+        battery: parameters of the battery.
 
     Returns:
         Percent, [*].
@@ -87,17 +87,17 @@ def flight_drain(vertical: Tensor, distance: Tensor, battery: BatteryConfig) -> 
 def used_so_far(
     elapsed: Tensor, vertical: Tensor, cruise: Tensor, cruised: Tensor, battery: BatteryConfig
 ) -> Tensor:
-    """Drain of a flight up to a time.
+    """Battery drain of a flight up to a time.
 
     Args:
         elapsed: time since takeoff, [*] seconds.
         vertical: duration of the takeoff, the same as of the landing, [*] seconds.
         cruise: duration of the cruise, [*] seconds.
         cruised: distance cruised so far, [*] metres.
-        battery: its figures.
+        battery: parameters of the battery.
 
     Returns:
-        Percent, [*]; ``flight_drain`` from the end of the flight on.
+        Percent, [*]; equals ``flight_drain`` from the end of the flight on.
     """
     took_off = torch.minimum(elapsed, vertical)
     landing = torch.minimum((elapsed - vertical - cruise).clamp(min=0), vertical)
@@ -105,17 +105,17 @@ def used_so_far(
 
 
 def charge_gain(seconds: Tensor, battery: BatteryConfig) -> Tensor:
-    """What charging for a time adds: [*] seconds to [*] percent; not clipped at a full battery."""
+    """Battery level gained by charging: [*] seconds to [*] percent; not clipped at a full battery."""
     full = 3600 * battery.capacity_kwh / battery.charging_power_kw
     return seconds * (100 / full)
 
 
 def observed(level: Tensor, battery: BatteryConfig) -> Tensor:
-    """The level as it is observed: [*] percent, rounded down to the resolution."""
-    # The slack keeps a level that float error left just below a step on that step.
+    """Observed battery level: [*] percent, rounded down to a multiple of the resolution."""
+    # The small offset keeps a level on its multiple where float error left it just below.
     return torch.floor(level / battery.resolution + 1e-4) * battery.resolution
 
 
 def _full_power_drain(battery: BatteryConfig) -> float:
-    """Percent per hour at full engine power."""
+    """Battery drain at full engine power [percent per hour]."""
     return 100 * battery.engine_power_kw / (battery.capacity_kwh * battery.efficiency)

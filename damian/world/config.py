@@ -1,4 +1,4 @@
-"""Settings of the physics: how many UAVs fly over which region, how they move, and what they listen for."""
+"""Settings of the simulated world: UAVs, region, motion, signal source, batteries and actions."""
 
 from dataclasses import dataclass, field
 
@@ -13,12 +13,12 @@ from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 FLIGHT_LEVEL_M = 30.48
-"""A flight level is a hundred feet."""
+"""Metres per flight level of a published region (one flight level is 100 feet)."""
 
 
 @dataclass
 class WorldConfig:
-    """Everything that the simulation reads."""
+    """All settings of the simulation."""
 
     agents: int = 3
     """Number of UAVs."""
@@ -40,10 +40,14 @@ class WorldConfig:
         )
 
     def airspace(self, rng: np.random.Generator) -> Airspace:
-        """Regions with their landing lattices.
+        """Build the regions and their landing points.
+
+        Args:
+            rng: random generator, for random regions.
 
         Raises:
-            InputError: a wrong file or polygon, or fewer landing points than UAVs.
+            InputError: a wrong file or polygon, fewer landing points than UAVs, or a flight level of a
+                UAV outside those of its region.
         """
         region = self.region
         regions = region.regions(rng)

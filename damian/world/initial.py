@@ -1,5 +1,4 @@
-"""Initial conditions: where UAVs start and how the source walks, drawn once so that a reset only picks
-one."""
+"""Initial conditions (start points of the UAVs, walk of the source), drawn once so that a reset picks one."""
 
 from typing import NamedTuple
 
@@ -15,23 +14,23 @@ from damian.world.signal_source import Walk, draw_walks
 
 
 class InitialConditions(NamedTuple):
-    """Q initial conditions, shared out evenly among the regions."""
+    """Q initial conditions, the same number for each region."""
 
     region: Tensor
-    """[Q]."""
+    """Index of the region, [Q]."""
     start: Tensor
     """Landing point of each UAV within its region, [Q, N]."""
     walk: Walk
-    """Of the source, [Q, K]."""
+    """Walk of the source over at most K stops, [Q, K]."""
 
 
 def draw_initial_conditions(
     config: WorldConfig, airspace: Airspace, rng: np.random.Generator
 ) -> InitialConditions:
-    """Draw starts and walks, on the CPU.
+    """Draw the start points of the UAVs and the walks of the source, on the CPU.
 
     Raises:
-        InputError: a given start or source position lies outside the region.
+        InputError: a given start position or source position lies outside the region.
     """
     per_region = config.region.initial_conditions // len(airspace.regions)
     walks, starts = [], []
@@ -46,7 +45,7 @@ def draw_initial_conditions(
 
 
 def _pad(walk: Walk, stops: int) -> Walk:
-    """Pad a walk with stops that it never reaches."""
+    """Pad walks to the given number of stops; the source never reaches the padded ones."""
     missing = stops - walk.arrive.shape[1]
 
     def repeat_last(field: Tensor) -> Tensor:
@@ -60,7 +59,7 @@ def _pad(walk: Walk, stops: int) -> Walk:
 def _draw_starts(
     config: WorldConfig, airspace: Airspace, region: int, n: int, rng: np.random.Generator
 ) -> Tensor:
-    """Landing points where the UAVs start, [n, N]: given, all the same, or all different."""
+    """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for each."""
     if config.region.start_positions is not None:
         place = torch.tensor(config.region.start_positions)
         within = inside(airspace.edges[region], place)

@@ -1,4 +1,4 @@
-"""What a UAV chooses: a distance and a heading, turned into a landing point that no other UAV has."""
+"""Actions (paper, section 4.2): a distance and a heading that lead to a landing point of the UAV's own."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,23 +12,23 @@ from damian.common.tensors import gather_rows
 from damian.world.airspace import Airspace, inside, nearest_points
 
 MAX_PAIRS = 2_000_000_000
-"""Pairs of a landing point's action and a landing point that are compared at construction: a minute."""
+"""Most pairs of (landing point, action) and landing point compared at construction: about a minute."""
 
 
 @dataclass
 class ActionConfig:
-    """The (distance, heading) pairs of SPEC 2."""
+    """The (distance, heading) actions of the UAVs (paper, section 4.2)."""
 
     kind: str = "discrete"
     """``discrete`` (every listed distance with every listed heading) or ``continuous``."""
     distances: list[float] = field(default_factory=lambda: [0.0, 50.0, 100.0, 150.0, 200.0])
-    """[m]; 0 holds the position. Continuous actions reach up to the largest."""
+    """Distances [m]; 0 holds the position. Continuous actions reach up to the largest distance."""
     headings: list[float] = field(
         default_factory=lambda: [-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0]
     )
-    """Clockwise from north [deg]; discrete actions only."""
+    """Headings clockwise from north [deg]; only discrete actions use them."""
     mask: bool = True
-    """Mask out discrete actions that would only hold (target outside, battery too low, in flight)."""
+    """Mask discrete actions without effect: target outside the region, battery too low, UAV in flight."""
 
     def __post_init__(self) -> None:
         checks.one_of("actions.kind", self.kind, ["discrete", "continuous"])
@@ -46,31 +46,39 @@ class ActionConfig:
         return len(self.distances) * len(self.headings)
 
     def table(self) -> Tensor:
-        """Discrete actions as (distance [m], heading [rad]), distance-major, [A, 2]."""
+        """Discrete actions as (distance [m], heading [rad]), [A, 2]; the heading changes fastest."""
         headings = [math.radians(heading) for heading in self.headings]
         return torch.tensor([[d, h] for d in self.distances for h in headings])
 
 
 def displacement(distance: Tensor, heading: Tensor) -> Tensor:
-    """Metres east and north of a flight, [*, 2]."""
+    """Displacement east and north, [*, 2] metres, of flights by distance [*] metres and heading [*] rad."""
     return distance.unsqueeze(-1) * torch.stack([heading.sin(), heading.cos()], -1)
 
 
 class Ranking(NamedTuple):
-    """M lists of K landing points, the most preferred first."""
+    """M lists of K landing points, the preferred one first."""
 
     point: Tensor
-    """Ids within the region, [M, K]."""
+    """Ids of the landing points within their region, [M, K]."""
     distance: Tensor
-    """From where the UAV stands [m], [M, K]."""
+    """Distance from the point where the UAV stands [m], [M, K]."""
 
 
 class Candidates:
-    """Landing points that an action may lead to, nearest its target first.
+    """Landing points to which an action may lead, nearest its target first.
 
     UAVs choose only while they stand on a landing point, so for discrete actions the candidates of every
-    (landing point, action) are computed once. ``2N - 1`` candidates always contain a free one: the
-    others stand on ``N - 1`` points at most and have booked as many.
+    (landing point, action) are computed once. Among ``2N - 1`` candidates, one is always free: the other
+    UAVs stand on at most ``N - 1`` points and have booked at most ``N - 1`` more.
+
+    Args:
+        airspace: regions and their landing points.
+        config: settings of the actions.
+        n_agents: number of UAVs N.
+
+    Raises:
+        InputError: too many landing points to rank for every discrete action.
     """
 
     def __init__(self, airspace: Airspace, config: ActionConfig, n_agents: int) -> None:
@@ -82,12 +90,15 @@ class Candidates:
             self._rank_all()
 
     def rank(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Ranking, Tensor]:
-        """Candidates, and each UAV's row among them [B, N].
+        """Rank the landing points to which the actions may lead.
 
         Args:
             flat: flat id of the landing point each UAV stands on, [B, N].
-            region: [B].
+            region: index of each world's region, [B].
             action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
+
+        Returns:
+            Candidates, and the row of each UAV among them, [B, N].
         """
         if self.config.kind == "discrete":
             return self.ranking, flat * self.config.n_actions + action
@@ -106,7 +117,7 @@ class Candidates:
     def _rank(
         self, points: Tensor, edges: Tensor, standing: Tensor, own: Tensor, move: Tensor
     ) -> tuple[Ranking, Tensor]:
-        """Candidates [*, K] and whether the target lies inside, [*]. Outside the UAV holds (SPEC 2)."""
+        """Candidates [*, K], and whether the target lies inside [*]; if it does not, the UAV holds."""
         target = standing + move
         valid = inside(edges, target)
         nearest = nearest_points(points, target, self.n_candidates)
@@ -117,11 +128,11 @@ class Candidates:
         return Ranking(nearest, distance), valid
 
     def _rank_all(self) -> None:
-        """Everything about every (landing point, action).
+        """Tabulate the candidates of every (landing point, action).
 
-        ``ranking`` of R*L*A lists; ``distance`` [R*L, A] to the nearest candidate, 0 if the action holds,
-        infinite if its target lies outside; ``hold`` [A] marks one action that holds (the first, if no
-        listed distance is 0).
+        ``ranking`` has R*L*A lists; ``distance`` [R*L, A] is that to the nearest candidate, 0 if the action
+        holds, infinite if its target lies outside; ``hold`` [A] marks one action that holds (the first
+        action, if no listed distance is 0).
         """
         table = self.config.table()
         n_regions, n_points = self.airspace.points.shape[:2]
@@ -134,22 +145,22 @@ class Candidates:
         )
         move = displacement(table[:, 0], table[:, 1])
         holds = table[:, 0] == 0
-        ranked, far, distance = [], [], []
+        ranked_points, ranked_distances, first_distance = [], [], []
         for points, edges in zip(self.airspace.points, self.airspace.edges, strict=True):
-            for own in torch.arange(len(points)).split(64):  # bounds the memory of the search
+            for own in torch.arange(len(points)).split(64):  # in parts, to bound the memory of the search
                 standing = torch.nan_to_num(points[own], posinf=0.0).unsqueeze(1)
                 own_point = own.unsqueeze(-1).expand(-1, len(table))
                 ranking, within = self._rank(points, edges, standing, own_point, move)
-                ranked.append(ranking.point.flatten(0, 1).to(torch.int32))
-                far.append(ranking.distance.flatten(0, 1))
-                distance.append(ranking.distance[..., 0].where(within | holds, torch.inf))
-        self.ranking = Ranking(torch.cat(ranked), torch.cat(far))
-        self.distance = torch.cat(distance)
+                ranked_points.append(ranking.point.flatten(0, 1).to(torch.int32))
+                ranked_distances.append(ranking.distance.flatten(0, 1))
+                first_distance.append(ranking.distance[..., 0].where(within | holds, torch.inf))
+        self.ranking = Ranking(torch.cat(ranked_points), torch.cat(ranked_distances))
+        self.distance = torch.cat(first_distance)
         self.can_hold = bool(holds.any())
         self.hold = torch.arange(len(table)) == int(holds.int().argmax())
 
     def to(self, device: torch.device) -> "Candidates":
-        """Move the tables in place."""
+        """Move the tables to a device, in place."""
         self.airspace = self.airspace.to(device)
         if self.config.kind == "discrete":
             self.ranking = Ranking(*(table.to(device) for table in self.ranking))
@@ -162,28 +173,28 @@ def assign_landing_points(
 ) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point.
 
-    A point is free if no other UAV stands on it or is bound for it (SPEC 2); a UAV's own always is. Most
-    UAVs get their first candidate at once; only the worlds in which one does not are looked at again.
+    A point is free to a UAV if no other UAV stands on it or is bound for it; its own point always is. Most
+    UAVs get their first candidate; only worlds in which two UAVs may conflict are assigned one by one.
 
     Args:
-        ranking: candidates.
-        row: each UAV's list among them, [B, N].
+        ranking: candidates, as M lists of K.
+        row: row of each UAV among these lists, [B, N].
         standing: point that each UAV stands on or is bound for, [B, N].
-        reach: how far the UAV may fly now [m], negative if it may not choose; a candidate beyond it is
-            none, so that it keeps nobody else from that point, [B, N].
-        n_points: landing points of a region; ids are below it.
+        reach: largest distance that the UAV may fly now [m], negative if it may not choose, [B, N]. A
+            candidate farther away does not count, and stays free for other UAVs.
+        n_points: number of landing points of a region; ids are below it.
 
     Returns:
-        Booked point of each UAV, [B, N].
+        Point that each UAV books, [B, N].
     """
     reached = gather_rows(ranking.distance[:, 0], row) <= reach
     choice = torch.where(reached, gather_rows(ranking.point[:, 0], row).long(), standing)
-    moves = choice != standing
-    # How many stand on each point or want to move there: who finds more than itself may have to yield.
+    departs = choice != standing
+    # Claims on each point: UAVs that stand there or choose it. A UAV that is not alone may have to yield.
     claims = standing.new_zeros(len(standing), n_points, dtype=torch.int16)
-    claim = torch.cat([torch.ones_like(moves), moves], -1).to(claims.dtype)
+    claim = torch.cat([torch.ones_like(departs), departs], -1).to(claims.dtype)
     claims = claims.scatter_add(1, torch.cat([standing, choice], -1), claim)
-    contested = (moves & (claims.gather(1, choice) > 1)).any(-1)
+    contested = (departs & (claims.gather(1, choice) > 1)).any(-1)
     return _settle(*ranking, row, standing, reach, choice, contested, n_points)
 
 
@@ -198,9 +209,10 @@ def _settle(
     contested: Tensor,
     n_points: int,
 ) -> Tensor:
-    """The choices, made anew in index order in the contested worlds [B].
+    """The choices [B, N], with those of the contested worlds [B] made again in index order.
 
-    An operator of its own, because how many these are depends on the data, which a compiler cannot trace.
+    This is a custom operator because the number of contested worlds depends on the data, which a compiler
+    cannot trace.
     """
     settled = choice.clone()
     worlds = contested.nonzero().squeeze(-1)
@@ -213,19 +225,19 @@ def _settle(
 
 
 @_settle.register_fake
-def _(point, distance, row, standing, reach, choice, contested, n_points):  # for compilers: its shape
+def _(point, distance, row, standing, reach, choice, contested, n_points):  # compilers need only the shape
     return torch.empty_like(choice)
 
 
 def _assign_in_order(candidates: Tensor, standing: Tensor, n_points: int) -> Tensor:
-    """Serial choice as the fixed point of "take the best candidate that no earlier UAV has taken".
+    """Serial assignment as the fixed point of "take the best candidate that no earlier UAV has taken".
 
-    After r rounds the first r + 1 UAVs are settled, so that N - 1 rounds suffice; mostly one or two do.
+    After r rounds the choices of the first r + 1 UAVs are final, so N - 1 rounds suffice.
 
     Args:
-        candidates: [B, N, K].
-        standing: [B, N].
-        n_points: ids are below it.
+        candidates: landing points, preferred first, [B, N, K].
+        standing: point that each UAV stands on or is bound for, [B, N].
+        n_points: number of landing points of a region; ids are below it.
     """
     n_agents = standing.shape[1]
     index = torch.arange(n_agents, device=standing.device).expand_as(standing)
@@ -234,7 +246,7 @@ def _assign_in_order(candidates: Tensor, standing: Tensor, n_points: int) -> Ten
     owner = index.new_full((len(index), n_points), n_agents).scatter_(1, standing, -1)
 
     def choose(owner: Tensor) -> Tensor:
-        """Best candidate that belongs to no earlier UAV; there always is one."""
+        """Best candidate of each UAV that belongs to no earlier one; there always is one."""
         owners = owner.gather(1, flat).view_as(candidates)
         allowed = own | (owners >= index.unsqueeze(-1))
         best = allowed.view(torch.uint8).argmax(-1, keepdim=True)

@@ -10,28 +10,29 @@ import torch
 from torch import Tensor
 
 MAX_EXACT_INTEGER = 2**24
-"""Messages are rows of float32: integers up to this are exact."""
+"""Messages are packed as float32, which holds integers up to this exactly."""
 
 
 class Column(NamedTuple):
-    """How a field is packed."""
+    """How a field of a message is packed."""
 
     width: int | None = 1
-    """Numbers that it takes; None for as many as the other fields leave (one field at most)."""
+    """Number of columns; None for all columns that the other fields leave (one field at most)."""
     dtype: torch.dtype = torch.float32
+    """Type of the unpacked field."""
 
 
 class Messages(NamedTuple):
     """One message of each UAV, with any leading dimensions; each field [*, N] or [*, N, width].
 
     A message carries what the paper lists (section 3.2) and, so that features and rewards follow from
-    messages alone, the UAV's count of motions and its latest landing points.
+    messages alone, the number of motions of the UAV and its latest landing points.
     """
 
     time: Annotated[Tensor, Column()]
-    """Generation time [s]."""
+    """Time at which the message was generated [s]."""
     position: Annotated[Tensor, Column(2)]
-    """East, north [m]."""
+    """Position of the UAV, east, north [m]."""
     target: Annotated[Tensor, Column(2)]
     """Landing point that the UAV is bound for, east, north [m]."""
     track: Annotated[Tensor, Column()]
@@ -39,9 +40,9 @@ class Messages(NamedTuple):
     battery: Annotated[Tensor, Column()]
     """Battery level, not rounded [%]."""
     spotted: Annotated[Tensor, Column(dtype=torch.bool)]
-    """Does the UAV spot the source."""
+    """Whether the UAV spots the source."""
     motions: Annotated[Tensor, Column(dtype=torch.long)]
-    """Motions since the UAV spotted the source before this message, holding included."""
+    """Motions (holding included) since the latest detection before this message."""
     detected_time: Annotated[Tensor, Column()]
     """Time of the latest detection [s]; -1 if there was none."""
     detected_position: Annotated[Tensor, Column(2)]
@@ -51,20 +52,20 @@ class Messages(NamedTuple):
 
     @classmethod
     def blank(cls, trail: Tensor) -> "Messages":
-        """Zeros in every field, no detection, and the given landing points, [*, N, window] long."""
+        """Messages of zeros, without a detection, with the landing points ``trail`` [*, N, window]."""
         width = sum(column.width or 0 for column in _COLUMNS) + trail.shape[-1]
         blank = cls.unpack(torch.zeros(*trail.shape[:-1], width))
         return blank._replace(detected_time=blank.detected_time - 1, trail=trail)
 
     def pack(self) -> Tensor:
-        """Messages as rows of numbers, fields in order, [*, N, M] float32."""
+        """Messages as rows of M numbers, fields in order, [*, N, M] float32."""
         fields = zip(self, _COLUMNS, strict=True)
         parts = [(field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields]
         return torch.cat(parts, -1)
 
     @classmethod
     def unpack(cls, rows: Tensor) -> "Messages":
-        """The fields of packed messages [*, N, M]; float fields are views of them."""
+        """Messages from their rows [*, N, M]; float fields are views of the rows."""
         rest = rows.shape[-1] - sum(column.width or 0 for column in _COLUMNS)
         parts = rows.split([column.width or rest for column in _COLUMNS], -1)
         return cls._make(_read(part, column) for part, column in zip(parts, _COLUMNS, strict=True))

@@ -1,7 +1,7 @@
-"""Flights: rest-to-rest polynomial phases up, across and down, and the shortest times they take.
+"""Flights: takeoff, cruise and landing as rest-to-rest polynomials, and the shortest times of each.
 
 A flight starts and ends at rest on a landing point: takeoff to the flight level, cruise at that
-level, landing (paper, eq. 1). Each phase follows one polynomial time law of degree 3, 5 or 7.
+level, landing (paper, eq. 1). Each phase follows a polynomial time law of degree 3, 5 or 7.
 """
 
 import math
@@ -25,7 +25,7 @@ class MotionConfig:
     """How UAVs move."""
 
     kind: str = "instant"
-    """``instant``: at the target when the step ends; ``polynomial``: flights take their time."""
+    """``instant``: a UAV is at its target when the step ends; ``polynomial``: flights take several steps."""
     degree: int = 5
     """Degree of the time law of each phase: 3, 5 or 7."""
     max_speed: float = 5.0
@@ -33,13 +33,13 @@ class MotionConfig:
     max_acceleration: float = 2.0
     """Acceleration limit of a phase [m/s^2]."""
     sensing_time: float = 0.0
-    """How long a landed UAV senses before it may choose again [s]."""
+    """Time that a landed UAV senses before it may choose again [s]."""
     min_level: float = 1.0
     """Flight level of the first UAV [m]."""
     max_level: float = 20.0
     """Highest flight level [m]."""
     level_separation: float = 0.5
-    """Distance between the flight levels of two UAVs [m]."""
+    """Vertical distance between the flight levels of two UAVs [m]."""
 
     def __post_init__(self) -> None:
         checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
@@ -53,7 +53,7 @@ class MotionConfig:
 
 
 class Pose(NamedTuple):
-    """Where a UAV is in its flight: position [*, 3] m, and the distance cruised so far [*] m."""
+    """State of a flight: position [*, 3] m, and distance cruised so far [*] m."""
 
     position: Tensor
     cruised: Tensor
@@ -63,7 +63,7 @@ def flight_levels(config: MotionConfig, n_agents: int) -> list[float]:
     """One flight level per UAV [m], from the lowest upward.
 
     Raises:
-        InputError: they do not fit under the highest level.
+        InputError: the levels do not fit under the highest one.
     """
     room = (config.max_level - config.min_level) / config.level_separation
     n_fit = math.floor(room + _TINY) + 1
@@ -78,7 +78,7 @@ def flight_levels(config: MotionConfig, n_agents: int) -> list[float]:
 
 
 def time_law(tau: Tensor, degree: int) -> Tensor:
-    """Share of a phase's length covered at the share ``tau`` of its time (SPEC 1, Motion).
+    """Share of a phase's length covered at the share ``tau`` of its time (paper, eq. 1).
 
     The polynomial of lowest degree with s(0) = 0, s(1) = 1 and 1, 2 or 3 vanishing derivatives at
     both ends. ``tau`` is clamped to [0, 1].
@@ -96,15 +96,15 @@ def time_law(tau: Tensor, degree: int) -> Tensor:
 
 
 def minimum_time(length: Tensor, degree: int, max_speed: float, max_acceleration: float) -> Tensor:
-    """Shortest time of a rest-to-rest phase within both limits (SPEC 1, Motion); 0 for length 0.
+    """Shortest time of a rest-to-rest phase within both limits; 0 for length 0.
 
     Closed form: the time law's largest derivatives are constants, so each limit gives one time.
 
     Args:
         length: [*] metres.
         degree: 3, 5 or 7.
-        max_speed: m/s.
-        max_acceleration: m/s^2.
+        max_speed: limit of the speed [m/s].
+        max_acceleration: limit of the acceleration [m/s^2].
 
     Returns:
         Seconds, [*].
@@ -123,7 +123,7 @@ def fly(
     cruise: Tensor,
     degree: int,
 ) -> Pose:
-    """Where UAVs are some time after takeoff; landed at the target from the end of the flight on.
+    """Poses of UAVs some time after takeoff; from the end of their flights on, they stand at the targets.
 
     Args:
         origin: takeoff points, [*, 2] metres.
@@ -132,9 +132,9 @@ def fly(
         elapsed: time since takeoff, [*] seconds.
         vertical: duration of takeoff, and of landing, above 0, [*] seconds.
         cruise: duration of the cruise, [*] seconds; 0 if origin and target are the same.
-        degree: of the time law, 3, 5 or 7.
+        degree: degree of the time law, 3, 5 or 7.
     """
-    # Landing is takeoff played backwards, s(1 - tau) = 1 - s(tau): one law serves both.
+    # A landing is a takeoff reversed in time, s(1 - tau) = 1 - s(tau), so one evaluation serves both.
     remaining = torch.add(cruise, vertical, alpha=2) - elapsed
     climbing = torch.minimum(elapsed, remaining) / vertical
     cruising = (elapsed - vertical) / cruise.clamp_min(_TINY)

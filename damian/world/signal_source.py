@@ -1,9 +1,9 @@
-"""The signal source: how far it is heard, and the walk that it takes.
+"""The signal source (paper, section 3.2): the radius within which UAVs detect it, and its walk.
 
 A dynamic source visits hotspots in a random order and, around each, a few inner points; it waits
 at every stop and goes straight to the next one with a trapezoidal speed profile. Walks are drawn
-once and held as padded tensors; where a source is at a time is then closed form. In a concave
-polygon the way between two stops may lie outside it.
+once as padded tensors, from which the position at any time follows in closed form. In a concave
+polygon, the straight line between two stops may leave the polygon.
 """
 
 import math
@@ -26,26 +26,26 @@ _FULL_DISC_ROUNDS, _ROUNDS = 256, 320
 
 @dataclass
 class SourceConfig:
-    """What the UAVs look for."""
+    """The signal source that the UAVs search for."""
 
     level_db: float = 140.0
     """Sound level at 1 m [dB re 1e-12 W/m^2]."""
     microphone_db: float = 105.0
-    """Faintest level that a UAV's microphone hears [dB re 1e-12 W/m^2]."""
+    """Lowest level that a UAV's microphone detects [dB re 1e-12 W/m^2]."""
     motion: str = "static"
-    """``static``, or ``dynamic``: a walk over hotspots."""
+    """``static``, or ``dynamic``: the source walks over hotspots."""
     emission: str = "constant"
-    """``constant``; ``per_stop`` or ``per_step``: on or off, drawn anew for each stop or step."""
+    """``constant``; ``per_stop`` or ``per_step``: on or off, drawn at each stop or simulation step."""
     emission_probability: float = 0.5
-    """How often an intermittent source is on."""
+    """Probability that an intermittent source is on."""
     position: list | None = None
-    """Where it is, or where its walk begins, [x, y] in metres; drawn each episode if not given."""
+    """Position, or start of the walk, [x, y] in metres; drawn for each initial condition if not given."""
     n_hotspots: int = 10
-    """Hotspots of a walk."""
+    """Number of hotspots of a walk."""
     min_stops: int = 3
-    """Fewest inner points around a hotspot."""
+    """Smallest number of inner points around a hotspot."""
     max_stops: int = 7
-    """Most inner points around a hotspot."""
+    """Largest number of inner points around a hotspot."""
     local_distance: float = 50.0
     """Largest distance of an inner point from its hotspot [m]."""
     speed: float = 20.0
@@ -94,18 +94,18 @@ class SourceConfig:
 
 
 class Walk(NamedTuple):
-    """Walks of ``W`` sources over at most ``K`` stops; a static source has one and never leaves.
+    """Walks of ``W`` sources over at most ``K`` stops; a static source has one stop and never leaves it.
 
-    Padded stops repeat the last real one: same place and departure, arrival at infinity.
+    Padded stops repeat the place and departure time of the last real stop; their arrival time is infinite.
 
     Attributes:
         stop: places, [W, K, 2] metres.
         arrive: arrival times, [W, K] seconds, increasing; the first is 0.
         depart: departure times, [W, K] seconds; infinite for a static source.
-        speed: largest speed of the leg that leaves the stop, [W, K] m/s.
-        acceleration: of the leg that leaves the stop, [W, K] m/s^2.
+        speed: largest speed on the leg that leaves the stop, [W, K] m/s.
+        acceleration: acceleration on the leg that leaves the stop, [W, K] m/s^2.
         emits: whether the source emits from its arrival until it arrives at the next stop, [W, K]
-            bool (always true unless emission is ``per_stop``).
+            bool (always true unless ``source.emission`` is ``per_stop``).
     """
 
     stop: Tensor
@@ -117,7 +117,7 @@ class Walk(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Where sources are: position [B, 2] m, latest stop [B] long, is the walk over [B] bool."""
+    """Positions of B sources [B, 2] m, index of the latest stop [B] int64, is the walk over [B] bool."""
 
     position: Tensor
     stop: Tensor
@@ -125,7 +125,7 @@ class Located(NamedTuple):
 
 
 class _Stops(NamedTuple):
-    """Stops without times: [W, K, 2] m, how many are real [W], which are hotspots [W, K]."""
+    """Stops without times: places [W, K, 2] m, number of real stops [W], which stops are hotspots [W, K]."""
 
     place: np.ndarray
     n: np.ndarray
@@ -133,8 +133,8 @@ class _Stops(NamedTuple):
 
 
 def footprint_radius(config: SourceConfig) -> float:
-    """Distance at which the source is just heard [m]: inverse-square law (paper, eq. 2 and 3)."""
-    # P = 4 pi I0 10^(level/10) over 4 pi I0 10^(microphone/10): all but the levels cancels.
+    """Largest distance at which a UAV detects the source [m]: inverse-square law (paper, eq. 2 and 3)."""
+    # R^2 = 4 pi I0 10^(level/10) / (4 pi I0 10^(microphone/10)), where all but the levels cancels.
     return 10 ** ((config.level_db - config.microphone_db) / 20)
 
 
@@ -147,8 +147,14 @@ def draw_walks(
     """Draw the walks of ``W = n_walks`` sources, float32 on the CPU.
 
     Hotspots are uniform in the polygon (hence in random order), inner points uniform in the part of
-    the disc around their hotspot that lies in the polygon. Where that part is a sliver
-    (under about 1 % of the disc), inner points lie nearer their hotspot than uniform ones would.
+    the disc around their hotspot that lies in the polygon. Where that part is very thin (under
+    about 1 % of the disc), inner points lie nearer their hotspot than uniform ones would.
+
+    Args:
+        polygon: operative region, local metres.
+        config: settings of the source.
+        n_walks: number of walks.
+        rng: random generator.
 
     Raises:
         InputError: the given position is not inside the polygon.
@@ -163,12 +169,12 @@ def draw_walks(
 
 
 def leg_duration(length: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
-    """Time of a rest-to-rest leg: trapezoidal speed, triangular if too short to reach ``speed``.
+    """Duration of a rest-to-rest leg: trapezoidal speed profile, triangular if too short to reach ``speed``.
 
     Args:
         length: [*] metres.
         speed: largest speed, [*] m/s.
-        acceleration: speeding up and slowing down, [*] m/s^2.
+        acceleration: acceleration and deceleration, [*] m/s^2.
 
     Returns:
         Seconds, [*]; 0 for length 0.
@@ -177,11 +183,11 @@ def leg_duration(length: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
 
 
 def locate(walk: Walk, time: Tensor) -> Located:
-    """Where the sources are at a time; at its last stop once the walk is over.
+    """Positions of sources at a time; a source whose walk is over stays at its last stop.
 
     Args:
         walk: one walk per world, leading dimension ``B``.
-        time: since the walk's beginning, not negative, [B] seconds.
+        time: time since the walk began, not negative, [B] seconds.
     """
     finished = time >= walk.depart[..., -1]
     last = walk.stop.shape[-2] - 1
@@ -201,16 +207,16 @@ def locate(walk: Walk, time: Tensor) -> Located:
 
 
 def _profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-    """Time of speeding up and of the whole leg [s], [*]."""
+    """Duration of the acceleration, and of the whole leg [s], [*]."""
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration
     return ramp, length / peak.clamp_min(torch.finfo(peak.dtype).tiny) + ramp
 
 
 def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tensor) -> Tensor:
-    """Distance covered of a leg, [*] metres; 0 before it begins, ``length`` once it is over."""
+    """Distance covered on a leg, [*] metres; 0 before it begins, ``length`` once it is over."""
     ramp, duration = _profile(length, speed, acceleration)
-    # The profile is symmetric: measure from the nearer end, where speed has only risen so far.
+    # The profile is symmetric: measured from the nearer end, speed has only risen or stayed the same.
     from_end = torch.minimum(elapsed, duration - elapsed).clamp_min(0.0)
     rising = torch.minimum(from_end, ramp)
     near = acceleration * rising * (from_end - rising / 2)
@@ -234,7 +240,7 @@ def _hotspots(
     n_hotspots: int,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Hotspots in the order of their visit, the first where the config says, [W, H, 2] metres."""
+    """Hotspots in the order of their visit, the first at ``source.position``, [W, H, 2] metres."""
     hotspots = sample_interior(polygon, n_walks * n_hotspots, rng).reshape(n_walks, n_hotspots, 2)
     if config.position is not None:
         hotspots[:, 0] = config.position
@@ -270,8 +276,8 @@ def _inner_points(
 ) -> np.ndarray:
     """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2] metres.
 
-    Rejection from the disc. What is still outside after the first rounds is drawn from ever smaller
-    discs, at last at the hotspot itself, so this ends however thin the polygon is.
+    Rejection sampling from the disc. Points still outside after the first rounds are drawn from ever
+    smaller discs, at last at the hotspot itself, so that sampling ends however thin the polygon is.
     """
     radii = config.local_distance / 2.0 ** np.maximum(np.arange(_ROUNDS) - _FULL_DISC_ROUNDS, 0)
     points = np.repeat(hotspots[:, :, None], config.max_stops, axis=2)
@@ -279,23 +285,23 @@ def _inner_points(
     missing = np.arange(len(flat))
     for radius in radii:
         drawn = centre[missing] + _in_disc(len(missing), radius, rng)
-        good = shapely.contains_xy(polygon, drawn)
-        flat[missing[good]] = drawn[good]
-        missing = missing[~good]
+        accepted = shapely.contains_xy(polygon, drawn)
+        flat[missing[accepted]] = drawn[accepted]
+        missing = missing[~accepted]
         if not len(missing):
             break
     return flat.reshape(points.shape)
 
 
 def _in_disc(n: int, radius: float, rng: np.random.Generator) -> np.ndarray:
-    """Points uniform in the disc about the origin, [n, 2]."""
+    """Points uniform in the disc about the origin, [n, 2] metres."""
     distance = radius * np.sqrt(rng.random(n))
     angle = 2 * math.pi * rng.random(n)
     return distance[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=1)
 
 
 def _timed_walk(stops: _Stops, config: SourceConfig, rng: np.random.Generator) -> Walk:
-    """Add waits, legs and emission to the stops."""
+    """Add waiting times, legs and emission to the stops."""
     shape = stops.hotspot.shape
     padded = np.arange(shape[1]) >= stops.n[:, None]
     last = (stops.n - 1)[:, None]

@@ -1,6 +1,6 @@
-"""The physics of B worlds at once: decisions, flights, the source, and the messages that the UAVs send.
+"""The physics of B parallel worlds: decisions, flights, the source, and the messages that the UAVs send.
 
-Pure functions of (state, action) over tensors, so that a step compiles into a few kernels.
+Steps are pure functions of (state, action) over tensors, so that a step compiles into a few kernels.
 """
 
 import math
@@ -21,13 +21,13 @@ from damian.world.vehicles import MOTION_MODELS
 
 
 class Simulation:
-    """Everything about the worlds that never changes, and how their state does.
+    """The constants of the worlds, and the functions that reset and step their state.
 
     Args:
-        config: of the physics.
-        dt: length of a step [s].
-        trail: how many of its last landing points a UAV reports.
-        seed: of the regions, starts and walks, which are drawn here, on the CPU.
+        config: settings of the world.
+        dt: length of a simulation step [s].
+        trail: number of its latest landing points that a UAV reports.
+        seed: seed of the regions, start points and walks, which are drawn here, on the CPU.
 
     Raises:
         InputError: the configuration asks for something impossible.
@@ -48,7 +48,7 @@ class Simulation:
         self.packed_initial = self.layout.pack(self.initial)
 
     def to(self, device: torch.device) -> "Simulation":
-        """Move everything, in place."""
+        """Move all tensors to a device, in place."""
         self.airspace = self.airspace.to(device)
         self.candidates.to(device)
         self.vehicles.to(device)
@@ -59,43 +59,43 @@ class Simulation:
 
     @property
     def n_initial_conditions(self) -> int:
-        """Q."""
+        """Number of initial conditions (Q)."""
         return len(self.initial.initial_condition)
 
     def reset(self, worlds: PackedState, mask: Tensor) -> PackedState:
         """Begin a new episode in the worlds of the mask [B]; the others stay as they are."""
-        chosen = mask.nonzero().squeeze(-1)  # mostly few
+        chosen = mask.nonzero().squeeze(-1)  # usually few worlds
         fresh = self.next_episode(tree_map(lambda rows: rows.index_select(0, chosen), worlds))
         return tree_map(lambda old, new: old.index_copy(0, chosen, new), worlds, fresh)
 
     def next_episode(self, worlds: PackedState) -> PackedState:
-        """A new episode in each of these worlds."""
+        """Begin a new episode in all of the given worlds."""
         seed, episode = worlds.integers[:, SEED], worlds.integers[:, EPISODE] + 1
         condition = counter_rng.bits(seed, episode) % self.n_initial_conditions
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)
-        kept = torch.stack([seed, episode], 1)  # the first two columns
+        kept = torch.stack([seed, episode], 1)  # SEED and EPISODE are the first two columns
         return fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
 
     def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
-        """One simulation step of ``dt``; actions of UAVs that are not ready change nothing.
+        """Simulate one step of ``dt``; actions of UAVs that are not ready change nothing.
 
         Args:
-            state: before it.
+            state: state before the step.
             action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
-            action_valid: whose action counts, [B, N]; everybody's if not given.
+            action_valid: whether each UAV's action counts, [B, N] bool; all count if not given.
         """
         state = self._decide(state, action, action_valid)
         state = self.vehicles.move(state)
         return self._sense(state._replace(steps=state.steps + 1), action_valid)
 
     def ready(self, state: State) -> Tensor:
-        """May each UAV choose now, [B, N]."""
+        """Whether each UAV may choose an action now, [B, N] bool."""
         return self.vehicles.ready(state)
 
     def action_mask(self, state: State) -> Tensor:
-        """Discrete actions that would do something, [B, N, A]; one that holds, of a UAV that is not ready.
+        """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds.
 
-        A single legal action has log-probability 0 and no gradient: in flight a policy learns nothing.
+        A single legal action has log-probability 0 and no gradient, so a policy does not learn from it.
         """
         distance = gather_rows(self.candidates.distance, state.goal)
         reach = self.vehicles.reach(state).unsqueeze(-1)
@@ -104,10 +104,10 @@ class Simulation:
             valid = valid | ~valid.any(-1, keepdim=True)
         return self.vehicles.mask_busy(valid, reach >= 0, self.candidates.hold)
 
-    # One step, in order.
+    # The stages of one step, in order.
 
     def _decide(self, state: State, action: Tensor, action_valid: Tensor | None) -> State:
-        """Assign landing points, and start flights."""
+        """Assign landing points to the UAVs that may choose, and start their flights."""
         base = state.region.unsqueeze(-1) * self.airspace.max_points
         standing = state.goal - base
         ranking, row = self.candidates.rank(state.goal, state.region, action)
@@ -125,13 +125,13 @@ class Simulation:
         return self.vehicles.take_off(state, goal, ready, departs)
 
     def _sense(self, state: State, action_valid: Tensor | None = None) -> State:
-        """Move the source, listen, and send messages."""
+        """Move the source, let UAVs on the ground detect it, and send messages."""
         now = (state.steps * self.dt).to(state.track.dtype)
         place, emits, over = self._source(state, now)
         on_ground = self.vehicles.on_ground(state)
         position = state.position[..., :2]
-        apart = (position - place.unsqueeze(-2)).square().sum(-1)
-        spotted = on_ground & emits.unsqueeze(-1) & (apart <= self.radius**2)
+        squared_distance = (position - place.unsqueeze(-2)).square().sum(-1)
+        spotted = on_ground & emits.unsqueeze(-1) & (squared_distance <= self.radius**2)
         times = now.unsqueeze(-1).repeat(1, state.track.shape[-1])
         messages = Messages(
             time=times,
@@ -161,7 +161,7 @@ class Simulation:
         return longer if added is None else torch.where(added.unsqueeze(-1), longer, before)
 
     def _source(self, state: State, now: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the source is [B, 2], whether it emits [B], and whether its walk is over [B]."""
+        """Position of the source [B, 2], whether it emits [B], and whether its walk is over [B]."""
         config = self.config.source
         emits = torch.ones_like(state.source_over)
         if config.motion == "static":
@@ -172,12 +172,12 @@ class Simulation:
             if config.emission == "per_stop":
                 emits = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
         if config.emission == "per_step":
-            chance = counter_rng.uniform(state.seed, state.episode, state.steps)
-            emits = chance < config.emission_probability
+            draw = counter_rng.uniform(state.seed, state.episode, state.steps)
+            emits = draw < config.emission_probability
         return place, emits & ~over, over
 
     def _initial_state(self, drawn: InitialConditions, trail: int, seed: int) -> State:
-        """The state at time 0 of every initial condition, [Q, ...]: what resets copy from."""
+        """The state at time 0 of every initial condition, [Q, ...]; resets copy rows of it."""
         n = len(drawn.region)
         goal = drawn.start + drawn.region.unsqueeze(-1) * self.airspace.max_points
         number = torch.arange(n)

@@ -1,4 +1,4 @@
-"""How UAVs move between landing points, how long that takes, and what it does to their batteries."""
+"""Motion models: how UAVs move between landing points, how long this takes, and how batteries change."""
 
 from abc import ABC, abstractmethod
 from typing import TypeVar
@@ -16,7 +16,7 @@ from damian.world.regions.polygon import MAX_COORDINATE_M
 from damian.world.state import State
 
 TIME_EPS = 1e-4
-"""Seconds; far below any step, far above float32 error within an episode."""
+"""Tolerance of times [s]; far below any step, far above float32 error within an episode."""
 
 Model = TypeVar("Model", bound="MotionModel")
 
@@ -25,13 +25,13 @@ class MotionModel(ABC):
     """Motion of N UAVs in B worlds, as pure functions of their state.
 
     Args:
-        config: of motion and battery.
-        airspace: landing points.
-        dt: length of a step [s].
+        config: settings of the world, of which motion, battery and the number of UAVs are used.
+        airspace: regions and their landing points.
+        dt: length of a simulation step [s].
     """
 
     instant: bool
-    """Is a UAV at its target as soon as a step ends."""
+    """Whether a UAV is at its target as soon as a step ends."""
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         self.motion, self.battery, self.dt = config.motion, config.battery, dt
@@ -43,7 +43,7 @@ class MotionModel(ABC):
         self.chargers = _charging_points(config, airspace)
 
     def to(self: Model, device: torch.device) -> Model:
-        """Move the tables, in place."""
+        """Move all tensors to a device, in place."""
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
                 setattr(self, name, value.to(device))
@@ -51,42 +51,41 @@ class MotionModel(ABC):
 
     @abstractmethod
     def ready(self, state: State) -> Tensor:
-        """May each UAV choose now, [B, N]."""
+        """Whether each UAV may choose an action now, [B, N] bool."""
 
     @abstractmethod
     def on_ground(self, state: State) -> Tensor:
-        """Does each UAV stand on its landing point, [B, N]."""
+        """Whether each UAV stands on its landing point, [B, N] bool."""
 
     @abstractmethod
     def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
-        """Legal actions [B, N, A]: the valid ones, but only ``hold`` [A] for a UAV that is not ready [B, N,
-        1]."""
+        """Legal actions [B, N, A]: ``valid`` for UAVs that are ready [B, N, 1], ``hold`` [A] for others."""
 
     @abstractmethod
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
-        """Set out for the landing points ``goal``.
+        """Start flights to the landing points ``goal``.
 
         Args:
-            state: before; its ``goal`` is where each UAV stands, or is bound for.
-            goal: flat ids, [B, N].
-            ready: has the UAV chosen just now, [B, N].
-            departs: and chosen to fly, [B, N].
+            state: state before; its ``goal`` is the point where each UAV stands or is bound for.
+            goal: flat ids of the assigned landing points, [B, N].
+            ready: whether the UAV has just chosen an action, [B, N] bool.
+            departs: whether the UAV has just chosen to fly, [B, N] bool.
         """
 
     @abstractmethod
     def move(self, state: State) -> State:
-        """Position and battery after a step of ``dt``."""
+        """State with the positions and batteries after a step of ``dt``."""
 
     @abstractmethod
     def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
-        """The new messages of UAVs on the ground [B, N], and those that the others sent before."""
+        """New messages of UAVs on the ground [B, N], and the messages ``before`` of UAVs in flight."""
 
     @abstractmethod
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
-        """Which UAVs add their landing point to their trail, [B, N]; None for all of them."""
+        """Whether each UAV adds its landing point to its trail, [B, N] bool; None if all UAVs do."""
 
     def reach(self, state: State) -> Tensor:
-        """How far each UAV may fly now [m], [B, N]: 0 if it can only hold, negative if it may not choose."""
+        """Longest cruise of each UAV now [m], [B, N]; 0: it can only hold; negative: it may not choose."""
         if self.battery.enabled:
             left = cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
         else:
@@ -94,24 +93,23 @@ class MotionModel(ABC):
         return torch.where(self.ready(state), left, -1.0)
 
     def length(self, origin: Tensor, goal: Tensor) -> Tensor:
-        """Distance between landing points by flat id [m]."""
+        """Distance between two landing points, given by flat ids [B, N], in metres [B, N]."""
         offset = gather_rows(self.points, goal) - gather_rows(self.points, origin)
         return torch.linalg.vector_norm(offset, dim=-1)
 
     def shortest_time(self, length: Tensor) -> Tensor:
-        """Duration of a flight phase of this length [s]."""
+        """Shortest duration [s] of a flight phase of the given length [m], any shape."""
         motion = self.motion
         return minimum_time(length, motion.degree, motion.max_speed, motion.max_acceleration)
 
     def drain_or_charge(self, state: State, drain: Tensor, rests: Tensor) -> State:
-        """Batteries after a step in which they lose ``drain`` [%], or charge where a UAV rests, each [B,
-        N]."""
+        """State after a step that drains batteries by ``drain`` [%] and charges UAVs at rest, each [B, N]."""
         gain = self.charge * (rests & gather_rows(self.chargers, state.goal))
         return state._replace(battery=(state.battery - drain + gain).clamp(0, 100))
 
 
 class InstantMotion(MotionModel):
-    """A UAV is at its target when the step ends: "no action delay" in the paper (section 5)."""
+    """A UAV is at its target when the step ends (paper, section 5: no action delay)."""
 
     instant = True
 
@@ -144,7 +142,7 @@ class InstantMotion(MotionModel):
 
 
 class PolynomialFlight(MotionModel):
-    """Takeoff, level flight and landing take their time; then a UAV senses before it may choose again."""
+    """Takeoff, cruise and landing take time (paper, eq. 1); the UAV then senses before it chooses again."""
 
     instant = False
 
@@ -190,21 +188,21 @@ class PolynomialFlight(MotionModel):
         return tree_where(on_ground, messages, before)
 
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
-        """One for each decision, however long the UAV then senses at its landing point."""
+        """Each decision adds one landing point, however long the UAV then senses there."""
         waited = (state.elapsed > self.dt + TIME_EPS) & state.message_sent
         return on_ground & ~waited
 
     def duration(self, state: State) -> Tensor:
-        """Of the latest flight [s], [B, N]; 0 if the UAV held."""
+        """Duration of the latest flight [s], [B, N]; 0 if the UAV held."""
         return 2 * state.vertical + state.cruise
 
 
 MOTION_MODELS: dict[str, type[MotionModel]] = {"instant": InstantMotion, "polynomial": PolynomialFlight}
-"""By ``motion.kind``."""
+"""Motion models by ``motion.kind``."""
 
 
 def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
-    """At which landing points UAVs charge, [R*L] bool."""
+    """Whether UAVs charge at each landing point, [R*L] bool."""
     places = config.battery.charging_points
     n_regions, n_points = airspace.points.shape[:2]
     if places is None:

@@ -1,1 +1,1 @@
-"""What several recipes share: settings, the command line, and many runs at a time."""
+"""Code that several recipes share: settings, command line, error messages, and parallel runs."""

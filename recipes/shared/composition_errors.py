@@ -1,4 +1,4 @@
-"""Hydra's and OmegaConf's errors as one line that names the key, the value and what would be right."""
+"""Hydra's and OmegaConf's errors as one line that names the key, the value and the remedy."""
 
 import difflib
 import re
@@ -16,16 +16,16 @@ COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, ValueError, TypeEr
 """What Hydra raises for overrides that it cannot compose."""
 
 _schemas: list[type] = [TrainConfig]
-"""Whose keys the program knows, its own first."""
+"""Schemas whose keys are suggested for a misspelt key, the running program's first."""
 
 
 def set_schema(schema: type) -> None:
-    """Say whose keys a misspelt one is compared with."""
+    """Set the running program's schema, whose keys are suggested for a misspelt key."""
     _schemas[:] = dict.fromkeys([schema, TrainConfig])
 
 
 def one_line(error: BaseException) -> str:
-    """What is wrong, from the deepest cause, without Hydra's lines of types, paths and hints."""
+    """The deepest cause of an error on one line, without Hydra's lines of types, paths and hints."""
     while isinstance(error.__cause__, OmegaConfBaseException):
         error = error.__cause__
     text, _, _ = str(error).partition("Config search path")
@@ -34,7 +34,7 @@ def one_line(error: BaseException) -> str:
     if option := re.search(r"Could not find '([\w-]+)/(\S+)'", text):
         return _no_such_option(*option.groups())
     if "Config group override must be a string" in text:
-        return next(map(_not_an_option, filter(_is_bare, sys.argv[1:])), text)
+        return next(map(_not_an_option, filter(_gives_group_no_name, sys.argv[1:])), text)
     key = re.search(r"full_key: (\S+)", text)
     if key and re.search(r"Key '.*' (is )?not in ", text):
         return no_such_key(key[1])
@@ -47,18 +47,18 @@ def one_line(error: BaseException) -> str:
 
 def _no_such_option(group: str, option: str) -> str:
     folder = Path(CONF) / group
-    known = sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
-    return f"{group}: {option} is not one of {', '.join(known)}"
+    options = sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
+    return f"{group}: {option} is not one of {', '.join(options)}"
 
 
-def _is_bare(word: str) -> bool:
-    """Does an override give a group a number or null, which Hydra refuses without naming it?"""
-    bare = re.fullmatch(r"\+?(\w+)=([\d,.]+|null)", word)
-    return bare is not None and (Path(CONF) / bare[1]).is_dir()
+def _gives_group_no_name(override: str) -> bool:
+    """Does an override set a group to a number or null, which Hydra refuses without naming the group?"""
+    match = re.fullmatch(r"\+?(\w+)=([\d,.]+|null)", override)
+    return match is not None and (Path(CONF) / match[1]).is_dir()
 
 
-def _not_an_option(word: str) -> str:
-    group, _, option = word.lstrip("+").partition("=")
+def _not_an_option(override: str) -> str:
+    group, _, option = override.lstrip("+").partition("=")
     return _no_such_option(group, option)
 
 
@@ -71,24 +71,24 @@ _RENAMED = {
     "delaybench": "scenario=delaybench/tracking and the like, not delaybench",
     "region.situations": "region.initial_conditions",
 }
-"""Words of damian 0.1, and those that took their place."""
+"""Keys and groups of damian 0.1, and those that replaced them."""
 
 
 def no_such_key(key: str) -> str:
-    """The message for an unknown key, with the nearest known one."""
+    """The message for an unknown key, with the nearest known key."""
     if re.match(r"delay\.(obs|act|rew)\.", key):
-        return f"{key}: no setting of the law that is there already; write another law over delay=none"
+        return f"{key}: no such key of the chosen delay law; to write another law, choose delay=none first"
     group = key.partition(".")[0]
     renamed = _RENAMED.get(key, _RENAMED.get(group))
     if renamed:
         return f"{key}: no such key; since damian 0.2 it is {renamed}"
-    near = (difflib.get_close_matches(key, _keys_of(schema), n=1, cutoff=0.75) for schema in _schemas)
-    nearest = next(filter(None, near), [])
+    matches = (difflib.get_close_matches(key, _keys_of(schema), n=1, cutoff=0.75) for schema in _schemas)
+    nearest = next(filter(None, matches), [])
     return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in nearest)
 
 
 def _keys_of(schema: type) -> list[str]:
-    """Every dotted key of a schema, with those of every learner."""
+    """Every dotted key of a schema; of ``TrainConfig`` with the keys of every learner."""
     learners = LEARNERS.values() if schema is TrainConfig else ()
     configs = [OmegaConf.structured(schema), *(OmegaConf.create({"learner": make()}) for make in learners)]
     return list(dict.fromkeys(name for config in configs for name in _keys(config)))

@@ -1,4 +1,4 @@
-"""From a command line to a checked configuration, with errors that are one line."""
+"""Run a recipe: from the command line to a checked configuration, with errors of one line."""
 
 import functools
 import os
@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
-os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises; ``launch`` prints
+os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``launch`` prints them
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import torch
@@ -25,28 +25,32 @@ from shared.composition_errors import COMPOSITION_ERRORS, no_such_key, one_line,
 from shared.settings import LEARNERS, TrainConfig
 
 Program = Callable[[TrainConfig, Path], None]
-"""Fills a run folder, as a configuration says."""
+"""The work of a recipe: takes a checked configuration and the run folder to fill."""
 
 
 def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
-    """The checked configuration of what Hydra composed, and the run folder.
+    """The checked configuration of a recipe, and its run folder.
 
-    A resumed run goes on in its own folder with its own configuration; only how long it lasts may change. The
-    overrides of a run named by ``checkpoint`` hold too, where the command line gives no others.
+    A resumed run continues in its own folder with its own configuration; only ``frames`` and ``episodes``
+    may change. The overrides of the run that ``checkpoint`` names apply too, unless others are given.
+
+    Args:
+        composed: the configuration that Hydra composed from the command line.
 
     Raises:
-        InputError: a value is impossible, a key is unknown, or there is nothing to resume.
+        InputError: a value is impossible, a key is unknown, or there is no run to resume.
     """
     hydra = HydraConfig.get()
     folder, overrides = Path(hydra.runtime.output_dir), list(hydra.overrides.task)
     if composed.resume is not None:
         if hydra.mode == RunMode.MULTIRUN:
-            raise InputError("resume: one run goes on at a time; leave out -m")
+            raise InputError("resume: only one run can be resumed at a time; leave out -m")
         _drop_empty(folder)
         folder = Path(composed.resume)
         return checked(_resumed(folder, overrides)), folder
     if (folder / CONFIG).exists():
-        raise InputError(f"hydra.run.dir: {folder} holds a run already; resume={folder} goes on with it")
+        remedy = f"choose another folder, or continue the run with resume={folder}"
+        raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
     if composed.checkpoint is not None:
         overrides = inherited(Path(composed.checkpoint), overrides)
         composed = composed_with(str(hydra.job.config_name), overrides)
@@ -56,10 +60,10 @@ def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
 
 
 def composed_with(config_name: str, overrides: Sequence[str]) -> DictConfig:
-    """What Hydra composes from overrides.
+    """The configuration that Hydra composes from overrides.
 
     Raises:
-        InputError: they cannot be composed.
+        InputError: the overrides cannot be composed.
     """
     try:
         return compose(config_name, list(overrides))
@@ -68,29 +72,29 @@ def composed_with(config_name: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def inherited(folder: Path, overrides: Sequence[str]) -> list[str]:
-    """The overrides of the run in a folder, where these give no others, and these.
+    """The given overrides, preceded by those of the run in a folder that they do not replace.
 
     Raises:
         InputError: the run's configuration cannot be read.
     """
     if not (folder / CONFIG).is_file():
-        return list(overrides)  # loading the checkpoint will say what is missing
-    given = [_key(word) for word in overrides]
+        return list(overrides)  # loading the checkpoint will report what is missing
+    given = [_key(override) for override in overrides]
     saved = cast(list[str], OmegaConf.to_container(stored_config(folder, "checkpoint"))["overrides"])  # type: ignore
-    return [word for word in saved if not any(_sets(key, _key(word)) for key in given)] + list(overrides)
+    return [old for old in saved if not any(_replaces(key, _key(old)) for key in given)] + list(overrides)
 
 
 def _key(override: str) -> str:
     return override.lstrip("+~").partition("=")[0]
 
 
-def _sets(given: str, key: str) -> bool:
-    """Does an override of the one, perhaps a group, also decide about the other?"""
+def _replaces(given: str, key: str) -> bool:
+    """Does an override of ``given``, a key or a group, replace an earlier override of ``key``?"""
     return key == given or key.startswith(f"{given}.")
 
 
 def perform(config: TrainConfig, folder: Path, program: Program) -> None:
-    """Run a program with its threads and its seed."""
+    """Run a program with the threads and the seed of its configuration."""
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     program(config, folder)
@@ -110,10 +114,10 @@ def checked(composed: DictConfig) -> Any:
 
 
 def unknown_keys(composed: Any, config: Any, path: str = "") -> list[str]:
-    """Keys that no field of the config takes: Hydra's ``+a.b=1`` adds them past a schema."""
-    known = {f.name: getattr(config, f.name) for f in fields(config)}
-    unknown = [f"{path}{key}" for key in composed if key not in known]
-    for key, value in known.items():
+    """Keys that no field of the config takes; Hydra's ``+a.b=1`` adds keys that the schema does not have."""
+    values = {f.name: getattr(config, f.name) for f in fields(config)}
+    unknown = [f"{path}{key}" for key in composed if key not in values]
+    for key, value in values.items():
         if hasattr(value, "__dataclass_fields__") and key in composed:
             unknown += unknown_keys(composed[key], value, f"{path}{key}.")
     return unknown
@@ -126,16 +130,20 @@ def save_config(config: TrainConfig, folder: Path) -> None:
 
 
 def stored_config(folder: Path, key: str) -> DictConfig:
-    """The configuration of the run in a folder that ``key`` names; what it lacks has its default.
+    """The configuration of the run in a folder; keys that it lacks have their defaults.
+
+    Args:
+        folder: the run folder.
+        key: the setting that names the folder, for the error message.
 
     Raises:
-        InputError: it cannot be read, or another version has written it.
+        InputError: it cannot be read, or damian 0.1 has written it.
     """
     file = folder / CONFIG
     try:
         saved = cast(DictConfig, OmegaConf.load(file))
         if "algo" in saved:
-            raise InputError("damian 0.1 wrote it, whose settings had other names: train again")
+            raise InputError("damian 0.1 wrote it, and settings have other names since: train again")
         schema = OmegaConf.structured(TrainConfig(learner=LEARNERS[saved.learner.name]()))
         return cast(DictConfig, OmegaConf.merge(schema, saved))
     except Exception as error:  # a damaged file can raise anything
@@ -143,10 +151,16 @@ def stored_config(folder: Path, key: str) -> DictConfig:
 
 
 def load(checkpoint: Checkpoint, folder: Path, key: str, components: Collection[str] | None = None) -> None:
-    """Restore a checkpoint, or some components of it, from a run folder that ``key`` names.
+    """Restore a checkpoint from a run folder.
+
+    Args:
+        checkpoint: its components are restored in place.
+        folder: the run folder.
+        key: the setting that names the folder, for the error message.
+        components: names of the components to restore; all if not given.
 
     Raises:
-        InputError: it is incomplete, or of another configuration.
+        InputError: the checkpoint is missing or incomplete, or belongs to another configuration.
     """
     try:
         checkpoint.load(folder / CHECKPOINT, components=components)
@@ -156,29 +170,29 @@ def load(checkpoint: Checkpoint, folder: Path, key: str, components: Collection[
 
 def _resumed(folder: Path, overrides: Sequence[str]) -> DictConfig:
     allowed = ("resume=", "frames=", "episodes=")
-    other = [word for word in overrides if not word.startswith(allowed)]
-    if other:
+    refused = [override for override in overrides if not override.startswith(allowed)]
+    if refused:
         raise InputError(
-            f"{other[0]}: a resumed run keeps its configuration; only {allowed[1]} and "
+            f"{refused[0]}: a resumed run keeps its configuration; only {allowed[1]} and "
             f"{allowed[2]} may change"
         )
     for needed in (CONFIG, CHECKPOINT):
         if not (folder / needed).exists():
-            raise InputError(f"resume: {folder} holds no {needed}, so there is nothing to go on with")
+            raise InputError(f"resume: {folder} holds no {needed}, so there is no run to resume")
     changed = OmegaConf.from_dotlist(list(overrides))
     return cast(DictConfig, OmegaConf.merge(stored_config(folder, "resume"), changed))
 
 
-_begun: list[bool] = []
-"""Filled once Hydra has composed a configuration: what fails from then on is not a wrong command line."""
+_composed: list[bool] = []
+"""Not empty once Hydra has composed a configuration: a later error of Hydra's is not a wrong command line."""
 
 
 def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-    """Turn wrong input into one line on stderr and exit code 2, and leave no folder."""
+    """Turn wrong input into one line on stderr and exit code 2, and remove the empty run folder."""
 
     @functools.wraps(main)
     def checked_main(composed: DictConfig) -> None:
-        _begun.append(True)
+        _composed.append(True)
         try:
             main(composed)
         except (InputError, OmegaConfBaseException) as error:
@@ -189,14 +203,14 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
 
 
 def launch(main: Callable[[], Any], schema: type = TrainConfig) -> None:
-    """Run a Hydra application; what Hydra refuses becomes one line on stderr and exit code 2."""
+    """Run a Hydra application; overrides that Hydra refuses end with one line on stderr and exit code 2."""
     set_schema(schema)
-    _begun.clear()
+    _composed.clear()
     try:
         main()
     except COMPOSITION_ERRORS as error:
-        if _begun:
-            raise  # a bug, whose traceback is needed
+        if _composed:
+            raise  # this is a bug, and its traceback is needed
         _give_up(error)
 
 
@@ -206,13 +220,13 @@ def _give_up(error: Exception) -> NoReturn:
 
 
 def _drop_empty(folder: Path) -> None:
-    """Remove a run folder that holds nothing, and the folders that Hydra made around it."""
+    """Remove an empty run folder, and the folders that Hydra made around it."""
     if not folder.is_dir() or any(folder.iterdir()):
         return
     folder.rmdir()
-    around = folder.parent
-    if [path.name for path in around.iterdir()] == ["multirun.yaml"]:
-        (around / "multirun.yaml").unlink()
-        _drop_empty(around)
-    elif around.resolve() != Path.cwd() and not any(around.iterdir()):
-        around.rmdir()
+    parent = folder.parent
+    if [path.name for path in parent.iterdir()] == ["multirun.yaml"]:
+        (parent / "multirun.yaml").unlink()
+        _drop_empty(parent)
+    elif parent.resolve() != Path.cwd() and not any(parent.iterdir()):
+        parent.rmdir()

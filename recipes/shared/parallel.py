@@ -1,6 +1,6 @@
-"""Many runs, several at a time: each in a folder of its own, with what it prints in log.txt there.
+"""Carry out many runs, several at a time, each in its own folder with its output in log.txt.
 
-What is finished is not run again, and what has a checkpoint goes on, so that Ctrl-C costs little.
+Finished runs are not repeated, and interrupted ones continue from their checkpoints.
 """
 
 import csv
@@ -28,12 +28,12 @@ from shared.settings import TrainConfig
 LOG = "log.txt"
 _SPAWN = multiprocessing.get_context("spawn")
 _stop = _SPAWN.Event()
-"""Set: begin nothing more. A worker has that of the process which began it."""
+"""Set after Ctrl-C: no further run begins. Worker processes share the event of the main process."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One arm and seed."""
+    """One seed of an arm, for one task and delay."""
 
     task: str
     delay: str
@@ -43,7 +43,7 @@ class Run:
     program: Program
     """``train``, or ``fly`` for an arm that evaluates the policy of another one; importable by name."""
     trains: bool
-    """Does the program train, so that it leaves checkpoints and can be resumed."""
+    """Does the program train, so that it writes checkpoints and can be resumed?"""
 
     @property
     def name(self) -> str:
@@ -54,11 +54,15 @@ class Run:
         return (self.folder / RESULTS).exists()
 
     def score(self, policy: str, measure: str) -> float:
-        """One number of a finished run."""
+        """A measure of one policy in the results of a finished run."""
         return next(row[measure] for row in self.results() if row["policy"] == policy)
 
     def results(self) -> list[dict[str, Any]]:
-        """A row for each policy."""
+        """The results of a finished run, a row for each policy.
+
+        Raises:
+            InputError: the file does not hold the results of a run.
+        """
         file = self.folder / RESULTS
         try:
             with file.open(newline="") as lines:
@@ -67,11 +71,16 @@ class Run:
                     for row in csv.DictReader(lines)
                 ]
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{file}: no results of a run ({one_line(error)}); delete the folder") from error
+            problem = f"it does not hold the results of a run ({one_line(error)})"
+            raise InputError(f"{file}: {problem}; delete the folder") from error
 
 
 def check_stored(run: Run) -> None:
-    """Refuse a folder that holds a run of another configuration; a setting that it lacks has its default."""
+    """Check that a run folder is empty or holds a run with the same settings; missing ones have defaults.
+
+    Raises:
+        InputError: the stored settings differ or cannot be read.
+    """
     if not (run.folder / CONFIG).exists():
         return
     try:
@@ -79,17 +88,18 @@ def check_stored(run: Run) -> None:
     except InputError as error:
         raise InputError(f"{error}; delete the folder") from error
     asked = OmegaConf.create(OmegaConf.to_yaml(OmegaConf.structured(run.config)))
-    known, wanted = (dict(_leaves(OmegaConf.to_container(config))) for config in (stored, asked))
-    for key in wanted | known:
-        own = key in ("resume", "overrides") or (key == "checkpoint" and not run.trains)
-        if not own and known.get(key) != wanted.get(key):
+    old, new = (dict(_leaves(OmegaConf.to_container(config))) for config in (stored, asked))
+    for key in new | old:
+        may_differ = key in ("resume", "overrides") or (key == "checkpoint" and not run.trains)
+        if not may_differ and old.get(key) != new.get(key):
             raise InputError(
-                f"{run.folder}: {key} is {known.get(key)} in this stored run, and {wanted.get(key)} is asked "
+                f"{run.folder}: {key} is {old.get(key)} in this stored run, and {new.get(key)} is asked "
                 "for: delete the folder, or choose another one with hydra.run.dir"
             )
 
 
 def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every dotted key of nested dictionaries with its value."""
     if isinstance(node, dict) and node:
         for key, value in node.items():
             yield from _leaves(value, f"{path}.{key}" if path else key)
@@ -98,15 +108,15 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> list[Run]:
-    """Carry out what is not finished; returns what has failed.
+    """Carry out the runs that are not finished; returns those that failed.
 
     Args:
-        runs: what flies the policy of another one comes after it.
-        processes: at the same time.
-        told: policy and measure that the progress bar shows of the latest run.
+        runs: a run that flies the policy of another one must come after it.
+        processes: number of runs at the same time.
+        told: policy and measure of the latest run that the progress bar shows.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C, when every run has written a checkpoint.
+        KeyboardInterrupt: after Ctrl-C, when every training run has written a checkpoint.
     """
     todo, failed = [run for run in runs if not run.finished], []
     ended = _in_turn(todo) if processes == 1 else _at_once(todo, processes)
@@ -121,7 +131,7 @@ def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> l
 
 
 def _in_turn(runs: Sequence[Run]) -> Iterator[tuple[Run, BaseException | None]]:
-    """Carry runs out in this process; yields each with what went wrong."""
+    """Carry out runs in this process, one after the other; yields each with its error, or None."""
     for run in runs:
         try:
             _perform(run)
@@ -132,12 +142,12 @@ def _in_turn(runs: Sequence[Run]) -> Iterator[tuple[Run, BaseException | None]]:
 
 
 def _at_once(runs: Sequence[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
-    """Carry runs out in so many other processes; yields each, when it is over, with what went wrong."""
+    """Carry out runs in worker processes; yields each, when it has ended, with its error, or None."""
     _stop.clear()
-    for trains in (True, False):  # a pool each: one whose worker was killed takes nothing more
-        now = [run for run in runs if run.trains == trains]
-        if now:
-            yield from _in_pool(now, processes)
+    for trains in (True, False):  # two pools, because a pool whose worker was killed accepts no more runs
+        group = [run for run in runs if run.trains == trains]
+        if group:
+            yield from _in_pool(group, processes)
 
 
 def _in_pool(runs: Sequence[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
@@ -146,19 +156,20 @@ def _in_pool(runs: Sequence[Run], processes: int) -> Iterator[tuple[Run, BaseExc
             futures = _submit(pool, runs)
             for future in as_completed(futures):
                 error = future.exception()
-                if isinstance(error, KeyboardInterrupt):  # it has heard it sooner
+                if isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the worker first
                     raise error
                 yield futures[future], error
         except KeyboardInterrupt:
             _stop.set()
-            for worker in multiprocessing.active_children():  # a terminal has told them, ``kill`` has not
+            # Ctrl-C in a terminal reaches the workers, but a signal sent to this process alone does not.
+            for worker in multiprocessing.active_children():
                 os.kill(worker.pid or 0, signal.SIGINT)
             pool.shutdown(cancel_futures=True)
             raise
 
 
 def _submit(pool: ProcessPoolExecutor, runs: Sequence[Run]) -> dict[Future[None], Run]:
-    """Hand runs over to workers that are born deaf to Ctrl-C: only a training run listens to it."""
+    """Submit runs to workers that start with Ctrl-C ignored: only a training run handles it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         return {pool.submit(_perform, run): run for run in runs}
@@ -167,20 +178,20 @@ def _submit(pool: ProcessPoolExecutor, runs: Sequence[Run]) -> dict[Future[None]
 
 
 def _begin(stop: Event) -> None:
-    """Of a worker: share the main process's wish to stop."""
-    global _stop  # noqa: PLW0603 (a worker has no other place for it)
+    """Initialise a worker process: it shares the stop event of the main process."""
+    global _stop  # noqa: PLW0603 (the event cannot be passed to ``_perform`` with a run)
     _stop = stop
 
 
 def _perform(run: Run) -> None:
-    """Train, or fly the policy of another run."""
+    """Carry out one run, resuming it if it has a checkpoint."""
     if _stop.is_set():
         raise KeyboardInterrupt
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
-            begun = run.trains and (run.folder / CHECKPOINT).exists()
-            config = replace(run.config, resume=str(run.folder)) if begun else run.config
+            resumes = run.trains and (run.folder / CHECKPOINT).exists()
+            config = replace(run.config, resume=str(run.folder)) if resumes else run.config
             perform(config, run.folder, run.program)
         except SystemExit as interrupted:
             raise KeyboardInterrupt from interrupted

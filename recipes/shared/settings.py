@@ -1,4 +1,4 @@
-"""All settings of the recipes: a scenario (``damian.envs.scenario``), and how to learn in it."""
+"""All settings of the recipes: those of a scenario (``damian.envs.scenario``), and those of the training."""
 
 import os
 import re
@@ -23,64 +23,66 @@ from damian.learners.sac import SacConfig
 from damian.learners.schedule import SystemClock
 
 CONF = str(Path(__file__).parents[2] / "conf")
-"""Absolute, so that a recipe can be imported as well as run."""
+"""Absolute path of the configuration files; Hydra would look for a relative one beside the calling module."""
 
 LEARNERS: dict[str, type[LearnerConfig]] = {config().name: config for config in (MappoConfig, SacConfig)}
-"""Settings of each learner, by ``learner.name``."""
+"""The settings class of each learner, by ``learner.name``."""
 
 
 @dataclass
 class LoggerConfig:
-    """Where the curves go, inside the run folder."""
+    """Which files of metrics the training writes into the run folder."""
 
     tensorboard: bool = True
-    """TensorBoard events."""
+    """Write TensorBoard events."""
     csv: bool = True
-    """``metrics.csv``."""
+    """Write ``metrics.csv``."""
 
 
 @dataclass
 class TrainConfig(ScenarioConfig):
-    """Everything that ``recipes/train.py`` can be told."""
+    """All settings of ``recipes/train.py``, beside those of the scenario."""
 
     learner: LearnerConfig = field(default_factory=MappoConfig)
     """``MappoConfig`` or ``SacConfig``."""
     model: ModelConfig = field(default_factory=ModelConfig)
+    """Networks of actor and critic."""
     critic: str = "server"
-    """What the critic sees: what the ``server`` holds, or ``privileged``, what is true (regime R1)."""
+    """The critic observes the messages that the ``server`` holds, or (``privileged``) the true state without
+    delay (regime R1)."""
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = 0
-    """Of everything that is drawn."""
+    """Seed of all random draws."""
     worlds: int = 64
-    """Worlds that are stepped together."""
+    """Number of parallel environments."""
     frames: int = 300_000
-    """Steps to learn from, over all worlds."""
+    """Environment steps to learn from, over all worlds."""
     episodes: int | None = None
-    """Stop after so many episodes, if that comes first."""
+    """Stop training after this number of episodes, if that comes before ``frames``."""
     eval_episodes: int = 200
-    """Episodes of each evaluation at the end."""
+    """Episodes of each evaluation after the training."""
     checkpoint_every: int = 20
     """Updates between two checkpoints."""
     backupdate: bool = False
-    """Correct stored steps with the messages that arrive late before learning from them (paper, section 3.4):
-    observations of the critic, rewards and ends of episodes; observations of the actor stay."""
+    """Back-updating (paper, section 3.4): late messages correct stored steps before the learner uses them.
+    They correct the critic's observations, rewards and ends of episodes, but not the actor's observations."""
     settle: bool = False
-    """With ``backupdate``: learn from a step only when none of its messages can be under way any more."""
+    """With ``backupdate``: learn from a step only when none of its messages can be in transit any more."""
     recompute_actor: bool = False
-    """The original authors' variant of ``backupdate``: late messages also rewrite what the actor saw and
-    the probability of what it did, as if it had known."""
+    """With ``backupdate``, the original authors' variant: late messages correct the actor's observations too,
+    and the log-probabilities of its actions follow from these."""
     checkpoint: str | None = None
-    """Run folder whose policy to begin with; its overrides hold too, where no others are given."""
+    """Run folder of the policy to start from; that run's overrides apply too, unless others are given."""
     overrides: list[str] = field(default_factory=list)
-    """What was asked for on the command line; filled in by the recipe."""
+    """Overrides on the command line; filled in by the recipe."""
     resume: str | None = None
-    """Run folder to go on with."""
+    """Run folder of the run to continue."""
     device: str = "cpu"
-    """cpu, cuda, cuda:1, ..."""
+    """Device of all tensors: cpu, cuda, cuda:1, ..."""
     threads: int = 1
-    """Threads of torch; small tensors are slower with more."""
+    """Number of torch's threads; more than one slow down small tensors."""
     compile: bool = False
-    """Compile the environment's step: worth it from some hundred worlds on."""
+    """Compile the environment's step, which pays off from some hundred worlds on."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -99,7 +101,7 @@ class TrainConfig(ScenarioConfig):
         checks.device("device", self.device)
 
     def check_learning(self) -> None:
-        """Refuse what cannot be learnt like this; what is only flown need not be.
+        """Check that the settings allow training; an evaluation has fewer requirements.
 
         Raises:
             InputError: names the key that does not fit.
@@ -107,18 +109,18 @@ class TrainConfig(ScenarioConfig):
         self.learner.check(self.learning_setup)
         self._check_skip()
         self._check_backupdate()
-        held = self.delay.hold == "max" and self.longest_delay == 0
-        checks.require(not held, "delay.hold", "max", "means nothing without delayed messages (delay.obs)")
+        useless = self.delay.hold == "max" and self.longest_delay == 0
+        checks.require(not useless, "delay.hold", "max", "means nothing without delayed messages (delay.obs)")
 
     def _check_backupdate(self) -> None:
-        """Back-updating corrects single rewards, and what the server knows at every step."""
+        """Back-updating recomputes the reward of every single step, undelayed, from the server's messages."""
         incompatible = {
             "delay.reward_window": (self.delay.reward_window, self.delay.reward_window > 1),
             "delay.rew": (self.delay.rew, has_delay(self.delay.rew, self.clock.dt)),
             "clock.server": (self.clock.server, self.clock.steps("server") > 1),
         }
         for key, (value, given) in incompatible.items():
-            should = "does not go with backupdate=true, which would undo it"
+            should = "does not go with backupdate=true, which would undo it; leave out one of them"
             checks.require(not (self.backupdate and given), key, value, should)
         for key in ("settle", "recompute_actor"):
             alone = getattr(self, key) and not self.backupdate
@@ -127,22 +129,22 @@ class TrainConfig(ScenarioConfig):
     def _check_skip(self) -> None:
         should = "does not go with model.rnn: hidden states change at every step, not only at decisions"
         checks.require(not (self.model.recurrent and self.clock.skip), "clock.skip", True, should)
-        discount, should = self.clock.skip_discount, "is that of the learner while it learns; leave it out"
+        discount, should = self.clock.skip_discount, "is set to learner.gamma in training; leave it out"
         checks.require(discount == 1, "clock.skip_discount", discount, should)
 
     @property
     def longest_delay(self) -> int:
-        """Of a message [steps]."""
+        """Longest delay of a message [steps]."""
         return self.delay.uplink.sampler(self.clock.dt).longest
 
     @property
     def update_steps(self) -> int:
-        """Steps of every world before the first update: the system clock's period, or the learner's."""
+        """Steps of every world before the first update: the system clock's period, or ``learner.steps``."""
         return self.clock.steps("system") if self.clock.system else self.learner.steps
 
     @property
     def learning_setup(self) -> LearningSetup:
-        """What a learner must know of this run."""
+        """The settings of this run that a learner needs beside its own."""
         clock = SystemClock(self.clock, self.update_steps)
         return LearningSetup(
             model=self.model,
@@ -160,35 +162,35 @@ class TrainConfig(ScenarioConfig):
 
     @property
     def backupdates(self) -> bool:
-        """Is back-updating wanted, and is there any message to correct with."""
+        """Is back-updating switched on, and can any message be late or lost?"""
         return self.backupdate and has_message_delay(self)
 
     @property
     def eval_scenario(self) -> ScenarioConfig:
-        """The scenario of an evaluation, which measures every step."""
+        """The scenario of an evaluation; it skips no steps, because every step is measured."""
         return replace(self, clock=replace(self.clock, skip=False, skip_discount=1.0))
 
     @property
     def train_scenario(self) -> ScenarioConfig:
-        """The scenario of training: within a skipped step, rewards are discounted as the learner does."""
+        """The scenario of the training; rewards of skipped steps are discounted by ``learner.gamma``."""
         discount = self.learner.gamma if self.clock.skip else 1.0
         return replace(self, clock=replace(self.clock, skip_discount=discount))
 
     @property
     def eval_seed(self) -> int:
-        """Seed of the initial conditions of an evaluation, which are not those of training."""
+        """Seed of the initial conditions of an evaluation; they differ from those of the training."""
         return self.seed + 10_000
 
     @property
     def horizon(self) -> int:
-        """Steps after which an evaluated episode is cut, if nothing else ends it."""
+        """Steps after which an episode of an evaluation is cut off, if nothing else ends it."""
         limit = self.episode.max_steps or 200
         return 4 * limit if self.episode.since_detection else limit
 
 
 _STORE = ConfigStore.instance()
 _SCHEMA = OmegaConf.structured(TrainConfig)
-_SCHEMA.learner = MISSING  # which the group ``learner`` fills in
+_SCHEMA.learner = MISSING  # the group ``learner`` fills it in
 _STORE.store(name="schema", node=_SCHEMA)
 for _name, _config in LEARNERS.items():
     _STORE.store(group="schema/learner", name=_name, node=_config)
@@ -196,7 +198,7 @@ OmegaConf.register_new_resolver("shipped", lambda name: str(files("damian") / "d
 
 
 def _plain(name: str) -> str:
-    """A folder's name without quotes, brackets and slashes, and not too long for a file system."""
+    """A folder's name without quotes, brackets and slashes, short enough for a file system."""
     plain = re.sub(r"[^\w.=,-]", "", name.replace("/", "-"))
     return plain if len(plain) <= 100 else f"{plain[:90]}_{zlib.crc32(plain.encode()):08x}"
 

@@ -1,4 +1,4 @@
-"""Clocks: their periods, which of them fit, and the batches between two ticks of the learner's."""
+"""Clocks: valid periods, the triggered system clock, and the batches between two of its ticks."""
 
 import itertools
 import math
@@ -19,7 +19,7 @@ from damian.learners.schedule import SystemClock
 from damian.server.termination import EpisodeConfig
 from damian.world.messages import Messages
 
-SPOTTED, QUIET = torch.tensor([[False, True]]), torch.tensor([[False, False]])
+SPOTTED, NOT_SPOTTED = torch.tensor([[False, True]]), torch.tensor([[False, False]])
 WORLDS = 4
 
 
@@ -28,20 +28,21 @@ def triggered(period: int, trigger: str = "2s", **bounds: str) -> SystemClock:
 
 
 def periods(clock: SystemClock, *spotted: torch.Tensor) -> list[int]:
-    found = []
+    """The period after each tick."""
+    result = []
     for flags in spotted:
         clock.tick(flags)
-        found.append(clock.period)
-    return found
+        result.append(clock.period)
+    return result
 
 
 @pytest.mark.parametrize(("clock", "seconds"), [("1s", 1.0), ("0.5m", 30.0), ("1h", 3600.0), ("0.2", 0.2)])
-def test_times_are_read_with_their_unit(clock, seconds):
+def test_a_period_is_read_with_its_unit(clock, seconds):
     assert ClockConfig(simulation=clock).dt == seconds
 
 
 @pytest.mark.parametrize(
-    ("clock", "told"),
+    ("clock", "message"),
     [
         ({"simulation": "1s", "agents": "1.5s"}, "clock.agents: 1.5s is not a multiple"),
         ({"simulation": "2s", "server": "1s"}, "clock.server: 1s is not a multiple"),
@@ -67,14 +68,14 @@ def test_times_are_read_with_their_unit(clock, seconds):
         ({"longest": "2s"}, "clock.longest: 2s means nothing without clock.trigger"),
     ],
 )
-def test_clocks_that_do_not_fit_are_refused(clock, told):
-    with pytest.raises(InputError, match="clock") as refused:
+def test_impossible_periods_are_refused(clock, message):
+    with pytest.raises(InputError, match="clock") as error:
         ClockConfig(**clock)
-    assert told in str(refused.value)
+    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("bounds", "told"),
+    ("bounds", "message"),
     [
         (
             {"shortest": "12s"},
@@ -84,36 +85,42 @@ def test_clocks_that_do_not_fit_are_refused(clock, told):
         ({"trigger": "11s"}, "clock.system: 10 steps is out of clock.shortest, clock.longest = 11, 20 steps"),
     ],
 )
-def test_a_first_period_out_of_the_bounds_is_refused(bounds, told):
-    with pytest.raises(InputError) as refused:
+def test_a_first_period_out_of_the_bounds_is_refused(bounds, message):
+    with pytest.raises(InputError) as error:
         triggered(10, **bounds)
-    assert told in str(refused.value)
+    assert message in str(error.value)
 
 
-def test_a_fixed_clock_never_changes():
+def test_the_period_of_a_fixed_clock_never_changes():
     clock = SystemClock(ClockConfig(), 7)
-    assert periods(clock, SPOTTED, QUIET, SPOTTED) == [7, 7, 7]
+    assert periods(clock, SPOTTED, NOT_SPOTTED, SPOTTED) == [7, 7, 7]
     assert (clock.unit, clock.shortest, clock.longest) == (7, 7, 7)
 
 
 def test_a_triggered_clock_shrinks_while_the_source_is_spotted_and_grows_otherwise():
-    assert periods(triggered(10), SPOTTED, SPOTTED, QUIET, QUIET, QUIET) == [8, 6, 8, 10, 12]
+    assert periods(triggered(10), SPOTTED, SPOTTED, NOT_SPOTTED, NOT_SPOTTED, NOT_SPOTTED) == [
+        8,
+        6,
+        8,
+        10,
+        12,
+    ]
 
 
 def test_a_triggered_clock_stays_within_its_bounds():
     clock = triggered(10, "4s", shortest="3s", longest="15s")
-    assert periods(clock, *[SPOTTED] * 3, *[QUIET] * 5, SPOTTED) == [6, 3, 3, 7, 11, 15, 15, 15, 11]
-    assert periods(triggered(10, "4s"), *[SPOTTED] * 3, *[QUIET] * 5) == [6, 4, 4, 8, 12, 16, 20, 20]
+    assert periods(clock, *[SPOTTED] * 3, *[NOT_SPOTTED] * 5, SPOTTED) == [6, 3, 3, 7, 11, 15, 15, 15, 11]
+    assert periods(triggered(10, "4s"), *[SPOTTED] * 3, *[NOT_SPOTTED] * 5) == [6, 4, 4, 8, 12, 16, 20, 20]
 
 
 @pytest.mark.parametrize(("spotting_worlds", "period"), [(0, 12), (1, 12), (2, 8), (4, 8)])
-def test_the_source_counts_as_spotted_from_half_of_the_worlds_on(spotting_worlds, period):
+def test_the_period_shrinks_if_the_source_is_spotted_in_half_of_the_worlds_or_more(spotting_worlds, period):
     spotted = torch.zeros(4, 3, dtype=torch.bool)
     spotted[:spotting_worlds, 1:] = True
     assert periods(triggered(10), spotted) == [period]
 
 
-def test_clocks_are_counted_in_steps_of_the_simulation():
+def test_periods_are_counted_in_simulation_steps():
     config = ClockConfig(simulation="0.5s", trigger="2s", shortest="0.1m", longest="20s", system="10s")
     clock = SystemClock(config, config.steps("system"))
     assert (clock.period, clock.change, clock.shortest, clock.longest) == (20, 4, 12, 40)
@@ -122,79 +129,79 @@ def test_clocks_are_counted_in_steps_of_the_simulation():
 @pytest.mark.parametrize("first", [7, 10, 12])
 @pytest.mark.parametrize("bounds", [{}, {"shortest": "6s", "longest": "15s"}, {"shortest": "1s"}])
 def test_every_period_that_can_occur_is_a_multiple_of_the_unit(first, bounds):
-    clock, reached, fresh = triggered(first, "3s", **bounds), {first}, [first]
+    clock, reached, unexplored = triggered(first, "3s", **bounds), {first}, [first]
     unit = clock.unit
-    while fresh:
-        clock.period = fresh.pop()
+    while unexplored:
+        clock.period = unexplored.pop()
         start = clock.state_dict()
-        for flags in (SPOTTED, QUIET):
+        for flags in (SPOTTED, NOT_SPOTTED):
             clock.load_state_dict(start)
-            fresh += {*periods(clock, flags)} - reached
+            unexplored += {*periods(clock, flags)} - reached
             reached.add(clock.period)
     assert len(reached) > 2
     assert unit == math.gcd(*reached, clock.shortest, clock.longest)
 
 
-def test_a_clock_goes_on_from_a_checkpoint():
+def test_a_clock_continues_from_a_checkpoint():
     one, other = triggered(10), triggered(10)
     periods(one, SPOTTED, SPOTTED)
     other.load_state_dict(one.state_dict())
-    assert periods(other, QUIET) == periods(one, QUIET) == [8]
+    assert periods(other, NOT_SPOTTED) == periods(one, NOT_SPOTTED) == [8]
 
 
-# What is collected between two ticks, as the training recipe does it.
+# Batches that the training recipe collects between two ticks.
 
 
 def config(clock: ClockConfig, level_db: float) -> TrainConfig:
-    fitted = square(episode=EpisodeConfig(max_steps=7), delay=DelayConfig(obs=2))
-    fitted.source.level_db = level_db
-    sections = {name: getattr(fitted, name) for name in ("region", "source", "episode", "delay")}
+    scenario = square(episode=EpisodeConfig(max_steps=7), delay=DelayConfig(obs=2))
+    scenario.source.level_db = level_db
+    sections = {name: getattr(scenario, name) for name in ("region", "source", "episode", "delay")}
     return TrainConfig(**sections, clock=clock, worlds=WORLDS, backupdate=True)
 
 
 def batches(config: TrainConfig, n_steps: int, period: int) -> list[tuple[int, TensorDictBase]]:
-    """Batches of so many steps together, each with the period that held while it was collected."""
+    """Batches of ``n_steps`` steps or more in all, each with the system clock's period at that time."""
     env, clock = learning_env(config), SystemClock(config.clock, period)
     frames = WORLDS * clock.unit
     collector = Collector(env, random_policy(env), frames_per_batch=frames, total_frames=-1)
     torch.manual_seed(3)
-    found, current = [], clock.period
+    collected, current = [], clock.period
     for batch in ticks(collector, clock):
-        found.append((current, batch))
+        collected.append((current, batch))
         current = clock.period
-        if sum(batch.shape[1] for _, batch in found) >= n_steps:
+        if sum(batch.shape[1] for _, batch in collected) >= n_steps:
             break
     collector.shutdown()
-    return found
+    return collected
 
 
 CLOCKS = {"fixed": ClockConfig(), "triggered": ClockConfig(trigger="3s", shortest="2s", longest="12s")}
 
 
 @pytest.mark.parametrize("kind", CLOCKS)
-def test_a_batch_has_the_steps_of_the_current_period_and_none_is_lost_or_doubled(kind):
+def test_a_batch_has_one_period_of_steps_and_no_step_is_lost_or_doubled(kind):
     setting = config(CLOCKS[kind], level_db=138.0)
-    found = batches(setting, 80, 5)
-    assert [batch.shape for _, batch in found] == [(WORLDS, period) for period, _ in found]
-    changes = {b - a for (a, _), (b, _) in itertools.pairwise(found)}
+    collected = batches(setting, 80, 5)
+    assert [batch.shape for _, batch in collected] == [(WORLDS, period) for period, _ in collected]
+    changes = {b - a for (a, _), (b, _) in itertools.pairwise(collected)}
     assert (changes == {0}) if kind == "fixed" else (min(changes) < 0 < max(changes))
-    for (period, batch), (following, _) in itertools.pairwise(found):
+    for (period, batch), (next_period, _) in itertools.pairwise(collected):
         spots = Messages.unpack(batch["next", "agents", "received"][:, -1]).spotted.any(-1)
         assert spots.equal(spotting(batch).any(-1))
         expected = SystemClock(setting.clock, 5)
         expected.period = period
         expected.tick(spots.unsqueeze(-1))
-        assert following == expected.period
-    pieces = torch.cat([batch for _, batch in found], 1)
+        assert next_period == expected.period
+    batched = torch.cat([batch for _, batch in collected], 1)
     torch.manual_seed(3)
     env = learning_env(setting)
-    whole = env.rollout(pieces.shape[1], random_policy(env), break_when_any_done=False)
-    assert whole["next", "done"].any()
-    for key in whole.keys(True, True):
-        assert pieces[key].equal(whole[key]), key
+    rollout = env.rollout(batched.shape[1], random_policy(env), break_when_any_done=False)
+    assert rollout["next", "done"].any()
+    for key in rollout.keys(True, True):
+        assert batched[key].equal(rollout[key]), key
 
 
-def test_without_delay_the_trigger_is_what_the_uavs_spot():
+def test_without_delay_the_trigger_depends_on_what_the_uavs_spot_now():
     loud = config(CLOCKS["triggered"], level_db=170.0)
     quiet = config(CLOCKS["triggered"], level_db=100.0)
     for setting in (loud, quiet):

@@ -1,4 +1,4 @@
-"""How episodes end and pay, what batteries do, and what the source does."""
+"""Ends of episodes and their rewards (paper, section 4.1), batteries, and the source."""
 
 import copy
 import itertools
@@ -33,22 +33,22 @@ from damian.world.battery import BatteryConfig, charge_gain, flight_drain
 from damian.world.motion import MotionConfig
 from damian.world.signal_source import SourceConfig
 
-# Ends.
+# Ends of episodes.
 
 
 @pytest.mark.parametrize(("share", "needed"), [(0.3, 1), (0.5, 2), (1.0, 3)])
-def test_success_needs_a_share_of_the_uavs_to_spot_at_once(share, needed):
+def test_success_needs_a_share_of_the_uavs_to_spot_the_source_at_once(share, needed):
     episode = EpisodeConfig(max_steps=None, success_share=share)
     env = fresh(square(source=SourceConfig(level_db=143.0), episode=episode), num_worlds=256)
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
-        shown = act(env, random_actions(env, generator))
-        enough = told(shown).spotted.sum(-1, keepdim=True) >= needed
+        output = act(env, random_actions(env, generator))
+        enough = told(output).spotted.sum(-1, keepdim=True) >= needed
         assert enough.any()
         assert not enough.all()
-        assert shown["success"].equal(enough)
-        assert shown["terminated"].equal(enough)
-        assert not shown["truncated"].any()
+        assert output["success"].equal(enough)
+        assert output["terminated"].equal(enough)
+        assert not output["truncated"].any()
 
 
 def test_the_time_limit_truncates_and_does_not_terminate():
@@ -63,20 +63,20 @@ def test_success_at_the_last_step_terminates_and_does_not_truncate():
     source = SourceConfig(level_db=130.0, position=[160.0, 100.0])
     episode = EpisodeConfig(max_steps=2, success_share=1.0)
     env = fresh(one_uav(source=source, episode=episode))
-    shown = go(env, HERE, EAST)
-    assert (shown["success"] & shown["terminated"] & ~shown["truncated"]).item()
+    output = go(env, HERE, EAST)
+    assert (output["success"] & output["terminated"] & ~output["truncated"]).item()
 
 
-def test_the_limit_can_count_from_the_latest_detection():
+def test_the_time_limit_can_count_from_the_latest_detection():
     source = SourceConfig(level_db=130.0, position=[60.0, 100.0])
     episode = EpisodeConfig(max_steps=3, since_detection=True)
     env = fresh(one_uav(source=source, episode=episode))
     assert not go(env, *[HERE] * 10)["done"].item()
     assert not go(env, EAST, EAST)["done"].item()
     assert go(env, HERE)["truncated"].item()
-    unheard = fresh(one_uav(episode=episode))
-    assert not go(unheard, HERE, HERE)["done"].item()
-    assert go(unheard, HERE)["truncated"].item()
+    never_detected = fresh(one_uav(episode=episode))
+    assert not go(never_detected, HERE, HERE)["done"].item()
+    assert go(never_detected, HERE)["truncated"].item()
 
 
 def test_empty_batteries_terminate_without_success():
@@ -87,22 +87,22 @@ def test_empty_batteries_terminate_without_success():
     env.state = env.state._replace(battery=torch.tensor([[1e-7]]))
     assert not go(env, HERE)["done"].item()
     env.state = env.state._replace(battery=torch.tensor([[0.0]]))
-    shown = go(env, HERE)
-    assert (shown["terminated"] & ~shown["truncated"] & ~shown["success"]).item()
-    assert shown["agents", "reward"].item() == -2.0
+    output = go(env, HERE)
+    assert (output["terminated"] & ~output["truncated"] & ~output["success"]).item()
+    assert output["agents", "reward"].item() == -2.0
 
 
-def test_the_end_of_the_sources_walk_silences_it_and_terminates_if_wanted():
+def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_configured():
     source = walking(level_db=170.0, n_hotspots=1, min_stops=0, max_stops=0, min_wait=2.0, max_wait=2.0)
-    for wanted in (True, False):
-        episode = EpisodeConfig(max_steps=None, end_with_source=wanted)
+    for terminates in (True, False):
+        episode = EpisodeConfig(max_steps=None, end_with_source=terminates)
         env = fresh(one_uav(source=source, episode=episode))
-        shown = go(env, HERE)
-        assert told(shown).spotted.item()
-        assert not shown["done"].item()
-        shown = go(env, HERE)
-        assert shown["terminated"].item() == wanted
-        assert not told(shown).spotted.item()
+        output = go(env, HERE)
+        assert told(output).spotted.item()
+        assert not output["done"].item()
+        output = go(env, HERE)
+        assert output["terminated"].item() == terminates
+        assert not told(output).spotted.item()
 
 
 def test_a_persistent_task_never_ends():
@@ -113,7 +113,7 @@ def test_a_persistent_task_never_ends():
 
 
 @pytest.mark.parametrize(("over_steps", "bonus"), [(False, 3.0), (True, 1.5)])
-def test_success_pays_the_bonus_and_a_time_failure_costs_the_penalty(over_steps, bonus):
+def test_success_gives_the_bonus_and_a_timeout_the_penalty(over_steps, bonus):
     source = SourceConfig(level_db=130.0, position=[160.0, 100.0])
     episode = EpisodeConfig(max_steps=3, success_share=1.0)
     task = RewardConfig(spotted=0.0, bonus=3.0, bonus_over_steps=over_steps, penalty=0.5)
@@ -129,7 +129,7 @@ def test_success_pays_the_bonus_and_a_time_failure_costs_the_penalty(over_steps,
 FAR = [[390.0, 10.0]]
 
 
-def test_a_flight_drains_what_it_should_whatever_the_step():
+def test_the_battery_drain_of_a_flight_does_not_depend_on_the_length_of_a_step():
     drained, cost = [], None
     for period in ("1s", "0.5s", "0.25s"):
         battery = BatteryConfig(enabled=True, capacity_kwh=0.1, charging_points=FAR)
@@ -151,7 +151,7 @@ def test_a_flight_drains_what_it_should_whatever_the_step():
     assert drained == pytest.approx([cost] * 3, abs=1e-3)
 
 
-def test_an_instant_flight_drains_as_much():
+def test_an_instant_flight_drains_the_energy_of_its_distance():
     battery = BatteryConfig(enabled=True, capacity_kwh=0.5)
     env = fresh(one_uav(battery=battery))
     origin = env.simulation.points[env.state.goal.item()]
@@ -162,7 +162,7 @@ def test_an_instant_flight_drains_as_much():
 
 
 @both_motions
-def test_a_target_beyond_the_batterys_reach_is_not_flown_to(motion):
+def test_a_uav_does_not_fly_to_a_landing_point_beyond_the_reach_of_its_battery(motion):
     battery = BatteryConfig(enabled=True, capacity_kwh=0.5, charging_points=FAR)
     env = fresh(one_uav(battery=battery, motion=MOTIONS[motion]))
     start = copy.deepcopy(env.state)
@@ -178,7 +178,7 @@ def test_a_target_beyond_the_batterys_reach_is_not_flown_to(motion):
 
 
 @both_motions
-def test_an_empty_uav_stays_until_it_has_charged(motion):
+def test_a_uav_with_an_empty_battery_stays_until_it_has_charged(motion):
     battery = BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=0.5)
     env = fresh(one_uav(battery=battery, motion=MOTIONS[motion]))
     start = env.state.goal.item()
@@ -199,14 +199,14 @@ def test_uavs_charge_only_at_charging_points():
     go(env, HERE, HERE)
     assert env.state.battery.item() == 50.0
     go(env, EAST)
-    flown = env.state.battery.item()
-    assert flown < 50.0
+    after_flight = env.state.battery.item()
+    assert after_flight < 50.0
     go(env, HERE)
     gain = charge_gain(torch.tensor(1.0), battery).item()
-    assert env.state.battery.item() == pytest.approx(flown + gain)
+    assert env.state.battery.item() == pytest.approx(after_flight + gain)
 
 
-def test_a_uav_charges_from_the_step_after_its_landing_on():
+def test_a_uav_begins_to_charge_in_the_step_after_its_landing():
     battery = BatteryConfig(enabled=True, capacity_kwh=0.1)
     env = fresh(one_uav(battery=battery, motion=FLYING))
     go(env, EAST)
@@ -221,7 +221,7 @@ def test_a_uav_charges_from_the_step_after_its_landing_on():
     assert env.state.battery.item() == pytest.approx(100 - cost + gain, abs=1e-3)
 
 
-def test_a_battery_never_leaves_its_bounds():
+def test_battery_levels_stay_between_0_and_100_percent():
     env = fresh(everything(episode=KEEPS_GOING), num_worlds=32)
     generator = torch.Generator().manual_seed(0)
     lowest = 100.0
@@ -235,26 +235,26 @@ def test_a_battery_never_leaves_its_bounds():
 # The source.
 
 
-def test_an_intermittent_source_is_heard_as_often_as_it_emits():
+def test_an_intermittent_source_is_spotted_as_often_as_it_emits():
     source = SourceConfig(
         level_db=160.0, position=[100.0, 100.0], emission="per_step", emission_probability=0.3
     )
     env = fresh(square(source=source, episode=KEEPS_GOING), num_worlds=400)
-    heard = torch.stack([told(act(env, torch.zeros(400, 3).long())).spotted for _ in range(25)])
-    assert heard.any(-1).equal(heard.all(-1))
-    assert heard.float().mean().item() == pytest.approx(0.3, abs=0.02)
-    # Neither worlds nor steps go together.
-    assert 0 < heard[0, :, 0].float().mean() < 1
-    assert 0 < heard[:, 0, 0].float().mean() < 1
+    spotted = torch.stack([told(act(env, torch.zeros(400, 3).long())).spotted for _ in range(25)])
+    assert spotted.any(-1).equal(spotted.all(-1))
+    assert spotted.float().mean().item() == pytest.approx(0.3, abs=0.02)
+    # Emissions differ between worlds and between steps.
+    assert 0 < spotted[0, :, 0].float().mean() < 1
+    assert 0 < spotted[:, 0, 0].float().mean() < 1
 
 
-def test_a_walking_source_moves_and_stays_inside():
+def test_a_walking_source_moves_and_stays_inside_its_region():
     env = fresh(everything(), num_worlds=16)
-    inside = env.simulation.airspace
-    begun = env.state.source.clone()
+    airspace = env.simulation.airspace
+    start = env.state.source.clone()
     for _ in range(60):
         act(env, torch.zeros(16, env.n_agents).long())
         for place, region in zip(env.state.source, env.state.region, strict=True):
-            polygon = inside.regions[region].polygon
+            polygon = airspace.regions[region].polygon
             assert polygon.distance(shapely.Point(place.tolist())) < 1e-3
-    assert (torch.linalg.vector_norm(env.state.source - begun, dim=-1) > 1).all()
+    assert (torch.linalg.vector_norm(env.state.source - start, dim=-1) > 1).all()

@@ -1,4 +1,4 @@
-"""Settings: what fits together, and what does not."""
+"""Scenario settings: valid and invalid combinations."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
 
 
-def test_the_library_needs_no_hydra_and_no_yaml():
+def test_a_scenario_needs_no_hydra_and_no_yaml():
     config = ScenarioConfig(agents=5)
     airspace = config.airspace(np.random.default_rng(0))
     assert airspace.n_points.min() >= 5
@@ -32,7 +32,7 @@ def test_flight_levels_must_fit_the_scenario_and_the_airspace():
         ScenarioConfig(agents=3, region=fir, motion=high).airspace(np.random.default_rng(0))
 
 
-def test_a_pool_draws_that_many_different_regions_and_the_same_seed_the_same():
+def test_a_pool_draws_that_many_different_regions_and_a_seed_repeats_them():
     config = ScenarioConfig(region=RegionConfig(pool=5))
     one, two = (config.airspace(np.random.default_rng(3)) for _ in range(2))
     assert len(one.regions) == 5
@@ -40,6 +40,6 @@ def test_a_pool_draws_that_many_different_regions_and_the_same_seed_the_same():
     assert [r.polygon.wkt for r in one.regions] == [r.polygon.wkt for r in two.regions]
 
 
-def test_keys_that_no_field_takes_are_found_at_any_depth():
+def test_unknown_keys_are_found_at_any_depth():
     written = {"agents": 3, "motion": {"kind": "instant", "wings": 2}, "delay": {"obs": 3, "foo": 1}}
     assert sorted(unknown_keys(written, ScenarioConfig())) == ["delay.foo", "motion.wings"]

@@ -1,4 +1,4 @@
-"""The environment as TorchRL sees it: its contract, batches against single worlds, seeds, compilation."""
+"""``UavEnv`` as a TorchRL environment: specs, batches against single worlds, seeds, compilation."""
 
 import copy
 import pickle
@@ -30,14 +30,14 @@ from damian.envs.uav_env import UavEnv
 from damian.server.rewards import INDIVIDUAL, SYSTEM
 from damian.world.landing import ActionConfig
 
-# TorchRL's contract.
+# Specs and TorchRL's rules.
 
 
 @pytest.mark.parametrize("region", REGIONS)
 @both_kinds
 @both_motions
 @pytest.mark.parametrize("scenario", KINDS)
-def test_every_kind_of_scenario_keeps_its_specs(scenario, motion, kind, region):
+def test_the_specs_of_every_kind_of_scenario_are_right(scenario, motion, kind, region):
     config = ScenarioConfig(
         **KINDS[scenario],
         agents=2,
@@ -50,27 +50,27 @@ def test_every_kind_of_scenario_keeps_its_specs(scenario, motion, kind, region):
 
 @both_kinds
 @both_motions
-def test_all_observations_lie_between_0_and_1_and_no_reward_is_lost(motion, kind):
+def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_terms(motion, kind):
     env = UavEnv(everything(motion, kind), num_worlds=16)
     generator = torch.Generator().manual_seed(0)
-    td = env.rollout(40, lambda td: td.set(*chosen(env, generator)), break_when_any_done=False)
+    td = env.rollout(40, lambda td: td.set(*random_action_entry(env, generator)), break_when_any_done=False)
     for name in ("observation", "global_observation"):
-        seen = td["next", "agents", name]
-        assert ((seen >= 0) & (seen <= 1)).all()
+        observation = td["next", "agents", name]
+        assert ((observation >= 0) & (observation <= 1)).all()
     terms = td["next", "agents", "reward_terms"]
     assert set(terms.keys()) == {*INDIVIDUAL, *SYSTEM}
-    extra = td["next", "agents", "reward"].squeeze(-1) - sum(terms.values())
-    paid = 1.0 * td["next", "success"] - 0.25 * (td["next", "done"] & ~td["next", "success"])
-    torch.testing.assert_close(extra, paid.expand_as(extra), atol=1e-5, rtol=0)
+    rest = td["next", "agents", "reward"].squeeze(-1) - sum(terms.values())
+    final = 1.0 * td["next", "success"] - 0.25 * (td["next", "done"] & ~td["next", "success"])
+    torch.testing.assert_close(rest, final.expand_as(rest), atol=1e-5, rtol=0)
     assert td["next", "done"].any()
 
 
-def chosen(env, generator):
+def random_action_entry(env, generator):
     return ("agents", "action"), random_actions(env, generator)
 
 
 @both_motions
-def test_an_environment_can_be_pickled_and_goes_on_alike(motion):
+def test_a_pickled_environment_continues_in_the_same_way(motion):
     env = fresh(everything(motion), num_worlds=3)
     generator = torch.Generator().manual_seed(0)
     act(env, random_actions(env, generator))
@@ -81,7 +81,7 @@ def test_an_environment_can_be_pickled_and_goes_on_alike(motion):
 
 
 @pytest.mark.parametrize("vector", [SerialEnv, ParallelEnv])
-def test_vectors_of_environments_work(vector):
+def test_serial_and_parallel_environments_work(vector):
     env = vector(2, make_small)
     try:
         td = env.rollout(8, break_when_any_done=False)
@@ -99,16 +99,16 @@ def make_small():
 def test_without_extras_observations_and_rewards_are_the_same(motion):
     scenario = everything(motion)
     generator = torch.Generator().manual_seed(0)
-    rich, poor = (fresh(scenario, num_worlds=4, extras=e) for e in (("message", "state"), ()))
-    actions = [random_actions(rich, generator) for _ in range(12)]
+    with_extras, without = (fresh(scenario, num_worlds=4, extras=e) for e in (("message", "state"), ()))
+    actions = [random_actions(with_extras, generator) for _ in range(12)]
     n_differences = 0
-    for one, other in zip(play(rich, actions), play(poor, actions), strict=True):
+    for one, other in zip(play(with_extras, actions), play(without, actions), strict=True):
         assert same(one.select(*other.keys(True, True)), other)
         n_differences += len(set(one.keys(True, True)) - set(other.keys(True, True)))
     assert n_differences > 0
-    kept = {"reward_terms", "message", "message_sent"} & set(poor.reset()["agents"].keys())
-    assert not kept
-    assert "state" not in poor.reset()
+    extras = {"reward_terms", "message", "message_sent"} & set(without.reset()["agents"].keys())
+    assert not extras
+    assert "state" not in without.reset()
 
 
 # Worlds and seeds.
@@ -128,30 +128,30 @@ def test_worlds_stepped_together_equal_worlds_stepped_alone(motion, kind):
     assert torch.stack([td["done"] for td in expected]).sum() >= 2 * n_worlds
     for b in range(n_worlds):
         alone.seed_worlds(seeds[b : b + 1])
-        shown = play(alone, [a[b : b + 1] for a in actions])
-        assert all_same(shown, [td[b : b + 1] for td in expected])
+        outputs = play(alone, [a[b : b + 1] for a in actions])
+        assert all_same(outputs, [td[b : b + 1] for td in expected])
 
 
 @both_motions
-def test_a_partial_reset_touches_only_its_worlds(motion):
+def test_a_partial_reset_changes_only_its_worlds(motion):
     env = fresh(everything(motion), num_worlds=6)
     generator = torch.Generator().manual_seed(0)
     for _ in range(3):
         after = act(env, random_actions(env, generator))
     before = copy.deepcopy(env.state)
     mask = torch.tensor([True, False, False, True, False, False])
-    shown = env.reset(after.exclude("reward").set("_reset", mask[:, None]))
+    output = env.reset(after.exclude("reward").set("_reset", mask[:, None]))
     check_equal(before, env.state, ~mask)
     assert env.state.steps.tolist() == [0, 3, 3, 0, 3, 3]
     assert env.state.episode.tolist() == [2, 1, 1, 2, 1, 1]
     keys = [("agents", "observation"), ("agents", "message"), "state"]
-    assert same(shown.select(*keys)[~mask], after.select(*keys)[~mask])
-    assert not same(shown.select(*keys)[mask], after.select(*keys)[mask])
+    assert same(output.select(*keys)[~mask], after.select(*keys)[~mask])
+    assert not same(output.select(*keys)[mask], after.select(*keys)[mask])
 
 
 @both_kinds
 @both_motions
-def test_the_same_seed_gives_the_same_rollout_and_another_seed_another(motion, kind):
+def test_the_same_seed_gives_the_same_rollout_and_another_seed_a_different_one(motion, kind):
     def rollout(seed):
         env = UavEnv(everything(motion, kind), num_worlds=2, seed=seed)
         generator = torch.Generator().manual_seed(0)
@@ -178,7 +178,7 @@ def test_set_seed_repeats_a_rollout_and_worlds_and_episodes_differ():
     assert len({int(env.reset()[0]["state"].sum() * 100) for _ in range(20)}) > 3
 
 
-# Compiled.
+# Compilation.
 
 
 @pytest.mark.slow
@@ -190,6 +190,6 @@ def test_a_compiled_environment_gives_the_same_rollout(scenario):
     actions = [random_actions(eager, generator) for _ in range(30)]
     for one, other in zip(play(eager, actions), play(compiled, actions), strict=True):
         for key in one.keys(True, True):
-            # Metres in flight: differences of float32 rounding at a hundred metres.
-            near = 1e-4 if key == "state" else 1e-5
-            torch.testing.assert_close(one[key], other[key], atol=near, rtol=1e-5)
+            # The state has positions of about 100 m, where float32 rounding is coarser.
+            tolerance = 1e-4 if key == "state" else 1e-5
+            torch.testing.assert_close(one[key], other[key], atol=tolerance, rtol=1e-5)

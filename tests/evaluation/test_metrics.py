@@ -1,4 +1,4 @@
-"""What is measured of episodes: of an evaluation, of training, and how it is written down."""
+"""Measures of episodes in evaluations and in training, and the files that hold them."""
 
 import csv
 import math
@@ -35,8 +35,8 @@ DELAYS = {
 }
 
 
-def together(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
-    """Two of three UAVs must spot a source at once that many of the landing points are near."""
+def joint_spotting(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
+    """Two of three UAVs must spot the source at the same time; it is near many of the landing points."""
     sections = {
         "motion": MOTIONS[motion],
         "delay": delay,
@@ -48,77 +48,77 @@ def together(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
     return square(**(sections | changed))
 
 
-def flown(scenario: ScenarioConfig, n_worlds: int = 24) -> tuple[TensorDictBase, Server]:
-    """A flight of the random policy [B, HORIZON], and the server."""
+def fly(scenario: ScenarioConfig, n_worlds: int = 24) -> tuple[TensorDictBase, Server]:
+    """A flight of the random policy, [B, HORIZON], and the server."""
     torch.manual_seed(1)
     env = make_env(scenario, n_worlds, seed=2, extras=["message"])
     return env.rollout(HORIZON, random_policy(env), break_when_any_done=False), env.server
 
 
 def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
-    """Ages of what is held [steps], and of each message sent whether it is late or lost, in an episode."""
-    agents, found = world["next", "agents"], {"age": [], "late": [], "lost": []}
+    """Ages of the messages held [steps], and whether each message sent is late or lost, in an episode."""
+    agents, delays = world["next", "agents"], {"age": [], "late": [], "lost": []}
     for i in range(agents["message_sent"].shape[-1]):
-        sent = {0: 0}  # the first message is there at once: when each was sent, and when it arrives
+        arrivals = {0: 0}  # step of arrival by step of generation; the first message arrives at once
         for t in range(1, steps + 1):
             if agents["message_sent"][t - 1, i]:
                 delay = int(agents["delay"][t - 1, i]) if "delay" in agents else 0
-                found["late"].append(delay > 0)
-                found["lost"].append(delay == -1)
-                sent |= {t: t + delay} if delay >= 0 else {}
-            found["age"].append(t - max(at for at, arrives in sent.items() if arrives <= t))
-    return found
+                delays["late"].append(delay > 0)
+                delays["lost"].append(delay == -1)
+                arrivals |= {t: t + delay} if delay >= 0 else {}
+            delays["age"].append(t - max(sent for sent, arrival in arrivals.items() if arrival <= t))
+    return delays
 
 
 def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[str, Any]:
-    """What the first episode of a flight [T] comes to, step by step."""
+    """Measures of the first episode of a flight [T], counted step by step."""
     row = {"episode_return": 0.0, "true_return": 0.0, "success": False, "true_success": False}
     row |= {"true_steps": HORIZON}
     truly_over = False
     for t in range(1, HORIZON + 1):
-        after = world["next"][t - 1]
-        row["episode_return"] += after["agents", "reward"].mean().item()
-        row["success"] |= after["success"].item()
-        truth, steps = Messages.unpack(after["agents", "message"][None]), torch.tensor([t])
-        judged = server.reward_and_status(
+        next_step = world["next"][t - 1]
+        row["episode_return"] += next_step["agents", "reward"].mean().item()
+        row["success"] |= next_step["success"].item()
+        truth, steps = Messages.unpack(next_step["agents", "message"][None]), torch.tensor([t])
+        undelayed = server.reward_and_status(
             server.features(truth, steps), truth, steps, torch.zeros(1, dtype=torch.bool)
         )
         if not truly_over:
-            row["true_return"] += judged.reward.mean().item()
+            row["true_return"] += undelayed.reward.mean().item()
         if truth.spotted.sum() >= needed and not truly_over:
             row["true_success"] = truly_over = True
             row["true_steps"] = t
-        if after["done"].item():
+        if next_step["done"].item():
             break
     row["steps"] = t if row["success"] else HORIZON
     return row | delays_by_hand(world, t)
 
 
 def by_hand(flight: TensorDictBase, server: Server, needed: int) -> tuple[dict[str, float], list[dict]]:
-    """The same measures as an ``Evaluation``, and each episode."""
+    """The measures of an ``Evaluation`` by name, and those of each episode."""
     rows = [episode_by_hand(world, server, needed) for world in flight]
 
     def mean(name: str) -> float:
         return sum(row[name] for row in rows) / len(rows)
 
-    def over_all(name: str) -> float:
+    def mean_over_all(name: str) -> float:
         values = [value for row in rows for value in row[name]]
         return sum(values) / len(values)
 
-    same = ("steps", "episode_return", "true_steps", "true_return")
+    averaged = ("steps", "episode_return", "true_steps", "true_return")
     means = {
         "episodes": len(rows),
         "success_rate": mean("success"),
         "true_success_rate": mean("true_success"),
     }
-    shares = {name: over_all(name) for name in ("age", "late", "lost")}
-    return means | {name: mean(name) for name in same} | shares, rows
+    pooled = {name: mean_over_all(name) for name in ("age", "late", "lost")}
+    return means | {name: mean(name) for name in averaged} | pooled, rows
 
 
 @both_motions
 @pytest.mark.parametrize("delay", DELAYS)
-def test_an_evaluation_is_what_counting_step_by_step_comes_to(motion, delay):
-    flight, server = flown(together(motion, DELAYS[delay]))
+def test_an_evaluation_equals_counting_step_by_step(motion, delay):
+    flight, server = fly(joint_spotting(motion, DELAYS[delay]))
     expected, _ = by_hand(flight, server, needed=2)
     assert asdict(evaluation(flight, server)) == pytest.approx(expected, rel=1e-5)
     assert 0 < expected["success_rate"] <= 1
@@ -126,8 +126,8 @@ def test_an_evaluation_is_what_counting_step_by_step_comes_to(motion, delay):
 
 
 @both_motions
-def test_successes_that_never_truly_were_or_are_learnt_of_late_are_told_apart(motion):
-    flight, server = flown(together(motion, DelayConfig(obs=BURSTS, loss=0.2)), 64)
+def test_false_late_and_missed_successes_differ_from_true_ones(motion):
+    flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.2)), 64)
     expected, rows = by_hand(flight, server, needed=2)
     false = [row for row in rows if row["success"] and not row["true_success"]]
     late = [row for row in rows if row["success"] and row["true_steps"] < row["steps"]]
@@ -142,10 +142,10 @@ def test_successes_that_never_truly_were_or_are_learnt_of_late_are_told_apart(mo
 
 
 @both_motions
-def test_without_delay_what_is_perceived_is_true_to_the_bit(motion):
+def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion):
     ends = EpisodeConfig(max_steps=9, success_share=0.3, discharged_share=0.6, end_with_source=True)
-    for scenario in (together(motion, DelayConfig()), everything(motion, episode=ends)):
-        flight, server = flown(scenario)
+    for scenario in (joint_spotting(motion, DelayConfig()), everything(motion, episode=ends)):
+        flight, server = fly(scenario)
         row = evaluation(flight, server)
         assert (row.true_success_rate, row.true_steps, row.true_return) == (
             row.success_rate,
@@ -156,15 +156,15 @@ def test_without_delay_what_is_perceived_is_true_to_the_bit(motion):
         assert (row.age == 0) == (motion == "instant")
 
 
-def test_an_episode_that_nothing_ends_counts_the_horizon():
-    persistent = together("instant", DELAYS["constant"], episode=EpisodeConfig(max_steps=None))
-    row = evaluation(*flown(persistent))
+def test_an_episode_without_an_end_counts_the_horizon():
+    endless = joint_spotting("instant", DELAYS["constant"], episode=EpisodeConfig(max_steps=None))
+    row = evaluation(*fly(endless))
     assert (row.steps, row.true_steps, row.success_rate, row.true_success_rate) == (HORIZON, HORIZON, 0, 0)
 
 
-def test_an_evaluation_flies_as_long_as_it_is_told_and_draws_or_takes_the_mode():
+def test_an_evaluation_flies_up_to_the_horizon_and_draws_actions():
     def env() -> DelayedEnv:
-        return make_env(together("instant", DELAYS["constant"]), 8, seed=2, extras=["message"])
+        return make_env(joint_spotting("instant", DELAYS["constant"]), 8, seed=2, extras=["message"])
 
     policy = random_policy(env())
     torch.manual_seed(1)
@@ -175,12 +175,12 @@ def test_an_evaluation_flies_as_long_as_it_is_told_and_draws_or_takes_the_mode()
     assert row.steps <= 6
 
 
-# While training.
+# Measures in training.
 
 
 def training_batch() -> TensorDictBase:
     env = make_env(
-        together("instant", DelayConfig(), episode=EpisodeConfig(max_steps=7, success_share=0.6)), 16
+        joint_spotting("instant", DelayConfig(), episode=EpisodeConfig(max_steps=7, success_share=0.6)), 16
     )
     env.append_transform(RewardSum([("agents", "reward")], [("agents", "episode_reward")]))
     env.append_transform(StepCounter())
@@ -189,22 +189,22 @@ def training_batch() -> TensorDictBase:
 
 
 def ended_episodes(batch: TensorDictBase) -> list[dict[str, float]]:
-    """Return, success and steps of each, in order of their ends."""
-    running, found = [[0.0, 0] for _ in range(len(batch))], []
+    """Return, success and steps of each ended episode, in the order in which they end."""
+    running, ended = [[0.0, 0] for _ in range(len(batch))], []  # return and steps of each world's episode
     for t in range(batch.shape[1]):
-        for world, so_far in enumerate(running):
-            after = batch["next"][world, t]
-            so_far[0] += after["agents", "reward"].mean().item()
-            so_far[1] += 1
-            if after["done"]:
-                won = float(after["success"])
-                found.append({"episode_return": so_far[0], "success_rate": won, "steps": float(so_far[1])})
+        for world, sums in enumerate(running):
+            next_step = batch["next"][world, t]
+            sums[0] += next_step["agents", "reward"].mean().item()
+            sums[1] += 1
+            if next_step["done"]:
+                success = float(next_step["success"])
+                ended.append({"episode_return": sums[0], "success_rate": success, "steps": float(sums[1])})
                 running[world] = [0.0, 0]
-    return found
+    return ended
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.9, 0.991])
-def test_the_episode_log_is_an_exponential_mean_over_episodes_in_order_of_their_ends(factor):
+def test_the_episode_log_is_an_exponential_mean_over_episodes_in_the_order_of_their_ends(factor):
     batch, log = training_batch(), EpisodeLog(factor)
     for part in batch.split([13, 1, 26], 1):
         log.add(part)
@@ -212,42 +212,42 @@ def test_the_episode_log_is_an_exponential_mean_over_episodes_in_order_of_their_
     assert log.finished == len(episodes) > 50
     for name, mean in log.means().items():
         weights = [factor**k for k in range(len(episodes))]
-        weighed = [w * row[name] for w, row in zip(weights, reversed(episodes), strict=True)]
-        assert mean == pytest.approx(sum(weighed) / sum(weights), rel=1e-5)
+        weighted = [w * row[name] for w, row in zip(weights, reversed(episodes), strict=True)]
+        assert mean == pytest.approx(sum(weighted) / sum(weights), rel=1e-5)
     assert {row["success_rate"] for row in episodes} == {0.0, 1.0}
 
 
-def test_before_any_episode_has_ended_there_is_no_mean():
+def test_means_are_nan_before_any_episode_has_ended():
     log = EpisodeLog()
     log.add(training_batch()[:, :0])
     assert log.finished == 0
     assert all(math.isnan(mean) for mean in log.means().values())
 
 
-def test_an_episode_log_goes_on_from_a_checkpoint():
+def test_a_restored_episode_log_continues_as_the_original():
     batch = training_batch()
     log, restored = EpisodeLog(0.9), EpisodeLog(0.9)
     log.add(batch[:, :20])
     restored.load_state_dict(log.state_dict())
     assert restored.means() == log.means()
-    for one in (log, restored):
-        one.add(batch[:, 20:])
+    for either in (log, restored):
+        either.add(batch[:, 20:])
     assert restored.means() == log.means()
     assert restored.finished == log.finished
 
 
-# On paper.
+# Tables and files.
 
 ROW = Evaluation(4, 0.25, 50.0, 1.5, 0.75, 30.0, 2.5, 0.125, 0.5, 0.1)
 
 
-def test_a_table_shows_success_and_the_truth_only_where_there_are_any():
+def test_a_table_shows_success_only_if_possible_and_true_measures_only_with_delays():
     plain = results_table({"random": ROW}, can_succeed=False).splitlines()
     assert plain[0] == "| policy | return | episodes |"
     assert plain[2] == "| random | 1.50 | 4 |"
-    task = results_table({"random": ROW}, can_succeed=True).splitlines()
-    assert task[0] == "| policy | success rate | steps | return | episodes |"
-    assert task[2] == "| random | 0.25 | 50.00 | 1.50 | 4 |"
+    success = results_table({"random": ROW}, can_succeed=True).splitlines()
+    assert success[0] == "| policy | success rate | steps | return | episodes |"
+    assert success[2] == "| random | 0.25 | 50.00 | 1.50 | 4 |"
     late = results_table({"random": ROW}, can_succeed=True, late=True).splitlines()
     assert late[2] == "| random | 0.25 | 50.00 | 1.50 | 0.75 | 30.00 | 2.50 | 0.12 | 0.50 | 0.10 | 4 |"
     assert late[0].count("true") == 3
@@ -263,7 +263,7 @@ def test_results_are_written_with_every_measure(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"result.csv", "result.md"}
 
 
-def test_a_spoilt_metrics_file_is_one_clear_line(tmp_path):
+def test_a_broken_metrics_file_is_refused_with_its_line(tmp_path):
     log = MetricsLog(tmp_path, tensorboard=False, to_csv=True)
     log.add(10, {"steps": 2.0})
     assert read_metrics(tmp_path) == [{"frames": 10.0, "steps": 2.0}]

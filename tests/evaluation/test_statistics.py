@@ -1,4 +1,4 @@
-"""The statistics of comparisons, against closed forms and slow, obvious twins."""
+"""The statistics of comparisons, against closed forms and slow, obvious implementations."""
 
 import itertools
 import math
@@ -26,9 +26,9 @@ def test_the_normalised_score_is_0_for_random_and_1_for_undelayed():
     np.testing.assert_array_equal(normalised(scores, 10.0, 2.0), [0, 1, 0.25, 1.25, -0.25])
 
 
-def test_the_normalised_score_means_nothing_where_undelayed_does_not_beat_random():
-    got = normalised(np.array([1.0, 1.0, 1.0]), np.array([2.0, 3.0, 4.0]), np.array([3.0, 3.0, 3.0]))
-    assert np.isnan(got).tolist() == [True, True, False]
+def test_the_normalised_score_is_nan_where_undelayed_does_not_beat_random():
+    scores = normalised(np.array([1.0, 1.0, 1.0]), np.array([2.0, 3.0, 4.0]), np.array([3.0, 3.0, 3.0]))
+    assert np.isnan(scores).tolist() == [True, True, False]
 
 
 def test_recovery_is_0_for_naive_and_1_for_undelayed():
@@ -37,35 +37,35 @@ def test_recovery_is_0_for_naive_and_1_for_undelayed():
 
 
 @pytest.mark.parametrize(
-    ("naive", "shown"), [(8.0, True), (9.0, True), (9.01, False), (10.0, False), (11.0, False)]
+    ("naive", "defined"), [(8.0, True), (9.0, True), (9.01, False), (10.0, False), (11.0, False)]
 )
-def test_recovery_is_not_shown_if_the_delay_costs_less_than_a_tenth(naive, shown):
-    assert np.isnan(recovery(9.5, naive, 10.0, 0.0)) == (not shown)
+def test_recovery_is_nan_if_the_delay_costs_less_than_a_tenth(naive, defined):
+    assert np.isnan(recovery(9.5, naive, 10.0, 0.0)) == (not defined)
 
 
 @pytest.mark.parametrize("n_values", range(1, 14))
-def test_the_interquartile_mean_is_that_of_the_values_repeated_until_quarters_are_whole(n_values):
+def test_the_interquartile_mean_equals_that_of_each_value_repeated_four_times(n_values):
     values = np.random.default_rng(n_values).normal(size=n_values)
     repeated = sorted(np.repeat(values, 4).tolist())
     middle = repeated[n_values : 3 * n_values]
     assert interquartile_mean(values) == pytest.approx(sum(middle) / len(middle), abs=1e-12)
 
 
-def test_the_interquartile_mean_does_not_see_the_outermost_quarters():
+def test_the_interquartile_mean_ignores_the_outermost_quarters():
     values = np.arange(8.0)
-    wild = values.copy()
-    wild[[0, 1, 6, 7]] = [-1e9, -5, 70, 1e9]
-    assert interquartile_mean(values) == interquartile_mean(np.flip(wild)) == 3.5
+    with_outliers = values.copy()
+    with_outliers[[0, 1, 6, 7]] = [-1e9, -5, 70, 1e9]
+    assert interquartile_mean(values) == interquartile_mean(np.flip(with_outliers)) == 3.5
 
 
 def test_the_interquartile_mean_takes_any_leading_dimensions():
     values = np.random.default_rng(0).normal(size=(2, 3, 7))
-    got = interquartile_mean(values)
-    for place in np.ndindex(2, 3):
-        assert got[place] == pytest.approx(interquartile_mean(values[place]), abs=1e-15)
+    averages = interquartile_mean(values)
+    for index in np.ndindex(2, 3):
+        assert averages[index] == pytest.approx(interquartile_mean(values[index]), abs=1e-15)
 
 
-def test_all_arms_of_a_stratum_are_resampled_together_and_strata_apart():
+def test_all_arms_of_a_stratum_share_their_resamples_and_strata_do_not():
     seeds = np.arange(5.0)
     scores = np.stack([[seeds, seeds + 10], [seeds + 100, seeds + 110]])  # [strata, arms, seeds]
     drawn = resampled(scores, draws=50)
@@ -76,16 +76,16 @@ def test_all_arms_of_a_stratum_are_resampled_together_and_strata_apart():
     assert set(drawn[:, 1, 1].ravel()) == set(seeds + 110)
 
 
-def test_a_resample_is_an_even_draw_with_replacement():
+def test_a_resample_is_a_uniform_draw_with_replacement():
     scores = np.arange(3.0)[None]
     drawn = resampled(scores, draws=30_000)[:, 0]
-    seen, counts = np.unique(drawn, axis=0, return_counts=True)
-    assert len(seen) == 27  # every ordered draw of three seeds
+    distinct, counts = np.unique(drawn, axis=0, return_counts=True)
+    assert len(distinct) == 27  # every ordered draw of three seeds
     assert abs(counts / 30_000 - 1 / 27).max() < 5 * math.sqrt(1 / 27 / 30_000)
 
 
 def exact_interval(values: list[float], weights: list[float]) -> tuple[float, float]:
-    """The 95 % percentile interval of a distribution that is known."""
+    """The 95 % percentile interval of a discrete distribution with these values and weights."""
     total, low, high = 0.0, math.nan, math.nan
     for value, weight in sorted(zip(values, weights, strict=True)):
         total += weight
@@ -94,14 +94,14 @@ def exact_interval(values: list[float], weights: list[float]) -> tuple[float, fl
     return low, high
 
 
-def test_the_interval_of_a_mean_is_that_of_all_possible_draws():
+def test_the_interval_of_a_mean_equals_that_over_all_possible_draws():
     scores = np.array([0.0, 1.0, 7.0, 20.0])
     every = [float(np.mean(draw)) for draw in itertools.product(scores, repeat=4)]
     low, high = bootstrap(means, scores[None], draws=20_000)
     assert (low[0], high[0]) == exact_interval(every, [4**-4] * len(every))
 
 
-def test_the_interval_of_a_recovery_is_that_of_all_possible_draws():
+def test_the_interval_of_a_recovery_equals_that_over_all_possible_draws():
     aware, naive, undelayed = np.array([[3.0, 4.0, 8.0], [1.0, 0.0, 2.0], [9.0, 7.0, 10.0]])
     ratios = []
     for draw in itertools.product(range(3), repeat=3):
@@ -116,16 +116,16 @@ def test_the_interval_of_a_recovery_is_that_of_all_possible_draws():
     np.testing.assert_allclose((low[0], high[0]), exact_interval(ratios, [3**-3] * 27), rtol=1e-12)
 
 
-def test_seeds_that_agree_leave_no_doubt():
+def test_equal_scores_of_all_seeds_give_an_interval_of_no_width():
     low, high = bootstrap(means, np.full((1, 2, 5), 3.5))
     np.testing.assert_array_equal(low, [[3.5, 3.5]])
     np.testing.assert_array_equal(high, [[3.5, 3.5]])
 
 
-@pytest.mark.parametrize(("unknown", "ends"), [(0, (2, 97)), (1, (1, 98)), (10, (-np.inf, np.inf))])
-def test_what_has_no_meaning_counts_at_both_ends_of_an_interval(unknown, ends):
+@pytest.mark.parametrize(("n_nans", "ends"), [(0, (2, 97)), (1, (1, 98)), (10, (-np.inf, np.inf))])
+def test_a_nan_counts_at_both_ends_of_an_interval(n_nans, ends):
     values = np.arange(100.0)
-    values[40 : 40 + unknown] = np.nan
+    values[40 : 40 + n_nans] = np.nan
     assert interval(values) == ends
 
 
@@ -136,6 +136,6 @@ def test_the_same_seed_gives_the_same_interval():
     assert (np.array(one) != np.array(other)).any()
 
 
-def test_no_draws_are_refused():
+def test_zero_draws_are_refused():
     with pytest.raises(InputError, match="draws: 0 is not at least 1"):
         bootstrap(means, np.zeros((1, 3)), draws=0)

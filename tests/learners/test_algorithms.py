@@ -1,4 +1,4 @@
-"""Each algorithm learns with each kind of action, of motion, and of awareness."""
+"""Every learner learns with every kind of action, motion and delay awareness."""
 
 import csv
 import math
@@ -32,18 +32,18 @@ LEARNERS = {
 
 
 def config(learner: str, rnn: str, kind: str, motion: str, aware: str) -> TrainConfig:
-    """Two rounds of learning under delay."""
-    asked = dict(AWARE[aware])
-    late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 3}, history=asked.pop("history", 0))
+    """Settings of a run with two updates, in which messages are up to 3 steps late."""
+    awareness = dict(AWARE[aware])
+    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 3}, history=awareness.pop("history", 0))
     return TrainConfig(
-        **vars(everything(motion, kind, delay=late)),
+        **vars(everything(motion, kind, delay=delay)),
         learner=LEARNERS[learner],
         model=ModelConfig(hidden=[8], rnn=rnn),
         logger=LoggerConfig(tensorboard=False),
         worlds=4,
         frames=96,
         eval_episodes=2,
-        **asked,
+        **awareness,
     )
 
 
@@ -63,48 +63,48 @@ def test_every_combination_learns_and_is_evaluated(tmp_path, learner, rnn, kind,
         assert all(math.isfinite(float(row["episode_return"])) for row in csv.DictReader(file))
 
 
-# What a learner is made of.
+# The parts of a learner.
 
 both_learners = pytest.mark.parametrize("name", LEARNERS)
 
 
-def made(name: str, aware: str = "backupdate", **changed) -> tuple[Mappo | Sac, DelayedEnv]:
-    """A learner and its environment, for messages up to 3 steps late."""
-    asked = replace(config(name, "none", "discrete", "instant", aware), **changed)
-    env = learning_env(asked)
-    return make_learner(asked, env), env
+def build_learner(name: str, aware: str = "backupdate", **changed) -> tuple[Mappo | Sac, DelayedEnv]:
+    """A learner and its environment, in which messages are up to 3 steps late."""
+    settings = replace(config(name, "none", "discrete", "instant", aware), **changed)
+    env = learning_env(settings)
+    return make_learner(settings, env), env
 
 
 @both_learners
 @pytest.mark.parametrize("settle", [False, True])
-def test_a_learner_waits_for_the_longest_delay_if_it_is_to_settle(name, settle):
-    learner, _ = made(name, settle=settle)
+def test_a_learner_waits_for_the_longest_delay_only_with_settle(name, settle):
+    learner, _ = build_learner(name, settle=settle)
     assert learner.setup.settle_steps == (3 if settle else 0)
 
 
 @both_learners
-def test_a_memory_corrects_if_it_should(name):
-    corrects = {aware: made(name, aware)[0].buffer for aware in ("backupdate", "history")}
-    assert isinstance(corrects["backupdate"].storage, BackupdateStorage)
-    assert corrects["backupdate"].storage.longest == 3
-    plain = corrects["history"]
+def test_a_replay_buffer_corrects_its_steps_only_with_backupdating(name):
+    buffers = {aware: build_learner(name, aware)[0].buffer for aware in ("backupdate", "history")}
+    assert isinstance(buffers["backupdate"].storage, BackupdateStorage)
+    assert buffers["backupdate"].storage.longest == 3
+    plain = buffers["history"]
     assert plain is None if name == "mappo" else not isinstance(plain.storage, BackupdateStorage)
 
 
 @both_learners
-def test_a_memory_has_room_for_whole_steps_of_the_longest_batch_and_all_that_is_late(name):
+def test_a_replay_buffer_has_room_for_the_longest_batch_and_twice_the_longest_delay(name):
     clock = ClockConfig(trigger="4s", longest="24s")
     config = replace(LEARNERS[name], **{"buffer_steps": 123} if name == "sac" else {})
-    learner, env = made(name, clock=clock, learner=config)
+    learner, env = build_learner(name, clock=clock, learner=config)
     assert learner.buffer.storage.max_size == 4 * (24 + 2 * 3)
     learner.learn(env.rollout(24, learner.actor, break_when_any_done=False))
 
 
 @pytest.mark.parametrize("recompute", [False, True])
-def test_late_messages_correct_what_the_actor_saw_only_if_that_is_recomputed(recompute):
-    learner, env = made("mappo", recompute_actor=recompute)
+def test_late_messages_correct_the_actors_observations_only_with_recompute_actor(recompute):
+    learner, env = build_learner("mappo", recompute_actor=recompute)
     batch = env.rollout(12, learner.actor, break_when_any_done=False)
-    known = learner.backupdated_batch(batch)
-    assert known["agents", "backupdated"].any()
+    corrected = learner.backupdated_batch(batch)
+    assert corrected["agents", "backupdated"].any()
     for key in ("observation", "action_log_prob"):
-        assert known["agents", key].equal(batch["agents", key]) is not recompute
+        assert corrected["agents", key].equal(batch["agents", key]) is not recompute

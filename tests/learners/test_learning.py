@@ -1,4 +1,4 @@
-"""Models, losses and the learner: what is learnt from, by whom, and what it does to importance ratios."""
+"""MAPPO: policies and critics, advantages, losses, and importance ratios with back-updating."""
 
 import itertools
 
@@ -38,26 +38,26 @@ def scenario(**changes) -> ScenarioConfig:
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_a_policy_trained_with_three_uavs_flies_ten(kind):
+def test_a_policy_made_for_three_uavs_works_with_ten(kind):
     actions = ActionConfig(kind=kind)
     actor = make_actor(UavEnv(scenario(actions=actions), 2), SMALL)
     ten = UavEnv(scenario(agents=10, actions=actions), 2)
-    flown = ten.rollout(4, actor)
-    assert flown["agents", "action"].shape[:3] == (2, 4, 10)
-    assert flown["agents", "action_log_prob"].shape == (2, 4, 10)
+    rollout = ten.rollout(4, actor)
+    assert rollout["agents", "action"].shape[:3] == (2, 4, 10)
+    assert rollout["agents", "action_log_prob"].shape == (2, 4, 10)
 
 
-def test_one_policy_is_shared_so_that_swapping_uavs_swaps_their_actions():
+def test_all_uavs_share_one_policy_so_that_swapping_uavs_swaps_their_actions():
     env = UavEnv(scenario(), 4)
     actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
-    seen = env.rollout(3)[:, -1].select(("agents", "observation"), ("agents", "global_observation"))
+    observed = env.rollout(3)[:, -1].select(("agents", "observation"), ("agents", "global_observation"))
     order = torch.tensor([2, 0, 1])
-    swapped = seen.clone()
+    swapped = observed.clone()
     for key in ("observation", "global_observation"):
-        swapped["agents", key] = seen["agents", key][:, order]
-    logits = actor.module[0](seen.clone())["agents", "logits"]
+        swapped["agents", key] = observed["agents", key][:, order]
+    logits = actor.module[0](observed.clone())["agents", "logits"]
     assert torch.equal(actor.module[0](swapped)["agents", "logits"], logits[:, order])
-    values = critic(seen.clone())["agents", "state_value"]
+    values = critic(observed.clone())["agents", "state_value"]
     assert torch.equal(critic(swapped)["agents", "state_value"], values[:, order])
 
 
@@ -65,10 +65,10 @@ def test_one_policy_is_shared_so_that_swapping_uavs_swaps_their_actions():
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 def test_masked_policies_never_choose_an_illegal_action(make, motion):
     env = UavEnv(scenario(motion=MotionConfig(kind=motion)), 32)
-    flown = env.rollout(20, make(env), break_when_any_done=False)
-    chosen = flown["agents", "action_mask"].gather(-1, flown["agents", "action"].unsqueeze(-1))
-    assert not flown["agents", "action_mask"].all()
-    assert chosen.all()
+    rollout = env.rollout(20, make(env), break_when_any_done=False)
+    legal = rollout["agents", "action_mask"].gather(-1, rollout["agents", "action"].unsqueeze(-1))
+    assert not rollout["agents", "action_mask"].all()
+    assert legal.all()
 
 
 def test_continuous_actions_lie_in_the_unit_square():
@@ -82,8 +82,8 @@ def test_continuous_actions_lie_in_the_unit_square():
         assert action.std() > 0.1
 
 
-def collected(motion: str, kind: str):
-    """Episodes of 9 steps; every other world ends for good, the others by the time limit."""
+def collect(motion: str, kind: str):
+    """A batch with episodes of 9 steps, terminated in every other world and truncated in the others."""
     config = scenario(
         episode=EpisodeConfig(max_steps=9),
         motion=MotionConfig(kind=motion),
@@ -98,8 +98,8 @@ def collected(motion: str, kind: str):
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_nothing_is_learnt_from_actions_that_were_none(kind):
-    batch, critic = collected("polynomial", kind)
+def test_the_advantage_is_zero_where_a_uav_was_not_ready(kind):
+    batch, critic = collect("polynomial", kind)
     add_advantages(batch, critic, MappoConfig())
     ready = batch["agents", "ready"]
     assert 0 < ready.float().mean() < 1
@@ -108,7 +108,7 @@ def test_nothing_is_learnt_from_actions_that_were_none(kind):
 
 
 @pytest.mark.parametrize(("kind", "mask"), [("discrete", True), ("discrete", False), ("continuous", True)])
-def test_entries_without_a_decision_move_the_critic_only(kind, mask):
+def test_steps_without_a_decision_train_the_critic_only(kind, mask):
     config = scenario(actions=ActionConfig(kind=kind, mask=mask))
     env = UavEnv(config, 4)
     actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
@@ -125,9 +125,9 @@ def test_entries_without_a_decision_move_the_critic_only(kind, mask):
         actors = sum(g for n, g in grads.items() if n.startswith("actor"))
         return actors, sum(grads.values()) - actors
 
-    actor_moves, critic_moves = gradients(ready=True)
-    assert actor_moves > 0
-    assert critic_moves > 0
+    actor_gradient, critic_gradient = gradients(ready=True)
+    assert actor_gradient > 0
+    assert critic_gradient > 0
     assert gradients(ready=False)[0] == 0
     assert gradients(ready=False)[1] > 0
 
@@ -148,7 +148,7 @@ def test_objective_and_entropy_are_means_over_decisions():
 
 
 def test_advantages_are_scaled_over_decisions_only():
-    batch, critic = collected("polynomial", "discrete")
+    batch, critic = collect("polynomial", "discrete")
     add_advantages(batch, critic, MappoConfig())
     advantage = batch["agents", "advantage"][batch["agents", "ready"]]
     assert advantage.mean().item() == pytest.approx(0, abs=1e-5)
@@ -158,11 +158,11 @@ def test_advantages_are_scaled_over_decisions_only():
 @both_motions
 def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(motion):
     config = MappoConfig(gamma=0.9, lmbda=0.8, normalize_advantage=False)
-    batch, critic = collected(motion, "discrete")
+    batch, critic = collect(motion, "discrete")
     add_advantages(batch, critic, config)
     value, reward = (batch[key].squeeze(-1) for key in (("agents", "state_value"), REWARD))
-    after = batch["next", "agents", "state_value"].squeeze(-1)
-    ready, then = batch["agents", "ready"], batch["next", "agents", "ready"]
+    next_value = batch["next", "agents", "state_value"].squeeze(-1)
+    ready, next_ready = batch["agents", "ready"], batch["next", "agents", "ready"]
     compared = 0
     for world, uav in itertools.product(range(8), range(3)):
         estimate = 0.0  # of the decision after this one
@@ -170,25 +170,26 @@ def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(
             if not ready[world, t, uav]:
                 continue
             earned, discount, last = 0.0, 1.0, t
-            while True:  # until the next decision, an end, or the end of what is known
+            while True:  # until the next decision, or the end of the episode or of the batch
                 earned += discount * reward[world, last, uav].item()
                 discount *= 0.9
                 over = batch["next", "done"][world, last].item()
-                if over or then[world, last, uav] or last == 23:
+                if over or next_ready[world, last, uav] or last == 23:
                     break
                 last += 1
             alive = not batch["next", "terminated"][world, last].item()
-            delta = earned + alive * discount * after[world, last, uav].item() - value[world, t, uav].item()
-            follows = 0.0 if over or last == 23 else discount * 0.8 * estimate
-            estimate = delta + follows
-            got = batch["agents", "advantage"][world, t, uav].item()
-            assert got == pytest.approx(estimate, abs=1e-5)
+            bootstrap = alive * discount * next_value[world, last, uav].item()
+            delta = earned + bootstrap - value[world, t, uav].item()
+            later = 0.0 if over or last == 23 else discount * 0.8 * estimate
+            estimate = delta + later
+            advantage = batch["agents", "advantage"][world, t, uav].item()
+            assert advantage == pytest.approx(estimate, abs=1e-5)
             compared += 1
     assert compared > 100
 
 
-def test_a_flight_of_three_steps_earns_what_comes_meanwhile_and_the_value_where_it_lands():
-    """By hand: gamma 1/2, rewards 1, 2, 4, and values 8 before the flight, 16 after it."""
+def test_a_flight_of_three_steps_earns_their_rewards_and_the_value_after_landing():
+    """Computed by hand: gamma 1/2, rewards 1, 2, 4, and values 8 before the flight, 16 after it."""
     agents = {
         "ready": torch.tensor([True, False, False]).view(1, 3, 1),
         "global_observation": torch.tensor([8.0, 100.0, -100.0]).view(1, 3, 1, 1),
@@ -208,11 +209,15 @@ def test_a_flight_of_three_steps_earns_what_comes_meanwhile_and_the_value_where_
     targets = [1 + 2 / 2 + 4 / 4 + 16 / 8, 2 + 4 / 2 + 16 / 4, 4 + 16 / 2]
     assert flight["agents", "value_target"].flatten().tolist() == targets
     add_advantages(flight, critic, MappoConfig(gamma=0.5, lmbda=0.7))
-    assert flight["agents", "advantage"].flatten().tolist() == [0.0, 0.0, 0.0]  # one decision is the mean
+    assert flight["agents", "advantage"].flatten().tolist() == [
+        0.0,
+        0.0,
+        0.0,
+    ]  # a single decision is the mean
     assert flight["agents", "value_target"].flatten().tolist() == targets
 
 
-def test_the_critic_alone_sees_global_features_under_ctde():
+def test_only_the_critic_observes_global_features_with_ctde():
     config = scenario()
     config.observation.ctde = True
     env = UavEnv(config, 2)
@@ -223,91 +228,91 @@ def test_the_critic_alone_sees_global_features_under_ctde():
     assert env.observation_spec["agents", "observation"].shape[-1] == 4
 
 
-# What hindsight does to the importance ratios of the first pass.
+# How back-updating changes the importance ratios of the first pass.
 
 ROUNDING = 1e-4
-"""Of log-probabilities that are computed step by step, and in one batch."""
+"""Largest difference between log-probabilities that are computed step by step and in one batch."""
 
 
-def collected_late(kind: str, recompute_actor: bool) -> tuple[Mappo, TensorDictBase]:
-    """A learner with back-updating, and a batch that its actor has flown under delay, with episodes' ends."""
-    late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
-    scenario = everything(kind=kind, delay=late, episode=EpisodeConfig(max_steps=9))
+def collect_delayed(kind: str, recompute_actor: bool) -> tuple[Mappo, TensorDictBase]:
+    """A learner with back-updating, and a batch of several episodes that its actor has flown under delay."""
+    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
+    scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["message"])
     env.append_transform(StepCounter())
-    view = server_recompute(env.server, actor=recompute_actor)
-    memory = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, view, longest=5))
+    recompute = server_recompute(env.server, actor=recompute_actor)
+    buffer = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, recompute, longest=5))
     torch.manual_seed(2)
     config = MappoConfig(minibatches=1, epochs=1)
-    learner = Mappo(env, config, learning(SMALL, recompute_actor=recompute_actor), memory)
+    learner = Mappo(env, config, learning(SMALL, recompute_actor=recompute_actor), buffer)
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         return learner, env.rollout(30, learner.actor, break_when_any_done=False)
 
 
 @torch.no_grad()
-def log_ratios(learner: Mappo, known: TensorDictBase, behaviour: Tensor) -> Tensor:
-    """Of the importance ratios of what is learnt from, [B, T, N]."""
-    return learner.actor.get_dist(known.clone()).log_prob(known["agents", "action"]) - behaviour
+def log_ratios(learner: Mappo, batch: TensorDictBase, behaviour: Tensor) -> Tensor:
+    """Logarithms of the importance ratios on a batch, [B, T, N], against ``behaviour`` log-probabilities."""
+    return learner.actor.get_dist(batch.clone()).log_prob(batch["agents", "action"]) - behaviour
 
 
 @both_kinds
-def test_with_backupdating_the_first_importance_ratios_are_one_as_the_actor_saw_what_it_saw(kind):
-    learner, batch = collected_late(kind, recompute_actor=False)
-    known, behaviour = learner.backupdated_batch(batch), batch["agents", "action_log_prob"]
-    assert known["agents", "observation"].equal(batch["agents", "observation"])
-    assert known["agents", "action_log_prob"].equal(behaviour)
-    assert known["agents", "backupdated"].any()
-    assert log_ratios(learner, known, behaviour).abs().max() < ROUNDING
+def test_with_backupdating_the_first_importance_ratios_are_one_as_actor_observations_stay(kind):
+    learner, batch = collect_delayed(kind, recompute_actor=False)
+    corrected, behaviour = learner.backupdated_batch(batch), batch["agents", "action_log_prob"]
+    assert corrected["agents", "observation"].equal(batch["agents", "observation"])
+    assert corrected["agents", "action_log_prob"].equal(behaviour)
+    assert corrected["agents", "backupdated"].any()
+    assert log_ratios(learner, corrected, behaviour).abs().max() < ROUNDING
 
 
 @both_kinds
-def test_recompute_actor_hides_that_corrected_observations_were_never_acted_on(kind):
-    learner, batch = collected_late(kind, recompute_actor=True)
-    known, behaviour = learner.backupdated_batch(batch), batch["agents", "action_log_prob"]
-    assert known["agents", "action"].equal(batch["agents", "action"])
-    corrected = (known["agents", "observation"] != batch["agents", "observation"]).any(-1)
-    assert 0.1 < corrected.float().mean() < 0.9
-    # What the loss is told: as if the actor had chosen with what came later.
-    assert log_ratios(learner, known, known["agents", "action_log_prob"]).abs().max() < ROUNDING
-    # What it did: another probability wherever something was corrected, and nowhere else.
-    true = log_ratios(learner, known, behaviour)
-    assert true.abs()[~corrected].max() < ROUNDING
-    assert (true.abs()[corrected] > ROUNDING).float().mean() > 0.95
-    assert (true.exp() - 1).abs()[corrected].mean() > 0.01
+def test_recompute_actor_hides_that_the_actor_never_had_the_corrected_observations(kind):
+    learner, batch = collect_delayed(kind, recompute_actor=True)
+    corrected, behaviour = learner.backupdated_batch(batch), batch["agents", "action_log_prob"]
+    assert corrected["agents", "action"].equal(batch["agents", "action"])
+    differs = (corrected["agents", "observation"] != batch["agents", "observation"]).any(-1)
+    assert 0.1 < differs.float().mean() < 0.9
+    # The loss gets ratios of 1, as if the actor had chosen from the corrected observations.
+    assert log_ratios(learner, corrected, corrected["agents", "action_log_prob"]).abs().max() < ROUNDING
+    # Ratios to the probabilities with which the actor chose differ from 1 where observations were corrected.
+    true = log_ratios(learner, corrected, behaviour)
+    assert true.abs()[~differs].max() < ROUNDING
+    assert (true.abs()[differs] > ROUNDING).float().mean() > 0.95
+    assert (true.exp() - 1).abs()[differs].mean() > 0.01
 
 
-def test_an_observation_is_corrected_where_a_message_came_late_for_the_step_before():
-    learner, batch = collected_late("discrete", recompute_actor=True)
-    known = learner.backupdated_batch(batch)
-    corrected = (known["agents", "observation"] != batch["agents", "observation"]).any(-1).any(-1)
-    late = known["agents", "backupdated"].squeeze(-1).any(-1)
+def test_an_observation_is_corrected_only_if_a_message_of_the_previous_step_was_late():
+    learner, batch = collect_delayed("discrete", recompute_actor=True)
+    corrected = learner.backupdated_batch(batch)
+    differs = (corrected["agents", "observation"] != batch["agents", "observation"]).any(-1).any(-1)
+    backupdated = corrected["agents", "backupdated"].squeeze(-1).any(-1)
     begins = batch["step_count"].squeeze(-1) == 0
     assert begins[:, 1:].any()
-    assert not corrected[begins].any()
-    assert not (corrected[:, 1:] & ~late[:, :-1]).any()
+    assert not differs[begins].any()
+    assert not (differs[:, 1:] & ~backupdated[:, :-1]).any()
 
 
-def test_what_has_settled_is_learnt_from_later_and_then_as_it_truly_was():
-    learner, flight = collected_late("discrete", recompute_actor=False)
-    short = everything(episode=EpisodeConfig(max_steps=9))
+def test_with_settle_steps_are_learnt_from_later_and_then_as_if_without_delay():
+    learner, flight = collect_delayed("discrete", recompute_actor=False)
+    undelayed = everything(episode=EpisodeConfig(max_steps=9))
     learner.setup = learning(SMALL, 5)
-    server = make_env(short, 4, seed=1).server
-    known = torch.cat([learner.backupdated_batch(flight[:, t : t + 10]) for t in (0, 10, 20)], 1)
-    assert known.shape[1] == len(flight[0]) - 5  # the first batch comes short
+    server = make_env(undelayed, 4, seed=1).server
+    learnt = torch.cat([learner.backupdated_batch(flight[:, t : t + 10]) for t in (0, 10, 20)], 1)
+    assert learnt.shape[1] == len(flight[0]) - 5  # the first batch is shorter
     settled = flight[:, :25]
-    assert known["agents", "action"].equal(settled["agents", "action"])
+    assert learnt["agents", "action"].equal(settled["agents", "action"])
     sent, steps = settled["next", "agents", "message"], settled["next", "step_count"].squeeze(-1)
     truth = server(Messages.unpack(sent), steps)
-    assert known["next", "agents", "global_observation"].equal(truth.global_observation)
-    assert not known["next", "agents", "global_observation"].equal(
+    assert learnt["next", "agents", "global_observation"].equal(truth.global_observation)
+    assert not learnt["next", "agents", "global_observation"].equal(
         settled["next", "agents", "global_observation"]
     )
 
 
-def test_what_was_corrected_is_reported_with_the_losses():
-    learner, batch = collected_late("discrete", recompute_actor=False)
+def test_the_share_of_backupdated_messages_is_reported_with_the_losses():
+    learner, batch = collect_delayed("discrete", recompute_actor=False)
     share = learner.backupdated_batch(batch)["agents", "backupdated"].float().mean().item()
-    learner, batch = collected_late("discrete", recompute_actor=False)
+    learner, batch = collect_delayed("discrete", recompute_actor=False)
     losses = learner.learn(batch)
     assert losses["backupdated"] == share
     assert {"loss_objective", "loss_entropy", "loss_critic"} < set(losses)

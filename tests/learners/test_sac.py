@@ -1,4 +1,4 @@
-"""SAC: its targets, its temperature, and what it learns from once late messages have arrived."""
+"""SAC: its targets, its temperature, and the decisions that it draws from the replay buffer."""
 
 import itertools
 import math
@@ -32,85 +32,84 @@ FAST = SacConfig(updates=2, batch_size=64, warm_up=0)
 
 def learner_of(env, config=FAST, settle=0, steps=200) -> Sac:
     torch.manual_seed(0)
-    memory = ReplayBuffer(storage=TimeStorage(steps * env.batch_size[0]))
-    return Sac(env, config, learning(SMALL, settle), memory)
+    buffer = ReplayBuffer(storage=TimeStorage(steps * env.batch_size[0]))
+    return Sac(env, config, learning(SMALL, settle), buffer)
 
 
-def flown(env, actor, steps=24):
+def fly(env, actor, steps=24):
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         return env.rollout(steps, actor, break_when_any_done=False)
 
 
 @both_kinds
 @both_motions
-def test_a_round_of_learning_moves_actor_critics_and_temperature(kind, motion):
+def test_a_round_of_updates_changes_actor_critics_and_temperature(kind, motion):
     env = UavEnv(everything(motion, kind=kind), 8)
     learner = learner_of(env)
     before = {name: value.clone() for name, value in learner.loss.state_dict().items()}
-    losses = learner.learn(flown(env, learner.actor))
+    losses = learner.learn(fly(env, learner.actor))
     assert set(losses) == set(LOSSES)
     assert all(torch.tensor([*losses.values()]).isfinite())
-    assert losses["alpha"] == pytest.approx(
-        FAST.alpha_init, rel=0.01
-    )  # a mean; in the first update as it began
-    moved = {name for name, value in learner.loss.state_dict().items() if not value.equal(before[name])}
+    # The mean over two updates, of which the first has the initial temperature.
+    assert losses["alpha"] == pytest.approx(FAST.alpha_init, rel=0.01)
+    changed = {name for name, value in learner.loss.state_dict().items() if not value.equal(before[name])}
     for part in ("actor_network", "target_qvalue_network", "qvalue_network", "log_alpha"):
-        assert any(name.startswith(part) for name in moved), part
+        assert any(name.startswith(part) for name in changed), part
 
 
 def test_nothing_is_learnt_before_the_warm_up():
     env = UavEnv(everything(), 8)
     learner = learner_of(env, SacConfig(warm_up=304))
-    assert math.isnan(learner.learn(flown(env, learner.actor))["loss_actor"])
+    assert math.isnan(learner.learn(fly(env, learner.actor))["loss_actor"])
     before = learner.loss.log_alpha.item()
-    learner.learn(flown(env, learner.actor, 13))  # 37 steps of 8 worlds: 296
+    learner.learn(fly(env, learner.actor, 13))  # 37 steps of 8 worlds: 296
     assert learner.loss.log_alpha.item() == before
-    learner.learn(flown(env, learner.actor, 1))
+    learner.learn(fly(env, learner.actor, 1))
     assert learner.loss.log_alpha.item() != before
 
 
 def test_the_target_of_a_decision_discounts_the_next_value_by_its_duration():
     env = UavEnv(everything("polynomial", kind="discrete"), 8)
     learner = learner_of(env, SacConfig(gamma=0.5, warm_up=0))
-    batch = flown(env, learner.actor, 60)
+    batch = fly(env, learner.actor, 60)
     learner.buffer.extend(batch)
     storage = learner.buffer.storage
     steps, order = storage.steps, storage.latest()
-    ready, after = (steps[key][order] for key in (("agents", "ready"), ("next", "agents", "ready")))
+    ready, next_ready = (steps[key][order] for key in (("agents", "ready"), ("next", "agents", "ready")))
     ends = (steps["next", key][order].squeeze(-1) for key in ("done", "terminated"))
-    found = find_decisions(ready, after, *ends)
-    made = transitions(steps, order, found, 0.5, learner.observed)
-    duration = made["steps_to_next_obs"]
+    decisions = find_decisions(ready, next_ready, *ends)
+    batch = transitions(steps, order, decisions, 0.5, learner.observed)
+    duration = batch["steps_to_next_obs"]
     assert duration.max() > 5
-    target = learner.loss._compute_target(made)
-    zero = made.clone()
-    zero["next", "agents", "reward"].zero_()
-    at_once = zero.clone()
-    at_once["steps_to_next_obs"] = torch.ones_like(duration)
-    value = learner.loss._compute_target(at_once) / 0.5  # of the state after it
-    expected = made["next", "agents", "reward"].squeeze(-1) + 0.5 ** duration.squeeze(-1) * value
+    target = learner.loss._compute_target(batch)
+    unrewarded = batch.clone()
+    unrewarded["next", "agents", "reward"].zero_()
+    one_step = unrewarded.clone()
+    one_step["steps_to_next_obs"] = torch.ones_like(duration)
+    next_value = learner.loss._compute_target(one_step) / 0.5
+    expected = batch["next", "agents", "reward"].squeeze(-1) + 0.5 ** duration.squeeze(-1) * next_value
     assert torch.allclose(target, expected, atol=1e-5)
 
 
-def test_the_temperature_rests_where_the_entropy_is_its_share_of_that_of_the_legal_actions():
+def test_the_target_entropy_is_a_share_of_the_entropy_of_a_uniform_choice_among_legal_actions():
     env = UavEnv(everything(kind="discrete"), 8)
     learner = learner_of(env, SacConfig(target_entropy=0.5))
     n_actions = env.full_action_spec_unbatched["agents", "action"].n
     mask = torch.zeros(2, n_actions, dtype=torch.bool)
     mask[0, :4], mask[1, :16] = True, True
-    seen = torch.rand(2, env.observation_spec["agents", "observation"].shape[-1])
-    glob = torch.rand(2, env.observation_spec["agents", "global_observation"].shape[-1])
+    observation = torch.rand(2, env.observation_spec["agents", "observation"].shape[-1])
+    global_observation = torch.rand(2, env.observation_spec["agents", "global_observation"].shape[-1])
     for parameter in learner.actor.parameters():
         parameter.data.zero_()  # a uniform choice among the legal actions
-    entries = {"observation": seen, "global_observation": glob, "action_mask": mask}
-    _, told = learner.loss.actor_loss(TensorDict({"agents": TensorDict(entries, [2])}, [2]))
-    # log pi = -log n where log n / 2 is asked for.
-    legal = torch.tensor([4.0, 16.0]).log()
-    assert torch.allclose(told["log_prob"], -legal / 2, atol=1e-5)
+    entries = {"observation": observation, "global_observation": global_observation, "action_mask": mask}
+    _, metadata = learner.loss.actor_loss(TensorDict({"agents": TensorDict(entries, [2])}, [2]))
+    # The log-probability is -log n, and the target entropy log n / 2.
+    log_n = torch.tensor([4.0, 16.0]).log()
+    assert torch.allclose(metadata["log_prob"], -log_n / 2, atol=1e-5)
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 1.0)])
-def test_continuous_actions_aim_at_the_entropy_of_one_uav_within_its_bounds(low, high):
+def test_the_target_entropy_of_continuous_actions_is_that_of_one_uav_within_its_bounds(low, high):
     env = UavEnv(everything(kind="continuous"), 4)
     bounds = env.full_action_spec["agents", "action"].space
     bounds.low, bounds.high = torch.full_like(bounds.low, low), torch.full_like(bounds.high, high)
@@ -118,34 +117,34 @@ def test_continuous_actions_aim_at_the_entropy_of_one_uav_within_its_bounds(low,
     assert target == pytest.approx(2 * (torch.tensor((high - low) / 2).log().item() - 1), abs=1e-6)
 
 
-def late_env():
-    late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
-    env = make_env(everything(delay=late, episode=EpisodeConfig(max_steps=9)), 4, 1, extras=["message"])
+def delayed_env():
+    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
+    env = make_env(everything(delay=delay, episode=EpisodeConfig(max_steps=9)), 4, 1, extras=["message"])
     env.append_transform(StepCounter())
     return env
 
 
 def test_a_late_message_corrects_transitions_that_are_stored_already():
-    env = late_env()
-    view = server_recompute(env.server)
-    memory = ReplayBuffer(storage=BackupdateStorage(60 * 4, view, longest=5))
-    learner = Sac(env, FAST, learning(SMALL, 5), memory)
-    batch = flown(env, learner.actor, 40)
+    env = delayed_env()
+    recompute = server_recompute(env.server)
+    buffer = ReplayBuffer(storage=BackupdateStorage(60 * 4, recompute, longest=5))
+    learner = Sac(env, FAST, learning(SMALL, 5), buffer)
+    batch = fly(env, learner.actor, 40)
     for part in batch.split(8, 1):
         learner.learn(part)
-    storage = memory.storage
-    held = storage.steps[storage.latest()[:-5]].transpose(0, 1)
+    storage = buffer.storage
+    stored = storage.steps[storage.latest()[:-5]].transpose(0, 1)
     settled = batch[:, :-5]
     sent, elapsed = settled["next", "agents", "message"], settled["next", "step_count"].squeeze(-1)
     truth = env.server(Messages.unpack(sent), elapsed)
-    assert held["next", "agents", "reward"].squeeze(-1).equal(truth.reward)
-    assert held["next", "agents", "global_observation"].equal(truth.global_observation)
-    assert not held["next", "agents", "reward"].equal(settled["next", "agents", "reward"])
-    assert held["agents", "observation"].equal(settled["agents", "observation"])  # what the actor saw stays
+    assert stored["next", "agents", "reward"].squeeze(-1).equal(truth.reward)
+    assert stored["next", "agents", "global_observation"].equal(truth.global_observation)
+    assert not stored["next", "agents", "reward"].equal(settled["next", "agents", "reward"])
+    assert stored["agents", "observation"].equal(settled["agents", "observation"])  # never corrected
 
 
-class Watched(Sac):
-    """Keeps what it learns from."""
+class RecordingSac(Sac):
+    """Keeps a copy of every batch from which it learns."""
 
     drawn: tuple[TensorDictBase, ...] = ()
 
@@ -155,101 +154,101 @@ class Watched(Sac):
 
 
 def two_decisions(flight: TensorDictBase, world: int, begin: int, agent: int, last: int) -> Tensor | None:
-    """What a UAV chose and what came of it until it had chosen once more, as a row of numbers.
+    """Transition of a UAV over two decisions, the first at step ``begin``, as a row of numbers (``ROW``).
 
-    None: it could not choose, or what came of it is not known by the last step.
+    None if the UAV was not ready, or if the outcome is not known by the last step.
     """
-    seen, after, ends = flight["agents"], flight["next", "agents"], flight["next"]
-    if not seen["ready"][world, begin, agent]:
+    agents, next_agents, ends = flight["agents"], flight["next", "agents"], flight["next"]
+    if not agents["ready"][world, begin, agent]:
         return None
     earned, left = 0.0, 2
     for t in range(begin, last + 1):
-        earned += 0.8 ** (t - begin) * after["reward"][world, t, agent]
-        then, over = after["ready"][world, t, agent], ends["done"][world, t]
-        left -= int(then | over)
+        earned += 0.8 ** (t - begin) * next_agents["reward"][world, t, agent]
+        ready, over = next_agents["ready"][world, t, agent], ends["done"][world, t]
+        left -= int(ready | over)
         if over or left == 0:
             break
     else:
         return None
     terminated = ends["terminated"][world, t]
-    if not (then | terminated):
+    if not (ready | terminated):
         return None
-    shown = [
-        entries[key][world, when, agent]
-        for entries, when in ((seen, begin), (after, t))
+    observations = [
+        entries[key][world, step, agent]
+        for entries, step in ((agents, begin), (next_agents, t))
         for key in ("observation", PRIVILEGED_OBSERVATION[-1])
     ]
-    chosen = seen["action"][world, begin, agent].view(1)
-    return torch.cat([*shown, chosen, earned, over, terminated, torch.tensor([t - begin + 1])])
+    action = agents["action"][world, begin, agent].view(1)
+    return torch.cat([*observations, action, earned, over, terminated, torch.tensor([t - begin + 1])])
 
 
-SHOWN = [OBSERVATION, PRIVILEGED_OBSERVATION]
-ROW = [*SHOWN, *(("next", *key) for key in SHOWN), ("agents", "action"), ("next", "agents", "reward")]
+OBSERVED = [OBSERVATION, PRIVILEGED_OBSERVATION]
+ROW = [*OBSERVED, *(("next", *key) for key in OBSERVED), ("agents", "action"), ("next", "agents", "reward")]
 ROW += [("next", "done"), ("next", "terminated"), "steps_to_next_obs"]
 
 
-def test_what_is_learnt_from_are_the_settled_decisions_that_the_memory_still_holds():
+def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_holds():
     scenario = everything("polynomial", episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["privileged"])
     config = SacConfig(gamma=0.8, n_steps=2, updates=2, batch_size=600, warm_up=0)
-    memory = ReplayBuffer(storage=TimeStorage(24 * 4))
-    learner = Watched(env, config, learning(SMALL, 3, critic_key=PRIVILEGED_OBSERVATION), memory)
-    flight = flown(env, learner.actor, 40)
-    flight["next", "terminated"][::2] = flight["next", "done"][::2]  # every other world ends for good
-    for part in flight.split(8, 1):  # the ring goes round
+    buffer = ReplayBuffer(storage=TimeStorage(24 * 4))
+    learner = RecordingSac(env, config, learning(SMALL, 3, critic_key=PRIVILEGED_OBSERVATION), buffer)
+    flight = fly(env, learner.actor, 40)
+    flight["next", "terminated"][::2] = flight["next", "done"][::2]  # no time limit in every other world
+    for part in flight.split(8, 1):  # more than the buffer holds, so that old steps are overwritten
         learner.drawn = ()
         learner.learn(part)
     assert [len(drawn) for drawn in learner.drawn] == [600, 600]
-    places = itertools.product(range(4), range(16, 37), range(3))
-    made = (two_decisions(flight, *place, last=36) for place in places)
-    expected = torch.stack([row for row in made if row is not None])
+    candidates = itertools.product(range(4), range(16, 37), range(3))  # world, first step, agent
+    rows = (two_decisions(flight, *candidate, last=36) for candidate in candidates)
+    expected = torch.stack([row for row in rows if row is not None])
     assert 0 < expected[:, -2].sum() < expected[:, -3].sum() < len(expected)  # terminated, done
     drawn = torch.cat(learner.drawn)
-    found = torch.cat([drawn[key].view(len(drawn), -1) for key in ROW], -1)
-    apart = (found.unsqueeze(1) - expected).abs().amax(-1)
-    assert apart.amin(1).max() < 1e-5
-    assert apart.amin(0).max() < 1e-5
+    drawn_rows = torch.cat([drawn[key].view(len(drawn), -1) for key in ROW], -1)
+    difference = (drawn_rows.unsqueeze(1) - expected).abs().amax(-1)
+    assert difference.amin(1).max() < 1e-5  # every drawn decision is expected
+    assert difference.amin(0).max() < 1e-5  # every expected decision is drawn
 
 
-def watched(**changed) -> Watched:
+def recording_learner(**changed) -> RecordingSac:
     """A learner that has made one update."""
     env = UavEnv(everything(kind="discrete"), 4)
     config = SacConfig(**({"updates": 1, "batch_size": 64, "warm_up": 0} | changed))
-    learner = Watched(env, config, learning(SMALL), ReplayBuffer(storage=TimeStorage(100)))
-    learner.learn(flown(env, learner.actor, 8))
+    learner = RecordingSac(env, config, learning(SMALL), ReplayBuffer(storage=TimeStorage(100)))
+    learner.learn(fly(env, learner.actor, 8))
     return learner
 
 
-def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_a_share_of_that():
-    learner = watched(lr=1e-2, alpha_lr=0.3, tau=0.25)
+def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_by_tau_times_that():
+    learner = recording_learner(lr=1e-2, alpha_lr=0.3, tau=0.25)
     loss = learner.loss
     learnt, target = (
         torch.cat([weight.flatten() for weight in getattr(loss, name).data.values(True, True)])
         for name in ("qvalue_network_params", "target_qvalue_network_params")
     )
-    # Both have begun at the same place.
-    begun = (target - 0.25 * learnt) / 0.75
-    assert (learnt - begun).abs().max().item() == pytest.approx(1e-2, rel=1e-2)  # of Adam's first step
+    # Critics and targets had the same initial weights.
+    initial = (target - 0.25 * learnt) / 0.75
+    assert (learnt - initial).abs().max().item() == pytest.approx(1e-2, rel=1e-2)  # Adam's first step
     moved = loss.log_alpha.item() - math.log(learner.config.alpha_init)
-    assert abs(moved) == pytest.approx(0.3, rel=1e-2)  # at a rate of its own
+    assert abs(moved) == pytest.approx(0.3, rel=1e-2)  # the temperature has its own rate
 
 
-def test_an_update_forgets_the_gradients_of_the_one_before():
-    learner = watched(lr=1e-12, alpha_lr=1e-12)
+def test_an_update_clears_the_gradients_of_the_previous_one():
+    learner = recording_learner(lr=1e-12, alpha_lr=1e-12)
     first = [weight.grad.clone() for weight in learner.loss.parameters()]
     learner.update(learner.drawn[0])
-    for weight, before in zip(learner.loss.parameters(), first, strict=True):
-        torch.testing.assert_close(weight.grad, before)
+    for weight, gradient in zip(learner.loss.parameters(), first, strict=True):
+        torch.testing.assert_close(weight.grad, gradient)
 
 
-def test_before_anything_has_settled_nothing_is_learnt():
-    env = late_env()
+def test_nothing_is_learnt_before_any_step_has_settled():
+    env = delayed_env()
     learner = learner_of(env, settle=10)
-    losses = [learner.learn(flown(env, learner.actor, 4))["loss_actor"] for _ in range(4)]
+    losses = [learner.learn(fly(env, learner.actor, 4))["loss_actor"] for _ in range(4)]
     assert [math.isnan(loss) for loss in losses] == [True, True, False, False]
 
 
-def test_a_checkpoint_brings_what_was_learnt_and_not_the_discount():
+def test_a_checkpoint_restores_the_networks_but_not_the_discount():
     env = UavEnv(everything(), 4)
     far, near = (learner_of(env, SacConfig(gamma=gamma)) for gamma in (0.99, 0.5))
     learnt = far.loss.state_dict()
@@ -260,14 +259,14 @@ def test_a_checkpoint_brings_what_was_learnt_and_not_the_discount():
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_it_learns_which_action_pays(kind):
-    """Reward for choosing to the east, at once and with no future: a contextless bandit."""
+def test_sac_learns_which_actions_are_rewarded(kind):
+    """Actions to the east are rewarded at once and gamma is 0: a bandit without context."""
     env = UavEnv(everything(kind=kind, actions=ActionConfig(kind=kind, mask=False)), 16)
     learner = learner_of(env, SacConfig(updates=60, batch_size=128, gamma=0.0, warm_up=0, alpha_init=0.01))
     for _ in range(4):
-        batch = flown(env, learner.actor, 16)
+        batch = fly(env, learner.actor, 16)
         action = batch["agents", "action"]
-        good = action % 8 == 4 if kind == "discrete" else action[..., 1] < 0.25
-        batch["next", "agents", "reward"] = good.float().unsqueeze(-1)
+        east = action % 8 == 4 if kind == "discrete" else action[..., 1] < 0.25
+        batch["next", "agents", "reward"] = east.float().unsqueeze(-1)
         learner.learn(batch)
-    assert good.float().mean() > 0.6
+    assert east.float().mean() > 0.6

@@ -1,4 +1,4 @@
-"""The belief recipe as a person runs it: what its table and figure say, and what it refuses."""
+"""The belief recipe, run by its command line: its table, its figure, and its refusals of wrong input."""
 
 import csv
 import sys
@@ -15,7 +15,7 @@ from shared.launch import launch
 UNDELAYED = ["delay.obs=0", "delay.loss=0"]
 FLYING = ["motion=polynomial", "clock.simulation=1s"]
 BADLY = ["delay=none", "delay.obs={law: uniform, low: 0, high: 5}", "delay.loss=0.3"]
-"""Messages that overtake each other or are lost: every case in a short flight."""
+"""Messages overtake each other and are lost, so that a short flight covers every case."""
 
 
 @pytest.fixture
@@ -42,8 +42,8 @@ def table(folder: Path) -> dict[str, np.ndarray]:
     return columns
 
 
-def told(capsys) -> list[str]:
-    """What the recipe has printed, line by line."""
+def printed_lines(capsys) -> list[str]:
+    """The lines that the recipe has printed."""
     return capsys.readouterr().out.splitlines()
 
 
@@ -53,13 +53,17 @@ def told(capsys) -> list[str]:
 def test_a_run_folder_holds_configuration_table_and_figure(run, capsys, overrides):
     folder = run(*overrides, "episode.max_steps=10")
     assert {path.name for path in folder.iterdir()} == {"config.yaml", "belief.csv", "belief.png"}
-    assert [line.split(":")[0] for line in told(capsys)] == ["mean age", "late messages", "lost messages"]
+    assert [line.split(":")[0] for line in printed_lines(capsys)] == [
+        "mean age",
+        "late messages",
+        "lost messages",
+    ]
     picture = imread(folder / "belief.png")
     assert picture.shape[1] == 1400
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 10
 
 
-def test_the_table_has_a_row_for_every_instant_and_uav(run):
+def test_the_table_has_a_row_for_every_time_and_uav(run):
     columns = table(run("agents=2", "episode.max_steps=7", "clock.simulation=2s"))
     assert columns["time_s"].tolist() == [[2.0 * step] * 2 for step in range(8)]
     assert columns["uav"].tolist() == [[0, 1]] * 8
@@ -76,26 +80,30 @@ def test_the_belief_is_the_truth_as_old_as_the_table_says(run, motion, order):
 
 
 @pytest.mark.parametrize("motion", [[], FLYING])
-def test_without_delay_and_loss_the_server_knows_the_latest_message(run, capsys, motion):
+def test_without_delay_and_loss_the_server_holds_the_latest_message(run, capsys, motion):
     columns = table(run(*UNDELAYED, *motion))
     message_sent = columns["arrived"] == 1
     assert (columns["believed"] == columns["true"])[message_sent].all()
     assert (columns["age_s"] == 0)[message_sent].all()
     assert message_sent.all() == (motion == [])
     assert (columns["lost"] == 0).all()
-    assert told(capsys)[1:] == ["late messages: 0.0%", "lost messages: 0.0%"]
+    assert printed_lines(capsys)[1:] == ["late messages: 0.0%", "lost messages: 0.0%"]
 
 
-def test_a_constant_delay_shifts_the_truth(run, capsys):
+def test_under_a_constant_delay_the_belief_is_the_truth_that_many_steps_ago(run, capsys):
     columns = table(run("delay.obs=3s", "clock.simulation=0.5s", "episode.max_steps=20"))
     age = np.minimum(columns["time_s"], 3.0)
     assert (columns["age_s"] == age).all()
     assert (columns["believed"][6:] == columns["true"][:-6]).all()
     assert columns["arrived"][:, 0].tolist() == [1] + [0] * 6 + [1] * 14
-    assert told(capsys) == [f"mean age: {age.mean():.2f} s", "late messages: 100.0%", "lost messages: 0.0%"]
+    assert printed_lines(capsys) == [
+        f"mean age: {age.mean():.2f} s",
+        "late messages: 100.0%",
+        "lost messages: 0.0%",
+    ]
 
 
-def test_a_belief_grows_older_unless_a_message_arrives(run):
+def test_the_age_of_a_belief_grows_unless_a_message_arrives(run):
     columns = table(run(*BADLY, "clock.simulation=0.1s"))
     quiet = columns["arrived"][1:] == 0
     assert (np.diff(columns["age_s"], axis=0)[quiet].round(9) == 0.1).all()
@@ -110,17 +118,17 @@ def test_a_lost_message_is_never_believed(run, capsys):
     assert lost
     assert not lost & believed
     share = len(lost) / columns["lost"][1:].size
-    assert told(capsys)[2] == f"lost messages: {share:.1%}"
+    assert printed_lines(capsys)[2] == f"lost messages: {share:.1%}"
 
 
 @pytest.mark.parametrize("motion", [[], FLYING])
-def test_where_everything_is_lost_nothing_arrives_and_only_what_is_sent_is_lost(run, capsys, motion):
+def test_if_every_message_is_lost_none_arrives_and_only_sent_messages_count_as_lost(run, capsys, motion):
     columns = table(run("delay.obs=0", "delay.loss=1", *motion, "episode.max_steps=60"))
     assert columns["arrived"].tolist() == [[1] * 3] + [[0] * 3] * 60
     assert columns["lost"].any()
     assert columns["lost"][1:].all() == (motion == [])
     assert (columns["age_s"] == columns["time_s"]).all()
-    assert told(capsys) == ["mean age: 30.00 s", "late messages: 0.0%", "lost messages: 100.0%"]
+    assert printed_lines(capsys) == ["mean age: 30.00 s", "late messages: 0.0%", "lost messages: 100.0%"]
 
 
 def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
@@ -139,10 +147,10 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
         (["+delay.foo=3"], "delay.foo: no such key"),
         (["delay.obs=soon"], "delay.obs: soon is neither whole steps"),
         (["delay=sometimes"], "delay: sometimes is not one of burst, none, paper"),
-        (["resume=runs/last"], "resume: a flight of the random policy has nothing to go on with"),
+        (["resume=runs/last"], "resume: the random policy is not trained, so there is no run to resume"),
         (["region.id=Nope"], "Nope"),
     ],
 )
-def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(run, capsys, tmp_path, overrides, message):
+def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(run, capsys, tmp_path, overrides, message):
     check_refused(lambda: run(*overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []

@@ -1,7 +1,9 @@
-"""The training part of ``recipes/bench.py``: what is compared, and the numbers that are shown."""
+"""The training part of ``recipes/bench.py``: the arms that are compared, and the rows of the table."""
 
 import importlib.util
+from dataclasses import replace
 
+from bench import QUICK, delayed, scenarios, step_times
 from bench_training import ARMS, HEADER, RIVAL, RIVALS, Seconds, arm_config, median, rows, training
 
 from damian.envs.pipeline import has_message_delay
@@ -22,7 +24,7 @@ def test_each_part_has_its_own_median():
     assert median(measured) == Seconds(2.0, 5.0, 8.0)
 
 
-def test_rows_show_the_share_of_backupdating_and_the_speed_beside_the_rival():
+def test_rows_hold_the_share_of_backupdating_and_the_speed_relative_to_vmas():
     medians = {"ours": Seconds(0.3, 0.1, 0.6), RIVAL: Seconds(1.0, 0.0, 1.0)}
     assert rows(medians, frames=8000) == [
         ("ours", "8,000", "300", "100", "600", "10.0%", "2.00"),
@@ -30,12 +32,20 @@ def test_rows_show_the_share_of_backupdating_and_the_speed_beside_the_rival():
     ]
 
 
-def test_without_the_rival_there_are_no_ratios():
+def test_without_vmas_there_are_no_ratios():
     assert rows({"ours": Seconds(0.3, 0.1, 0.6)}, frames=8000)[0][-1] == "-"
 
 
 def test_every_arm_trains_and_has_a_row():
     vmas = importlib.util.find_spec("vmas")
-    shown = training(worlds=2, steps=8, repeats=1)
-    assert [row[0] for row in shown] == [*ARMS, *(RIVALS if vmas else ())]
-    assert {len(row) for row in shown} == {len(HEADER)}
+    table = training(worlds=2, steps=8, repeats=1)
+    assert [row[0] for row in table] == [*ARMS, *(RIVALS if vmas else ())]
+    assert {len(row) for row in table} == {len(HEADER)}
+
+
+def test_every_environment_of_the_delay_table_is_measured():
+    sizes = replace(QUICK, worlds=2, steps=2, repeats=1)
+    times = step_times(delayed(scenarios()["everything"], "eager", sizes), sizes.steps, sizes.repeats)
+    assert "bare" in times
+    assert len(times) > 5
+    assert all(ms > 0 for ms in times.values())

@@ -1,4 +1,4 @@
-"""The comparison of arms as a person runs it: what runs and goes on, what is refused, what it adds up to."""
+"""The comparison recipe, run by its command line: its runs, its refusals of wrong input, its statistics."""
 
 import csv
 import sys
@@ -26,7 +26,7 @@ SMALL = [
 
 
 def listed(*words: str) -> str:
-    """Overrides for every run."""
+    """The setting ``overrides`` of the comparison: overrides for every run."""
     return f"overrides={list(words)}"
 
 
@@ -41,7 +41,7 @@ ARMS = {
 
 @pytest.fixture
 def compare(tmp_path, monkeypatch):
-    """Run the recipe with overrides in an empty folder; returns where its results lie."""
+    """Run the recipe with overrides in an empty folder; returns the folder of the experiment."""
     monkeypatch.chdir(tmp_path)
 
     def run_recipe(*overrides: str) -> Path:
@@ -58,40 +58,41 @@ def table(path: Path) -> list[dict[str, str]]:
 
 
 def stamps(folder: Path) -> dict[str, int]:
+    """Time of the last change of every file in the folders of the runs."""
     return {str(path): path.stat().st_mtime_ns for path in sorted(folder.rglob("seed_*/*")) if path.is_file()}
 
 
-def test_arms_and_seeds_are_run_once_and_go_on(compare, capsys):
+def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare, capsys):
     folder = compare(*TWO)
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     runs = [f"none/undelayed/seed_{n}" for n in (8, 9)] + [f"paper/unaware/seed_{n}" for n in (8, 9)]
     found = sorted(path.parent.relative_to(folder / "usecase2") for path in folder.rglob("result.csv"))
     assert [str(path) for path in found] == runs
     assert "| random |" in (folder / "usecase2" / runs[0] / "log.txt").read_text()
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
     text = (folder / "table.md").read_text()
-    assert text.strip() in told
+    assert text.strip() in printed
     for part in ("**developing**", "2 seeds (8 to 9), 3 episodes", "Trained for 16 frames or 500", '"arms='):
         assert part in text
     rows = table(folder / "results.csv")
     assert len(rows) == 4 * 4
-    mine = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("unaware", SAMPLED, "paper")]
-    assert [r["seed"] for r in mine] == ["8", "9"]
+    unaware = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("unaware", SAMPLED, "paper")]
+    assert [r["seed"] for r in unaware] == ["8", "9"]
     stored = [table(folder / "usecase2" / name / "result.csv")[0]["true_return"] for name in runs[2:]]
-    assert [float(r["true_return"]) for r in mine] == [float(number) for number in stored]
+    assert [float(r["true_return"]) for r in unaware] == [float(number) for number in stored]
 
     before = stamps(folder)
-    (folder / "usecase2" / runs[3] / "result.csv").unlink()  # as after Ctrl-C while it was evaluated
+    (folder / "usecase2" / runs[3] / "result.csv").unlink()  # as after Ctrl-C during the evaluation
     compare(*TWO[:2], "arms=[undelayed,unaware,deployed]", TWO[3])
     after = stamps(folder)
-    again = {path for path in before if before[path] != after[path]}
-    assert again
-    assert all(runs[3] in path for path in again)
+    rewritten = {path for path in before if before[path] != after[path]}
+    assert rewritten
+    assert all(runs[3] in path for path in rewritten)
     assert {Path(path).parent.parent.name for path in after.keys() - before.keys()} == {"deployed"}
-    went_on = [
+    resumed = [
         "resume: null" not in (folder / "usecase2" / name / "config.yaml").read_text() for name in runs
     ]
-    assert went_on == [False, False, False, True]
+    assert resumed == [False, False, False, True]
 
     capsys.readouterr()
     compare(*TWO[:1], "seeds=3", *TWO[2:], "report_only=true")
@@ -109,12 +110,12 @@ def test_arms_and_seeds_are_run_once_and_go_on(compare, capsys):
 
 
 @pytest.mark.slow
-def test_several_processes_do_the_same_as_one_and_a_failed_run_is_named(compare, capsys):
+def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_named(compare, capsys):
     words = [*TWO[:2], "arms=[undelayed,unaware,deployed]", TWO[3]]
     folder = compare(*words)
-    alone = (folder / "results.csv").read_text()
+    expected = (folder / "results.csv").read_text()
     compare(*words, "processes=2", "hydra.run.dir=runs/usecase2/other")
-    assert (folder / "other" / "results.csv").read_text() == alone
+    assert (folder / "other" / "results.csv").read_text() == expected
     broken = folder / "other" / "usecase2" / "none" / "undelayed" / "seed_8"
     (broken / "result.csv").unlink()
     (broken / "metrics.csv").write_text("nonsense")
@@ -126,14 +127,14 @@ def test_several_processes_do_the_same_as_one_and_a_failed_run_is_named(compare,
 
 
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "message"),
     [
         ([listed("framess=3")], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
         ([listed("delay=papers")], "delay: papers is not one of burst, none, paper"),
         ([listed("agents=two")], "agents: Value 'two'"),
         ([listed("delay.loss=0.1", "source.position=[1,2,3]")], "source.position: [1, 2, 3] is not"),
         (["overrides=[seed=3]"], "a value with = in it needs quotes"),
-        ([listed("seed=3")], "overrides: seed=3 is not for all runs alike"),
+        ([listed("seed=3")], "overrides: seed=3 cannot be the same for every run"),
         (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not one of"),
         (["arms=[undelayed,awake]"], "arms: awake is not one of undelayed, unaware, deployed, history"),
         (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
@@ -145,23 +146,26 @@ def test_several_processes_do_the_same_as_one_and_a_failed_run_is_named(compare,
         (["policy=best"], "policy: best is not one of sampled, mode"),
         (["experiment.arms.both.regime=R7"], "experiment.arms.both.regime: R7 is not one of R0, "),
         (["experiment.arms.both.delayed=false"], "experiment.arms: ['undelayed', 'both'] are not delayed"),
-        (["+experiment.delays.none=[]"], "experiment.delays: none is no name for a folder"),
-        (["report_only=true"], "experiment: nothing of it is finished in"),
+        (["+experiment.delays.none=[]"], "experiment.delays: none cannot name a folder"),
+        (["report_only=true"], "experiment: no run of it is finished in"),
     ],
 )
-def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(compare, capsys, tmp_path, overrides, told):
-    check_refused(lambda: compare("experiment=usecase2", "seeds=2", *overrides), told, capsys)
+def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
+    compare, capsys, tmp_path, overrides, message
+):
+    check_refused(lambda: compare("experiment=usecase2", "seeds=2", *overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []
 
 
 def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = SAMPLED) -> dict:
-    """A row of which every measure is the value."""
-    where = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
+    """A row of results in which every measure has the same value."""
+    labels = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
     names = ("true_return", "true_success_rate", "true_steps", "episode_return", "success_rate", "steps")
-    return where | dict.fromkeys((*names, "age", "late", "lost", "episodes"), value)
+    return labels | dict.fromkeys((*names, "age", "late", "lost", "episodes"), value)
 
 
 def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
+    """Rows of every arm, seed and policy, from the values of the arms by seed."""
     return [
         row(task, "none" if arm == "best" else delay, arm, seed, x, policy)
         for arm, values in scores.items()
@@ -178,27 +182,27 @@ def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
     norm, recovery = compared["aware"]
     assert norm.value == 7.5 / 10
     assert recovery.value == (7.5 - 4) / (10 - 4)
-    # of two seeds there are three resamples: each seed alone, and both
+    # Two seeds have three resamples: each seed twice, and both.
     assert (recovery.low, recovery.high) == ((6 - 5) / (9 - 5), (9 - 5) / (11 - 5))
     assert compared["blind"][0].value == 3 / 10
     assert np.isnan(compared["blind"][1].value)
     assert np.isnan(compared["flown"][1].value)
 
 
-def test_recovery_is_not_shown_if_the_delay_costs_nothing():
+def test_recovery_is_left_out_if_the_delay_costs_nothing():
     scores = SCORES | {"blind": [9.0, 9.5]}
     norm, recovery = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
     assert norm.value == 0.75
     assert str(recovery) == "-"
 
 
-def test_fewer_steps_are_better():
+def test_fewer_steps_give_a_higher_score():
     steps = {arm: [20 - x for x in values] for arm, values in SCORES.items()}
     by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "true_steps").compared("t", "late")
     assert by_steps == Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
 
 
-def test_only_seeds_that_all_arms_have_are_compared():
+def test_only_seeds_that_every_arm_has_are_compared():
     rows = rows_of("t", "late", SCORES)
     more = rows_of("t", "late", {"best": [0, 0, 99.0], "aware": [0, 0, -7.0]})
     more = [row for row in more if row["seed"] == 2]
@@ -222,33 +226,33 @@ def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
 
 
 def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
-    found = Comparison(rows_of("t", "late", SCORES), ARMS).lines
-    told = [(line.delay, line.arm, line.policy) for line in found]
-    assert told == [
+    lines = Comparison(rows_of("t", "late", SCORES), ARMS).lines
+    labels = [(line.delay, line.arm, line.policy) for line in lines]
+    assert labels == [
         ("none", "best", SAMPLED),
         ("none", "best", MODE),
         ("none", RANDOM, RANDOM),
         *[("late", arm, policy) for arm in ("blind", "flown", "aware") for policy in (SAMPLED, MODE)],
         ("late", RANDOM, RANDOM),
     ]
-    cells = found[7].cells()
+    cells = lines[7].cells()
     assert [cells[name] for name in ("arm", "regime", "policy", "seeds")] == ["aware", "R0", SAMPLED, 2]
     assert [cells[f"true_return{end}"] for end in ("", "_low", "_high")] == [7.5, 6.0, 9.0]
     assert (cells["J_norm"], cells["recovery"]) == (0.75, 3.5 / 6)
-    assert (found[3].cells()["recovery"], found[8].cells()["J_norm"]) == ("", "")
+    assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
-def test_the_greedy_policy_stands_beside_the_random_one_where_it_was_flown():
+def test_the_table_lists_the_greedy_policy_where_it_was_evaluated():
     rows = rows_of("t", "late", SCORES)
     greedy = [row("t", delay, arm, 0, 7.0, GREEDY) for delay, arm in (("none", "best"), ("late", "blind"))]
     table = markdown(Comparison(rows + greedy, ARMS), [], {"t": "long"}, never=set())
-    told = [line.split(" |")[:4] for line in table.splitlines() if "greedy" in line]
-    assert told == [
+    cells = [line.split(" |")[:4] for line in table.splitlines() if "greedy" in line]
+    assert cells == [
         [f"| {name}", " ", " greedy", " 7.000 [7.000, 7.000]"] for name in ("greedy (undelayed)", "greedy")
     ]
 
 
-def test_a_task_without_success_shows_none_and_several_places_are_summed_up():
+def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
     rows = rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES)
     text = markdown(Comparison(rows, ARMS), ["a note"], {"t": "long", "u": "short"}, never={"u"})
     first, second, overall = text.split("##")[1:]
@@ -259,18 +263,18 @@ def test_a_task_without_success_shows_none_and_several_places_are_summed_up():
     assert "| aware | 0.750 [" in overall
 
 
-def test_figures_take_arms_that_learn_nothing_and_runs_without_a_finished_episode(tmp_path):
+def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finished_episode(tmp_path):
     comparison = Comparison(rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES), ARMS)
     curve = [{"episodes": n, "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in range(5)]
-    none = [dict.fromkeys(curve[0], np.nan) | {"episodes": 0.0}]
-    curves = {("t", "none", "best"): [curve, curve[1:]], ("t", "late", "blind"): [none, none]}
+    unfinished = [dict.fromkeys(curve[0], np.nan) | {"episodes": 0.0}]
+    curves = {("t", "none", "best"): [curve, curve[1:]], ("t", "late", "blind"): [unfinished, unfinished]}
     plot_curves(comparison, curves, {"steps": 1.0}, {"u"}, tmp_path / "curves.png")
     plot_norms(comparison, tmp_path / "norms.png")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("curves.png", "norms.png"))
 
 
 @pytest.mark.parametrize("name", [path.stem for path in sorted((Path(CONF) / "experiment").iterdir())])
-def test_every_experiment_that_there_is_makes_runs_that_can_be_learnt(compare, capsys, name):
+def test_every_experiment_file_gives_runs_whose_settings_allow_training(compare, capsys, name):
     only = ["delays=[paper]", "tasks=[flights]"] if name == "delaybench" else []
     words = [f"experiment={name}", "seeds=1", "report_only=true", *only]
-    check_refused(lambda: compare(*words), "experiment: nothing of it is finished in", capsys)
+    check_refused(lambda: compare(*words), "experiment: no run of it is finished in", capsys)

@@ -1,4 +1,4 @@
-"""A trained policy that is flown again, as a person does it: elsewhere, by others, under other delays."""
+"""The evaluation recipe, run by its command line: a trained policy with other UAVs, regions and delays."""
 
 import csv
 import shutil
@@ -27,9 +27,9 @@ TRAINED = [
 
 
 @pytest.fixture(scope="module")
-def learnt(tmp_path_factory) -> Path:
-    """The folder of a run with three UAVs."""
-    folder = tmp_path_factory.mktemp("learnt") / "run"
+def trained(tmp_path_factory) -> Path:
+    """The folder of a training run with three UAVs."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train.py", *TRAINED, f"hydra.run.dir={folder}"])
         launch(train.main)
@@ -37,11 +37,11 @@ def learnt(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def fly(learnt, tmp_path, monkeypatch) -> Callable[..., Path]:
-    """Fly the policy of a run in an empty folder; returns where the results lie."""
+def fly(trained, tmp_path, monkeypatch) -> Callable[..., Path]:
+    """Evaluate the policy of a run in an empty folder; returns the folder with the results."""
     monkeypatch.chdir(tmp_path)
 
-    def run_recipe(*overrides: str, of: Path | str | None = learnt, folder: str = "flown") -> Path:
+    def run_recipe(*overrides: str, of: Path | str | None = trained, folder: str = "flown") -> Path:
         policy = [f"checkpoint={of}"] if of else []
         monkeypatch.setattr(sys, "argv", ["evaluate.py", *overrides, *policy, f"hydra.run.dir={folder}"])
         launch(main)
@@ -58,41 +58,41 @@ def results(folder: Path) -> dict[str, dict[str, float]]:
         }
 
 
-def test_it_is_flown_as_it_was_trained_if_nothing_else_is_asked_for(fly, learnt, capsys):
+def test_without_overrides_the_evaluation_after_the_training_is_repeated(fly, trained, capsys):
     folder = fly()
     assert {path.name for path in folder.iterdir()} == {"config.yaml", "result.csv", "result.md"}
     assert (folder / "result.md").read_text().strip() in capsys.readouterr().out
-    again, before = results(folder), results(learnt)
+    again, before = results(folder), results(trained)
     assert again.keys() == before.keys() == {"trained, sampled", "trained, mode", "random", "greedy"}
     assert again["trained, mode"] == before["trained, mode"]
-    config, trained = (OmegaConf.load(path / "config.yaml") for path in (folder, learnt))
-    differ = {name for name in trained if config[name] != trained[name]}
+    config, other = (OmegaConf.load(path / "config.yaml") for path in (folder, trained))
+    differ = {name for name in other if config[name] != other[name]}
     assert differ == {"checkpoint", "overrides"}
 
 
-def test_a_policy_trained_with_three_is_flown_with_ten(fly):
+def test_a_policy_trained_with_three_uavs_flies_ten(fly):
     folder = fly("agents=10", "eval_episodes=5")
     assert OmegaConf.load(folder / "config.yaml").agents == 10
     assert results(folder)["trained, mode"]["episodes"] == 5
 
 
-def test_a_policy_of_sac_flies_as_one_of_mappo_does(fly, tmp_path, monkeypatch):
+def test_a_policy_of_sac_is_evaluated_like_one_of_mappo(fly, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py", "learner=sac", *TRAINED, "hydra.run.dir=soft"])
     launch(train.main)
     assert results(fly("agents=5", of="soft")).keys() == {*results(tmp_path / "soft")}
 
 
-def test_new_overrides_win_and_the_others_of_the_run_hold(fly):
+def test_new_overrides_replace_those_of_the_run_and_the_others_apply(fly):
     folder = fly("delay.obs=4", "seed=5")
     config = OmegaConf.load(folder / "config.yaml")
     assert (config.delay.obs, config.seed) == (4, 5)
     assert (config.episode.max_steps, config.eval_episodes, config.model.hidden) == (10, 8, [16])
-    older, newer = (results(path)["random"]["age"] for path in (folder, fly(folder="trained")))
-    assert older == pytest.approx((1 + 2 + 3 + 7 * 4) / 10, rel=1e-6)
-    assert newer == 1
+    longer, shorter = (results(path)["random"]["age"] for path in (folder, fly(folder="trained")))
+    assert longer == pytest.approx((1 + 2 + 3 + 7 * 4) / 10, rel=1e-6)
+    assert shorter == 1
 
 
-def test_several_delays_are_flown_in_one_sweep(fly, tmp_path):
+def test_several_delays_are_evaluated_in_one_sweep(fly, tmp_path):
     fly("-m", "delay.obs=0,2", "hydra.sweep.dir=sweep")
     tables = {
         OmegaConf.load(path.parent / "config.yaml").delay.obs: results(path.parent)
@@ -103,20 +103,20 @@ def test_several_delays_are_flown_in_one_sweep(fly, tmp_path):
     assert shares == {0: (0.0, 0.0), 2: (1.0, 0.0)}
 
 
-def test_a_new_choice_of_a_group_wins_over_the_runs_keys_in_it(fly):
+def test_a_new_option_of_a_group_replaces_the_keys_of_the_run_in_this_group(fly):
     folder = fly("delay=paper")
     assert OmegaConf.load(folder / "config.yaml").delay.obs.law == "uniform"
 
 
-def test_a_run_that_was_resumed_is_flown_as_it_was_trained(fly, learnt, tmp_path, monkeypatch):
-    resumed = shutil.copytree(learnt, tmp_path / "resumed")
+def test_a_resumed_run_is_evaluated_with_its_own_overrides(fly, trained, tmp_path, monkeypatch):
+    resumed = shutil.copytree(trained, tmp_path / "resumed")
     monkeypatch.setattr(sys, "argv", ["train.py", f"resume={resumed}", "frames=96"])
     launch(train.main)
     assert OmegaConf.load(fly(of=resumed) / "config.yaml").delay.obs == 1
 
 
-def test_a_checkpoint_may_lie_in_a_folder_of_a_sweep(fly, learnt, tmp_path):
-    swept = shutil.copytree(learnt, tmp_path / "agents=3,seed=3")
+def test_a_checkpoint_may_be_in_a_folder_of_a_sweep(fly, trained, tmp_path):
+    swept = shutil.copytree(trained, tmp_path / "agents=3,seed=3")
     assert OmegaConf.load(fly(of=f"'{swept}'") / "config.yaml").delay.obs == 1
 
 
@@ -127,7 +127,7 @@ def test_the_same_seed_gives_the_same_results_and_another_one_others(fly):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "message"),
     [
         (["model.hidden=[8]"], "size mismatch for module.0.module.0.weight"),
         (["observation.local_features=[battery,spotted]"], "size mismatch for module.0.module.0.weight"),
@@ -139,31 +139,31 @@ def test_the_same_seed_gives_the_same_results_and_another_one_others(fly):
         (["resume=nowhere"], "a resumed run keeps its configuration"),
     ],
 )
-def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(fly, capsys, tmp_path, overrides, told):
-    check_refused(lambda: fly(*overrides), told, capsys)
+def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path, overrides, message):
+    check_refused(lambda: fly(*overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("policy", "told"),
+    ("policy", "message"),
     [(None, "checkpoint: it is missing"), ("nowhere", "checkpoint: nowhere/checkpoint: ")],
 )
-def test_without_a_policy_nothing_is_flown(fly, capsys, tmp_path, policy, told):
-    check_refused(lambda: fly(of=policy), told, capsys)
+def test_without_a_policy_nothing_is_evaluated(fly, capsys, tmp_path, policy, message):
+    check_refused(lambda: fly(of=policy), message, capsys)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_spoilt_checkpoint_is_refused(fly, learnt, capsys, tmp_path):
-    spoilt = shutil.copytree(learnt, tmp_path / "spoilt")
-    (spoilt / "checkpoint" / "manifest.json").write_text("{")
-    check_refused(lambda: fly(of=spoilt), "checkpoint: ", capsys)
-    shutil.rmtree(spoilt / "checkpoint")
-    check_refused(lambda: fly(of=spoilt), "checkpoint: ", capsys)
-    assert list(tmp_path.iterdir()) == [spoilt]
+def test_a_damaged_checkpoint_is_refused(fly, trained, capsys, tmp_path):
+    damaged = shutil.copytree(trained, tmp_path / "damaged")
+    (damaged / "checkpoint" / "manifest.json").write_text("{")
+    check_refused(lambda: fly(of=damaged), "checkpoint: ", capsys)
+    shutil.rmtree(damaged / "checkpoint")
+    check_refused(lambda: fly(of=damaged), "checkpoint: ", capsys)
+    assert list(tmp_path.iterdir()) == [damaged]
 
 
 @pytest.mark.parametrize("text", ["a: [1", "- 1", "overrides: null"])
-def test_a_spoilt_configuration_beside_a_checkpoint_is_refused(fly, learnt, capsys, tmp_path, text):
-    spoilt = shutil.copytree(learnt, tmp_path / "spoilt")
-    (spoilt / "config.yaml").write_text(text)
-    check_refused(lambda: fly(of=spoilt), "config.yaml: ", capsys)
+def test_a_damaged_configuration_beside_a_checkpoint_is_refused(fly, trained, capsys, tmp_path, text):
+    damaged = shutil.copytree(trained, tmp_path / "damaged")
+    (damaged / "config.yaml").write_text(text)
+    check_refused(lambda: fly(of=damaged), "config.yaml: ", capsys)

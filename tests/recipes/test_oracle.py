@@ -1,4 +1,4 @@
-"""The oracle: what each UAV would be told if some of the messages were on time."""
+"""The oracle recipe: observations of UAVs that know some messages on time, and its table."""
 
 import sys
 
@@ -15,13 +15,13 @@ from damian.envs.pipeline import make_env
 from damian.world.messages import Messages
 
 TINY = ["frames=64", "worlds=4", "learner.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]
-N_FEATURES = slice(None, -4)  # two past actions stand behind
+FEATURES = slice(None, -4)  # the last four entries are the two past actions
 
 
-def flown(motion, own=False):
-    """A flight under delay [B, T] with two past actions behind what is seen, and its server."""
-    late = DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, history=2)
-    scenario = everything(motion, delay=late)
+def fly_delayed(motion, own=False):
+    """A rollout [B, T] under delay, with two past actions in the observations, and its server."""
+    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, history=2)
+    scenario = everything(motion, delay=delay)
     scenario.observation.own = own
     env = make_env(scenario, 4, seed=3, extras=["message"])
     env.append_transform(StepCounter())
@@ -29,60 +29,57 @@ def flown(motion, own=False):
     return env.rollout(15, break_when_any_done=False), env.server
 
 
-def told(flight, server, on_time, fields=oracle.ALL):
-    """What ``observe_with_timely_messages`` shows at every step but the first, [B, T, N, F]."""
-    steps = flight["next"].select(("agents", "received"), ("agents", "message"), ("agents", "observation"))
-    steps["step_count"] = flight["next", "step_count"]
-    return oracle.observe_with_timely_messages(server, on_time, fields)(steps.reshape(-1))[
-        "agents", "observation"
-    ]
+def timely_observation(rollout, server, on_time, fields=oracle.ALL):
+    """Observations with some messages known on time, after every step of a rollout [B, T], [B * T, N, F]."""
+    steps = rollout["next"].select(("agents", "received"), ("agents", "message"), ("agents", "observation"))
+    steps["step_count"] = rollout["next", "step_count"]
+    observe = oracle.observe_with_timely_messages(server, on_time, fields)
+    return observe(steps.reshape(-1))["agents", "observation"]
 
 
 @both_motions
-def test_nobodys_messages_on_time_change_nothing_and_everybodys_tell_all(motion):
-    flight, server = flown(motion)
+def test_no_message_on_time_changes_nothing_and_all_messages_on_time_give_the_true_features(motion):
+    rollout, server = fly_delayed(motion)
     everybody = torch.ones(3, 3, dtype=torch.bool)
-    seen = flight["next", "agents", "observation"].flatten(0, 1)
-    assert told(flight, server, ~everybody).equal(seen)
-    truth = Messages.unpack(flight["next", "agents", "message"].flatten(0, 1))
-    expected = server(truth, flight["next", "step_count"].flatten()).observation
-    assert told(flight, server, everybody)[..., N_FEATURES].equal(expected)
-    assert not expected.equal(seen[..., N_FEATURES])
+    delayed = rollout["next", "agents", "observation"].flatten(0, 1)
+    assert timely_observation(rollout, server, ~everybody).equal(delayed)
+    sent = Messages.unpack(rollout["next", "agents", "message"].flatten(0, 1))
+    expected = server(sent, rollout["next", "step_count"].flatten()).observation
+    assert timely_observation(rollout, server, everybody)[..., FEATURES].equal(expected)
+    assert not expected.equal(delayed[..., FEATURES])
 
 
 @both_motions
 @pytest.mark.parametrize("fields", [oracle.ALL, oracle.PLACE])
-def test_each_uav_is_told_with_its_own_message_on_time_what_a_loop_over_uavs_says(motion, fields):
-    flight, server = flown(motion)
-    after = flight["next"].flatten(0, 1)
-    shown = told(flight, server, torch.eye(3, dtype=torch.bool), fields)
+def test_own_messages_on_time_give_the_same_observations_as_a_loop_over_uavs(motion, fields):
+    rollout, server = fly_delayed(motion)
+    after = rollout["next"].flatten(0, 1)
+    observation = timely_observation(rollout, server, torch.eye(3, dtype=torch.bool), fields)
     for uav in range(3):
         held, sent = (Messages.unpack(after["agents", key].clone()) for key in ("received", "message"))
         for name in fields:
             getattr(held, name)[:, uav] = getattr(sent, name)[:, uav]
-        served = server(held, after["step_count"].view(-1))
-        assert shown[:, uav, N_FEATURES].equal(served.observation[:, uav])
-    assert shown[..., -4:].equal(after["agents", "observation"][..., -4:])
+        expected = server(held, after["step_count"].view(-1)).observation
+        assert observation[:, uav, FEATURES].equal(expected[:, uav])
+    assert observation[..., -4:].equal(after["agents", "observation"][..., -4:])
 
 
 @both_motions
-def test_a_uav_that_knows_its_own_messages_sees_them_at_once_and_all_else_as_late_as_before(motion):
-    late, server = flown(motion)
-    prompt, _ = flown(motion, own=True)
-    assert prompt["agents", "action"].equal(late["agents", "action"])
+def test_observation_own_is_the_oracle_that_knows_its_own_messages_on_time(motion):
+    late, server = fly_delayed(motion)
+    own_on_time, _ = fly_delayed(motion, own=True)
+    assert own_on_time["agents", "action"].equal(late["agents", "action"])
     own = torch.eye(3, dtype=torch.bool)
-    seen = prompt["next", "agents", "observation"].flatten(0, 1)
-    assert seen[..., N_FEATURES].equal(told(late, server, own)[..., N_FEATURES])
-    assert not seen[..., N_FEATURES].equal(
-        late["next", "agents", "observation"].flatten(0, 1)[..., N_FEATURES]
-    )
-    for key in ("global_observation", "reward"):  # the server knows no more than before
-        assert prompt["next", "agents", key].equal(late["next", "agents", key])
+    observation = own_on_time["next", "agents", "observation"].flatten(0, 1)[..., FEATURES]
+    assert observation.equal(timely_observation(late, server, own)[..., FEATURES])
+    assert not observation.equal(late["next", "agents", "observation"].flatten(0, 1)[..., FEATURES])
+    for key in ("global_observation", "reward"):  # the server holds no other messages than before
+        assert own_on_time["next", "agents", key].equal(late["next", "agents", key])
 
 
 @pytest.fixture
 def foresee(tmp_path, monkeypatch):
-    """Train a little, then run the recipe on it with overrides; returns its run folder."""
+    """Train a small policy, then run the recipe on it with overrides; returns the recipe's run folder."""
     monkeypatch.chdir(tmp_path)
 
     def run(program, *words: str) -> None:
@@ -92,13 +89,13 @@ def foresee(tmp_path, monkeypatch):
     run(train, *TINY, "delay.obs=2", "hydra.run.dir=trained")
 
     def run_recipe(*words: str):
-        run(oracle, "checkpoint=trained", *words, "hydra.run.dir=told")
-        return tmp_path / "told"
+        run(oracle, "checkpoint=trained", *words, "hydra.run.dir=oracle")
+        return tmp_path / "oracle"
 
     return run_recipe
 
 
-def test_a_person_reads_whose_lateness_costs_what(foresee, capsys):
+def test_the_table_has_a_row_for_each_set_of_messages_known_on_time(foresee, capsys):
     table = (foresee() / "result.md").read_text()
     assert [line.split(" | ")[0][2:] for line in table.splitlines()[2:]] == [
         "nothing",
@@ -110,9 +107,9 @@ def test_a_person_reads_whose_lateness_costs_what(foresee, capsys):
     assert "what a UAV knows on time" in capsys.readouterr().out
 
 
-def test_where_nothing_is_late_there_is_nothing_to_foresee(foresee, capsys, tmp_path):
+def test_a_scenario_without_late_messages_is_refused(foresee, capsys, tmp_path):
     with pytest.raises(SystemExit) as stopped:
         foresee("delay=none")
     assert stopped.value.code == 2
-    assert "delay.obs: nothing is late" in capsys.readouterr().err
-    assert not (tmp_path / "told").exists()
+    assert "delay.obs: no message is late or lost" in capsys.readouterr().err
+    assert not (tmp_path / "oracle").exists()

@@ -1,4 +1,4 @@
-"""The delay transforms where others can check them: SAC on Pendulum-v1 (``recipes/pendulum.py``)."""
+"""The pendulum recipe: SAC on Pendulum-v1 with the delay transforms, run by its command line."""
 
 import csv
 import json
@@ -15,7 +15,7 @@ TINY = ["--seeds", "4", "--steps", "1002", "--episodes", "2", "--hidden", "8", "
 
 
 def learn(delay: int, history: int, steps: int) -> nn.Module:
-    """The policy of one seed."""
+    """The policy that is trained with one seed."""
     torch.manual_seed(0)
     env = make_env(delay, history)
     env.set_seed(0)
@@ -26,13 +26,13 @@ def learn(delay: int, history: int, steps: int) -> nn.Module:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A finished run of two processes."""
+    """The run folder of a comparison that two processes have finished."""
     folder = tmp_path_factory.mktemp("pendulum")
     main([*TINY, "--out", str(folder), "--jobs", "2"])
     return folder
 
 
-def test_the_table_holds_every_arm_beside_its_reference(folder):
+def test_the_table_lists_every_arm_beside_its_reference(folder):
     with (folder / "results.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     arms = [(row["arm"], row["delay"]) for row in rows]
@@ -44,7 +44,7 @@ def test_the_table_holds_every_arm_beside_its_reference(folder):
         assert f"| {' | '.join(row.values())} |" in (folder / "results.md").read_text()
 
 
-def test_what_is_finished_stays_and_what_is_not_comes_out_alike_in_another_process(folder, capsys):
+def test_finished_arms_are_kept_and_a_missing_one_is_reproduced_by_another_process(folder, capsys):
     files = [folder / f"seed4_{arm}.json" for arm in ARMS]
     before = [(file.stat().st_mtime_ns, file.read_text()) for file in files]
     files[1].unlink()
@@ -59,7 +59,7 @@ def test_what_is_finished_stays_and_what_is_not_comes_out_alike_in_another_proce
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["--steps", "1000"], "--steps: 1000 is not above 1000"),
         (["--delay", "0"], "--delay: 0 steps is not between 1 and 200 steps"),
@@ -70,19 +70,19 @@ def test_what_is_finished_stays_and_what_is_not_comes_out_alike_in_another_proce
         (["--lag", "6"], "unrecognized arguments: --lag 6"),
     ],
 )
-def test_wrong_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys, words, told):
+def test_wrong_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stopped:
         main(words)
     error = capsys.readouterr().err
     assert stopped.value.code == 2
     assert error.startswith("error: ")
-    assert told in error
+    assert message in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
-def test_results_of_other_settings_are_not_mixed_in(tmp_path, capsys):
+def test_a_folder_with_results_of_other_settings_is_refused(tmp_path, capsys):
     runs, _, _ = pendulum.parse(TINY)
     runs[0].file(tmp_path).write_text(json.dumps({**runs[0]._asdict(), "delay": 6, "returns": {}}))
     with pytest.raises(SystemExit):
@@ -91,7 +91,7 @@ def test_results_of_other_settings_are_not_mixed_in(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_delay_ruins_a_policy_and_its_own_latest_actions_mend_it():
+def test_delay_lowers_the_return_and_the_action_history_restores_it():
     undelayed = learn(delay=0, history=0, steps=6_000)
     returns = {delay: evaluate_under(delay, 0, undelayed, 20) for delay in (0, 6)}
     assert returns[0] > -300

@@ -1,4 +1,4 @@
-"""Arms that others are compared with: messages held to a constant delay, and a critic that sees the truth."""
+"""Reference arms: messages held back to a constant delay (``delay.hold``), and a privileged critic."""
 
 import math
 import sys
@@ -51,9 +51,9 @@ LAWS: dict[str, Any] = {
     "geometric": ({"law": "geometric", "mean": 2, "longest": 6}, 6),
     "burst": (BURST | {"bad_loss": 0.0}, 4),
 }
-"""Laws that lose nothing, and the longest delay [steps] of each."""
+"""Laws without losses, and the longest delay [steps] of each."""
 
-TRUTH = PRIVILEGED_OBSERVATION
+PRIVILEGED = PRIVILEGED_OBSERVATION
 
 
 def actions_for(env: DelayedEnv, n_steps: int) -> list[Tensor]:
@@ -61,10 +61,10 @@ def actions_for(env: DelayedEnv, n_steps: int) -> list[Tensor]:
     return [random_actions(env.uav_env, generator) for _ in range(n_steps)]
 
 
-def flown(
+def rollout_of(
     scenario: ScenarioConfig, extras: tuple[str, ...] = EXTRAS, n_steps: int = 20
 ) -> list[TensorDictBase]:
-    """What a rollout of random actions shows, the same ones at each call."""
+    """Outputs of the environment for random actions, which are the same at each call."""
     env = make_env(scenario, 4, extras=extras)
     return play(env, actions_for(env, n_steps))
 
@@ -76,13 +76,13 @@ def flown(
 @pytest.mark.parametrize("law", LAWS)
 def test_held_messages_arrive_as_with_a_constant_delay(law, motion):
     obs, longest = LAWS[law]
-    held = flown(everything(motion, delay=DelayConfig(obs=obs, hold="max", history=2)))
-    assert all_same(held, flown(everything(motion, delay=DelayConfig(obs=longest, history=2))))
+    held = rollout_of(everything(motion, delay=DelayConfig(obs=obs, hold="max", history=2)))
+    assert all_same(held, rollout_of(everything(motion, delay=DelayConfig(obs=longest, history=2))))
 
 
-def test_what_the_server_knows_is_as_old_as_the_longest_delay_once_that_has_passed():
-    shown = flown(everything(delay=DelayConfig(obs=PAPER, hold="max"), episode=KEEPS_GOING))
-    ages = torch.stack([td["agents", "age"] for td in shown[1::2]])
+def test_held_messages_have_the_age_of_the_longest_delay_once_that_has_passed():
+    outputs = rollout_of(everything(delay=DelayConfig(obs=PAPER, hold="max"), episode=KEEPS_GOING))
+    ages = torch.stack([td["agents", "age"] for td in outputs[1::2]])
     expected = torch.arange(1, len(ages) + 1).clamp(max=7)
     assert ages.equal(expected.view(-1, 1, 1, 1).expand_as(ages).float())
 
@@ -91,8 +91,8 @@ def test_what_the_server_knows_is_as_old_as_the_longest_delay_once_that_has_pass
 def test_held_messages_are_lost_as_often_as_before(law, tmp_path):
     (tmp_path / "delays.csv").write_text("delay\n0\n5\nlost\n2\n")
     trace = {"law": "trace", "path": str(tmp_path / "delays.csv")}
-    late, longest = {"uniform": (PAPER, 7), "burst": (BURST, 4), "trace": (trace, 5)}[law]
-    free, held = (each.sampler(loss=0.2) for each in (law_of(late), Held(law_of(late))))
+    law_config, longest = {"uniform": (PAPER, 7), "burst": (BURST, 4), "trace": (trace, 5)}[law]
+    free, held = (each.sampler(loss=0.2) for each in (law_of(law_config), Held(law_of(law_config))))
     before, after = (drawn(sampler, torch.arange(500), 20) for sampler in (free, held))
     assert (held.longest, held.lost) == (longest, free.lost)
     assert after.equal(torch.where(before == free.lost, held.lost, longest))
@@ -101,95 +101,96 @@ def test_held_messages_are_lost_as_often_as_before(law, tmp_path):
     assert held.certain is None
 
 
-def test_where_no_message_can_be_late_there_is_nothing_to_hold():
-    nothing = everything(delay=DelayConfig(hold="max"))
-    assert not has_message_delay(nothing)
-    assert all_same(flown(nothing), flown(everything()))
+def test_holding_messages_changes_nothing_without_delay():
+    undelayed = everything(delay=DelayConfig(hold="max"))
+    assert not has_message_delay(undelayed)
+    assert all_same(rollout_of(undelayed), rollout_of(everything()))
 
 
 # The privileged observation.
 
 
 @both_motions
-@pytest.mark.parametrize("delay", [{}, {"obs": PAPER, "act": 1, "history": 2}], ids=["prompt", "late"])
-def test_an_environment_that_shows_the_truth_keeps_its_specs(motion, delay):
+@pytest.mark.parametrize("delay", [{}, {"obs": PAPER, "act": 1, "history": 2}], ids=["undelayed", "late"])
+def test_an_environment_with_privileged_observations_keeps_its_specs(motion, delay):
     env = make_env(everything(motion, delay=DelayConfig(**delay)), 2, extras=["privileged"])
-    assert TRUTH in env.observation_spec.keys(True, True)
+    assert PRIVILEGED in env.observation_spec.keys(True, True)
     check_env_specs(env, seed=0, break_when_any_done="both")
-    assert env.observation_spec[TRUTH].is_in(env.rollout(3)[TRUTH][:, -1])
+    assert env.observation_spec[PRIVILEGED].is_in(env.rollout(3)[PRIVILEGED][:, -1])
 
 
 @both_motions
 @pytest.mark.parametrize("order", ["generation", "arrival"])
-def test_no_delay_and_no_loss_changes_what_is_true(motion, order):
+def test_delays_and_losses_do_not_change_the_privileged_observation(motion, order):
     late = {
         "delay": DelayConfig(obs=BURST, loss=0.3, order=order, history=2, rew=1),
         "clock": ClockConfig(server="2s"),
     }
-    prompt, delayed = (
-        flown(everything(motion, episode=KEEPS_GOING, **sections), ("privileged",)) for sections in ({}, late)
+    undelayed, delayed = (
+        rollout_of(everything(motion, episode=KEEPS_GOING, **sections), ("privileged",))
+        for sections in ({}, late)
     )
-    seen = ("agents", "global_observation")
-    assert not all(one[seen].equal(other[seen]) for one, other in zip(prompt, delayed, strict=True))
-    for one, other in zip(prompt, delayed, strict=True):
-        assert one[TRUTH].equal(other[TRUTH])
-        assert one[TRUTH][..., :-2].equal(one[seen])
+    held = ("agents", "global_observation")
+    assert not all(one[held].equal(other[held]) for one, other in zip(undelayed, delayed, strict=True))
+    for one, other in zip(undelayed, delayed, strict=True):
+        assert one[PRIVILEGED].equal(other[PRIVILEGED])
+        assert one[PRIVILEGED][..., :-2].equal(one[held])
 
 
 @both_motions
-def test_the_truth_ends_with_how_far_east_and_north_the_source_is(motion):
-    place = [20.0, 150.0]
-    shown = flown(
-        square(motion=MOTIONS[motion], source=SourceConfig(position=place)), ("privileged", "state")
+def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
+    position = [20.0, 150.0]
+    outputs = rollout_of(
+        square(motion=MOTIONS[motion], source=SourceConfig(position=position)), ("privileged", "state")
     )
-    for td in shown:
-        here = td["state"][:, :9].unflatten(-1, (3, 3))[..., :2]
-        toward = (torch.tensor(place) - here) / (200 * math.sqrt(2))
-        torch.testing.assert_close(td[TRUTH][..., -2:], toward, atol=1e-6, rtol=0)
+    for td in outputs:
+        uavs = td["state"][:, :9].unflatten(-1, (3, 3))[..., :2]
+        to_source = (torch.tensor(position) - uavs) / (200 * math.sqrt(2))
+        torch.testing.assert_close(td[PRIVILEGED][..., -2:], to_source, atol=1e-6, rtol=0)
 
 
-def test_the_truth_of_a_source_beyond_the_region_is_its_direction():
-    assert moved([9000.0, -9000.0])[TRUTH][0, 0, -2:].tolist() == [1.0, -1.0]
+def test_the_vector_to_a_source_far_beyond_the_region_is_clamped():
+    assert step_with_source_at([9000.0, -9000.0])[PRIVILEGED][0, 0, -2:].tolist() == [1.0, -1.0]
 
 
-@pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs=PAPER)], ids=["prompt", "late"])
-def test_showing_the_truth_changes_nothing_else(delay):
+@pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs=PAPER)], ids=["undelayed", "late"])
+def test_privileged_observations_change_no_other_output(delay):
     scenario = everything(delay=delay)
-    with_it, without = flown(scenario, (*EXTRAS, "privileged")), flown(scenario)
-    assert all(TRUTH in td.keys(True, True) for td in with_it)
-    assert all_same([td.exclude(TRUTH) for td in with_it], without)
+    with_it, without = rollout_of(scenario, (*EXTRAS, "privileged")), rollout_of(scenario)
+    assert all(PRIVILEGED in td.keys(True, True) for td in with_it)
+    assert all_same([td.exclude(PRIVILEGED) for td in with_it], without)
 
 
-def test_both_compile():
+def test_held_messages_and_privileged_observations_compile():
     scenario = square(delay=DelayConfig(obs=BURST, hold="max"))
     env = make_env(scenario, 4, extras=["message", "privileged"]).compile(backend="eager")
-    assert all_same(play(env, actions_for(env, 15)), flown(scenario, ("message", "privileged"), 15))
+    assert all_same(play(env, actions_for(env, 15)), rollout_of(scenario, ("message", "privileged"), 15))
 
 
-# Who sees it.
+# The privileged critic.
 
 
-def moved(place: list[float]) -> TensorDictBase:
-    """After a step in which no message arrived, with the source put somewhere that no UAV hears."""
+def step_with_source_at(position: list[float]) -> TensorDictBase:
+    """Outputs after a step in which no message arrived; no UAV may hear a source at the position."""
     scenario = one_uav(delay=DelayConfig(loss=1.0))
     env = make_env(scenario, extras=["privileged"])
     env.reset()
-    env.uav_env.state = env.uav_env.state._replace(source=torch.tensor([place]))
+    env.uav_env.state = env.uav_env.state._replace(source=torch.tensor([position]))
     return go(env, HERE)
 
 
-def test_only_a_privileged_critic_learns_of_a_source_that_moved_before_any_message_arrives():
+def test_only_a_privileged_critic_observes_the_source_before_any_message_arrives():
     env = make_env(one_uav(), extras=["privileged"])
-    here, there = moved([390.0, 100.0]), moved([390.0, 160.0])
-    assert same(here.exclude(TRUTH), there.exclude(TRUTH))
-    for seen, differs in ((TRUTH, True), (GLOBAL_OBSERVATION, False)):
-        critic = make_critic(env, ModelConfig([16]), seen)
+    here, there = step_with_source_at([390.0, 100.0]), step_with_source_at([390.0, 160.0])
+    assert same(here.exclude(PRIVILEGED), there.exclude(PRIVILEGED))
+    for key, differs in ((PRIVILEGED, True), (GLOBAL_OBSERVATION, False)):
+        critic = make_critic(env, ModelConfig([16]), key)
         one, other = (critic(td.clone())["agents", "state_value"] for td in (here, there))
         assert one.equal(other) is not differs
 
 
 def settings(**changed: Any) -> TrainConfig:
-    """A tiny run, a message in three late."""
+    """Settings of a tiny run with a privileged critic, in which 30 % of the messages are late."""
     obs = PAPER | {"low": 1, "high": 3, "probability": 0.3}
     sections = vars(everything(delay=DelayConfig(obs=obs, history=2)))
     tiny = {"worlds": 4, "learner": MappoConfig(steps=12, minibatches=2), "model": ModelConfig([16])}
@@ -203,37 +204,37 @@ def learner_of(config: TrainConfig) -> tuple[Mappo | Sac, DelayedEnv]:
 
 @both_kinds
 @pytest.mark.parametrize("config", [MappoConfig(steps=12, minibatches=2), SacConfig()])
-def test_the_actor_of_a_privileged_critic_sees_no_truth(config, kind):
+def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(config, kind):
     learner, env = learner_of(settings(learner=config, actions=ActionConfig(kind=kind)))
-    assert TRUTH not in learner.actor.in_keys
+    assert PRIVILEGED not in learner.actor.in_keys
     td = env.reset()
     other = td.clone()
-    other[TRUTH] = -td[TRUTH]
+    other[PRIVILEGED] = -td[PRIVILEGED]
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        chosen = [learner.actor(shown)["agents", "action"] for shown in (td, other)]
-    assert chosen[0].equal(chosen[1])
+        actions = [learner.actor(each)["agents", "action"] for each in (td, other)]
+    assert actions[0].equal(actions[1])
 
 
 @pytest.mark.parametrize("critic", ["server", "privileged"])
-def test_the_critic_reads_what_was_asked_for(critic):
+def test_the_critic_observes_what_the_settings_choose(critic):
     learner, env = learner_of(settings(critic=critic))
-    seen = {"server": GLOBAL_OBSERVATION, "privileged": TRUTH}[critic]
-    assert learner.critic.in_keys == [seen]
-    soft, _ = learner_of(settings(critic=critic, learner=SacConfig()))
-    assert seen in soft.loss.qvalue_network.in_keys
-    assert (TRUTH in env.observation_spec.keys(True, True)) == (critic == "privileged")
+    expected = {"server": GLOBAL_OBSERVATION, "privileged": PRIVILEGED}[critic]
+    assert learner.critic.in_keys == [expected]
+    sac, _ = learner_of(settings(critic=critic, learner=SacConfig()))
+    assert expected in sac.loss.qvalue_network.in_keys
+    assert (PRIVILEGED in env.observation_spec.keys(True, True)) == (critic == "privileged")
 
 
-def test_back_updating_leaves_the_truth_as_it_was():
+def test_back_updating_does_not_change_the_privileged_observation():
     learner, env = learner_of(settings(backupdate=True))
     batch = env.rollout(12, learner.actor, break_when_any_done=False)
-    known = learner.backupdated_batch(batch)
-    assert known["agents", "backupdated"].any()
-    assert not known["next", "agents", "global_observation"].equal(
+    corrected = learner.backupdated_batch(batch)
+    assert corrected["agents", "backupdated"].any()
+    assert not corrected["next", "agents", "global_observation"].equal(
         batch["next", "agents", "global_observation"]
     )
-    for key in (TRUTH, ("next", *TRUTH)):
-        assert known[key].equal(batch[key])
+    for key in (PRIVILEGED, ("next", *PRIVILEGED)):
+        assert corrected[key].equal(batch[key])
     losses = learner.learn(env.rollout(12, learner.actor, break_when_any_done=False))
     assert all(math.isfinite(loss) for loss in losses.values())
 
@@ -265,20 +266,20 @@ ARMS = [
 
 
 @pytest.mark.parametrize("overrides", ARMS, ids=["privileged", "privileged sac", "held"])
-def test_a_reference_arm_is_trained_and_flown(train, overrides):
+def test_a_reference_arm_is_trained_and_evaluated(train, overrides):
     folder = train("scenario=delaybench/tracking", "delay=paper", *overrides)
     assert (folder / "result.csv").is_file()
     assert (folder / "learning_curve.png").is_file()
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "message"),
     [
         ("delay.hold=longest", "delay.hold: longest is not one of none, max"),
         ("delay.hold=max", "delay.hold: max means nothing without delayed messages (delay.obs)"),
         ("critic=oracle", "critic: oracle is not one of server, privileged"),
     ],
 )
-def test_a_reference_arm_that_means_nothing_is_refused(train, override, told, capsys, tmp_path):
-    check_refused(lambda: train(override), told, capsys)
+def test_impossible_settings_of_a_reference_arm_are_refused(train, override, message, capsys, tmp_path):
+    check_refused(lambda: train(override), message, capsys)
     assert not (tmp_path / "run").exists()

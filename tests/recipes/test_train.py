@@ -1,4 +1,4 @@
-"""The recipes as a person runs them: what they write, what they refuse, how they go on."""
+"""The training recipe, run by its command line: its run folder, its refusals of wrong input, resumed runs."""
 
 import csv
 import json
@@ -42,13 +42,13 @@ def metrics(folder: Path) -> list[dict[str, float]]:
 
 
 def weights(folder: Path, *names: str) -> dict[str, Tensor]:
-    """What the named parts of a run, actor or critic, have learnt."""
+    """Parameters of the named networks of a run, actor or critic."""
     config = OmegaConf.to_object(stored_config(folder, "folder"))
     env = make_env(config)
     make = {"actor": make_actor, "critic": make_critic}
-    parts = {name: make[name](env, config.model) for name in names}
-    Checkpoint(**parts).load(folder / "checkpoint", components=names)
-    return {f"{part}.{name}": w for part, net in parts.items() for name, w in net.state_dict().items()}
+    networks = {name: make[name](env, config.model) for name in names}
+    Checkpoint(**networks).load(folder / "checkpoint", components=names)
+    return {f"{key}.{name}": w for key, net in networks.items() for name, w in net.state_dict().items()}
 
 
 @pytest.mark.parametrize(
@@ -67,15 +67,15 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
         ["aware=backupdate"],
     ],
 )
-def test_a_run_folder_explains_itself(run, capsys, overrides):
+def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):
     folder = run(*TINY, *overrides)
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     written = {path.name for path in folder.iterdir()}
     assert {"config.yaml", "metrics.csv", "checkpoint", "learning_curve.png"} <= written
-    assert (folder / "result.md").read_text().strip() in told
-    assert "| random |" in told
-    assert "| greedy |" in told
-    assert str(Path(folder.name) / "learning_curve.png") in told
+    assert (folder / "result.md").read_text().strip() in printed
+    assert "| random |" in printed
+    assert "| greedy |" in printed
+    assert str(Path(folder.name) / "learning_curve.png") in printed
     assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0]
     config = OmegaConf.load(folder / "config.yaml")
     assert config.agents == (2 if "agents=2" in overrides else 1 if "agents=1" in overrides else 3)
@@ -85,7 +85,7 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "message"),
     [
         (["agent=3"], "agent: no such key; did you mean agents?"),
         (["learner=ppo"], "learner: ppo is not one of mappo, sac"),
@@ -109,7 +109,7 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
             "learner.warm_up: 200000 steps is not between",
         ),
         (["clock.skip=true", "model=gru"], "clock.skip: True does not go with model.rnn"),
-        (["clock.skip=true", "clock.skip_discount=0.5"], "clock.skip_discount: 0.5 is that of the learner"),
+        (["clock.skip=true", "clock.skip_discount=0.5"], "clock.skip_discount: 0.5 is set to learner.gamma"),
         (["observation.own=true", "clock.server=2s", "clock.agents=2s"], "observation.own: True does not go"),
         (["learner=sac", "learner.warm_up=300000"], "learner.warm_up: 300000 is not between 0 and 200000"),
         (["learner=sac", "learner.warmup=1"], "learner.warmup: no such key; did you mean learner.warm_up?"),
@@ -121,7 +121,10 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
         (["backupdate=true", "delay.reward_window=3"], "delay.reward_window: 3 does not go with"),
         (["backupdate=true", "delay.rew=3"], "delay.rew: 3 does not go with"),
         (["backupdate=true", "clock.server=4s"], "clock.server: 4s does not go with"),
-        (["delay=paper", "delay.obs={law: burst, enter: 0.1}"], "write another law over delay=none"),
+        (
+            ["delay=paper", "delay.obs={law: burst, enter: 0.1}"],
+            "to write another law, choose delay=none first",
+        ),
         (["delay=papers"], "delay: papers is not one of burst, none, paper"),
         (["delay=paper", "delay.obs.high=1s"], "delay.obs.low: 3s and high=1s are not two"),
         (["delay.obs={law: poisson}"], "delay.obs.law: poisson is not one of constant, uniform"),
@@ -174,8 +177,8 @@ def test_a_run_folder_explains_itself(run, capsys, overrides):
         (["resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
     ],
 )
-def test_what_a_person_gets_wrong_is_one_line_and_leaves_nothing(run, capsys, tmp_path, overrides, told):
-    check_refused(lambda: run(*overrides), told, capsys)
+def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(run, capsys, tmp_path, overrides, message):
+    check_refused(lambda: run(*overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -188,7 +191,7 @@ def test_the_same_seed_gives_the_same_curve_and_another_one_another(run, learner
 
 
 @both_learners
-def test_a_resumed_run_goes_on_below_its_own_rows(run, learner):
+def test_a_resumed_run_appends_to_its_own_metrics(run, learner):
     folder = run(*TINY, *learner, folder="first")
     before = (folder / "metrics.csv").read_text()
     run(f"resume={folder}", "frames=512", folder="second")
@@ -197,7 +200,7 @@ def test_a_resumed_run_goes_on_below_its_own_rows(run, learner):
     assert not (folder.parent / "second").exists()
 
 
-def test_a_resumed_run_with_a_triggered_clock_goes_on_with_its_period(run):
+def test_a_resumed_run_continues_with_the_period_of_its_triggered_clock(run):
     quiet = ["source.level_db=106", "learner.steps=4", "clock.trigger=2s", "clock.longest=10s"]
     folder = run(*TINY, *quiet, "frames=80", "delay.obs=2", "backupdate=true", folder="first")
     assert [row["frames"] / 8 for row in metrics(folder)] == [4, 4 + 6]
@@ -206,26 +209,26 @@ def test_a_resumed_run_with_a_triggered_clock_goes_on_with_its_period(run):
     assert frames == [4, 4 + 6, 4 + 6 + 8, 4 + 6 + 8 + 10, 4 + 6 + 8 + 10 + 10]
 
 
-def test_a_run_begins_with_the_policy_of_a_checkpoint_and_its_overrides(run):
+def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
     first = run(*TINY, "agents=2", folder="first")
     still = run(f"checkpoint={first}", "learner.lr=1e-30", "seed=1", folder="still")
     fresh = run(*TINY, "agents=2", "learner.lr=1e-30", "seed=1", folder="fresh")
-    learnt, kept, other = (weights(folder, "actor", "critic") for folder in (first, still, fresh))
-    assert {name.partition(".")[0] for name in learnt} == {"actor", "critic"}
-    assert all(kept[name].equal(learnt[name]) for name in learnt)
-    assert not all(other[name].equal(learnt[name]) for name in learnt)
-    assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # it counts from the start
+    trained, kept, other = (weights(folder, "actor", "critic") for folder in (first, still, fresh))
+    assert {name.partition(".")[0] for name in trained} == {"actor", "critic"}
+    assert all(kept[name].equal(trained[name]) for name in trained)
+    assert not all(other[name].equal(trained[name]) for name in trained)
+    assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # frames count from 0 again
     assert OmegaConf.load(still / "config.yaml").agents == 2
 
 
-def test_one_algorithm_begins_with_the_policy_of_the_other(run):
+def test_one_learner_starts_from_the_policy_of_the_other(run):
     first = run(*TINY, folder="first")
     second = run(*TINY, f"checkpoint={first}", *SAC, "learner.lr=1e-30", folder="second")
     one, other = (weights(folder, "actor") for folder in (first, second))
     assert all(other[name].equal(one[name]) for name in one)
 
 
-def test_a_run_goes_on_without_the_folder_that_it_began_with(run):
+def test_a_run_can_be_resumed_without_the_folder_of_the_policy_that_it_started_from(run):
     first = run(*TINY, folder="first")
     second = run(*TINY, f"checkpoint={first}", folder="second")
     first.rename(first.with_name("moved"))
@@ -250,7 +253,7 @@ def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):
 
 
 @both_learners
-def test_a_finished_run_that_is_resumed_learns_nothing_more(run, learner):
+def test_resuming_a_finished_run_trains_no_further(run, learner):
     folder = run(*TINY, *learner, folder="first")
     before = (folder / "metrics.csv").read_text()
     run(f"resume={folder}", folder="second")
@@ -258,7 +261,7 @@ def test_a_finished_run_that_is_resumed_learns_nothing_more(run, learner):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("damage", "message"),
     [
         (lambda f: (f / "config.yaml").write_text("a: [1"), "config.yaml: "),
         (lambda f: (f / "config.yaml").write_text("- 1"), "config.yaml: "),
@@ -266,19 +269,19 @@ def test_a_finished_run_that_is_resumed_learns_nothing_more(run, learner):
         (lambda f: (f / "metrics.csv").write_text("x,y\n1,2\n"), "metrics.csv, line 1: no column frames"),
     ],
 )
-def test_a_spoilt_run_folder_is_refused_in_one_line(run, capsys, spoil, told):
+def test_a_damaged_run_folder_is_refused_in_one_line(run, capsys, damage, message):
     folder = run(*TINY, folder="first")
-    spoil(folder)
+    damage(folder)
     capsys.readouterr()
     with pytest.raises(SystemExit) as stopped:
         run(f"resume={folder}", "frames=512", folder="second")
     error = capsys.readouterr().err.splitlines()[-1]
     assert stopped.value.code == 2
     assert error.startswith("error: ")
-    assert told in error
+    assert message in error
 
 
-def test_a_folder_that_holds_a_run_is_not_written_over(run, capsys):
+def test_a_folder_that_holds_a_run_is_not_overwritten(run, capsys):
     folder = run(*TINY)
     before = (folder / "metrics.csv").read_text()
     with pytest.raises(SystemExit):
@@ -287,12 +290,12 @@ def test_a_folder_that_holds_a_run_is_not_written_over(run, capsys):
     assert (folder / "metrics.csv").read_text() == before
 
 
-def test_each_reward_term_has_its_column(run):
+def test_each_reward_term_has_a_column_in_the_metrics(run):
     rows = metrics(run(*TINY, "reward=tracking", "scenario=spotting"))
     assert {"reward/spotting_agents", "reward/source_distance", "reward/source_time"} <= set(rows[0])
 
 
-def test_a_run_without_a_single_decision_in_a_batch_goes_on(run):
+def test_training_continues_after_a_batch_without_any_decision(run):
     folder = run(
         "agents=1",
         "worlds=1",
@@ -308,7 +311,7 @@ def test_a_run_without_a_single_decision_in_a_batch_goes_on(run):
     assert len(metrics(folder)) == 15
 
 
-def test_what_came_late_changes_what_is_learnt(run):
+def test_delays_and_back_updating_change_the_losses(run):
     slow = ["delay.obs=4", "scenario=tracking"]
     naive, aware, undelayed = (
         metrics(run(*TINY, *overrides, folder=name))
@@ -328,7 +331,7 @@ def test_a_sweep_fills_one_folder_per_run(run, tmp_path):
 
 
 @pytest.mark.parametrize("case", [1, 2])
-def test_use_case_presets_are_the_golden_scenarios(run, case):
+def test_the_use_case_scenarios_have_the_settings_of_the_reference_data(run, case):
     folder = run(*TINY, f"scenario=paper/usecase{case}", "learner.minibatches=1")
     config = OmegaConf.load(folder / "config.yaml")
     golden = json.loads((GOLDEN / f"usecase{case}.json").read_text())
@@ -349,7 +352,7 @@ def test_use_case_presets_are_the_golden_scenarios(run, case):
     assert {heading % 360 for heading in config.actions.headings} == headings
 
 
-def test_every_default_of_the_schema_survives_a_round_trip(tmp_path):
+def test_every_default_of_the_schema_survives_saving_and_loading(tmp_path):
     OmegaConf.save(OmegaConf.structured(TrainConfig), tmp_path / "config.yaml")
     loaded = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(tmp_path / "config.yaml"))
     assert OmegaConf.to_object(loaded) == TrainConfig()

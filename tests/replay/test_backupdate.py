@@ -1,4 +1,4 @@
-"""Back-updating: late messages in their place, against a loop, and against the same flight undelayed."""
+"""Back-updating with late messages, against a loop and against the same rollout without delays."""
 
 from dataclasses import replace
 
@@ -21,15 +21,17 @@ from damian.server.termination import EpisodeConfig
 from damian.world.messages import Messages
 
 LONGEST = 5
-LATE = {"law": "uniform", "low": 0, "high": LONGEST}
+RANDOM_DELAY = {"law": "uniform", "low": 0, "high": LONGEST}
 WORLDS, UAVS = 3, 2
 
 
-# The pure function, against a loop.
+# The pure functions, against a loop.
 
 
-def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> tuple[MessageLog, Tensor]:
-    """Random messages that say when they were sent, what is held of them, and where episodes begin."""
+def random_log(
+    n_steps: int, loss: float, order: str, generator: torch.Generator
+) -> tuple[MessageLog, Tensor]:
+    """A log of random messages, which contain the step of their generation, and where episodes begin."""
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -44,39 +46,40 @@ def mail(n_steps: int, loss: float, order: str, generator: torch.Generator) -> t
         for i in range(UAVS):
             for t in range(n_steps):
                 start = max(s for s in range(t + 1) if begins[s, b, i])
-                came = [g for g in range(start, t + 1) if 0 <= delay[g, b, i] <= t - g]
-                latest = [g for g in came if g + delay[g, b, i] == max(h + delay[h, b, i] for h in came)]
-                held[t, b, i] = max((came if order == "generation" else latest), default=start - 1)
+                arrived = [g for g in range(start, t + 1) if 0 <= delay[g, b, i] <= t - g]
+                last_arrival = max((g + delay[g, b, i] for g in arrived), default=None)
+                latest = [g for g in arrived if g + delay[g, b, i] == last_arrival]
+                held[t, b, i] = max((arrived if order == "generation" else latest), default=start - 1)
     return MessageLog(sent.unsqueeze(-1).float(), delay, held.unsqueeze(-1).float(), sent - held), begins
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 @pytest.mark.parametrize("loss", [0.0, 0.5])
-def test_hindsight_does_what_a_loop_over_messages_does(loss, order):
+def test_latest_arrived_equals_a_loop_over_messages(loss, order):
     generator = torch.Generator().manual_seed(1)
     for _ in range(20):
-        given, begins = mail(16, loss, order, generator)
+        log, begins = random_log(16, loss, order, generator)
         now = int(torch.randint(16, (), generator=generator))
-        known = latest_arrived(given, now)[..., 0]
+        latest = latest_arrived(log, now)[..., 0]
         for b in range(WORLDS):
             for i in range(UAVS):
                 for t in range(now + 1):
                     start = max(s for s in range(t + 1) if begins[s, b, i])
-                    came = [g for g in range(start, t + 1) if 0 <= given.delay[g, b, i] <= now - g]
-                    assert known[t, b, i] == max(came, default=start - 1)
+                    arrived = [g for g in range(start, t + 1) if 0 <= log.delay[g, b, i] <= now - g]
+                    assert latest[t, b, i] == max(arrived, default=start - 1)
 
 
-def test_nothing_that_arrives_after_the_learning_instant_is_used():
-    given, _ = mail(16, 0.2, "generation", torch.Generator().manual_seed(2))
+def test_no_message_that_arrives_after_the_time_of_learning_is_used():
+    log, _ = random_log(16, 0.2, "generation", torch.Generator().manual_seed(2))
     now = 9
-    arrives = torch.arange(16).view(-1, 1, 1) + given.delay
-    later = (arrives > now) | (torch.arange(16).view(-1, 1, 1) > now)
-    spoilt = given._replace(sent=torch.where(later.unsqueeze(-1), torch.nan, given.sent))
+    arrival = torch.arange(16).view(-1, 1, 1) + log.delay
+    later = (arrival > now) | (torch.arange(16).view(-1, 1, 1) > now)
+    spoilt = log._replace(sent=torch.where(later.unsqueeze(-1), torch.nan, log.sent))
     assert later[: now + 1].any()
-    assert latest_arrived(spoilt, now)[: now + 1].equal(latest_arrived(given, now)[: now + 1])
+    assert latest_arrived(spoilt, now)[: now + 1].equal(latest_arrived(log, now)[: now + 1])
 
 
-def test_an_episode_is_over_after_its_first_end():
+def test_an_episode_has_ended_after_its_first_end():
     def column(*flags: int) -> Tensor:
         return torch.tensor(flags, dtype=torch.bool).unsqueeze(-1)
 
@@ -86,11 +89,11 @@ def test_an_episode_is_over_after_its_first_end():
     assert ended_before(ended, begins, torch.ones(1).bool()).equal(column(1, 1, 1, 1, 0, 0, 0))
 
 
-# The storage, on flights.
+# The storage, on rollouts.
 
 
-def flight(scenario: ScenarioConfig, n_steps: int, n_worlds: int = 4) -> TensorDictBase:
-    """Steps [B, T] of random actions, the same at each call."""
+def rollout(scenario: ScenarioConfig, n_steps: int, n_worlds: int = 4) -> TensorDictBase:
+    """Steps [B, T] with random actions, the same at each call."""
     env = make_env(scenario, n_worlds, extras=EXTRAS)
     env.append_transform(StepCounter())
     generator = torch.Generator().manual_seed(5)
@@ -107,14 +110,14 @@ def buffer(
     scenario: ScenarioConfig, capacity: int, n_worlds: int = 4, actor: bool = False, **options
 ) -> TensorDictReplayBuffer:
     env = make_env(scenario, n_worlds)
-    view = server_recompute(env.base_env.server, reward_terms=True, actor=actor)
-    storage = BackupdateStorage(capacity * n_worlds, view, LONGEST)
+    recompute = server_recompute(env.base_env.server, reward_terms=True, actor=actor)
+    storage = BackupdateStorage(capacity * n_worlds, recompute, LONGEST)
     return TensorDictReplayBuffer(storage=storage, batch_size=8, **options)
 
 
-def in_order(stored: TensorDictReplayBuffer, n_steps: int) -> TensorDictBase:
-    """The latest steps, [T, B]."""
-    storage = stored.storage
+def in_order(replay: TensorDictReplayBuffer, n_steps: int) -> TensorDictBase:
+    """The latest stored steps in order of time, [T, B]."""
+    storage = replay.storage
     return storage[storage.latest(n_steps)]
 
 
@@ -128,179 +131,180 @@ CORRECTED = [
 ]
 
 
-def check_truth(known: TensorDictBase, truth: TensorDictBase) -> None:
+def check_corrected(corrected: TensorDictBase, expected: TensorDictBase) -> None:
     for key in CORRECTED:
-        ours, theirs = known[key], truth[key]
-        for name, value in theirs.items() if isinstance(theirs, TensorDictBase) else [("", theirs)]:
-            assert (ours[name] if name else ours).equal(value), (key, name)
+        entry, right = corrected[key], expected[key]
+        for name, value in right.items() if isinstance(right, TensorDictBase) else [("", right)]:
+            assert (entry[name] if name else entry).equal(value), (key, name)
 
 
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 @pytest.mark.parametrize("parts", [1, 3, 13])
-def test_hindsight_is_truth_once_every_message_has_arrived(motion, parts):
+def test_back_updated_steps_equal_undelayed_ones_once_every_message_has_arrived(motion, parts):
     scenario = everything(motion, episode=PERSISTENT)
-    undelayed = flight(scenario, 39)
-    late = flight(replace(scenario, delay=DelayConfig(obs=LATE)), 39)
-    stored = buffer(scenario, 64)
-    for part in late.split(39 // parts, 1):
-        stored.extend(part)
-    known, truth = (td[: 39 - LONGEST] for td in (in_order(stored, 39), undelayed.transpose(0, 1)))
-    assert not known["next", "agents", "received"].equal(truth["next", "agents", "message"])
-    check_truth(known, truth)
+    undelayed = rollout(scenario, 39)
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 39)
+    replay = buffer(scenario, 64)
+    for part in delayed.split(39 // parts, 1):
+        replay.extend(part)
+    corrected, expected = (td[: 39 - LONGEST] for td in (in_order(replay, 39), undelayed.transpose(0, 1)))
+    assert not corrected["next", "agents", "received"].equal(expected["next", "agents", "message"])
+    check_corrected(corrected, expected)
 
 
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 @pytest.mark.parametrize("ctde", [False, True])
-def test_an_actor_may_be_shown_what_it_would_have_seen_without_delay_beside_what_it_remembers(motion, ctde):
+def test_an_actors_observation_can_be_back_updated_but_its_action_history_stays(motion, ctde):
     scenario = everything(motion, episode=PERSISTENT)
     scenario.observation.ctde = ctde
-    undelayed = flight(replace(scenario, delay=DelayConfig(history=2)), 39)
-    late = flight(replace(scenario, delay=DelayConfig(obs=LATE, history=2)), 39)
-    stored = buffer(scenario, 64, actor=True)
-    for part in late.split(13, 1):
-        stored.extend(part)
-    known, truth, perceived = (
-        td[: 39 - LONGEST] for td in (in_order(stored, 39), undelayed.transpose(0, 1), late.transpose(0, 1))
+    undelayed = rollout(replace(scenario, delay=DelayConfig(history=2)), 39)
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, history=2)), 39)
+    replay = buffer(scenario, 64, actor=True)
+    for part in delayed.split(13, 1):
+        replay.extend(part)
+    corrected, expected, original = (
+        td[: 39 - LONGEST]
+        for td in (in_order(replay, 39), undelayed.transpose(0, 1), delayed.transpose(0, 1))
     )
     for key in (("agents", "observation"), ("next", "agents", "observation")):
-        told, true, held = (td[key][..., : -2 * 2] for td in (known, truth, perceived))
-        assert not held.equal(true)
-        assert told.equal(true)
-    n_told = len(scenario.observation.actor)
-    remembered = late["agents", "observation"].transpose(0, 1)[..., -2 * 2 :]
-    assert remembered.any()
-    assert in_order(stored, 39)["agents", "observation"][..., -2 * 2 :].equal(remembered)
-    assert known["agents", "observation"].shape[-1] >= n_told + 2 * 2
+        after, right, before = (td[key][..., : -2 * 2] for td in (corrected, expected, original))
+        assert not before.equal(right)
+        assert after.equal(right)
+    n_features = len(scenario.observation.actor)
+    history = delayed["agents", "observation"].transpose(0, 1)[..., -2 * 2 :]
+    assert history.any()
+    assert in_order(replay, 39)["agents", "observation"][..., -2 * 2 :].equal(history)
+    assert corrected["agents", "observation"].shape[-1] >= n_features + 2 * 2
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
-def test_backupdated_is_where_something_newer_than_what_was_held_came_late(motion, order):
+def test_backupdated_is_true_where_a_late_message_is_newer_than_the_held_one(motion, order):
     scenario = everything(motion, episode=EpisodeConfig(max_steps=9))
-    late = flight(replace(scenario, delay=DelayConfig(obs=LATE, loss=0.2, order=order)), 40)
-    stored = buffer(scenario, 64)
-    for part in late.split(8, 1):
-        stored.extend(part)
-    flags = in_order(stored, 40)["agents", "backupdated"].squeeze(-1)
-    delay = late["next", "agents", "delay"].squeeze(-1)
-    held = Messages.unpack(late["next", "agents", "received"]).time
-    step_count, expected = late["step_count"].squeeze(-1), torch.zeros_like(flags)
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, loss=0.2, order=order)), 40)
+    replay = buffer(scenario, 64)
+    for part in delayed.split(8, 1):
+        replay.extend(part)
+    flags = in_order(replay, 40)["agents", "backupdated"].squeeze(-1)
+    delay = delayed["next", "agents", "delay"].squeeze(-1)
+    held = Messages.unpack(delayed["next", "agents", "received"]).time
+    step_count, expected = delayed["step_count"].squeeze(-1), torch.zeros_like(flags)
     for b in range(4):
         for t in range(40):
             start = t - int(step_count[b, t])
             for i in range(flags.shape[-1]):
-                came = [g for g in range(start, t + 1) if 0 <= delay[b, g, i] <= 39 - g]
-                newest = max((g - start + 1 for g in came), default=0)
+                arrived = [g for g in range(start, t + 1) if 0 <= delay[b, g, i] <= 39 - g]
+                newest = max((g - start + 1 for g in arrived), default=0)
                 expected[t, b, i] = newest > held[b, t, i]
     assert 0.05 < expected.float().mean() < 0.95
     assert flags.equal(expected)
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])
-def test_in_pieces_and_around_the_ring_the_same_is_known_as_at_once(order):
+def test_writing_in_small_batches_around_the_ring_gives_the_same_as_writing_at_once(order):
     scenario = everything("instant", episode=EpisodeConfig(max_steps=7))
     delay = DelayConfig(obs={"law": "burst", "bad": LONGEST, "bad_loss": 0.3}, loss=0.1, order=order)
-    late = flight(replace(scenario, delay=delay), 60)
+    delayed = rollout(replace(scenario, delay=delay), 60)
     whole, ring = buffer(scenario, 80), buffer(scenario, 25)
-    whole.extend(late)
-    for part in late.split(4, 1):
+    whole.extend(delayed)
+    for part in delayed.split(4, 1):
         ring.extend(part)
     n_final = 25 - 2 * LONGEST
-    known, again = in_order(whole, n_final), in_order(ring, n_final)
-    for key in known.keys(True, True):
+    at_once, in_parts = in_order(whole, n_final), in_order(ring, n_final)
+    for key in at_once.keys(True, True):
         if key != "index":
-            assert known[key].equal(again[key]), key
+            assert at_once[key].equal(in_parts[key]), key
 
 
-def test_messages_from_elsewhere_count_as_if_they_had_arrived_just_now():
-    scenario = everything(delay=DelayConfig(obs=LATE, loss=0.4))
-    steps, stored, expected = flight(scenario, 30), buffer(scenario, 60), buffer(scenario, 60)
+def test_messages_from_outside_count_as_if_they_had_arrived_after_the_latest_step():
+    scenario = everything(delay=DelayConfig(obs=RANDOM_DELAY, loss=0.4))
+    steps, replay, expected = rollout(scenario, 30), buffer(scenario, 60), buffer(scenario, 60)
     delay = steps["next", "agents", "delay"]
     lost = (delay[:, -LONGEST:] < 0).squeeze(-1).nonzero()
     world, agent, ago = lost[:, 0], lost[:, 2], LONGEST - 1 - lost[:, 1]
     assert len(lost) > 10
-    came = steps.clone()
-    came["next", "agents", "delay"][world, 29 - ago, agent, 0] = ago
-    expected.extend(came)
+    arrived = steps.clone()
+    arrived["next", "agents", "delay"][world, 29 - ago, agent, 0] = ago
+    expected.extend(arrived)
     message = steps["next", "agents", "message"][world, 29 - ago, agent]
-    steps["next", "agents", "message"][world, 29 - ago, agent] = 0.0  # nobody has heard them
-    stored.extend(steps)
+    steps["next", "agents", "message"][world, 29 - ago, agent] = 0.0  # no copy of the lost messages
+    replay.extend(steps)
     with pytest.raises(AssertionError):
-        check_truth(in_order(stored, 30), in_order(expected, 30))
-    stored.storage.receive(world, agent, ago, message)
-    check_truth(in_order(stored, 30), in_order(expected, 30))
+        check_corrected(in_order(replay, 30), in_order(expected, 30))
+    replay.storage.receive(world, agent, ago, message)
+    check_corrected(in_order(replay, 30), in_order(expected, 30))
     with pytest.raises(ValueError, match=f"steps_ago: 0 to {LONGEST + 1} is not between 0 and {LONGEST}"):
-        stored.storage.receive(world[:2], agent[:2], torch.tensor([0, LONGEST + 1]), message[:2])
+        replay.storage.receive(world[:2], agent[:2], torch.tensor([0, LONGEST + 1]), message[:2])
 
 
-def test_what_the_actor_saw_and_did_stays():
+def test_the_actors_observations_and_actions_stay():
     scenario = everything("instant", episode=EpisodeConfig(max_steps=9))
-    late = flight(replace(scenario, delay=DelayConfig(obs=LATE, history=2)), 30)
-    stored = buffer(scenario, 64)
-    stored.extend(late)
-    known = in_order(stored, 30).transpose(0, 1)
-    changed = {key for key in late.keys(True, True) if not known[key].equal(late[key])}
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, history=2)), 30)
+    replay = buffer(scenario, 64)
+    replay.extend(delayed)
+    corrected = in_order(replay, 30).transpose(0, 1)
+    changed = {key for key in delayed.keys(True, True) if not corrected[key].equal(delayed[key])}
     assert ("agents", "observation") not in changed
     assert ("agents", "action") not in changed
     assert ("next", "agents", "reward") in changed
     assert ("agents", "global_observation") in changed
-    begins, seen = late["step_count"].squeeze(-1) == 0, ("agents", "global_observation")
+    begins, key = delayed["step_count"].squeeze(-1) == 0, ("agents", "global_observation")
     assert begins[:, 1:].any()
-    assert known[seen][begins].equal(late[seen][begins])
+    assert corrected[key][begins].equal(delayed[key][begins])
 
 
-def test_a_success_that_was_learnt_of_late_ends_the_episode_where_it_happened():
+def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened():
     scenario = square(episode=EpisodeConfig(max_steps=12, success_share=0.3))
-    undelayed = flight(scenario, 60, 16)
-    late = flight(replace(scenario, delay=DelayConfig(obs=3)), 60, 16)
-    stored = buffer(scenario, 80, 16)
-    stored.extend(late)
-    known = in_order(stored, 60).transpose(0, 1)
-    first = known["step_count"].squeeze(-1).cumsum(1) == torch.arange(60).cumsum(0)  # of each world
-    began = first & known["valid"].squeeze(-1)
-    ends, true_ends = (td["next", "success"].squeeze(-1) for td in (known, undelayed))
+    undelayed = rollout(scenario, 60, 16)
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=3)), 60, 16)
+    replay = buffer(scenario, 80, 16)
+    replay.extend(delayed)
+    corrected = in_order(replay, 60).transpose(0, 1)
+    first_episode = corrected["step_count"].squeeze(-1).cumsum(1) == torch.arange(60).cumsum(0)
+    valid = first_episode & corrected["valid"].squeeze(-1)
+    ends, true_ends = (td["next", "success"].squeeze(-1) for td in (corrected, undelayed))
     for b in range(16):
-        steps = began[b].nonzero().flatten()
+        steps = valid[b].nonzero().flatten()
         if true_ends[b, : len(steps)].any():
             assert ends[b, steps].tolist() == true_ends[b, : len(steps)].tolist()
-    assert (~known["valid"]).any()
-    assert known["next", "done"][known["reset_after"]].all()
+    assert (~corrected["valid"]).any()
+    assert corrected["next", "done"][corrected["reset_after"]].all()
 
 
-def test_what_it_cannot_hold_is_refused():
+def test_batches_and_delays_that_are_too_long_are_refused():
     scenario = everything("instant", episode=PERSISTENT)
-    late = flight(replace(scenario, delay=DelayConfig(obs=LATE)), 20)
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 20)
     with pytest.raises(ValueError, match="max_size: 116 is too little for batches of 20 steps"):
-        buffer(scenario, 29).extend(late)
-    later = flight(replace(scenario, delay=DelayConfig(obs=LONGEST + 1)), 20)
+        buffer(scenario, 29).extend(delayed)
+    too_late = rollout(replace(scenario, delay=DelayConfig(obs=LONGEST + 1)), 20)
     with pytest.raises(ValueError, match="longest: a message takes 6 steps, more than 5"):
-        buffer(scenario, 64).extend(later)
+        buffer(scenario, 64).extend(too_late)
 
 
 @pytest.mark.parametrize(
     "sampler", [SamplerWithoutReplacement(), SliceSampler(num_slices=2, end_key=("next", "done"))]
 )
-def test_torchrls_samplers_work_on_it(sampler):
+def test_torchrls_samplers_work_on_the_storage(sampler):
     scenario = everything("instant", episode=EpisodeConfig(max_steps=9))
-    stored = buffer(scenario, 64, sampler=sampler)
-    stored.extend(flight(replace(scenario, delay=DelayConfig(obs=LATE)), 40))
-    assert stored.sample()["valid"].shape == (8, 1)
+    replay = buffer(scenario, 64, sampler=sampler)
+    replay.extend(rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 40))
+    assert replay.sample()["valid"].shape == (8, 1)
 
 
-def test_it_is_saved_and_goes_on_as_before(tmp_path):
+def test_a_saved_storage_continues_in_the_same_way(tmp_path):
     scenario = everything("instant", episode=EpisodeConfig(max_steps=9))
-    late = flight(replace(scenario, delay=DelayConfig(obs=LATE)), 40)
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 40)
     one, other = buffer(scenario, 64), buffer(scenario, 64)
-    one.extend(late[:, :25])
+    one.extend(delayed[:, :25])
     one.dumps(tmp_path)
     other.loads(tmp_path)
-    for stored in (one, other):
-        stored.extend(late[:, 25:])
-    known, again = in_order(one, 40), in_order(other, 40)
-    assert all(known[key].equal(again[key]) for key in known.keys(True, True) if key != "index")
+    for replay in (one, other):
+        replay.extend(delayed[:, 25:])
+    original, loaded = in_order(one, 40), in_order(other, 40)
+    assert all(original[key].equal(loaded[key]) for key in original.keys(True, True) if key != "index")
 
 
-def test_the_message_of_a_uav_says_when_it_was_sent():
-    late = flight(replace(square(), delay=DelayConfig(obs=LATE)), 12)
-    sent = Messages.unpack(late["next", "agents", "message"])
-    assert sent.time.equal(late["next", "step_count"].float().expand_as(sent.time))
+def test_the_message_of_a_uav_contains_its_generation_time():
+    delayed = rollout(replace(square(), delay=DelayConfig(obs=RANDOM_DELAY)), 12)
+    sent = Messages.unpack(delayed["next", "agents", "message"])
+    assert sent.time.equal(delayed["next", "step_count"].float().expand_as(sent.time))

@@ -1,4 +1,4 @@
-"""Skipping what lies between two decisions changes nothing of what is learnt from them."""
+"""Skipping the steps between two decisions does not change their advantages and transitions."""
 
 from dataclasses import replace
 
@@ -19,62 +19,61 @@ GAMMA = 0.9
 
 
 @pytest.fixture(scope="module")
-def flights():
-    """One UAV's flights, every step and from decision to decision, each [B, T], and a critic."""
+def rollouts():
+    """Rollouts of one UAV, with every simulation step and from decision to decision, [B, T], and a critic."""
     scenario = everything("polynomial", agents=1, episode=EpisodeConfig(max_steps=30))
     skipped = replace(scenario, clock=ClockConfig(skip=True, skip_discount=GAMMA))
     torch.manual_seed(0)
     model = ModelConfig(hidden=[16])
-    first = make_env(scenario, 16, seed=2)
-    actor, critic = make_actor(first, model), make_critic(first, model)
+    env = make_env(scenario, 16, seed=2)
+    actor, critic = make_actor(env, model), make_critic(env, model)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        steps, jumps = (
-            make_env(asked, 16, seed=2).rollout(95, actor, break_when_any_done=False)
-            for asked in (scenario, skipped)
+        every_step, skipping = (
+            make_env(config, 16, seed=2).rollout(95, actor, break_when_any_done=False)
+            for config in (scenario, skipped)
         )
-    assert jumps["next", "duration"].float().mean() > 1.5
-    return steps, jumps, critic
+    assert skipping["next", "duration"].float().mean() > 1.5
+    return every_step, skipping, critic
 
 
-def decided(flight: TensorDictBase, worlds: int, values: torch.Tensor) -> list[list[float]]:
+def at_decisions(rollout: TensorDictBase, worlds: int, values: torch.Tensor) -> list[list[float]]:
     """Values [B, T, ...] at the decisions of each world, in order."""
-    ready = flight["agents", "ready"][..., 0]
+    ready = rollout["agents", "ready"][..., 0]
     return [values[world][ready[world]].flatten(1).squeeze(-1).tolist() for world in range(worlds)]
 
 
-def test_advantages_are_the_same(flights):
-    steps, jumps, critic = flights
+def test_advantages_are_the_same(rollouts):
+    every_step, skipping, critic = rollouts
     config = MappoConfig(gamma=GAMMA, lmbda=0.7, normalize_advantage=False)
-    found = []
-    for flight in (steps, jumps):
-        add_advantages(flight, critic, config)
-        found.append(decided(flight, 16, flight["agents", "advantage"][..., 0, :]))
-    ended = [steps["next", "done"][world].nonzero()[-1, 0].item() for world in range(16)]
-    compared = 0
-    for world, (all_, few) in enumerate(zip(*found, strict=True)):
-        # Up to the last end that both have seen: what comes after is estimated from different last steps.
-        n = int(steps["agents", "ready"][world, : ended[world] + 1].sum())
-        assert all_[:n] == pytest.approx(few[:n], abs=1e-4)
-        compared += n
-    assert compared > 100
+    advantages = []
+    for rollout in (every_step, skipping):
+        add_advantages(rollout, critic, config)
+        advantages.append(at_decisions(rollout, 16, rollout["agents", "advantage"][..., 0, :]))
+    last_end = [every_step["next", "done"][world].nonzero()[-1, 0].item() for world in range(16)]
+    n_compared = 0
+    for world, (one, other) in enumerate(zip(*advantages, strict=True)):
+        # Only up to the last end of an episode, because the two rollouts stop at different steps after it.
+        n = int(every_step["agents", "ready"][world, : last_end[world] + 1].sum())
+        assert one[:n] == pytest.approx(other[:n], abs=1e-4)
+        n_compared += n
+    assert n_compared > 100
 
 
-def test_transitions_are_the_same(flights):
-    steps, jumps, _ = flights
-    made = []
-    for flight in (steps, jumps):
-        by_time = flight.transpose(0, 1)
-        ready, then = by_time["agents", "ready"], by_time["next", "agents", "ready"]
-        ends = (by_time["next", key].squeeze(-1) for key in ("done", "terminated"))
-        found = find_decisions(ready, then, *ends, 2)
-        order = torch.arange(len(by_time))
-        learnt = transitions(by_time, order, found, GAMMA, ["observation", "global_observation"])
-        of_world = [learnt[found.world == world] for world in range(16)]
-        made.append(of_world)
-    compared = 0
-    for all_, few in zip(*made, strict=True):
-        n = min(len(all_), len(few))
-        compared += n
+def test_transitions_are_the_same(rollouts):
+    every_step, skipping, _ = rollouts
+    by_world = []
+    for rollout in (every_step, skipping):
+        steps = rollout.transpose(0, 1)
+        ready, ready_next = steps["agents", "ready"], steps["next", "agents", "ready"]
+        ends = (steps["next", key].squeeze(-1) for key in ("done", "terminated"))
+        decisions = find_decisions(ready, ready_next, *ends, 2)
+        order = torch.arange(len(steps))
+        batch = transitions(steps, order, decisions, GAMMA, ["observation", "global_observation"])
+        by_world.append([batch[decisions.world == world] for world in range(16)])
+    n_compared = 0
+    for one, other in zip(*by_world, strict=True):
+        n = min(len(one), len(other))
+        n_compared += n
         for key in ("steps_to_next_obs", ("next", "agents", "reward"), ("next", "agents", "observation")):
-            assert torch.allclose(all_[:n][key].float(), few[:n][key].float(), atol=1e-5)
-    assert compared > 100
+            assert torch.allclose(one[:n][key].float(), other[:n][key].float(), atol=1e-5)
+    assert n_compared > 100

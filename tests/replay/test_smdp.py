@@ -1,4 +1,4 @@
-"""Decisions among stored steps, beside a loop over steps, worlds and UAVs."""
+"""Decisions and transitions of stored steps, against a loop over steps, worlds and UAVs."""
 
 import itertools
 
@@ -12,16 +12,16 @@ T, B, N = 12, 5, 3
 
 
 def flags(seed: int):
-    """Readiness before and after each step, and ends of episodes, as a flight would have them."""
+    """Random ``ready``, ``ready_next``, ``done`` and ``terminated`` that a rollout could have."""
     torch.manual_seed(seed)
     after, done = torch.rand(T, B, N) < 0.4, torch.rand(T, B) < 0.1
     ready = torch.cat([torch.ones(1, B, N, dtype=torch.bool), after[:-1]])
-    ready[1:] |= done[:-1].unsqueeze(-1)  # a reset begins with everybody ready
+    ready[1:] |= done[:-1].unsqueeze(-1)  # after a reset every UAV is ready
     return ready, after, done, done & (torch.rand(T, B) < 0.5)
 
 
-def loop(ready, after, done, terminated, n_decisions):
-    """Every decision that ends in time, and not in flight at a time limit, step by step."""
+def find_in_loop(ready, after, done, terminated, n_decisions):
+    """Every decision that ends within the steps and is not truncated in flight, found step by step."""
     found = set()
     for begin, world, agent in itertools.product(range(T), range(B), range(N)):
         if not ready[begin, world, agent]:
@@ -40,23 +40,23 @@ def loop(ready, after, done, terminated, n_decisions):
 
 @pytest.mark.parametrize("n_decisions", [1, 2, 4])
 @pytest.mark.parametrize("seed", range(5))
-def test_each_decision_lasts_until_the_next_or_the_end_as_a_loop_finds(n_decisions, seed):
+def test_decisions_are_those_that_a_loop_finds(n_decisions, seed):
     found = torch.stack(find_decisions(*flags(seed), n_decisions), -1)
-    expected = loop(*flags(seed), n_decisions)
+    expected = find_in_loop(*flags(seed), n_decisions)
     assert {tuple(row) for row in found.tolist()} == expected
     assert len(found) == len(expected) > 20
 
 
-def test_without_flights_every_step_but_the_last_ones_is_a_decision():
-    yes = torch.ones(T, B, N, dtype=torch.bool)
-    no = torch.zeros(T, B, dtype=torch.bool)
-    found = find_decisions(yes, yes, no, no, 3)
+def test_if_uavs_are_always_ready_every_step_but_the_last_ones_begins_a_decision():
+    ready = torch.ones(T, B, N, dtype=torch.bool)
+    never = torch.zeros(T, B, dtype=torch.bool)
+    found = find_decisions(ready, ready, never, never, 3)
     assert (found.end - found.begin == 2).all()
     assert len(found.begin) == (T - 2) * B * N
 
 
-def stored(seed: int) -> TensorDict:
-    """Steps in the order of a ring that has gone round: the first lies at place 4."""
+def random_steps(seed: int) -> TensorDict:
+    """Random steps, as a ring buffer holds them whose oldest step lies at index 4."""
     torch.manual_seed(seed)
     agents = {"action": torch.rand(T, B, N, 2), "observation": torch.rand(T, B, N, 4)}
     after = {"observation": torch.rand(T, B, N, 4), "reward": torch.rand(T, B, N, 1)}
@@ -64,34 +64,34 @@ def stored(seed: int) -> TensorDict:
     return TensorDict({"agents": agents, "next": {"agents": after, **ends}}, [T, B])
 
 
-def test_a_transition_holds_what_was_seen_before_it_and_after_it_and_what_it_earned():
-    steps, order = stored(0), torch.arange(4, T + 4) % T
+def test_a_transition_has_the_observations_before_and_after_it_and_its_discounted_reward():
+    steps, order = random_steps(0), torch.arange(4, T + 4) % T
     decisions = find_decisions(*flags(0), 2)
-    made = transitions(steps, order, decisions, 0.9, ["observation"])
-    by_time, later = steps[order], steps["next"][order]
+    batch = transitions(steps, order, decisions, 0.9, ["observation"])
+    before, after = steps[order], steps["next"][order]
     for k, (begin, world, agent, end) in enumerate(zip(*(part.tolist() for part in decisions), strict=True)):
         for key in ("action", "observation"):
-            assert made["agents", key][k].equal(by_time["agents", key][begin, world, agent])
-        seen = later["agents", "observation"][end, world, agent]
-        assert made["next", "agents", "observation"][k].equal(seen)
+            assert batch["agents", key][k].equal(before["agents", key][begin, world, agent])
+        observation = after["agents", "observation"][end, world, agent]
+        assert batch["next", "agents", "observation"][k].equal(observation)
         for key in ("done", "terminated"):
-            assert made["next", key][k].equal(later[key][end, world])
-        rewards = later["agents", "reward"][begin : end + 1, world, agent, 0].tolist()
-        earned = sum(0.9**k * reward for k, reward in enumerate(rewards))
-        assert made["next", "agents", "reward"][k].item() == pytest.approx(earned, rel=1e-5)
-        assert made["steps_to_next_obs"][k].item() == end - begin + 1
+            assert batch["next", key][k].equal(after[key][end, world])
+        rewards = after["agents", "reward"][begin : end + 1, world, agent, 0].tolist()
+        expected = sum(0.9**k * reward for k, reward in enumerate(rewards))
+        assert batch["next", "agents", "reward"][k].item() == pytest.approx(expected, rel=1e-5)
+        assert batch["steps_to_next_obs"][k].item() == end - begin + 1
 
 
-def test_a_flight_of_three_steps_by_hand():
-    steps = stored(1)
+def test_the_reward_of_a_decision_of_three_steps_by_hand():
+    steps = random_steps(1)
     steps["next", "agents", "reward"][2:5, 1, 0, 0] = torch.tensor([1.0, 2.0, 4.0])
     one = Decisions(*(torch.tensor([number]) for number in (2, 1, 0, 4)))
-    made = transitions(steps, torch.arange(T), one, 0.5, [])
-    assert made["next", "agents", "reward"].item() == 1 + 2 / 2 + 4 / 4
-    assert made["steps_to_next_obs"].item() == 3
+    transition = transitions(steps, torch.arange(T), one, 0.5, [])
+    assert transition["next", "agents", "reward"].item() == 1 + 2 / 2 + 4 / 4
+    assert transition["steps_to_next_obs"].item() == 3
 
 
-def test_each_of_them_may_be_drawn_and_nothing_else():
+def test_sample_draws_every_decision_and_nothing_else():
     found = find_decisions(*flags(2))
     rows = {tuple(row) for row in torch.stack(found, -1).tolist()}
     drawn = {tuple(row) for row in torch.stack(found.sample(5000), -1).tolist()}

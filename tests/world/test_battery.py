@@ -1,4 +1,4 @@
-"""Battery: golden figures of the original, and the odd run of it that is not SPEC 1."""
+"""Battery: recorded figures of the original implementation, and its one run that departs from the model."""
 
 import json
 import math
@@ -32,7 +32,7 @@ def tensor(value):
     return torch.tensor(value, dtype=torch.float64)
 
 
-def test_the_defaults_are_the_golden_parameters():
+def test_the_defaults_equal_the_recorded_parameters():
     golden = ENERGY["params"]
     assert (BATTERY.engine_power_kw, BATTERY.reference_speed) == (golden["p_eng"], golden["v_ref"])
     assert (BATTERY.capacity_kwh, BATTERY.efficiency) == (golden["p_bat"], golden["b_efficiency"])
@@ -44,7 +44,7 @@ def test_the_defaults_are_the_golden_parameters():
     assert full.item() == pytest.approx(100.0)
 
 
-def test_golden_flights_drain_the_same():
+def test_recorded_flights_have_the_same_drain():
     rows = [row for row in ENERGY["consumption"] if row["mode"] == "estimate"]
     assert len(rows) == 5
     for row in rows:
@@ -53,7 +53,7 @@ def test_golden_flights_drain_the_same():
         assert drain.item() == pytest.approx(row["battery_percent"], rel=1e-4)
 
 
-def test_golden_steps_of_a_flight_drain_the_same():
+def test_recorded_steps_of_a_flight_have_the_same_drain():
     rows = [row for row in ENERGY["consumption"] if row["mode"] == "real time"]
     assert len(rows) == 12
     for row in rows:
@@ -64,7 +64,7 @@ def test_golden_steps_of_a_flight_drain_the_same():
         assert drain.item() == pytest.approx(row["battery_percent"], rel=1e-4)
 
 
-def test_golden_charging_adds_the_same():
+def test_recorded_charging_has_the_same_gain():
     assert len(ENERGY["charged"]) == 4
     for row in ENERGY["charged"]:
         gain = charge_gain(tensor(row["dt"]), BATTERY)
@@ -72,25 +72,25 @@ def test_golden_charging_adds_the_same():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_golden_levels_are_observed_the_same(dtype):
+def test_recorded_levels_are_observed_as_the_same_levels(dtype):
     levels, expected = zip(*ENERGY["observable_level"], strict=True)
     assert observed(torch.tensor(levels, dtype=dtype), BATTERY).tolist() == list(expected)
 
 
 @given(multiple=st.integers(0, 20), error=st.floats(-4e-4, 4e-4))
-def test_a_level_that_float_error_left_below_a_step_is_observed_on_it(multiple, error):
+def test_float_error_does_not_change_the_observed_level(multiple, error):
     level = torch.tensor(5.0 * multiple + error)
     assert observed(level, BATTERY).item() == 5.0 * multiple
 
 
-def test_every_transition_of_the_odd_golden_run_is_left_out_for_a_known_reason():
-    # In this run of the original a flight's drain is: takeoff and landing (as in SPEC 1); a cruise
-    # whose speed is the length over 10 000 s (the placeholder for the time of an instant motion);
-    # and what the whole flight would have *charged*, taken off instead of left out. Then one step
-    # of charging is added. So no transition follows SPEC 1; this test pins that reading, and with
-    # it what the original does agree on.
+def test_the_odd_recorded_run_is_left_out_because_it_subtracts_charging():
+    # In this run, the original drains a flight by three parts: takeoff and landing, as in this
+    # project; a cruise whose speed is the length over 10 000 s (its placeholder for the duration of
+    # an instant motion); and the gain of *charging* for the whole flight, which it subtracts. Then it
+    # adds one step of charging. So no transition agrees with this project; this test pins the formula
+    # of the original, and the parts that both share.
     left_out, level, place = 0, 100.0, START
-    for _, _, x, y, after, seen, vertical, cruise in ODD_RUN["rows"]:
+    for _, _, x, y, after, recorded_level, vertical, cruise in ODD_RUN["rows"]:
         length = math.dist(place, (x, y))
         ours = flight_drain(tensor(vertical), tensor(length), BATTERY).item()
         theirs = (
@@ -99,7 +99,7 @@ def test_every_transition_of_the_odd_golden_run_is_left_out_for_a_known_reason()
             - charge_gain(tensor(1.0), BATTERY)
         ).item()
         assert level - after == pytest.approx(theirs, abs=2e-7)
-        assert observed(tensor(after), BATTERY).item() == seen
+        assert observed(tensor(after), BATTERY).item() == recorded_level
         left_out += level - after > 2 * ours
         level, place = after, (x, y)
     assert left_out == len(ODD_RUN["rows"]) == 40
@@ -107,8 +107,8 @@ def test_every_transition_of_the_odd_golden_run_is_left_out_for_a_known_reason()
 
 @pytest.mark.parametrize("degree", [3, 5, 7])
 @pytest.mark.parametrize("n_steps", [3, 17, 400])
-def test_the_drain_of_a_flight_is_the_same_whatever_the_step(degree, n_steps):
-    # The twin integrates the rate 100 (p_eng v / v_ref) / (p_bat eff) per hour over the speed.
+def test_the_drain_of_a_flight_does_not_depend_on_the_time_step(degree, n_steps):
+    # The expected drain integrates the rate 100 (p_eng v / v_ref) / (p_bat eff) per hour over time.
     origin, target, level = tensor([[0.0, 0.0]]), tensor([[30.0, 40.0]]), tensor([2.0])
     vertical, cruise = minimum_time(tensor([2.0, 50.0]), degree, max_speed=5.0, max_acceleration=2.0)
 
@@ -129,7 +129,7 @@ def test_the_drain_of_a_flight_is_the_same_whatever_the_step(degree, n_steps):
     cruise=st.floats(0, 100),
     part=st.floats(0, 1),
 )
-def test_what_a_flight_used_so_far_is_its_phases_one_by_one(share, vertical, cruise, part):
+def test_the_drain_so_far_is_the_sum_over_the_phases_of_a_flight(share, vertical, cruise, part):
     elapsed = share * (2 * vertical + cruise)
     cruised = part * 150.0
     if elapsed <= vertical:
@@ -143,7 +143,7 @@ def test_what_a_flight_used_so_far_is_its_phases_one_by_one(share, vertical, cru
     assert used_so_far(*values, BATTERY).item() == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-def test_a_flight_that_is_over_used_its_whole_drain():
+def test_the_drain_so_far_at_the_end_is_that_of_the_whole_flight():
     vertical, cruise, length = tensor(3.0), tensor(20.0), tensor(90.0)
     used = used_so_far(tensor(30.0), vertical, cruise, length, BATTERY)
     assert used.item() == pytest.approx(flight_drain(vertical, length, BATTERY).item())

@@ -1,4 +1,4 @@
-"""Coverage by bit masks against shapely's exact geometry, the authors' figures and symmetries."""
+"""Coverage by bit masks, against exact geometry by shapely, the authors' figures and symmetries."""
 
 import itertools
 import json
@@ -23,20 +23,20 @@ R = 56.2341
 
 
 def exact_share(polygon, positions, radius=R):
-    """The slow twin, one world: positions ``[N, n, 2]`` -> ``[N]``, set algebra UAV by UAV."""
+    """Exact coverage of one world by shapely, UAV by UAV: positions ``[N, n, 2]`` [m] -> ``[N]``."""
     discs = [[Point(p).buffer(radius, quad_segs=128) for p in uav] for uav in positions]
     shares = []
     for i, own in enumerate(discs):
         areas = []
         for k, disc in enumerate(own):
-            lost = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
-            areas.append(disc.intersection(polygon).difference(shapely.union_all(lost)).area)
+            excluded = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
+            areas.append(disc.intersection(polygon).difference(shapely.union_all(excluded)).area)
         shares.append(np.mean(areas) / (math.pi * radius**2))
     return np.array(shares)
 
 
 def star(rng, low, high):
-    """A polygon around 0 whose vertices lie at distances ``low .. high`` [m]."""
+    """A random polygon around (0, 0) whose vertices lie at distances ``low .. high`` [m]."""
     n = rng.integers(5, 12)
     angle = 2 * np.pi * (np.arange(n) + rng.uniform(0, 0.8, n)) / n
     r = rng.uniform(low, high, n)
@@ -57,7 +57,7 @@ def random_polygon(rng, kind):
 
 
 def random_points(rng, polygon, count, spread):
-    """Points strictly inside the polygon, all over it or within ``spread`` [m] of one another."""
+    """Random points inside the polygon: all over it, or in squares of half-width ``spread`` [m]."""
     inside = np.empty((0, 2))
     centre = rng.uniform(-60, 60, 2)
     while len(inside) < count:
@@ -70,7 +70,7 @@ def random_points(rng, polygon, count, spread):
 
 
 def share_at(polygon, positions, radius=R):
-    """Coverage with tables built for these very positions ``[*, N, n, 2]``: ``[*, N]``."""
+    """Coverage ``[*, N]`` with tables built for exactly these positions ``[*, N, n, 2]`` [m]."""
     positions = np.asarray(positions, float)
     tables = build_tables([polygon], positions.reshape(1, -1, 2), radius)
     ids = torch.arange(positions[..., 0].size).view(positions.shape[:-1])
@@ -87,7 +87,7 @@ def square():
 
 
 def at_random(points, shape, seed=0):
-    """Random flat ids of ``shape`` and where they are."""
+    """Random flat ids of the given shape, and the positions of these points."""
     ids = torch.randint(len(points), shape, generator=torch.Generator().manual_seed(seed))
     return ids, torch.tensor(points, dtype=torch.float32)[ids]
 
@@ -119,7 +119,7 @@ def test_coverage_is_exact_to_one_percent_for_any_radius(seed, kind, size, sprea
     np.testing.assert_allclose(got, exact, rtol=0, atol=0.01)
 
 
-def test_the_authors_clean_areas_come_out_within_one_percent_of_the_disc():
+def test_the_authors_areas_are_reproduced_within_one_percent_of_the_disc():
     golden = json.loads((DATA / "motion_energy_coverage.json").read_text())["coverage"]
     scenario = json.loads((DATA / "usecase1.json").read_text())["scenario"]
     polygon, radius = Polygon(scenario["polygon_vertices_ring"]), golden["footprint_radius"]
@@ -131,10 +131,10 @@ def test_the_authors_clean_areas_come_out_within_one_percent_of_the_disc():
         np.testing.assert_allclose(got, expected, rtol=0, atol=0.01 * golden["disc_area"])
 
 
-def test_a_lone_uav_covers_its_disc_inside_the_polygon():
+def test_a_single_uav_covers_the_part_of_its_disc_inside_the_polygon():
     polygon = shapely.box(0, -500, 500, 500)
     places = [[[0.001, 0.0]], [[R, 300.0]], [[R / 2, -300.0]]]
-    half_in = 2 / 3 + math.sqrt(3) / (4 * math.pi)  # all but the segment beyond a chord at R / 2
+    half_in = 2 / 3 + math.sqrt(3) / (4 * math.pi)  # the disc without the segment beyond a chord at R / 2
     np.testing.assert_allclose(share_at(polygon, places), [0.5, 1, half_in], atol=0.005)
 
 
@@ -158,7 +158,7 @@ def test_bits_of_extreme_words_are_counted(word):
 
 
 @pytest.mark.parametrize("count", range(1, 10))
-def test_or_over_the_first_dimension_is_pythons(count):
+def test_or_over_the_first_dimension_equals_numpys(count):
     masks = np.random.default_rng(count).integers(-(2**63), 2**63 - 1, (count, 5, 2))
     got = coverage._or_first(torch.tensor(masks))
     assert got.tolist() == np.bitwise_or.reduce(masks, 0).tolist()
@@ -174,7 +174,7 @@ def test_a_batch_equals_a_loop_over_its_worlds(square, n_uavs, n_last):
         assert torch.equal(batch[b], covered_share(tables, ids[b], positions[b]))
 
 
-def test_splitting_the_worlds_into_chunks_changes_nothing(square, monkeypatch):
+def test_splitting_the_worlds_into_chunks_does_not_change_the_shares(square, monkeypatch):
     tables, _, points = square
     ids, positions = at_random(points, (11, 3, 2))
     whole = covered_share(tables, ids, positions)
@@ -192,7 +192,7 @@ def test_permuting_the_uavs_permutes_their_shares(square):
         assert torch.equal(permuted, share[:, order])
 
 
-def test_uavs_more_than_two_radii_apart_do_not_interact():
+def test_uavs_more_than_two_radii_apart_cover_their_whole_discs():
     open_sea = shapely.box(-1e5, -1e5, 1e5, 1e5)
     apart = [[[0.0, 0.0]], [[2.01 * R, 0.0]], [[0.0, -2.01 * R]], [[-9e4, 9e4]]]
     assert share_at(open_sea, apart).tolist() == [1, 1, 1, 1]
@@ -211,8 +211,8 @@ def test_holding_counts_the_footprint_once(n_last):
     assert share_at(open_sea, np.full((1, n_last, 2), 17.3)) == pytest.approx(1 / n_last)
 
 
-def test_only_older_positions_of_the_uav_itself_are_taken_away():
-    left = shapely.box(-1e5, -1e5, 0, 1e5)  # the newest footprint half outside, the older inside
+def test_only_older_footprints_of_the_same_uav_are_subtracted():
+    left = shapely.box(-1e5, -1e5, 0, 1e5)  # half of ``newest`` and most of ``oldest`` lie inside
     newest, oldest = [-0.001, 0.0], [-R / 2, 0.0]
     forth, back = [[newest, oldest]], [[oldest, newest]]
     forth_share, back_share = share_at(left, forth), share_at(left, back)
@@ -220,7 +220,7 @@ def test_only_older_positions_of_the_uav_itself_are_taken_away():
     np.testing.assert_allclose(back_share, exact_share(left, back), atol=0.01)
 
 
-def test_others_count_at_the_same_step_only(square):
+def test_footprints_of_other_uavs_are_subtracted_at_the_same_index_only(square):
     _, polygon, _ = square
     here, there = [0.0, 0.0], [140.0, 0.0]
     assert share_at(polygon, [[here, there], [there, here]]) == pytest.approx([1, 1])
@@ -236,7 +236,7 @@ def test_flat_ids_run_over_regions_and_padding_covers_nothing():
     np.testing.assert_allclose(share, [1, 1, 0.5, 0], atol=0.005)
 
 
-def test_the_result_has_the_positions_dtype_and_tables_move(square):
+def test_shares_have_the_dtype_of_the_positions_also_after_tables_are_moved(square):
     tables, _, points = square
     ids, positions = at_random(points, (2, 3, 2))
     share = covered_share(tables.to("cpu"), ids, positions.double())
@@ -244,7 +244,7 @@ def test_the_result_has_the_positions_dtype_and_tables_move(square):
     np.testing.assert_allclose(share, covered_share(tables, ids, positions), atol=1e-6)
 
 
-def test_it_compiles_to_one_graph(square):
+def test_coverage_compiles_to_one_graph(square):
     tables, _, points = square
     ids, positions = at_random(points, (7, 3, 2))
     compiled = torch.compile(covered_share, fullgraph=True, backend="eager")
@@ -252,7 +252,7 @@ def test_it_compiles_to_one_graph(square):
 
 
 @pytest.mark.parametrize("radius", [0, -3.0, math.nan, math.inf])
-def test_a_radius_that_is_no_length_is_refused(radius):
+def test_a_radius_that_is_not_positive_and_finite_is_refused(radius):
     with pytest.raises(InputError, match=r"^footprint radius: \S+ m: must be finite and above 0 m$"):
         build_tables([shapely.box(0, 0, 1, 1)], np.zeros((1, 1, 2)), radius)
 

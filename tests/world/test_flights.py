@@ -1,4 +1,4 @@
-"""Where UAVs stand, what they may choose, when they are ready and when they talk."""
+"""Positions, legal actions and readiness of UAVs, and the times at which they send messages."""
 
 import copy
 import math
@@ -40,7 +40,7 @@ from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 from damian.world.state import State
 
-# Where UAVs stand.
+# Positions on landing points.
 
 
 @both_kinds
@@ -74,7 +74,7 @@ def test_uavs_stand_on_landing_points_of_their_own_inside_the_region(n_agents, k
         moved += int((goal != before.goal).sum())
         clash = goal.unsqueeze(-1) == goal.unsqueeze(-2)
         clash &= ~torch.eye(n_agents, dtype=torch.bool)
-        if together:  # Two may share one point only as long as neither has left the start.
+        if together:  # Two UAVs may share a point only while neither has left the common start.
             stays = goal == before.goal
             both = stays.unsqueeze(-1) & stays.unsqueeze(-2)
             clash &= ~both
@@ -88,7 +88,7 @@ def test_uavs_stand_on_landing_points_of_their_own_inside_the_region(n_agents, k
     assert moved > 24 * n_agents
 
 
-def test_starts_are_different_points_or_one_or_those_given():
+def test_uavs_start_on_different_points_or_on_one_or_on_the_given_ones():
     apart = told(UavEnv(square(), num_worlds=64).reset()).position
     assert (torch.cdist(apart, apart) + 1e9 * torch.eye(3)).min() > 1
     region = RegionConfig(kind="vertices", vertices=SQUARE, start_together=True)
@@ -101,7 +101,7 @@ def test_starts_are_different_points_or_one_or_those_given():
     assert given[0].tolist() == expected
 
 
-# Choosing, flying, talking.
+# Decisions, flights and messages.
 
 
 def test_the_action_of_a_uav_that_is_not_ready_changes_nothing():
@@ -124,63 +124,63 @@ def test_the_action_of_a_uav_that_is_not_ready_changes_nothing():
 
 
 @pytest.mark.parametrize("sensing", [0.0, 2.5])
-def test_a_uav_is_ready_again_once_it_has_landed_and_sensed(sensing):
+def test_a_uav_is_ready_once_it_has_landed_and_sensed(sensing):
     motion = MotionConfig("polynomial", sensing_time=sensing)
     env = fresh(one_uav(motion=motion))
     assert env.reset()["agents", "ready"].all()
-    shown = [go(env, EAST)]
+    outputs = [go(env, EAST)]
     duration = flight(env)
     assert duration > 15
-    shown += [go(env, EAST) for _ in range(math.ceil(duration + sensing) - 1)]
-    for seconds, td in enumerate(shown, start=1):
+    outputs += [go(env, EAST) for _ in range(math.ceil(duration + sensing) - 1)]
+    for seconds, td in enumerate(outputs, start=1):
         assert td["agents", "ready"].item() == (seconds >= duration + sensing)
         assert td["agents", "message_sent"].item() == (seconds >= duration)
-    assert shown[-1]["agents", "ready"].item()
+    assert outputs[-1]["agents", "ready"].item()
 
 
-def test_in_flight_the_message_stays_the_last_one_and_its_time_does_too():
+def test_a_uav_in_flight_sends_no_new_message():
     env = fresh(one_uav(motion=FLYING))
     before = env.reset()["agents", "message"].clone()
-    flown = go(env, EAST)
-    duration, landing = flight(env), None
+    output = go(env, EAST)
+    duration = flight(env)
     for _ in range(math.ceil(duration) - 1):
-        assert not flown["agents", "message_sent"].item()
-        assert flown["agents", "message"].equal(before)
-        landing = flown = go(env, HERE)
-    message = told(landing)
-    assert landing["agents", "message_sent"].item()
+        assert not output["agents", "message_sent"].item()
+        assert output["agents", "message"].equal(before)
+        output = go(env, HERE)
+    message = told(output)
+    assert output["agents", "message_sent"].item()
     assert message.time.item() == math.ceil(duration)
     assert message.position[0, 0].equal(env.simulation.points[env.state.goal.item()])
     assert message.position.equal(message.target)
     assert message.track.item() == pytest.approx(math.pi / 2, abs=0.3)
 
 
-def test_in_flight_nobody_listens():
-    source = SourceConfig(level_db=130.0, position=[110.0, 100.0])  # On the way: 31.6 m are heard.
-    loud = one_uav(motion=MotionConfig("polynomial"), source=source)
-    loud.region.start_positions = [[20.0, 100.0]]
-    loud.actions.distances = [0.0, 200.0]
-    env = fresh(loud)
+def test_a_uav_in_flight_does_not_detect_the_source():
+    source = SourceConfig(level_db=130.0, position=[110.0, 100.0])  # on the way; its radius is 17.8 m
+    scenario = one_uav(motion=MotionConfig("polynomial"), source=source)
+    scenario.region.start_positions = [[20.0, 100.0]]
+    scenario.actions.distances = [0.0, 200.0]
+    env = fresh(scenario)
     go(env, EAST)
     near = False
     for _ in range(math.ceil(flight(env)) - 2):
-        shown = go(env, HERE)
-        away = torch.linalg.vector_norm(env.state.position[0, 0, :2] - env.state.source[0])
-        near |= bool(away < 10)
-        assert not told(shown).spotted.item()
+        output = go(env, HERE)
+        distance = torch.linalg.vector_norm(env.state.position[0, 0, :2] - env.state.source[0])
+        near |= bool(distance < 10)
+        assert not told(output).spotted.item()
     assert near
-    assert env.state.motions.item() == 1  # As after a detection it would not be.
+    assert env.state.motions.item() == 1  # a detection would have set it to 0
 
 
-def test_a_hold_of_no_distance_keeps_the_point_and_counts_as_a_motion():
+def test_an_action_of_distance_0_holds_and_counts_as_a_motion():
     env = fresh(one_uav())
     place = env.state.goal.clone()
-    shown = go(env, HERE, HERE, HERE)
+    output = go(env, HERE, HERE, HERE)
     assert env.state.goal.equal(place)
-    assert told(shown).motions.item() == 3
+    assert told(output).motions.item() == 3
 
 
-def test_a_target_outside_the_region_holds():
+def test_a_uav_whose_target_lies_outside_the_region_holds():
     env = fresh(one_uav())
     place = env.state.goal.clone()
     go(env, WEST)
@@ -202,7 +202,7 @@ def test_motions_count_from_the_latest_detection():
 
 
 @pytest.mark.parametrize("energy", [False, True])
-def test_a_masked_action_holds_and_a_legal_one_that_leads_elsewhere_moves(energy):
+def test_masked_actions_hold_and_legal_actions_lead_to_their_nearest_point(energy):
     battery = BatteryConfig(enabled=energy, capacity_kwh=0.05)
     scenario = ScenarioConfig(
         agents=1,
@@ -216,10 +216,10 @@ def test_a_masked_action_holds_and_a_legal_one_that_leads_elsewhere_moves(energy
     masked = reached = 0
     for _ in range(30):
         act(env, random_actions(env, generator))
-        # World 0's situation everywhere; then each world tries another action.
-        alike = [field[:1].expand_as(field).contiguous() for field in env.state[:-1]]
+        # Copy the state of world 0 to every world; then each world tries another action.
+        copies = [field[:1].expand_as(field).contiguous() for field in env.state[:-1]]
         level = 100 * torch.rand(1, generator=generator) if energy else torch.tensor([100.0])
-        state = State(*alike, env.state.sent)._replace(battery=level.expand(n_actions, 1).clone())
+        state = State(*copies, env.state.sent)._replace(battery=level.expand(n_actions, 1).clone())
         env.state = state
         legal = env.simulation.action_mask(state)[0, 0]
         act(env, torch.arange(n_actions)[:, None])
@@ -237,8 +237,8 @@ def test_in_flight_exactly_one_action_is_legal_and_it_holds():
     generator = torch.Generator().manual_seed(0)
     waiting = 0
     for _ in range(20):
-        shown = act(env, random_actions(env, generator))
-        mask, ready = shown["agents", "action_mask"], shown["agents", "ready"]
+        output = act(env, random_actions(env, generator))
+        mask, ready = output["agents", "action_mask"], output["agents", "ready"]
         assert (mask[~ready].sum(-1) == 1).all()
         assert (mask[~ready].int().argmax(-1) == 0).all()
         assert mask.any(-1).all()
@@ -246,13 +246,13 @@ def test_in_flight_exactly_one_action_is_legal_and_it_holds():
     assert waiting > 50
 
 
-def test_without_a_mask_none_is_shown():
+def test_the_action_mask_is_absent_if_it_is_switched_off():
     assert "action_mask" not in UavEnv(usecase(2)).reset()["agents"]
     assert "action_mask" in UavEnv(square()).reset()["agents"]
 
 
 @pytest.mark.parametrize("sensing_time", [0.0, 4.0])
-def test_the_trail_takes_one_place_for_each_decision_however_long_the_uav_senses(sensing_time):
+def test_each_decision_adds_one_point_to_the_trail_however_long_the_uav_senses(sensing_time):
     scenario = everything("polynomial", episode=EpisodeConfig(max_steps=None))
     scenario.motion.sensing_time = sensing_time
     env = fresh(scenario, num_worlds=8)
@@ -262,8 +262,8 @@ def test_the_trail_takes_one_place_for_each_decision_however_long_the_uav_senses
     landings = 0
     for _ in range(60):
         due |= env.simulation.ready(env.state)
-        shown = act(env, random_actions(env, generator))
-        for b, n in (due & shown["agents", "message_sent"]).nonzero().tolist():
+        output = act(env, random_actions(env, generator))
+        for b, n in (due & output["agents", "message_sent"]).nonzero().tolist():
             expected[b][n] = [env.state.goal[b, n].item(), *expected[b][n][:-1]]
             due[b, n] = False
             landings += 1
@@ -271,7 +271,7 @@ def test_the_trail_takes_one_place_for_each_decision_however_long_the_uav_senses
     assert landings > 50
 
 
-def test_a_uav_that_cannot_fly_there_keeps_nobody_else_from_a_point():
+def test_a_point_out_of_reach_of_one_uav_stays_free_for_others():
     actions = ActionConfig(kind="continuous")
     env = fresh(square(agents=2, battery=BatteryConfig(enabled=True), actions=actions))
     aim, *pair = (env.simulation.points - 100.0).norm(dim=-1).argsort()[:3].tolist()

@@ -1,4 +1,4 @@
-"""Actions against plain loops: booking in index order, nearest points, inside tests, the table."""
+"""Actions against plain loops: booking in index order, nearest points, inside tests, the action table."""
 
 import math
 
@@ -19,12 +19,12 @@ from damian.world.landing import ActionConfig, Candidates, Ranking, assign_landi
 from damian.world.regions.region import Region
 
 
-def fleets(seed, n_worlds, n_agents, n_points, together):
-    """Random preferences, standing points (``together``: of few) and who may choose."""
+def random_bookings(seed, n_worlds, n_agents, n_points, together):
+    """Random preferences, standing points (at most 3 if ``together``) and flags of UAVs that may choose."""
     rng = np.random.default_rng(seed)
     n_candidates = min(2 * n_agents - 1, n_points)
     ranked = np.stack([rng.permutation(n_points)[:n_candidates] for _ in range(40)])
-    # Alike preferences make contention: many UAVs share a row.
+    # Few different preferences make UAVs compete: many UAVs share a row.
     row = rng.integers(0, rng.integers(1, 40, endpoint=True), (n_worlds, n_agents))
     if together:
         standing = rng.integers(0, min(n_points, 3), (n_worlds, n_agents))
@@ -35,7 +35,7 @@ def fleets(seed, n_worlds, n_agents, n_points, together):
 
 
 def booked(ranked, row, standing, ready, n_points):
-    """Points booked by UAVs that are ready or not, however far they can fly."""
+    """Points booked by UAVs, ready or not, whose reach is unlimited."""
     ranking = Ranking(ranked, torch.zeros(ranked.shape))
     return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0), n_points)
 
@@ -48,7 +48,7 @@ def booked(ranked, row, standing, ready, n_points):
 )
 def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
     n_points = n_agents + spare
-    case = fleets(seed, 6, n_agents, n_points, together)
+    case = random_bookings(seed, 6, n_agents, n_points, together)
     ranked, row, standing, ready = map(torch.as_tensor, case)
     ours = booked(ranked.int(), row, standing, ready, n_points)
     expected = [
@@ -60,35 +60,35 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
 
 @given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(2, 12), spare=st.integers(0, 6))
 def test_uavs_on_different_points_never_book_the_same(seed, n_agents, spare):
-    case = fleets(seed, 20, n_agents, n_agents + spare, False)
+    case = random_bookings(seed, 20, n_agents, n_agents + spare, False)
     ranked, row, standing, ready = map(torch.as_tensor, case)
     ours = booked(ranked.int(), row, standing, ready, n_agents + spare)
     assert all(len(set(world)) == n_agents for world in ours.tolist())
     assert ours[~ready].equal(standing[~ready])
 
 
-def test_of_two_that_want_one_point_the_first_gets_it_and_the_other_its_next():
+def test_of_two_uavs_that_choose_one_point_the_first_gets_it_and_the_other_its_next():
     ranked = torch.tensor([[5, 7, 1], [5, 0, 2]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 1], [1, 0]]), torch.tensor([[1, 2], [1, 2]])
     ready = torch.ones(2, 2, dtype=torch.bool)
     assert booked(ranked, row, standing, ready, 8).tolist() == [[5, 0], [5, 7]]
 
 
-def test_a_point_that_is_left_in_this_step_is_not_free_yet():
+def test_a_point_that_a_uav_leaves_in_this_step_is_not_free_yet():
     ranked = torch.tensor([[5, 7, 1], [1, 6, 2]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
     ready = torch.ones(1, 2, dtype=torch.bool)
     assert booked(ranked, row, standing, ready, 8).tolist() == [[5, 6]]
 
 
-def test_a_point_out_of_reach_is_left_to_whoever_can_fly_there():
+def test_a_point_out_of_reach_of_one_uav_goes_to_another_that_can_fly_there():
     ranking = Ranking(torch.tensor([[5, 7, 1], [5, 2, 0]]), torch.tensor([[9.0, 4.0, 0.0], [9.0, 0.0, 4.0]]))
     row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
     assert assign_landing_points(ranking, row, standing, torch.tensor([[8.0, 9.0]]), 8).tolist() == [[1, 5]]
     assert assign_landing_points(ranking, row, standing, torch.tensor([[9.0, 9.0]]), 8).tolist() == [[5, 2]]
 
 
-def test_from_a_common_start_one_may_stay_and_the_others_leave():
+def test_uavs_on_a_common_start_may_stay_there_or_leave():
     ranked = torch.tensor([[3, 0, 1, 2, 4], [4, 0, 1, 2, 3]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 0, 1]]), torch.tensor([[3, 3, 3]])
     ready = torch.ones(1, 3, dtype=torch.bool)
@@ -96,11 +96,11 @@ def test_from_a_common_start_one_may_stay_and_the_others_leave():
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_points=st.integers(1, 40), integer_grid=st.booleans())
-def test_nearest_points_are_numpys_and_ties_go_to_the_lowest_id(seed, n_points, integer_grid):
+def test_nearest_points_equal_numpys_and_ties_go_to_the_lowest_id(seed, n_points, integer_grid):
     rng = np.random.default_rng(seed)
     points = rng.uniform(-200, 200, (n_points, 2)).astype(np.float32)
     targets = rng.uniform(-200, 200, (7, 2)).astype(np.float32)
-    if integer_grid:  # Whole metres: many equal distances.
+    if integer_grid:  # whole metres, with many equal distances
         points, targets = (np.round(x / 50).astype(np.float32) for x in (points, targets))
     squared = ((points.astype(float) - targets[:, None].astype(float)) ** 2).sum(-1)
     expected = np.argsort(squared, axis=1, kind="stable")
@@ -109,7 +109,7 @@ def test_nearest_points_are_numpys_and_ties_go_to_the_lowest_id(seed, n_points, 
     assert ours.tolist() == expected[:, :n].tolist()
 
 
-def test_padded_points_are_nobodys_nearest():
+def test_padded_points_are_never_nearest():
     points = torch.tensor([[9e3, 9e3], [torch.inf, torch.inf], [-9e3, 0.0]])
     assert nearest_points(points, torch.zeros(1, 2), 2).tolist() == [[2, 0]]
 
@@ -133,34 +133,35 @@ def star(rng):
 
 
 def check_inside(polygon, rng):
+    """Assert that ``inside`` agrees with shapely at random targets away from the boundary."""
     airspace = build_airspace([Region(polygon, "test", None, None)], 1.0, 45.0, None, 1)
     west, south, east, north = polygon.bounds
     target = rng.uniform([west - 1, south - 1], [east + 1, north + 1], (2000, 2))
-    # A quarter of the targets on the level of some corner, where rays meet edges' ends.
+    # A quarter of the targets have the y of some corner, so that their rays meet the ends of edges.
     corners = shapely.get_coordinates(polygon)
     target[:500, 1] = corners[rng.integers(len(corners), size=500), 1]
     target = target.astype(np.float32).astype(float)
-    clear = shapely.distance(polygon.boundary, shapely.points(target)) > 1e-3
-    assert clear.sum() > 1500
-    ours = inside(airspace.edges[0], torch.as_tensor(target[clear], dtype=torch.float32))
-    expected = shapely.contains_xy(polygon, target[clear])
+    off_boundary = shapely.distance(polygon.boundary, shapely.points(target)) > 1e-3
+    assert off_boundary.sum() > 1500
+    ours = inside(airspace.edges[0], torch.as_tensor(target[off_boundary], dtype=torch.float32))
+    expected = shapely.contains_xy(polygon, target[off_boundary])
     assert 0 < expected.sum() < len(expected)
     assert ours.numpy().tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize("name", POLYGONS)
-def test_inside_is_shapelys_contains(name):
+def test_inside_equals_shapelys_contains(name):
     check_inside(POLYGONS[name], np.random.default_rng(3))
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_inside_is_shapelys_contains_for_jagged_polygons(seed):
+def test_inside_equals_shapelys_contains_for_jagged_polygons(seed):
     rng = np.random.default_rng(seed)
     check_inside(star(rng), rng)
 
 
 def candidates(kind):
-    """A region with a notch, and one kind of actions."""
+    """Candidates and action settings for two regions, the first with a notch, and one kind of actions."""
     notch = Polygon([(0, 0), (210, 0), (210, 190), (120, 190), (100, 60), (80, 190), (0, 190)])
     regions = [Region(notch, "notch", None, None), Region(HORSESHOE.buffer(40), "oval", None, None)]
     airspace = build_airspace(regions, 30.0, 45.0, None, 3)
@@ -170,7 +171,7 @@ def candidates(kind):
     return Candidates(airspace, config, 3), config
 
 
-def test_the_discrete_table_equals_the_continuous_path():
+def test_discrete_and_continuous_actions_have_the_same_first_candidate():
     discrete, config = candidates("discrete")
     continuous, _ = candidates("continuous")
     airspace, table = discrete.airspace, config.table()
@@ -183,49 +184,49 @@ def test_the_discrete_table_equals_the_continuous_path():
         action = torch.tensor(share).expand(count, -1, -1)
         regions = torch.full((count,), region)
         ranking, row = discrete.rank(flat, regions, number)
-        loose, loose_row = continuous.rank(flat, regions, action)
-        assert loose_row.shape == row.shape == flat.shape
-        assert ranking.point[row][..., :1].long().equal(loose.point[loose_row][..., :1])
+        expected, expected_row = continuous.rank(flat, regions, action)
+        assert expected_row.shape == row.shape == flat.shape
+        assert ranking.point[row][..., :1].long().equal(expected.point[expected_row][..., :1])
         compared += row.numel()
     assert compared == 20 * int(airspace.n_points.sum())
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_candidates_are_the_points_nearest_the_target_or_the_own_one(kind):
-    ways, config = candidates(kind)
-    polygon = ways.airspace.regions[0].polygon
-    points = ways.airspace.points[0].tolist()
-    flat = torch.arange(int(ways.airspace.n_points[0]))[:, None]
+def test_candidates_are_the_points_nearest_the_target_or_the_uavs_own_point(kind):
+    tables, config = candidates(kind)
+    polygon = tables.airspace.regions[0].polygon
+    points = tables.airspace.points[0].tolist()
+    flat = torch.arange(int(tables.airspace.n_points[0]))[:, None]
     rng = np.random.default_rng(0)
     number = torch.as_tensor(rng.integers(config.n_actions, size=flat.shape))
     share = torch.as_tensor(rng.random((*flat.shape, 2)), dtype=torch.float32)
-    moves = config.table()[number[:, 0]]
+    displacements = config.table()[number[:, 0]]
     if kind == "continuous":
-        moves = share[:, 0] * torch.tensor([153.9, 2 * math.pi])
+        displacements = share[:, 0] * torch.tensor([153.9, 2 * math.pi])
     action = number if kind == "discrete" else share
-    ranking, row = ways.rank(flat, torch.zeros(len(flat), dtype=torch.long), action)
+    ranking, row = tables.rank(flat, torch.zeros(len(flat), dtype=torch.long), action)
     outside = 0
-    for own, (distance, bearing) in enumerate(moves.tolist()):
+    for own, (distance, bearing) in enumerate(displacements.tolist()):
         x, y = points[own]
         target = (x + distance * math.sin(bearing), y + distance * math.cos(bearing))
-        found = ranking.point[row[own, 0]].tolist()
-        assert len(found) == 2 * 3 - 1
+        ranked = ranking.point[row[own, 0]].tolist()
+        assert len(ranked) == 2 * 3 - 1
         if shapely.contains_xy(polygon, *target):
-            far = sorted(math.dist(p, target) for p in points)
-            assert [math.dist(points[p], target) for p in found] == pytest.approx(far[:5], abs=1e-3)
+            nearest = sorted(math.dist(p, target) for p in points)[:5]
+            assert [math.dist(points[p], target) for p in ranked] == pytest.approx(nearest, abs=1e-3)
         else:
-            assert found == [own] * 5
+            assert ranked == [own] * 5
             outside += 1
-    assert 10 < outside < len(moves) - 10
+    assert 10 < outside < len(displacements) - 10
 
 
-def test_headings_turn_clockwise_from_north():
-    moved = displacement(torch.tensor([10.0] * 4), torch.tensor([0.0, 90, 180, 270]).deg2rad())
+def test_headings_are_clockwise_from_north():
+    displaced = displacement(torch.tensor([10.0] * 4), torch.tensor([0.0, 90, 180, 270]).deg2rad())
     expected = [[0.0, 10.0], [10.0, 0.0], [0.0, -10.0], [-10.0, 0.0]]
-    assert moved.tolist() == [pytest.approx(pair, abs=1e-5) for pair in expected]
+    assert displaced.tolist() == [pytest.approx(pair, abs=1e-5) for pair in expected]
 
 
-def test_the_table_holds_every_distance_with_every_heading_distance_by_distance():
+def test_the_table_holds_every_heading_of_the_first_distance_then_of_the_next():
     config = ActionConfig(distances=[0.0, 10.0], headings=[0.0, 90.0, -90.0])
     expected = [[d, math.radians(h)] for d in (0.0, 10.0) for h in (0.0, 90.0, -90.0)]
     assert config.n_actions == 6

@@ -1,4 +1,4 @@
-"""Flights: golden trajectories of the original, its flight run, limits, and an obvious twin."""
+"""Flights, against recorded trajectories of the original, their limits, and a slow reference (twin)."""
 
 import json
 import math
@@ -34,14 +34,14 @@ class Times(NamedTuple):
 
 
 def phase_times(origin, target, level, motion):
-    """Shortest takeoff (and landing) and cruise of a flight."""
+    """Shortest durations of takeoff (and landing) and of cruise [s]."""
     limits = (motion.degree, motion.max_speed, motion.max_acceleration)
     cruise = torch.linalg.vector_norm(target - origin, dim=-1)
     return Times(minimum_time(level, *limits), minimum_time(cruise, *limits))
 
 
 def slow_law(tau, degree):
-    """The time laws as SPEC 1 prints them."""
+    """The time laws as printed polynomials (paper, eq. 1)."""
     tau = min(max(tau, 0.0), 1.0)
     return {
         3: 3 * tau**2 - 2 * tau**3,
@@ -51,7 +51,7 @@ def slow_law(tau, degree):
 
 
 def slow_pose(origin, target, level, elapsed, *, vertical, cruise, degree):
-    """One UAV, one branch per phase."""
+    """Position and distance cruised of one UAV, with one branch per phase."""
     length = math.dist(origin, target)
     if elapsed < vertical:
         return [*origin, level * slow_law(elapsed / vertical, degree)], 0.0
@@ -73,19 +73,19 @@ def derivatives(length, time, degree, n=2001):
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_a_time_law_equals_its_printed_polynomial_and_is_clamped(degree):
+def test_time_laws_equal_their_printed_polynomials_and_are_clamped(degree):
     tau = torch.linspace(-0.5, 1.5, 401, dtype=torch.float64)
     expected = [slow_law(t, degree) for t in tau.tolist()]
     torch.testing.assert_close(time_law(tau, degree), torch.tensor(expected, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_a_time_law_ends_exactly_in_float32(degree):
+def test_time_laws_are_exact_at_both_ends_in_float32(degree):
     assert time_law(torch.tensor([0.0, 1.0]), degree).tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c['degree']}-{c['flight_level']}")
-def test_golden_flights_take_the_same_time(case):
+def test_recorded_flights_take_the_same_time(case):
     motion = MotionConfig(
         degree=case["degree"], max_speed=case["max_speed"], max_acceleration=case["max_acc"]
     )
@@ -102,7 +102,7 @@ def test_golden_flights_take_the_same_time(case):
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c['degree']}-{c['flight_level']}")
-def test_golden_flights_have_the_same_positions_velocities_and_accelerations(case):
+def test_recorded_flights_have_the_same_positions_velocities_and_accelerations(case):
     start = {"takeoff": 0.0, "flight": case["T_takeoff"]}
     start["landing"] = case["T_takeoff"] + case["T_flight"]
     rows = case["continuous_samples_phase_t_pos_vel_acc"]
@@ -126,28 +126,28 @@ def test_golden_flights_have_the_same_positions_velocities_and_accelerations(cas
         velocity.append(v)
         acceleration.append(torch.autograd.grad(v.sum(), elapsed, retain_graph=True)[0])
     torch.testing.assert_close(pose.position.detach(), expected[:, :3], atol=1e-4, rtol=0)
-    # Where two phases meet their derivatives differ, so those are compared strictly inside.
+    # Derivatives jump where two phases meet, so they are compared only inside the phases.
     inside = [i for i in range(n) if i % 5 in (1, 2, 3)]
     torch.testing.assert_close(torch.stack(velocity, -1)[inside], expected[inside, 3:6], atol=1e-4, rtol=0)
     torch.testing.assert_close(torch.stack(acceleration, -1)[inside], expected[inside, 6:], atol=1e-4, rtol=0)
 
 
-def test_the_golden_flight_run_has_the_same_times_and_positions():
+def test_the_recorded_flight_run_has_the_same_times_and_positions():
     motion = MotionConfig(kind="polynomial", degree=5, max_speed=5.0, max_acceleration=2.0)
     compared = landed = 0
     for row in FLIGHT_RUN:
         if row["start"] == row["target"]:
-            landed += 1  # The original has already moved the start on.
+            landed += 1  # the original has already replaced the start by the target
             continue
         origin, target = (torch.tensor(row[k], dtype=torch.float64) for k in ("start", "target"))
         level = torch.tensor(2.0, dtype=torch.float64)
         times = phase_times(origin, target, level, motion)
         assert [*times, times.vertical] == pytest.approx(row["T"][:2] + row["T"][2:], abs=1e-4)
-        # It samples a phase at its counter, before it adds dt = 1 s.
+        # The original samples a phase at its counter before it adds dt = 1 s to it.
         phase = max(i for i, counter in enumerate(row["counters"]) if counter > 0)
-        into_phase = row["counters"][phase] - 1.0
-        began = [0.0, row["T"][0], row["T"][0] + row["T"][1]][phase]
-        pose = fly(origin, target, level, torch.tensor(began + into_phase), *times, 5)
+        since_phase_start = row["counters"][phase] - 1.0
+        phase_start = [0.0, row["T"][0], row["T"][0] + row["T"][1]][phase]
+        pose = fly(origin, target, level, torch.tensor(phase_start + since_phase_start), *times, 5)
         assert pose.position.tolist() == pytest.approx(row["pos"], abs=1e-4)
         compared += 1
     assert compared + landed == len(FLIGHT_RUN)
@@ -156,7 +156,7 @@ def test_the_golden_flight_run_has_the_same_times_and_positions():
 
 @pytest.mark.parametrize("degree", DEGREES)
 @given(length=sizes, speed=limits, acceleration=limits)
-def test_minimum_times_reach_a_limit_and_exceed_none(degree, length, speed, acceleration):
+def test_minimum_times_reach_one_limit_and_exceed_none(degree, length, speed, acceleration):
     time = minimum_time(torch.tensor(length, dtype=torch.float64), degree, speed, acceleration)
     v, a = derivatives(length, time, degree)
     fastest, hardest = (x.abs().max().item() for x in (v, a))
@@ -165,16 +165,16 @@ def test_minimum_times_reach_a_limit_and_exceed_none(degree, length, speed, acce
     assert max(fastest / speed, hardest / acceleration) >= 1 - 1e-4
 
 
-def test_a_phase_of_no_length_takes_no_time():
+def test_a_phase_of_length_0_takes_no_time():
     assert minimum_time(torch.zeros(3), 5, 5.0, 2.0).tolist() == [0.0] * 3
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_flying_equals_its_twin_at_dense_times(degree):
+def test_flights_equal_those_of_the_twin_at_dense_times(degree):
     motion = MotionConfig(degree=degree)
     generator = torch.Generator().manual_seed(degree)
     origin, target = 100 * torch.randn(2, 4, 3, 1, 2, generator=generator, dtype=torch.float64)
-    target[0, 0] = origin[0, 0]  # A UAV that only goes up and down.
+    target[0, 0] = origin[0, 0]  # a UAV that only goes up and down
     level = torch.tensor([1.0, 1.5, 8.0], dtype=torch.float64)[:, None].expand(4, 3, 1)
     times = phase_times(origin, target, level, motion)
     share = torch.linspace(-0.02, 1.1, 200, dtype=torch.float64)
@@ -198,12 +198,12 @@ def test_flying_equals_its_twin_at_dense_times(degree):
                 assert pose.cruised[b, n, k].item() == pytest.approx(cruised, abs=1e-9)
 
 
-def test_a_flight_that_is_over_stands_exactly_at_its_target():
+def test_a_uav_whose_flight_is_over_stands_exactly_at_its_target():
     origin, target = torch.tensor([[3.7, -8.1]]), torch.tensor([[-91.3, 77.7]])
     level = torch.tensor([3.5])
     times = phase_times(origin, target, level, MotionConfig())
-    for late in (0.0, 0.5, 1000.0):
-        elapsed = 2 * times.vertical + times.cruise + late
+    for since_landing in (0.0, 0.5, 1000.0):
+        elapsed = 2 * times.vertical + times.cruise + since_landing
         pose = fly(origin, target, level, elapsed, *times, 5)
         assert pose.position[0, :2].tolist() == target[0].tolist()
         assert pose.position[0, 2].item() == pytest.approx(0.0, abs=1e-6)
@@ -211,7 +211,7 @@ def test_a_flight_that_is_over_stands_exactly_at_its_target():
         assert pose.cruised.item() == pytest.approx(math.dist(origin[0], target[0]), rel=1e-6)
 
 
-def test_a_hop_on_the_spot_goes_up_and_down_and_nowhere_else():
+def test_a_flight_to_its_own_start_only_goes_up_and_down():
     here, level = torch.tensor([3.0, 4.0]), torch.tensor(2.0)
     times = phase_times(here, here, level, MotionConfig())
     for share, height in ((0.0, 0.0), (0.5, 1.0), (1.0, 2.0), (1.5, 1.0), (2.0, 0.0)):
@@ -220,7 +220,7 @@ def test_a_hop_on_the_spot_goes_up_and_down_and_nowhere_else():
         assert pose.cruised.item() == 0.0
 
 
-def test_flying_compiles_to_one_graph():
+def test_flights_compile_to_one_graph():
     motion = MotionConfig()
 
     def flight(origin, target, level, elapsed):
@@ -232,7 +232,7 @@ def test_flying_compiles_to_one_graph():
         torch.testing.assert_close(one, other)
 
 
-def test_flight_levels_are_separated_and_lie_within_bounds():
+def test_flight_levels_are_separated_and_lie_within_their_bounds():
     config = MotionConfig(min_level=1.0, max_level=2.2, level_separation=0.4)
     assert flight_levels(config, 4) == pytest.approx([1.0, 1.4, 1.8, 2.2])
     assert len(flight_levels(MotionConfig(max_level=1.7, level_separation=0.1), 8)) == 8

@@ -1,4 +1,4 @@
-"""The source: sound, walks over many polygons, and where it is (integrated speed profiles)."""
+"""The signal source: footprint radius, walks in many polygons, and positions by integrated speed profiles."""
 
 import json
 import math
@@ -38,7 +38,7 @@ POLYGONS = {
 DYNAMIC = SourceConfig(motion="dynamic")
 
 
-def drawn(polygon=USE_CASE, n=8, seed=0, **settings_):
+def dynamic_walks(polygon=USE_CASE, n=8, seed=0, **settings_):
     config = SourceConfig(motion="dynamic", **settings_)
     return draw_walks(polygon, config, n, np.random.default_rng(seed))
 
@@ -52,12 +52,12 @@ def n_stops(walk):
 
 
 def leg_lengths(walk):
-    """Lengths of all real legs."""
+    """Lengths of all legs between real stops [m]."""
     return walk.stop.diff(dim=1).norm(dim=-1)[walk.arrive[:, 1:].isfinite()]
 
 
 def twin_duration(length, speed, acceleration):
-    """Longhand: two ramps and a coast, or two ramps that meet."""
+    """Duration of a leg: two ramps and a constant speed between them, or two ramps that meet."""
     if length == 0:
         return 0.0
     ramp = speed**2 / (2 * acceleration)
@@ -67,7 +67,7 @@ def twin_duration(length, speed, acceleration):
 
 
 def twin_covered(length, speed, acceleration, elapsed, n=4000):
-    """Integrate the speed: rise, hold, fall, whichever allows least (midpoint rule)."""
+    """Integrate the speed, the least of rising, largest and falling speed, by the midpoint rule."""
     duration = twin_duration(length, speed, acceleration)
     end = min(max(elapsed, 0.0), duration)
     t = (np.arange(n) + 0.5) * end / n
@@ -76,7 +76,7 @@ def twin_covered(length, speed, acceleration, elapsed, n=4000):
 
 
 def twin_position(walk, w, time):
-    """One walk, searched from its first stop on."""
+    """Position [m] and latest stop of walk w at a time, by a search over its stops."""
     stop, arrive, depart, speed, acceleration = (x[w].tolist() for x in walk[:5])
     n = sum(math.isfinite(a) for a in arrive)
     k = max(i for i in range(n) if arrive[i] <= time)
@@ -87,7 +87,7 @@ def twin_position(walk, w, time):
     return [a + share * (b - a) for a, b in zip(stop[k], stop[k + 1], strict=True)], k
 
 
-def test_the_footprint_radius_is_the_golden_one():
+def test_the_footprint_radius_equals_the_recorded_one():
     assert footprint_radius(SourceConfig()) == pytest.approx(SCENARIO["footprint_radius_m"])
     assert footprint_radius(SourceConfig()) == pytest.approx(56.23413252, abs=1e-8)
 
@@ -101,22 +101,22 @@ def test_the_footprint_radius_follows_from_power_and_intensity():
 
 @example(length=1e-18, speed=1.0, acceleration=0.05)
 @given(length=st.floats(0, 2000), speed=st.floats(0.1, 50), acceleration=st.floats(0.05, 20))
-def test_a_leg_takes_as_long_as_its_ramps_and_its_coast(length, speed, acceleration):
+def test_the_duration_of_a_leg_is_that_of_its_ramps_and_its_constant_speed(length, speed, acceleration):
     values = (torch.tensor(x, dtype=torch.float64) for x in (length, speed, acceleration))
     expected = twin_duration(length, speed, acceleration)
     assert leg_duration(*values).item() == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 @given(length=st.floats(0.01, 2000), speed=st.floats(0.1, 50), acceleration=st.floats(0.05, 20))
-def test_a_leg_covers_its_length_in_its_time_and_not_sooner(length, speed, acceleration):
+def test_a_leg_covers_its_length_in_its_duration_and_not_sooner(length, speed, acceleration):
     values = [torch.tensor(x, dtype=torch.float64) for x in (length, speed, acceleration)]
     duration = leg_duration(*values).item()
     assert twin_covered(length, speed, acceleration, duration) == pytest.approx(length, rel=1e-3)
     assert twin_covered(length, speed, acceleration, 0.9 * duration) < length * 0.99
 
 
-def golden_legs():
-    """(first leg of all, length, the original's time) of each leg that it recorded."""
+def recorded_legs():
+    """Whether a leg of the original is the first of its run, its length [m] and its duration [s]."""
     for run in GOLDEN["source_motion_action_delay"]:
         places = [place[:2] for place in run["hotspot_walk"]]
         moving = [dict(zip(run["columns"], row, strict=True)) for row in run["rows"]]
@@ -126,11 +126,11 @@ def golden_legs():
             yield k == 1, math.dist(places[k - 1], places[k]), time
 
 
-def test_golden_legs_take_the_same_time():
-    # Left out: triangular legs, which the original times as if they reached their largest speed,
-    # and legs whose time it forgot to renew. Lengths are between planned stops.
+def test_recorded_legs_take_the_same_time():
+    # Left out are triangular legs, which the original times as if they reached their largest speed,
+    # and legs for which it kept the time of the leg before. Lengths are between planned stops.
     compared, triangular, stale, before = 0, 0, 0, math.nan
-    for first, length, theirs in golden_legs():
+    for first, length, theirs in recorded_legs():
         local = (DYNAMIC.local_speed, DYNAMIC.local_acceleration)
         speed, acceleration = (DYNAMIC.speed, DYNAMIC.acceleration) if first else local
         values = (torch.tensor(x, dtype=torch.float64) for x in (length, speed, acceleration))
@@ -146,7 +146,7 @@ def test_golden_legs_take_the_same_time():
     assert (compared, triangular, stale) == (8, 2, 3)
 
 
-def test_a_static_source_stays_where_it_is_put_for_ever():
+def test_a_static_source_stays_at_its_configured_position():
     config = SourceConfig(position=SCENARIO["source_position"])
     walk = draw_walks(USE_CASE, config, 3, np.random.default_rng(0))
     assert walk.stop.shape == (3, 1, 2)
@@ -168,8 +168,8 @@ def test_static_sources_are_drawn_inside_the_polygon(name):
 
 @pytest.mark.parametrize("name", POLYGONS)
 def test_every_stop_is_inside_the_polygon_and_near_its_hotspot(name):
-    walk = drawn(POLYGONS[name], n=20, local_distance=40.0)
-    # A millimetre for the rounding to float32.
+    walk = dynamic_walks(POLYGONS[name], n=20, local_distance=40.0)
+    # The tolerance of a millimetre allows for the rounding to float32.
     places = shapely.points(walk.stop.double().numpy())
     assert shapely.dwithin(POLYGONS[name], places, 1e-3).all()
     hotspots = 0
@@ -185,35 +185,35 @@ def test_every_stop_is_inside_the_polygon_and_near_its_hotspot(name):
 
 def test_inner_points_fill_the_part_of_the_disc_inside_the_polygon():
     box = shapely.box(0, 0, 60, 60)
-    walk = drawn(box, n=400, n_hotspots=1, min_stops=7, position=[30.0, 0.5], local_distance=20.0)
+    walk = dynamic_walks(box, n=400, n_hotspots=1, min_stops=7, position=[30.0, 0.5], local_distance=20.0)
     inner = walk.stop[:, 1:].reshape(-1, 2)
     distance = (inner - torch.tensor([30.0, 0.5])).norm(dim=1)
-    # Uniform in (almost) a half disc: half of the points lie beyond 20 / sqrt(2) m.
+    # Points are uniform in nearly a half disc, so half of them lie beyond 20 / sqrt(2) m.
     assert (distance > 20 / math.sqrt(2)).float().mean().item() == pytest.approx(0.5, abs=0.05)
     assert (inner[:, 0] > 30).float().mean().item() == pytest.approx(0.5, abs=0.05)
 
 
-def test_even_in_a_sliver_a_source_moves_around_its_hotspot():
-    walk = in_double(drawn(SLIVER))
+def test_a_source_moves_around_its_hotspot_even_in_a_thin_polygon():
+    walk = in_double(dynamic_walks(SLIVER))
     assert leg_lengths(walk).median() > 1e-4
 
 
-def test_a_walk_begins_at_the_given_place():
-    walk = drawn(position=[51.5, 32.5])
+def test_a_walk_begins_at_the_configured_position():
+    walk = dynamic_walks(position=[51.5, 32.5])
     assert walk.stop[:, 0].tolist() == [[51.5, 32.5]] * 8
     assert (walk.stop[0, 1] != walk.stop[1, 1]).any()
 
 
-def test_a_given_place_outside_the_polygon_is_refused():
+def test_a_position_outside_the_polygon_is_refused():
     with pytest.raises(InputError) as error:
-        drawn(HOLE, position=[0.0, 10.0])
+        dynamic_walks(HOLE, position=[0.0, 10.0])
     assert str(error.value) == (
         "source.position: [0.0, 10.0] m is not inside the polygon (x -100 to 100 m, y -100 to 100 m)"
     )
 
 
-def test_waits_and_legs_follow_each_other():
-    walk = in_double(drawn(n=20))
+def test_waits_and_legs_alternate_without_gaps():
+    walk = in_double(dynamic_walks(n=20))
     for w, n in enumerate(n_stops(walk).tolist()):
         arrive, depart = walk.arrive[w, :n].tolist(), walk.depart[w, :n].tolist()
         assert arrive[0] == 0.0
@@ -229,7 +229,7 @@ def test_waits_and_legs_follow_each_other():
 
 
 def test_padded_stops_repeat_the_last_one_and_are_never_reached():
-    walk = drawn(n=20)
+    walk = dynamic_walks(n=20)
     assert len(n_stops(walk).unique()) > 1
     assert n_stops(walk).max() == walk.arrive.shape[1]
     for w, n in enumerate(n_stops(walk).tolist()):
@@ -250,7 +250,7 @@ def test_a_position_equals_the_integrated_speed_profile(
     *, seed, speed, acceleration, max_stops, n_hotspots, share
 ):
     walk = in_double(
-        drawn(
+        dynamic_walks(
             n=3,
             seed=seed,
             speed=speed,
@@ -270,7 +270,7 @@ def test_a_position_equals_the_integrated_speed_profile(
         assert located.stop[w].item() == stop
 
 
-def test_a_triangular_leg_is_half_done_at_half_time_and_never_reaches_its_speed():
+def test_a_triangular_leg_accelerates_for_half_its_length_and_then_decelerates():
     stop = torch.tensor([[[0.0, 0.0], [0.0, 8.0]]])
     speed, acceleration = torch.full((1, 2), 20.0), torch.full((1, 2), 2.0)
     arrive, depart = torch.tensor([[0.0, 14.0]]), torch.tensor([[10.0, 20.0]])
@@ -281,7 +281,7 @@ def test_a_triangular_leg_is_half_done_at_half_time_and_never_reaches_its_speed(
 
 
 def traced(walk, n):
-    """Positions along whole walks at n equal steps, [n, W, 2], and the steps, [W] seconds."""
+    """Positions [n, W, 2] of whole walks at n equally spaced times, ``locate``'s result, times, spacing."""
     step = walk.depart[:, -1] * 1.05 / (n - 1)
     repeated = Walk(*(x.repeat(n, *[1] * (x.ndim - 1)) for x in walk))
     times = torch.arange(n, dtype=torch.float64)[:, None] * step
@@ -289,13 +289,13 @@ def traced(walk, n):
     return located.position.reshape(n, -1, 2), located, times, step
 
 
-def test_positions_are_continuous_and_never_faster_than_their_speed():
-    walk = in_double(drawn(n=4, n_hotspots=3, min_wait=1.0, max_wait=10.0))
+def test_positions_are_continuous_and_never_exceed_the_largest_speed():
+    walk = in_double(dynamic_walks(n=4, n_hotspots=3, min_wait=1.0, max_wait=10.0))
     positions, located, times, step = traced(walk, 20_000)
     moved = positions.diff(dim=0).norm(dim=-1)
     stop = located.stop.reshape(times.shape)
     allowed = walk.speed.gather(1, stop.T).T
-    # Legs end a rounding of the arrival's float32 early or late.
+    # Arrival times are rounded to float32, so legs end slightly early or late.
     slack = 5e-3
     either = torch.maximum(allowed[1:], allowed[:-1])
     assert (moved <= either * step + slack).all()
@@ -303,7 +303,7 @@ def test_positions_are_continuous_and_never_faster_than_their_speed():
 
 
 def test_a_source_stays_exactly_at_a_stop_while_it_waits():
-    walk = in_double(drawn(n=6))
+    walk = in_double(dynamic_walks(n=6))
     for k in (0, 1, 5, 20):
         for share in (0.0, 0.5, 1.0):
             time = walk.arrive[:, k] + share * (walk.depart[:, k] - walk.arrive[:, k])
@@ -314,42 +314,42 @@ def test_a_source_stays_exactly_at_a_stop_while_it_waits():
 
 
 def test_a_walk_is_over_after_its_last_wait_and_the_source_stays_there():
-    walk = drawn(n=20)
+    walk = dynamic_walks(n=20)
     end = walk.depart[:, -1]
     assert end.isfinite().all()
     assert not locate(walk, 0.999 * end).finished.any()
-    for late in (end, end + 1, end + 1e6):
-        located = locate(walk, late)
+    for time in (end, end + 1, end + 1e6):
+        located = locate(walk, time)
         assert located.finished.all()
         assert (located.position == walk.stop[:, -1]).all()
         assert (located.stop == n_stops(walk) - 1).all()
 
 
 def test_a_walk_of_one_stop_ends_too():
-    walk = drawn(n_hotspots=1, min_stops=0, max_stops=0)
+    walk = dynamic_walks(n_hotspots=1, min_stops=0, max_stops=0)
     assert walk.stop.shape == (8, 1, 2)
     assert not locate(walk, torch.zeros(8)).finished.any()
     assert locate(walk, torch.full((8,), 361.0)).finished.all()
 
 
-def test_emission_is_drawn_per_stop_only_if_asked_for():
-    assert drawn().emits.all()
-    assert drawn(emission="per_step", emission_probability=0.0).emits.all()
-    walk = drawn(n=100, emission="per_stop", emission_probability=0.3)
+def test_walks_contain_random_emission_only_if_it_is_per_stop():
+    assert dynamic_walks().emits.all()
+    assert dynamic_walks(emission="per_step", emission_probability=0.0).emits.all()
+    walk = dynamic_walks(n=100, emission="per_stop", emission_probability=0.3)
     assert walk.emits.float().mean().item() == pytest.approx(0.3, abs=0.03)
     assert (walk.emits[:, 1:] != walk.emits[:, :-1]).any()
 
 
 def test_the_same_seed_draws_the_same_walks_in_float32():
-    for one, other in zip(drawn(seed=7), drawn(seed=7), strict=True):
+    for one, other in zip(dynamic_walks(seed=7), dynamic_walks(seed=7), strict=True):
         assert torch.equal(one, other)
         assert one.dtype in (torch.float32, torch.bool)
-    assert not torch.equal(drawn(seed=7).stop[:, :30], drawn(seed=8).stop[:, :30])
+    assert not torch.equal(dynamic_walks(seed=7).stop[:, :30], dynamic_walks(seed=8).stop[:, :30])
 
 
 @pytest.mark.parametrize("n_hotspots", [1, 4])
-def test_locating_compiles_to_one_graph(n_hotspots):
-    walk = drawn(n_hotspots=n_hotspots, min_stops=0, max_stops=n_hotspots - 1)
+def test_locate_compiles_to_one_graph(n_hotspots):
+    walk = dynamic_walks(n_hotspots=n_hotspots, min_stops=0, max_stops=n_hotspots - 1)
     compiled = torch.compile(locate, fullgraph=True, backend="eager")
     time = torch.linspace(0, 2000, 8)
     for one, other in zip(compiled(walk, time), locate(walk, time), strict=True):

@@ -1,4 +1,4 @@
-"""Whole rollouts beside a slow, obvious twin, and the coverage beside exact geometry."""
+"""Whole rollouts against the slow twin, and the coverage against exact geometry."""
 
 import math
 
@@ -27,14 +27,13 @@ from damian.world.landing import ActionConfig
 from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
-# The slow twin.
-
 TWIN_FEATURES = [name for name in GLOBAL if name != "coverage"]
-SHOWN = [*TWIN_FEATURES, *LOCAL]
+OBSERVED = [*TWIN_FEATURES, *LOCAL]
+"""Features in the order of the critic's observation."""
 
 
 def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> ScenarioConfig:
-    """Every term and feature but the coverage; odd distances, so that no two points tie."""
+    """Every reward term and feature except the coverage; uneven distances, so that no two points tie."""
     task = dict.fromkeys((*INDIVIDUAL, *SYSTEM), 0.5) | {"coverage": 0.0}
     return ScenarioConfig(
         agents=n_agents,
@@ -55,7 +54,7 @@ def twin_scenario(n_agents: int, kind: str, since: bool, estimate: str) -> Scena
 
 
 def twins(env: UavEnv) -> list[twin.World]:
-    """The slow worlds that begin as the environment's do."""
+    """The twin's worlds, in the initial conditions of the environment's worlds."""
     airspace, state, worlds = env.simulation.airspace, env.state, []
     for b, region in enumerate(state.region.tolist()):
         points = airspace.points[region, : airspace.n_points[region]].tolist()
@@ -78,47 +77,48 @@ def twins(env: UavEnv) -> list[twin.World]:
     return worlds
 
 
-def check_shown(world: twin.World, seen: torch.Tensor):
-    """The critic's observation [N, G] of one world."""
+def check_observation(world: twin.World, observation: torch.Tensor):
+    """Assert that the critic's observation [N, G] of one world equals the twin's."""
     columns = [
-        np.array(values).reshape(len(world.uavs), -1) for values in (world.observe()[name] for name in SHOWN)
+        np.array(values).reshape(len(world.uavs), -1)
+        for values in (world.observe()[name] for name in OBSERVED)
     ]
-    apart = np.abs(np.concatenate(columns, 1) - seen.numpy())
-    # Bearings and drifts are angles over a full turn: 0 is 1.
+    difference = np.abs(np.concatenate(columns, 1) - observation.numpy())
+    # Bearings and drifts are angles over a full turn, so 0 equals 1.
     widths = np.cumsum([0, *[c.shape[1] for c in columns]])
     for name in ("source_bearing", "source_drift"):
-        k = widths[SHOWN.index(name)]
-        apart[:, k] = np.minimum(apart[:, k], 1 - apart[:, k])
-    assert apart.max() < 1e-4
+        k = widths[OBSERVED.index(name)]
+        difference[:, k] = np.minimum(difference[:, k], 1 - difference[:, k])
+    assert difference.max() < 1e-4
 
 
 @pytest.mark.parametrize(("since", "estimate"), [(False, "mean"), (True, "newest")])
 @both_kinds
 @pytest.mark.parametrize("n_agents", [1, 2, 4])
-def test_rollouts_equal_those_of_a_slow_twin(n_agents, kind, since, estimate):
+def test_rollouts_equal_those_of_the_twin(n_agents, kind, since, estimate):
     env = UavEnv(twin_scenario(n_agents, kind, since, estimate), num_worlds=12, seed=n_agents)
     table = env.scenario.actions.table()
     generator = torch.Generator().manual_seed(n_agents)
     compared = ended = spotted = 0
     for _ in range(3):
-        shown = env.reset()
+        output = env.reset()
         worlds = twins(env)
         for b, world in enumerate(worlds):
-            check_shown(world, shown["agents", "global_observation"][b])
+            check_observation(world, output["agents", "global_observation"][b])
         for _ in range(8):
             action = random_actions(env, generator)
             moves = table[action] if kind == "discrete" else action * torch.tensor([118.4, math.tau])
-            shown = act(env, action)
+            output = act(env, action)
             for b, world in enumerate(worlds):
                 if any(world.ended):
                     continue
                 rewards = world.step(moves[b].tolist())
                 places = [list(uav.place) for uav in world.uavs]
-                assert told(shown).position[b].tolist() == places
-                check_shown(world, shown["agents", "global_observation"][b])
-                ours = shown["agents", "reward"][b, :, 0].tolist()
+                assert told(output).position[b].tolist() == places
+                check_observation(world, output["agents", "global_observation"][b])
+                ours = output["agents", "reward"][b, :, 0].tolist()
                 assert ours == pytest.approx(rewards, abs=1e-4)
-                flags = [shown[k][b].item() for k in ("success", "terminated", "truncated")]
+                flags = [output[k][b].item() for k in ("success", "terminated", "truncated")]
                 assert tuple(flags) == world.ended
                 spotted += sum(uav.spots for uav in world.uavs)
                 ended += any(world.ended)
@@ -128,7 +128,7 @@ def test_rollouts_equal_those_of_a_slow_twin(n_agents, kind, since, estimate):
     assert spotted > 10
 
 
-def test_the_coverage_counts_the_last_landing_points_within_a_hundredth():
+def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
     window = 3
     scenario = everything(
         observation=ObservationConfig(global_features=["coverage"], window=window),
@@ -140,23 +140,23 @@ def test_the_coverage_counts_the_last_landing_points_within_a_hundredth():
     radius = env.simulation.radius
     trails = env.state.position[..., :2].unsqueeze(2).expand(-1, -1, window, -1)
     for _ in range(5):
-        shown = act(env, random_actions(env, generator))
+        output = act(env, random_actions(env, generator))
         newest = env.state.position[..., :2].unsqueeze(2)
         trails = torch.cat([newest, trails[:, :, :-1]], 2)
         for b, region in enumerate(env.state.region.tolist()):
             polygon = env.simulation.airspace.regions[region].polygon
             expected = exact_coverage(polygon, trails[b].double().numpy(), radius)
-            assert shown["agents", "reward"][b, :, 0].tolist() == pytest.approx(expected, abs=0.01)
+            assert output["agents", "reward"][b, :, 0].tolist() == pytest.approx(expected, abs=0.01)
 
 
 def exact_coverage(polygon, trails, radius):
-    """Shares of fresh footprints by shapely, UAV by UAV; the newest landing point comes first."""
+    """Coverage of each UAV by shapely; the newest landing point of a trail comes first."""
     discs = [[shapely.Point(p).buffer(radius, quad_segs=64) for p in trail] for trail in trails]
     shares = []
     for i, own in enumerate(discs):
         areas = []
         for k, disc in enumerate(own):
-            lost = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
-            areas.append((disc & polygon).difference(shapely.union_all(lost)).area)
+            excluded = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
+            areas.append((disc & polygon).difference(shapely.union_all(excluded)).area)
         shares.append(np.mean(areas) / (math.pi * radius**2))
     return shares
