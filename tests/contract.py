@@ -1,4 +1,4 @@
-"""What the contract of the transforms is checked on: an environment with gradients, and a table of cases."""
+"""The cases on which the contract of the transforms is checked, and an environment that passes gradients."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,13 +22,14 @@ from damian.transforms import (
 )
 
 LATE = {"law": "uniform", "low": 1, "high": 3}
-ACTION, SEEN, REWARD = ("agents", "action"), ("agents", "observation"), ("agents", "reward")
+ACTION, OBSERVATION, REWARD = ("agents", "action"), ("agents", "observation"), ("agents", "reward")
 
 
 class Drift(EnvBase):
-    """Three points that are pushed about, each by its action; an episode takes 3, 4 and 5 steps.
+    """Three worlds with a moving point each, which the action pushes; their episodes last 3, 4 and 5 steps.
 
-    A step passes gradients from the action on, but keeps none for the next step.
+    Observation and reward have a gradient with respect to the action of the same step, but not of earlier
+    steps.
     """
 
     def __init__(self) -> None:
@@ -39,54 +40,54 @@ class Drift(EnvBase):
         self._longest = torch.tensor([3, 4, 5])
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        again = torch.ones(3, dtype=torch.bool)
+        reset = torch.ones(3, dtype=torch.bool)
         if tensordict is not None and "_reset" in tensordict:
-            again = tensordict["_reset"].view(3)
+            reset = tensordict["_reset"].view(3)
         first = torch.arange(6.0).view(3, 2)
-        if again.all():
+        if reset.all():
             self.place, self.time = first, torch.zeros(3, dtype=torch.long)
-        self.place = torch.where(again.unsqueeze(-1), first, self.place)
-        self.time = self.time.masked_fill(again, 0)
+        self.place = torch.where(reset.unsqueeze(-1), first, self.place)
+        self.time = self.time.masked_fill(reset, 0)
         return TensorDict({"observation": self.place}, [3])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         place = 0.9 * self.place + tensordict["action"]
         self.place, self.time = place.detach(), self.time + 1
-        over = (self.time >= self._longest).unsqueeze(-1)
-        ends = {"done": over, "terminated": over}
-        return TensorDict({"observation": place, "reward": place.sum(-1, keepdim=True), **ends}, [3])
+        done = (self.time >= self._longest).unsqueeze(-1)
+        flags = {"done": done, "terminated": done}
+        return TensorDict({"observation": place, "reward": place.sum(-1, keepdim=True), **flags}, [3])
 
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing is drawn."""
+        """The environment has no randomness."""
 
 
 def cartpole() -> EnvBase:
-    """One world, no batch."""
+    """A single world without batch dimensions."""
     return GymEnv("CartPole-v1", categorical_action_encoding=True, max_episode_steps=4)
 
 
 def uavs() -> EnvBase:
-    """Two worlds of three agents, what belongs to them under a nested key."""
+    """Two worlds of three UAVs, whose entries are under a nested key."""
     return UavEnv(square(), num_worlds=2, extras=["message"])
 
 
 def unserved() -> EnvBase:
-    """The same, without a server node."""
+    """As ``uavs``, but without a server node."""
     return UavEnv(square(), num_worlds=2, extras=["message"], messages_only=True)
 
 
 class Case(NamedTuple):
-    """A transform and an environment that it works on."""
+    """An environment, and a transform that works on it."""
 
     env: Callable[[], EnvBase]
     make: Callable[[], Transform]
 
     def build(self) -> TransformedEnv:
-        """Both together."""
+        """The environment with the transform."""
         return TransformedEnv(self.env(), self.make())
 
 
-def _served() -> Transform:
+def _server_node() -> Transform:
     return ServerNode(unserved().server, ("agents", "message"))
 
 
@@ -97,12 +98,12 @@ CASES = {
     "ActionHistory, one world": Case(cartpole, lambda: ActionHistory(2, append_to="observation")),
     "ActionHistory, worlds": Case(Drift, lambda: ActionHistory(3)),
     "ActionHistory, agents": Case(
-        uavs, lambda: ActionHistory(2, ACTION, append_to=SEEN, recorded_key="ready")
+        uavs, lambda: ActionHistory(2, ACTION, append_to=OBSERVATION, recorded_key="ready")
     ),
     "SampleAndHold, one world": Case(cartpole, lambda: SampleAndHold(3)),
     "SampleAndHold, worlds": Case(Drift, lambda: SampleAndHold(2, in_keys_inv=["action"])),
     "SampleAndHold, agents": Case(
-        uavs, lambda: SampleAndHold("2s", [SEEN], [ACTION], ready_key=("agents", "ready"))
+        uavs, lambda: SampleAndHold("2s", [OBSERVATION], [ACTION], ready_key=("agents", "ready"))
     ),
     "CumulativeReward, one world": Case(cartpole, lambda: CumulativeReward(3)),
     "CumulativeReward, worlds": Case(Drift, lambda: CumulativeReward(3)),
@@ -110,33 +111,34 @@ CASES = {
     "ObservationDelay, one world": Case(cartpole, lambda: ObservationDelay(LATE)),
     "ObservationDelay, worlds": Case(Drift, lambda: ObservationDelay({"law": "burst"}, fresh_key="fresh")),
     "ObservationDelay, agents": Case(
-        uavs, lambda: ObservationDelay(LATE, [SEEN], loss=0.2, delay_key="delay", sent_key="message_sent")
+        uavs,
+        lambda: ObservationDelay(LATE, [OBSERVATION], loss=0.2, delay_key="delay", sent_key="message_sent"),
     ),
     "RewardDelay, one world": Case(cartpole, lambda: RewardDelay(LATE)),
     "RewardDelay, worlds": Case(Drift, lambda: RewardDelay({"law": "geometric"})),
     "RewardDelay, agents": Case(uavs, lambda: RewardDelay(LATE, REWARD)),
-    "ServerNode": Case(unserved, _served),
+    "ServerNode": Case(unserved, _server_node),
 }
-"""Every transform on an environment of every kind that it works on, named after it."""
+"""Every transform on every kind of environment that it works on; the name before the comma is its class."""
 
 DRAWS = [
     CASES[name] for name in CASES if name.split(",")[0] in ("ActionDelay", "ObservationDelay", "RewardDelay")
 ]
-"""Those that draw random numbers."""
+"""Cases whose transform draws random numbers."""
 
 
 def onward(env: EnvBase, td: TensorDictBase, n_steps: int = 6, seed: int = 0) -> list[TensorDictBase]:
-    """Go on with random actions and partial resets: what every step and every reset showed."""
+    """Step with random actions and partial resets; the outputs of every step and every reset."""
     torch.manual_seed(seed)
-    shown = []
+    outputs = []
     for _ in range(n_steps):
         after, td = env.step_and_maybe_reset(env.rand_action(td))
-        shown += [after["next"].clone(), td.clone()]
-    return shown
+        outputs += [after["next"].clone(), td.clone()]
+    return outputs
 
 
 def begun(env: EnvBase, n_steps: int = 5, seed: int = 0) -> TensorDictBase:
-    """Reset and step for a while: where to go on from."""
+    """Reset and step an environment; the TensorDict from which ``onward`` can continue."""
     env.set_seed(seed)
     torch.manual_seed(seed)
     td = env.reset()
@@ -144,14 +146,14 @@ def begun(env: EnvBase, n_steps: int = 5, seed: int = 0) -> TensorDictBase:
 
 
 def memory(transform: Transform) -> list[Tensor]:
-    """Everything that it remembers."""
+    """All tensors that a transform remembers."""
     return [value for value in transform.state_dict().values() if value is not None]
 
 
 def flat(state: dict) -> dict[str, Tensor]:
-    """Nested dictionaries of tensors as one."""
-    found = {}
+    """Flatten nested dictionaries of tensors, with dots between the keys."""
+    flattened = {}
     for key, value in state.items():
         inner = flat(value) if isinstance(value, dict) else {"": value}
-        found |= {f"{key}.{name}".rstrip("."): tensor for name, tensor in inner.items()}
-    return found
+        flattened |= {f"{key}.{name}".rstrip("."): tensor for name, tensor in inner.items()}
+    return flattened

@@ -1,7 +1,6 @@
-"""Delays as slow and obvious Python: one receiver, one purse, one clock, one memory at a time.
+"""Reference implementations of delays in plain Python, for one agent at a time.
 
-Beside them stands a small world whose numbers tell where they come from: every observation says which
-world, agent, step and episode it was made in.
+``Counting`` is a small environment in which every observation tells its world, agent, step and episode.
 """
 
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from damian.delays.samplers import Sampler
 
 
 def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
-    """Delays of the messages sent at the steps 1, 2, ... by senders with these streams [M], [T, M]."""
+    """Delays of the messages that senders with these random streams [M] send in steps 1 to T, [T, M]."""
     memory, delays = sampler.initial_state(streams), []
     for clock in range(1, n_steps + 1):
         delay, memory = sampler(streams, torch.tensor(clock), memory)
@@ -28,7 +27,7 @@ def drawn(sampler: Sampler, streams: Tensor, n_steps: int) -> Tensor:
 
 
 class Message(NamedTuple):
-    """On its way, or there."""
+    """A message in transit, or received."""
 
     arrives: int
     sent: int
@@ -36,26 +35,26 @@ class Message(NamedTuple):
 
 
 class Receiver:
-    """Holds one message of one sender.
+    """Receives the messages of one sender, and holds one of them.
 
     Args:
-        order: believe what was sent last (``generation``) or what came last (``arrival``).
+        order: hold the message that was sent last (``generation``) or that arrived last (``arrival``).
     """
 
     def __init__(self, order: str) -> None:
         self.order = order
 
     def begin(self, now: int, content: Any) -> None:
-        """A new episode: the first message is there at once, and nothing else is on its way."""
-        self.began, self.holds, self.under_way = now, Message(now, now, content), []
+        """Begin an episode: the first message is received without delay, and no other is in transit."""
+        self.began, self.holds, self.in_transit = now, Message(now, now, content), []
 
     def step(self, now: int, content: Any, delay: int | None) -> bool:
-        """A message is sent (None: or lost), others arrive; is what is held new?"""
+        """Send a message, unless the delay is None, and receive others; is a new message held?"""
         if delay is not None:
-            self.under_way.append(Message(now + delay, now, content))
-        came = [message for message in self.under_way if message.arrives == now]
-        self.under_way = [message for message in self.under_way if message.arrives > now]
-        newest = max(came, key=lambda message: message.sent, default=None)
+            self.in_transit.append(Message(now + delay, now, content))
+        arrived = [message for message in self.in_transit if message.arrives == now]
+        self.in_transit = [message for message in self.in_transit if message.arrives > now]
+        newest = max(arrived, key=lambda message: message.sent, default=None)
         if newest is None or (self.order == "generation" and newest.sent < self.holds.sent):
             return False
         self.holds = newest
@@ -63,26 +62,27 @@ class Receiver:
 
     @property
     def waits(self) -> bool:
-        """Has nothing arrived in this episode."""
+        """Has no message of this episode arrived but the first."""
         return self.holds.sent == self.began
 
 
 @dataclass
 class Purse:
-    """Rewards of one agent, paid when they are due."""
+    """Delayed rewards of one agent."""
 
-    owed: list[tuple[int, float]] = field(default_factory=list)
+    in_transit: list[tuple[int, float]] = field(default_factory=list)
+    """Step of arrival and value of each reward."""
 
     def step(self, now: int, reward: float, delay: int, done: bool) -> float:
-        """What is paid; everything, when the episode ends."""
-        self.owed.append((now + delay, reward))
-        due = [debt for debt in self.owed if done or debt[0] == now]
-        self.owed = [debt for debt in self.owed if debt not in due]
-        return sum(reward for _, reward in due)
+        """Delay a reward; return the sum of those that arrive now, or of all of them if the episode ends."""
+        self.in_transit.append((now + delay, reward))
+        arrived = [entry for entry in self.in_transit if done or entry[0] == now]
+        self.in_transit = [entry for entry in self.in_transit if entry not in arrived]
+        return sum(reward for _, reward in arrived)
 
 
 def looking_back(rewards: Sequence[float], steps: int, gamma: float) -> float:
-    """Eq. 4 at the last of an episode's rewards so far."""
+    """Cumulative reward (paper, eq. 4) at the latest of an episode's rewards so far."""
     last = len(rewards) - 1
     return sum(gamma ** (last - t) * rewards[t] for t in range(max(last - steps + 1, 0), last + 1))
 
@@ -93,18 +93,18 @@ def last_actions(actions: Sequence[Any], steps: int, default: Any) -> list[Any]:
 
 
 class Counting(EnvBase):
-    """A deterministic world whose numbers tell where they come from; episodes end at random.
+    """An environment in which every observation tells where it comes from; episodes end at random.
 
-    Its number x goes on by x' = 3 x + a + 1 (mod 101) with the action a that it executes. Shown are, for
-    each agent, [world, agent, steps in all, episode, x, action executed, does it act]; the reward is
+    Each agent's state x becomes 3 x + a + 1 (mod 101) when it executes the action a. Its observation is
+    [world, agent, steps since construction, episode, x, executed action, ``action_valid``], its reward
     x + 100 * world.
 
     Args:
-        worlds: their names, integers; alone, a world does what it does among others.
-        n_agents: N.
-        continuous: actions are two numbers in [-1, 3], which count rounded.
-        ends: chance that an episode ends in a step.
-        tampered: (world, agent, step) whose observation and reward lie.
+        worlds: integer names of the worlds; what a world does depends on its name, but on no other world.
+        n_agents: number of agents in each world, N.
+        continuous: actions are two numbers in [-1, 3], which are rounded to an integer, instead of integers.
+        ends: probability that an episode ends in a step.
+        tampered: (world, agent, step) whose observation and reward are falsified.
     """
 
     N_ACTIONS = 7
@@ -129,9 +129,9 @@ class Counting(EnvBase):
         if continuous:
             action = Bounded(-1.0, 3.0, shape=(*agents, 2))
         flag = Binary(shape=agents, n=n_agents, dtype=torch.bool)
-        seen = Unbounded((*agents, 7), dtype=torch.float64)
+        observation = Unbounded((*agents, 7), dtype=torch.float64)
         self.action_spec = group(action=action)
-        self.observation_spec = group(observation=seen, message_sent=flag, ready=flag.clone())
+        self.observation_spec = group(observation=observation, message_sent=flag, ready=flag.clone())
         self.reward_spec = group(reward=Unbounded((*agents, 1)))
         self._begin(torch.ones(worlds_shape, dtype=torch.bool))
         self.episode = torch.zeros(worlds_shape, dtype=torch.long)
@@ -143,25 +143,25 @@ class Counting(EnvBase):
         self.executed, self.action_valid = torch.zeros(shape), torch.ones(shape)
 
     def _flag(self, salt: int) -> Tensor:
-        """A flag that is true two times out of three, [B, N]."""
+        """A flag that is true with probability 2/3, [B, N]."""
         agents = torch.arange(self.n_agents)
         return (
             counter_rng.bits(self.names.unsqueeze(-1), agents, torch.tensor([2 * self.total + salt])) % 3 > 0
         )
 
-    def _show(self) -> TensorDict:
+    def _outputs(self) -> TensorDict:
         shape = (*self.batch_size, self.n_agents)
         names, agents = self.names.unsqueeze(-1).expand(shape), torch.arange(self.n_agents).expand(shape)
         total, episode = torch.full(shape, self.total), self.episode.unsqueeze(-1).expand(shape)
-        seen = torch.stack(
+        observation = torch.stack(
             [names, agents, total, episode, self.x, self.executed, self.action_valid], -1
         ).double()
-        lies = torch.zeros(shape, dtype=torch.bool)
+        falsified = torch.zeros(shape, dtype=torch.bool)
         if self.tampered is not None and self.tampered[2] == self.total:
-            lies[self.tampered[:2]] = True
-        seen = seen - lies.unsqueeze(-1) * 1000.0
-        values = {"observation": seen, "message_sent": self._flag(0), "ready": self._flag(1)}
-        self.lies = lies
+            falsified[self.tampered[:2]] = True
+        observation = observation - falsified.unsqueeze(-1) * 1000.0
+        values = {"observation": observation, "message_sent": self._flag(0), "ready": self._flag(1)}
+        self.falsified = falsified
         return TensorDict({"agents": TensorDict(values, shape)}, self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
@@ -169,7 +169,7 @@ class Counting(EnvBase):
         mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
         self._begin(mask)
         self.episode = self.episode + mask
-        return self._show().set("done", torch.zeros(*self.batch_size, 1, dtype=torch.bool))
+        return self._outputs().set("done", torch.zeros(*self.batch_size, 1, dtype=torch.bool))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.total += 1
@@ -179,11 +179,11 @@ class Counting(EnvBase):
         self.x = (3 * self.x + action.long() + 1) % 101
         self.executed = action
         self.action_valid = tensordict.get(("agents", "action_valid"), self.action_valid)
-        shown = self._show()
-        reward = (self.x + 100 * self.names.unsqueeze(-1) - 1000 * self.lies).float()
-        shown["agents"].set("reward", reward.unsqueeze(-1))
-        over = counter_rng.uniform(self.names, torch.tensor(self.total)) < self.ends
-        return shown.set("done", over.unsqueeze(-1)).set("terminated", over.unsqueeze(-1))
+        outputs = self._outputs()
+        reward = (self.x + 100 * self.names.unsqueeze(-1) - 1000 * self.falsified).float()
+        outputs["agents"].set("reward", reward.unsqueeze(-1))
+        done = counter_rng.uniform(self.names, torch.tensor(self.total)) < self.ends
+        return outputs.set("done", done.unsqueeze(-1)).set("terminated", done.unsqueeze(-1))
 
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing here is random."""
+        """The random numbers depend only on the worlds' names and the step."""

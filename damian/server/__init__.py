@@ -1,1 +1,1 @@
-"""The server node: features, rewards and the end of an episode from the messages that have arrived."""
+"""The server node computes features, rewards and the ends of episodes from the messages that it holds."""

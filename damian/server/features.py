@@ -1,7 +1,7 @@
-"""Messages turned into the named features of the paper's Table 2.
+"""The features of the paper's Table 2, computed from messages.
 
-``observe`` is pure and batched, and reads nothing but the messages that it is given: the caller decides
-whether these are all messages or those that have arrived.
+``observe`` is pure and batched, and reads nothing but the messages it is given: the caller decides whether
+these are the latest messages sent or the latest received.
 """
 
 import math
@@ -19,6 +19,7 @@ from damian.world.coverage import FootprintTables, covered_share
 from damian.world.messages import Messages
 
 LOCAL = ("battery", "spotted")
+"""Features of a UAV itself (Table 2)."""
 GLOBAL = (
     "source_distance",
     "source_bearing",
@@ -31,35 +32,38 @@ GLOBAL = (
     "mean_distance_spotting",
     "spotting_agents",
 )
+"""Features that the server computes from the messages of all UAVs (Table 2)."""
 
 
 @dataclass
 class ObservationConfig:
-    """Which features actor and critic see."""
+    """Which features the actor and the critic observe."""
 
     local_features: list[str] = field(default_factory=lambda: ["spotted"])
-    """Features of the UAV itself: battery, spotted."""
+    """Features of the UAV itself, from ``LOCAL``."""
     global_features: list[str] = field(
         default_factory=lambda: ["source_distance", "source_bearing", "source_time"]
     )
-    """Features that the server computes from everybody's messages."""
+    """Features that the server computes from the messages of all UAVs, from ``GLOBAL``."""
     ctde: bool = False
-    """Centralised training, decentralised execution: the actor sees the local features only."""
+    """Centralised training, decentralised execution: the actor observes only the local features."""
     time_scale: float | None = None
-    """Times are divided by this [s]; by the episode's time limit, or an hour, if not given."""
+    """Times are divided by this [s]; if not given, by the episode's time limit, or else by an hour."""
     age: bool = False
-    """Show each UAV the age of the message that the server holds of it (age of information). The critic does
-    not see it: after back-updating, it would tell how far from the end of its batch a step was."""
+    """Append to each actor's observation the age of the message that the server holds of its UAV (age of
+    information). The critic does not observe it: after back-updating, the age would tell the critic how far a
+    step is from the end of its batch."""
     age_scale: float = 10.0
     """Ages are divided by this [s]."""
     own: bool = False
-    """A UAV knows its own latest message at once, with no need to hear of it from the server; else, as in the
-    paper, all that it sees comes from there."""
+    """Each UAV observes its own latest message without delay. If false, as in the paper, its whole
+    observation follows from the messages that the server holds, its own included."""
     estimate: str = "mean"
-    """Where the server believes the source: at the ``mean`` of the places of all UAVs' latest detections, or
-    only of the ``newest`` of these: a source that moves has left the older ones."""
+    """How the server estimates the source's position. ``mean``: the mean position of all UAVs' latest
+    detections. ``newest``: the mean of only the newest of these, as a moving source has left the older
+    ones."""
     window: int = 2
-    """Positions over which the coverage area is counted."""
+    """Number of each UAV's latest landing points whose footprints the coverage counts."""
 
     def __post_init__(self) -> None:
         for name in self.local_features:
@@ -81,8 +85,8 @@ class ObservationConfig:
     @property
     def actor(self) -> list[str]:
         """Features of the actor's observation, in order."""
-        seen = self.local_features if self.ctde else self.critic
-        return [*seen, "age"] if self.age else list(seen)
+        features = self.local_features if self.ctde else self.critic
+        return [*features, "age"] if self.age else list(features)
 
     @property
     def critic(self) -> list[str]:
@@ -94,33 +98,36 @@ class ServerContext(NamedTuple):
     """What the server knows besides the messages."""
 
     now: Tensor
-    """[s], [*]."""
+    """Current time [s], [*]."""
     scale: Tensor
     """Largest vertex distance of the region [m], [*]."""
     time_scale: float
-    """[s]."""
+    """Times are divided by this [s]."""
     battery: BatteryConfig
-    """For the resolution of what is observed."""
+    """Gives the resolution with which battery levels are observed."""
     footprints: FootprintTables | None
-    """For the coverage; None if nobody asks for it."""
+    """For the feature ``coverage``; None if it is not needed."""
     points: Tensor
     """Landing points by flat id, [R*L, 2] metres."""
     age_scale: float
-    """[s]."""
+    """Ages are divided by this [s]."""
     newest: bool = False
-    """Do only the newest detections tell where the source is?"""
+    """Estimate the source's position from only the newest detections (``ObservationConfig.estimate``)."""
 
 
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
     """Features by name (Table 2), each scaled to [0, 1].
 
     Args:
-        messages: of N UAVs, [*, N].
-        context: with leading dimensions [*].
-        names: wanted features; others are not computed.
+        messages: one message of each of N UAVs, [*, N].
+        context: with the leading dimensions [*] of the messages.
+        names: features to compute.
 
     Returns:
-        Each feature [*, N]; ``agent_distances`` [*, N, N-1], the others in index order.
+        Each feature [*, N]; but ``agent_distances`` [*, N, N-1], to the other UAVs in index order.
+
+    Raises:
+        ValueError: ``coverage`` is among the names, but the context has no footprint tables.
     """
     view = FeatureCache(messages, context)
     return {name: _FEATURES[name](view) for name in names}
@@ -133,40 +140,42 @@ def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
 
 
 class FeatureCache:
-    """Messages, and the quantities that several features share, each computed once and only on demand."""
+    """Messages, and intermediate results that several features share, each computed once and on demand."""
 
     def __init__(self, messages: Messages, context: ServerContext) -> None:
         self.messages, self.context = messages, context
         self._shared: dict[Callable, Tensor] = {}
 
     def __call__(self, compute: Callable[["FeatureCache"], Tensor]) -> Tensor:
+        """The result of ``compute(self)``, from the cache after the first call."""
         if compute not in self._shared:
             self._shared[compute] = compute(self)
         return self._shared[compute]
 
     @property
     def scale(self) -> Tensor:
+        """Largest vertex distance of the region [m], [*, 1]."""
         return self.context.scale.unsqueeze(-1)
 
 
-def _known(v: FeatureCache) -> Tensor:
-    """Has the UAV ever heard the source, [*, N]."""
+def _has_detected(v: FeatureCache) -> Tensor:
+    """Has this UAV ever detected the source, [*, N]."""
     return v.messages.detected_time >= 0
 
 
-def _ever(v: FeatureCache) -> Tensor:
-    """Has anybody, [*, 1]."""
-    return v(_known).any(-1, keepdim=True)
+def _any_has_detected(v: FeatureCache) -> Tensor:
+    """Has any UAV ever detected the source, [*, 1]."""
+    return v(_has_detected).any(-1, keepdim=True)
 
 
 def _to_source(v: FeatureCache) -> Tensor:
-    """From each UAV to where the source is believed, [*, N, 2] metres."""
-    told, when = v(_known), v.messages.detected_time
+    """Vector from each UAV to the estimated position of the source [m], [*, N, 2]."""
+    counts, detected_time = v(_has_detected), v.messages.detected_time
     if v.context.newest:
-        told = told & (when == when.amax(-1, keepdim=True))
-    known = told.to(v.messages.position.dtype)
-    places = (v.messages.detected_position * known.unsqueeze(-1)).sum(-2, keepdim=True)
-    estimate = places / known.sum(-1).clamp(min=1)[..., None, None]
+        counts = counts & (detected_time == detected_time.amax(-1, keepdim=True))
+    weight = counts.to(v.messages.position.dtype)
+    total = (v.messages.detected_position * weight.unsqueeze(-1)).sum(-2, keepdim=True)
+    estimate = total / weight.sum(-1).clamp(min=1)[..., None, None]
     return estimate - v.messages.position
 
 
@@ -177,36 +186,36 @@ def _raw_source_distance(v: FeatureCache) -> Tensor:
 def _bearing(v: FeatureCache) -> Tensor:
     """Bearing of the source, clockwise from north, [*, N] in (-pi, pi]."""
     east, north = v(_to_source).unbind(-1)
-    # Within a millimetre of the source there is no bearing, only rounding errors: north it is.
+    # Within a millimetre of the source the bearing would be a rounding error: it is set to 0 (north).
     away = east.abs() + north.abs() > 1e-3
     return torch.atan2(east, north) * away
 
 
 def _pairwise(v: FeatureCache) -> Tensor:
-    """Distances between UAVs over the scale, [*, N, N]."""
-    place = v.messages.position
-    offset = place.unsqueeze(-2) - place.unsqueeze(-3)
+    """Distances between UAVs, divided by the largest vertex distance of the region, [*, N, N]."""
+    position = v.messages.position
+    offset = position.unsqueeze(-2) - position.unsqueeze(-3)
     return torch.linalg.vector_norm(offset, dim=-1) / v.scale.unsqueeze(-1)
 
 
 def _source_distance(v: FeatureCache) -> Tensor:
-    return torch.where(v(_ever), v(_raw_source_distance).clamp(max=1), 1.0)
+    return torch.where(v(_any_has_detected), v(_raw_source_distance).clamp(max=1), 1.0)
 
 
 def _source_bearing(v: FeatureCache) -> Tensor:
-    return torch.where(v(_ever), torch.remainder(v(_bearing) / (2 * math.pi), 1.0), 1.0)
+    return torch.where(v(_any_has_detected), torch.remainder(v(_bearing) / (2 * math.pi), 1.0), 1.0)
 
 
 def _source_drift(v: FeatureCache) -> Tensor:
-    """(wrapped (bearing - track) + pi) / 2 pi: aligned is 0.5."""
+    """((bearing - track) wrapped to [-pi, pi) + pi) / 2 pi: 0.5 if the UAV flies straight at the source."""
     turn = (v(_bearing) - v.messages.track) / (2 * math.pi)
-    return torch.where(v(_ever), torch.remainder(turn + 0.5, 1.0), 1.0)
+    return torch.where(v(_any_has_detected), torch.remainder(turn + 0.5, 1.0), 1.0)
 
 
 def _source_time(v: FeatureCache) -> Tensor:
     latest = v.messages.detected_time.amax(-1, keepdim=True)
     since = (v.context.now.unsqueeze(-1) - latest) / v.context.time_scale
-    return torch.where(v(_ever), since.clamp(max=1), 1.0).expand_as(v.messages.time)
+    return torch.where(v(_any_has_detected), since.clamp(max=1), 1.0).expand_as(v.messages.time)
 
 
 def _agent_distances(v: FeatureCache) -> Tensor:
@@ -230,7 +239,7 @@ def _mean_distance(v: FeatureCache) -> Tensor:
 
 
 def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
-    """Mean distance to the other UAVs that do not spot; 0 for a spotting UAV or without such others."""
+    """Mean distance to the other UAVs that do not spot; 0 for a spotting UAV, or if there are no others."""
     silent = (~v.messages.spotted).to(v.scale.dtype)
     others = silent.sum(-1, keepdim=True) - 1
     total = (v(_pairwise) * silent.unsqueeze(-2)).sum(-1) * silent
@@ -238,7 +247,7 @@ def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
 
 
 def _mean_distance_spotting(v: FeatureCache) -> Tensor:
-    """Mean distance of the spotting UAVs to the source; 0 if there is none."""
+    """Mean distance of the spotting UAVs to the source; 0 if no UAV spots."""
     spotting = v.messages.spotted.to(v.scale.dtype)
     total = (v(_raw_source_distance) * spotting).sum(-1, keepdim=True)
     mean = total / spotting.sum(-1, keepdim=True).clamp(min=1)
@@ -246,7 +255,7 @@ def _mean_distance_spotting(v: FeatureCache) -> Tensor:
 
 
 def _spotting_agents(v: FeatureCache) -> Tensor:
-    """N_ss / N."""
+    """Share of the UAVs that spot the source, N_ss / N."""
     spotting = v.messages.spotted.to(v.scale.dtype)
     return spotting.mean(-1, keepdim=True).expand_as(spotting)
 

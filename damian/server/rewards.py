@@ -1,7 +1,7 @@
-"""Features turned into named reward terms (paper, eq. 5-8).
+"""The terms of the reward, computed from features (paper, eq. 5-8).
 
-``reward`` is pure and batched, as ``observe`` is. A term's name is its feature, its weight's key and its
-tag in the logs.
+``reward`` is pure and batched, as ``observe`` is. A term has the name of its feature; its weight in the
+configuration and its tag in the logs have the same name.
 """
 
 import math
@@ -16,6 +16,7 @@ from damian.common import checks
 from damian.server.termination import Status
 
 INDIVIDUAL = ("coverage", "spotted", "battery")
+"""Terms of the individual reward (eq. 7)."""
 SYSTEM = (
     "source_distance",
     "source_time",
@@ -26,20 +27,21 @@ SYSTEM = (
     "mean_distance_not_spotting",
     "mean_distance_spotting",
 )
+"""Terms of the system reward (eq. 6)."""
 
 
 @dataclass
 class RewardConfig:
-    """A task: weights of the reward terms. A term with weight 0 is not computed."""
+    """The task, as weights of the reward terms (eq. 5-8). A term with weight 0 is not computed."""
 
     coverage: float = 0.0
     """w_ca of R1^a (eq. 7)."""
     spotted: float = 1.0
-    """w_k of R2^a (eq. 7), divided by the motions that it took."""
+    """w_k of R2^a (eq. 7); the term is divided by the motions since the UAV last spotted."""
     battery: float = 0.0
     """w_b of R3^a (eq. 7)."""
     source_distance: float = 0.0
-    """w_ds of R1^s (eq. 6), divided by the motions since the UAV spotted."""
+    """w_ds of R1^s (eq. 6); the term is divided by the motions since the UAV last spotted."""
     source_time: float = 0.0
     """w_ts of R2^s (eq. 6)."""
     source_bearing: float = 0.0
@@ -55,25 +57,26 @@ class RewardConfig:
     mean_distance_spotting: float = 0.0
     """w_ss of R8^s (eq. 6)."""
     individual: float = 1.0
-    """w_a (eq. 8)."""
+    """w_a (eq. 8), the weight of the individual reward."""
     system: float = 1.0
-    """w_s (eq. 8)."""
+    """w_s (eq. 8), the weight of the system reward."""
     drift: str = "smooth"
-    """``smooth``: 1 - |2 theta - 1|; ``printed``: 2 theta up to 1/2, then 1 - theta (as in eq. 6)."""
+    """R4^s for a drift theta. ``smooth``: 1 - |2 theta - 1|; ``printed``: 2 theta up to 1/2, then
+    1 - theta, as eq. 6 is printed."""
     desired_spotting: float = 1.0
-    """M_ss of R5^s: desired share of spotting UAVs."""
+    """M_ss of R5^s: desired share of the UAVs that spot the source."""
     desired_distance: float = 0.5
-    """D of R6^s, as a share of the region's largest vertex distance."""
+    """D of R6^s: desired mean distance, as a share of the region's largest vertex distance."""
     desired_distance_not_spotting: float = 0.5
-    """D_nss of R7^s, likewise."""
+    """D_nss of R7^s: desired mean distance between UAVs that do not spot, as such a share."""
     desired_distance_spotting: float = 0.1
-    """D_ss of R8^s, likewise."""
+    """D_ss of R8^s: desired mean distance of the spotting UAVs to the source, as such a share."""
     bonus: float = 0.0
-    """Added on success."""
+    """Added to the reward of every UAV on success."""
     bonus_over_steps: bool = False
-    """Divide the bonus by the steps that the success took (use case 2: 2 / steps)."""
+    """Divide the bonus by the elapsed steps of the episode (use case 2: 2 / steps)."""
     penalty: float = 0.0
-    """Subtracted when an episode ends without success."""
+    """Subtracted from the reward of every UAV when an episode ends without success."""
 
     def __post_init__(self) -> None:
         for name in (*INDIVIDUAL, *SYSTEM, "individual", "system", "bonus", "penalty"):
@@ -84,23 +87,23 @@ class RewardConfig:
 
     @property
     def terms(self) -> list[str]:
-        """Names of the terms that count."""
+        """Names of the terms whose weight is not 0."""
         individual = [n for n in INDIVIDUAL if getattr(self, n) * self.individual != 0]
         return individual + [n for n in SYSTEM if getattr(self, n) * self.system != 0]
 
     def weight(self, name: str) -> float:
-        """The weight of a term in the total (eq. 8)."""
+        """The weight of a term in the total reward (eq. 8)."""
         group = self.individual if name in INDIVIDUAL else self.system
         return getattr(self, name) * group
 
 
 class Counters(NamedTuple):
-    """What reward and status need besides the features."""
+    """Counts that rewards depend on besides the features."""
 
     steps: Tensor
     """Elapsed steps of the episode, [*]."""
     motions: Tensor
-    """Motions since each UAV last spotted, [*, N]."""
+    """Motions since each UAV last spotted the source, [*, N]."""
 
 
 def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig) -> dict[str, Tensor]:
@@ -108,11 +111,11 @@ def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig
 
     Args:
         features: as ``observe`` returns them, each [*, N].
-        counters: [*] and [*, N].
-        config: weights.
+        counters: steps [*] and motions [*, N].
+        config: weights of the terms.
 
     Returns:
-        Each term with a weight, [*, N].
+        Each term whose weight is not 0, [*, N].
     """
     return {
         name: config.weight(name) * _TERMS[name](features[name], counters, config) for name in config.terms

@@ -1,7 +1,8 @@
-"""The server node: observations, rewards and the task's status from the messages that it holds.
+"""The server node computes observations, rewards and the task's status from messages (paper, section 3.2).
 
-The environment asks it when nothing is delayed, the ``ServerNode`` transform for the messages that have
-arrived, and a replay storage for those that have arrived by the time of learning: one copy of every formula.
+Every formula exists once: the environment calls the server with the latest messages sent, the
+``ServerNode`` transform with the latest received, and the replay storage with those that have arrived by the
+time of learning.
 """
 
 from collections.abc import Sequence
@@ -24,46 +25,46 @@ Features = dict[str, Tensor]
 
 
 class RewardAndStatus(NamedTuple):
-    """The UAVs' rewards, and how the task stands."""
+    """The UAVs' rewards and the status of the task."""
 
     reward: Tensor
-    """Paper, eq. 8, with bonus and penalty, [*, N]."""
+    """Rewards (paper, eq. 8) with bonus and penalty, [*, N]."""
     terms: dict[str, Tensor]
-    """Its weighted terms by name, [*, N]."""
+    """Weighted terms of the rewards by name, [*, N] each."""
     status: Status
-    """[*]."""
+    """Success and the end of the episode, [*]."""
 
 
 class ServerOutputs(NamedTuple):
-    """Everything that the server computes from messages."""
+    """Everything that the server computes from one message of each UAV."""
 
     observation: Tensor
-    """Of the actors, [*, N, F]."""
+    """Observations of the actors, [*, N, F]."""
     global_observation: Tensor
-    """Of the critic, [*, N, G]."""
+    """Observations of the critic, [*, N, G]."""
     reward: Tensor
-    """[*, N]."""
+    """Rewards (paper, eq. 8) with bonus and penalty, [*, N]."""
     terms: dict[str, Tensor]
-    """[*, N]."""
+    """Weighted terms of the rewards by name, [*, N] each."""
     status: Status
-    """[*]."""
+    """Success and the end of the episode, [*]."""
 
 
 class Server:
-    """Features, rewards and status of messages [*, N], with any leading dimensions.
+    """Computes features, rewards and status from messages [*, N], with any leading dimensions.
 
     Args:
-        observation: which features actor and critic see.
+        observation: which features the actor and the critic observe.
         reward: weights of the reward terms.
         episode: when an episode ends.
-        battery: for the resolution with which levels are observed.
+        battery: gives the resolution with which battery levels are observed.
         airspace: regions and landing points.
-        radius: of a UAV's footprint [m].
+        radius: radius of a UAV's footprint [m].
         dt: length of a step [s].
-        time_scale: what times are divided by [s].
+        time_scale: times are divided by this [s].
 
     Raises:
-        InputError: more landing points than a message can number.
+        InputError: there are more landing points than a message can number.
     """
 
     def __init__(
@@ -79,7 +80,9 @@ class Server:
         time_scale: float,
     ) -> None:
         if airspace.points.shape[:2].numel() >= MAX_EXACT_INTEGER:
-            raise InputError("region.lattice_step: a message cannot number so many landing points")
+            raise InputError(
+                "region.lattice_step: a message cannot number so many landing points: take a larger step"
+            )
         self.observation, self.reward, self.episode, self.battery = observation, reward, episode, battery
         self.dt, self.time_scale = dt, time_scale
         self._names = sorted({*observation.actor, *observation.critic, *reward.terms})
@@ -93,27 +96,32 @@ class Server:
             self._footprints = build_tables(polygons, places, radius)
 
     def to(self, device: torch.device) -> "Server":
-        """Move the tables, in place."""
+        """Move the tables to a device, in place."""
         self._scale, self._points = self._scale.to(device), self._points.to(device)
         if self._footprints is not None:
             self._footprints = self._footprints.to(device)
         return self
 
     def __call__(self, messages: Messages, steps: Tensor, source_over: Tensor | None = None) -> ServerOutputs:
-        """Everything at once; arguments as of ``reward_and_status``, with a source that never ends if not
-        given."""
+        """Observations, rewards and status of messages.
+
+        Args:
+            messages: one message of each UAV, [*, N].
+            steps: elapsed steps of the episode, [*].
+            source_over: has the source finished its walk, [*] or [*, 1]; if not given, it never has.
+        """
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         features = self.features(messages, steps)
         result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
         return ServerOutputs(*self.observations(features), *result)
 
     def features(self, messages: Messages, steps: Tensor, names: list[str] | None = None) -> Features:
-        """The features of observations and rewards (paper, Table 2).
+        """The features that observations and rewards are made of (paper, Table 2).
 
         Args:
-            messages: held by the server, [*, N].
-            steps: elapsed in the episode, [*].
-            names: wanted features; every one that an observation or a reward term needs, if not given.
+            messages: one message of each UAV, [*, N].
+            steps: elapsed steps of the episode, [*].
+            names: features to compute; if not given, all that an observation or a reward term needs.
         """
         context = ServerContext(
             now=steps * self.dt,
@@ -128,7 +136,7 @@ class Server:
         return observe(messages, context, names or self._names)
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
-        """Observations of the actors [*, N, F], and of the critic [*, N, G]."""
+        """Observations of the actors [*, N, F] and of the critic [*, N, G]."""
         return stack(features, self.observation.actor), stack(features, self.observation.critic)
 
     def observe_with_timely_messages(
@@ -139,21 +147,21 @@ class Server:
         on_time: Tensor | None = None,
         fields: Sequence[str] = Messages._fields,
     ) -> Tensor:
-        """Observations of actors that know some messages without delay, [*, N, F].
+        """Observations of actors that receive some messages without delay, [*, N, F].
 
         Args:
             received: packed messages that the server holds, [*, N, M].
             sent: packed messages that the UAVs sent last, [*, N, M].
-            steps: elapsed in the episode, [*].
-            on_time: row i, column j: does UAV i know UAV j's message at once, [N, N]; only its own if not
-                given.
-            fields: fields of the messages that are known at once.
+            steps: elapsed steps of the episode, [*].
+            on_time: element (i, j) tells whether UAV i receives the messages of UAV j without delay, [N, N]
+                bool; if not given, each UAV receives only its own without delay.
+            fields: fields of these messages that are received without delay; the server provides the others.
         """
         n_agents, names = received.shape[-2], self.observation.actor
         if on_time is None:
             on_time = torch.eye(n_agents, dtype=torch.bool, device=received.device)
         timely = torch.where(on_time.unsqueeze(-1), sent.unsqueeze(-3), received.unsqueeze(-3))
-        known = Messages.unpack(received.unsqueeze(-3).expand_as(timely))  # [*, N, N], first by who knows
+        known = Messages.unpack(received.unsqueeze(-3).expand_as(timely))  # [*, N receivers, N senders]
         timely = Messages.unpack(timely)._asdict()
         known = known._replace(**{name: timely[name] for name in fields})
         features = self.features(known, steps.unsqueeze(-1).expand(received.shape[:-1]), names)
@@ -162,12 +170,12 @@ class Server:
     def reward_and_status(
         self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor
     ) -> RewardAndStatus:
-        """Rewards (paper, eq. 5-8) and the end of the episode.
+        """Rewards (paper, eq. 5-8) and the end of the episode (section 4.1).
 
         Args:
-            features: of the messages.
-            messages: held by the server, [*, N].
-            steps: elapsed in the episode, [*].
+            features: features of the messages, as returned by ``features``.
+            messages: one message of each UAV, [*, N].
+            steps: elapsed steps of the episode, [*].
             source_over: has the source finished its walk, [*].
         """
         counters = Counters(steps, messages.motions)
@@ -177,8 +185,8 @@ class Server:
         return RewardAndStatus(sum(terms.values(), start=final), terms, ended)
 
     def _scales(self, messages: Messages) -> Tensor:
-        """Largest vertex distance of each world's region, which follows from its landing points, [*]."""
-        here = messages.trail[..., 0, 0]
+        """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
+        point = messages.trail[..., 0, 0]
         if len(self._scale) == 1:
-            return self._scale.expand(here.shape)
-        return gather_rows(self._scale, here // self._max_points)
+            return self._scale.expand(point.shape)
+        return gather_rows(self._scale, point // self._max_points)

@@ -1,4 +1,4 @@
-"""When an episode ends, and whether it was a success, as far as the server knows (paper, section 4.1)."""
+"""The ends of episodes and the success of the task, as the server knows them (paper, section 4.1)."""
 
 import math
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ from damian.world.messages import Messages
 
 @dataclass
 class EpisodeConfig:
-    """When an episode ends (paper, section 4.1). With every end switched off the task is persistent."""
+    """Conditions that end an episode (paper, section 4.1). Without any of them the task never ends."""
 
     max_steps: int | None = 50
-    """Time limit [steps]; none if not given."""
+    """Time limit [steps]; no limit if not given."""
     since_detection: bool = False
-    """Count the limit from the latest detection instead of from the start."""
+    """Count the time limit from the latest detection instead of from the start of the episode."""
     success_share: float | None = None
-    """Share of the UAVs that must spot at once for success; no success if not given."""
+    """Share of the UAVs that must spot the source at the same time for success; if not given, no success."""
     discharged_share: float | None = None
-    """Share of empty UAVs that ends the episode; never if not given."""
+    """Share of the UAVs whose empty batteries end the episode; if not given, batteries never end it."""
     end_with_source: bool = False
-    """End when the source has finished its walk."""
+    """End the episode when the source has finished its walk."""
 
     def __post_init__(self) -> None:
         if self.max_steps is not None:
@@ -37,14 +37,17 @@ class EpisodeConfig:
 
 
 class Status(NamedTuple):
-    """How the task stands, each [*] bool."""
+    """Status of the task, as the server knows it."""
 
     success: Tensor
+    """Is the task accomplished, [*] bool."""
     terminated: Tensor
+    """Has the episode ended by success or failure, [*] bool."""
     truncated: Tensor
+    """Has the episode ended by its time limit, [*] bool."""
 
     def entries(self) -> dict[str, Tensor]:
-        """As TorchRL shows it, with ``done``, each [*, 1]."""
+        """TorchRL's entries ``done``, ``terminated`` and ``truncated``, and ``success``, each [*, 1]."""
         done = self.terminated | self.truncated
         flags = {"success": self.success, "done": done}
         flags |= {"terminated": self.terminated, "truncated": self.truncated}
@@ -59,35 +62,34 @@ def status(
     dt: float,
     config: EpisodeConfig,
 ) -> Status:
-    """Does the episode end, and how, as far as the server knows (paper, section 4.1).
+    """Success and the end of the episode, as the server knows them (paper, section 4.1).
 
-    Time limits truncate, all else terminates; a success at the last step is a success.
+    A time limit truncates, every other end terminates. A success in the last step counts as a success.
 
     Args:
-        messages: held by the server, [*, N].
-        steps: elapsed steps, [*].
-        now: time [s], [*].
+        messages: messages that the server holds, [*, N].
+        steps: elapsed steps of the episode, [*].
+        now: current time [s], [*].
         source_over: has the source finished its walk, [*].
         dt: length of a step [s].
-        config: which ends count.
+        config: conditions that end an episode.
     """
     n_agents = messages.spotted.shape[-1]
-    no = torch.zeros_like(source_over)
-    success = over = late = no
+    success = ended = timed_out = torch.zeros_like(source_over)
     if config.success_share is not None:
         success = messages.spotted.sum(-1) >= share_of(config.success_share, n_agents)
     if config.discharged_share is not None:
-        over = (messages.battery <= 0).sum(-1) >= share_of(config.discharged_share, n_agents)
+        ended = (messages.battery <= 0).sum(-1) >= share_of(config.discharged_share, n_agents)
     if config.end_with_source:
-        over = over | source_over
+        ended = ended | source_over
     if config.max_steps is not None:
-        waited = steps
+        elapsed = steps
         if config.since_detection:
-            waited = (now - messages.detected_time.amax(-1).clamp(min=0)) / dt
-        late = waited >= config.max_steps - 1e-3
-    return Status(success, success | over, late & ~(success | over))
+            elapsed = (now - messages.detected_time.amax(-1).clamp(min=0)) / dt
+        timed_out = elapsed >= config.max_steps - 1e-3
+    return Status(success, success | ended, timed_out & ~(success | ended))
 
 
 def share_of(share: float, n_agents: int) -> int:
-    """The least number of UAVs that is at least a share of them, and at least one."""
+    """Least number of UAVs that is at least this share of them, and at least one."""
     return max(1, math.ceil(share * n_agents - 1e-9))

@@ -1,6 +1,7 @@
-"""Delays, memories and clocks as TorchRL transforms; all but ``ServerNode`` work on any environment.
+"""Delays, action histories and slow clocks as TorchRL transforms.
 
-``damian.transforms.skip_until_ready`` holds one more, which only a ``DelayedEnv`` on a ``UavEnv`` takes.
+All but ``ServerNode`` work on any TorchRL environment. One more, ``SkipUntilReady`` in
+``damian.transforms.skip_until_ready``, works only in a ``DelayedEnv`` on a ``UavEnv``.
 """
 
 from damian.transforms.action_delay import ActionDelay

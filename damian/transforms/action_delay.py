@@ -1,4 +1,4 @@
-"""Actions that reach the environment late."""
+"""A transform that delays actions (paper, section 3.3)."""
 
 from typing import Any
 
@@ -13,29 +13,35 @@ from damian.transforms.order import KeyUsage
 
 
 class ActionDelay(ActionTransform):
-    """The environment executes the action chosen some steps ago, and a default action until the first
-    arrives.
+    """Delays actions: the environment executes the action that the policy chose some steps ago.
 
-    In a step at which no action arrives, the latest arrival is executed again. The chosen action stays in the
-    data. With delay 0 the rollout is the same, bit for bit, as without the transform.
+    Until the first action of an episode arrives, the environment executes a default action. In a step in
+    which no newer action arrives, it executes the same action again. The TensorDict keeps the chosen action.
+    With delay 0 the rollout is the same, bit for bit, as without the transform.
 
     Args:
-        delay: a law, steps, or a time (``damian.delays.laws.law_of``); drawn for each world, agent and step.
-        action_key: the action.
-        default: executed until the first action arrives: a number, or values of an action's shape; the index,
-            if actions are discrete. If not given, the legal value nearest to 0.
+        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
+            A delay is drawn for each world, each agent (under a nested key) and each step.
+        action_key: key of the action.
+        default: action that is executed until the first one arrives: a number, or values in the shape of an
+            action; an index for discrete actions. If not given, the legal value nearest to 0.
         loss: probability that an action never arrives.
-        dt: length of a step [s], for laws in time.
-        sent_key: flag that the policy sees: an action is sent only where it is true, [...] bool.
-        valid_key: flag written for the environment: is this action executed for the first time (or is it the
-            default), [...] bool. The environment itself must read it: a ``SerialEnv`` passes it on, a
-            ``ParallelEnv`` only if its specs name it.
-        seed: of the delays.
+        dt: length of a step [s], for delays given as times.
+        sent_key: key of a flag in the policy's input, [...] bool: an action is sent only where it is true.
+            If not given, every action is sent.
+        valid_key: key of a flag that is written for the environment, [...] bool: true if the action is
+            executed for the first time, or is the default. The environment must read it itself; a
+            ``SerialEnv`` passes it on, a ``ParallelEnv`` only if its specs name it.
+        seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
 
-    A bare name for one of the last keys means an entry in the same TensorDict as the action.
+    A bare name for ``sent_key`` or ``valid_key`` means an entry in the same TensorDict as the action.
 
     Raises:
-        InputError: an impossible law.
+        InputError: the delay is not valid.
+
+    Examples:
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))
+        >>> rollout = env.rollout(100)  # each action is executed two steps after it was chosen
     """
 
     def __init__(

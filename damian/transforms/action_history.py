@@ -1,4 +1,4 @@
-"""An agent's memory of what it has done."""
+"""A transform that lets an agent observe its own latest actions (paper, section 3.3)."""
 
 from typing import Any
 
@@ -15,24 +15,34 @@ from damian.transforms.order import KeyUsage
 
 
 class ActionHistory(ActionTransform):
-    """Shows an agent its own latest actions: with them a delayed environment is Markovian again.
+    """Lets an agent observe its own latest actions, which make a delayed environment Markovian again.
 
-    What it records is what was chosen, so it comes after whatever delays or holds actions. The latest
-    action comes last (Katsikopoulos and Engelbrecht, 2003; the paper, section 3.3).
+    The transform records actions as the policy chose them, so it must come after transforms that delay or
+    hold actions. The latest action comes last. Sources: Katsikopoulos and Engelbrecht (2003); paper, section
+    3.3.
 
     Args:
-        steps: how many actions.
-        action_key: the action.
-        out_key: where they are shown, [..., steps * A]; beside the action, if a bare name.
-        append_to: an entry to whose end they are put instead.
-        codes: how discrete actions are shown, a row each, [n_actions, A]; if not given, all actions are
-            scaled to [0, 1] (one-hot ones are shown as they are).
-        default: the actions before the first: a number, or an action's values; 0, or the nearest to it, if
-            not given.
-        recorded_key: flag that the policy sees: only where it is true is the action recorded, [...] bool;
-            beside the action, if a bare name.
-        age_key: age of what the agent is shown [steps], [..., 1] (``ObservationDelay``): only actions chosen
-            since then are shown, in place of older ones, of which that knows already, the default.
+        steps: number of actions.
+        action_key: key of the action.
+        out_key: key of the history, [..., steps * A]; a bare name means an entry beside the action.
+        append_to: key of an entry to which the history is appended; ``out_key`` is then not used.
+        codes: vectors that represent discrete actions, [n_actions, A]. If not given, actions are scaled to
+            [0, 1]; one-hot actions are already.
+        default: action that fills the history before the first one: a number, or values in the shape of an
+            action. If not given, the legal value nearest to 0.
+        recorded_key: key of a flag in the policy's input, [...] bool: an action is recorded only where it is
+            true; a bare name means an entry beside the action. If not given, every action is recorded.
+        age_key: key of the age of the observation [steps], [..., 1], as ``ObservationDelay`` writes it. The
+            history then contains only the actions chosen since the observation was generated: older actions,
+            which the observation already reflects, are replaced by the default.
+
+    Raises:
+        InputError: the number of steps is not a positive integer, or ``append_to`` cannot be appended to.
+
+    Examples:
+        >>> history = ActionHistory(2, append_to="observation")
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ActionDelay(2), history))
+        >>> env.rollout(100)["observation"]  # the last two columns are the last two actions
     """
 
     def __init__(
@@ -67,6 +77,7 @@ class ActionHistory(ActionTransform):
         scale = {"low": actions.low, "width": actions.width}
         scale |= {} if self.codes is None else {"codes": self.codes.to(actions.initial.device)}
         first = self._encode(scale, actions.initial).repeat(1, self.steps)
+        # "since": steps since each recorded action was chosen
         since = torch.zeros(len(first), self.steps, dtype=torch.long, device=first.device)
         return scale | {"first": first, "recent": first, "since": since}
 
@@ -89,14 +100,14 @@ class ActionHistory(ActionTransform):
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         recent, key = memory["recent"], self.out_keys[0]
         if self.age_key:
-            unknown = memory["since"] <= entries[self.age_key].reshape(-1, 1)
+            not_reflected = memory["since"] <= entries[self.age_key].reshape(-1, 1)
             width = recent.shape[-1] // self.steps
-            recent = torch.where(unknown.repeat_interleave(width, -1), recent, memory["first"])
-        shown = from_rows(recent, self.rows)
-        return memory, {key: torch.cat([entries[key], shown], -1) if key in entries else shown}
+            recent = torch.where(not_reflected.repeat_interleave(width, -1), recent, memory["first"])
+        history = from_rows(recent, self.rows)
+        return memory, {key: torch.cat([entries[key], history], -1) if key in entries else history}
 
     def _encode(self, scale: Memory, action: Tensor) -> Tensor:
-        """Actions [M, ...] as numbers [M, A]."""
+        """Represent actions [M, ...] by vectors [M, A]."""
         if self.codes is not None:
             return gather_rows(scale["codes"], action)
         return ((action.float() - scale["low"]) / scale["width"]).view(len(action), -1).float()
@@ -110,7 +121,7 @@ class ActionHistory(ActionTransform):
             return observation_spec
         old = observation_spec[key]
         flat = old.dtype.is_floating_point and len(old.shape) == len(self.actions.rows) + 1
-        should = "is no row of floats, to which actions could be appended; take out_key instead"
+        should = "is not a vector of floats, so no actions can be appended to it; use out_key instead"
         checks.require(flat, "append_to", key, should)
         shape = torch.Size((*old.shape[:-1], old.shape[-1] + width))
         observation_spec[key] = Unbounded(shape, dtype=old.dtype, device=device)

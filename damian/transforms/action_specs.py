@@ -1,4 +1,4 @@
-"""Shape, range and default of an environment's actions, read from its specs."""
+"""Shape, range and default of an environment's actions, read from its action spec."""
 
 from typing import Any, NamedTuple
 
@@ -13,26 +13,26 @@ from damian.transforms.entries import as_rows, spec_rows
 
 
 class ActionSpecs(NamedTuple):
-    """Actions of M rows (worlds, or agents of worlds)."""
+    """Actions of M rows; a row is a world, or an agent of a world."""
 
     rows: torch.Size
-    """Shape of the rows, M in all."""
+    """Batch size of the actions' TensorDict; its elements are the M rows."""
     initial: Tensor
     """Default actions, [M, ...]."""
     low: Tensor
-    """Least value of each number of an action."""
+    """Lower bound of each number of an action."""
     width: Tensor
-    """From the least to the largest; 1 where actions have no bounds, or are not numbers."""
+    """Upper minus lower bound of each number of an action; 1 where actions have no bounds, or are one-hot."""
 
 
 def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs:
     """Read the action spec of an environment.
 
     Args:
-        env: has the action.
-        key: of the action.
-        default: a number, or an action's values (an index, if actions are discrete); if None, the legal value
-            nearest to 0.
+        env: environment that has the action.
+        key: key of the action.
+        default: default action: a number, or values in the shape of an action (an index for discrete
+            actions); if None, the legal value nearest to 0.
     """
     spec, rows = env.full_action_spec[key], spec_rows(env.full_action_spec, key)
     value = torch.as_tensor(0 if default is None else default, device=spec.device)
@@ -50,8 +50,8 @@ def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs
 
 
 def _range(spec: TensorSpec, rows: torch.Size) -> tuple[Tensor, Tensor]:
-    """Least value and width of each number of an action."""
-    if isinstance(spec, MultiCategorical):  # which is a Categorical, too
+    """Lower bound and width of the range of each number of an action."""
+    if isinstance(spec, MultiCategorical):  # before Categorical, of which it is a subclass
         width = spec.nvec.view(-1, spec.shape[-1])[0] - 1
         return torch.zeros_like(width), width.clamp(min=1).to(spec.device)
     if isinstance(spec, Categorical):
@@ -65,7 +65,13 @@ def _range(spec: TensorSpec, rows: torch.Size) -> tuple[Tensor, Tensor]:
 
 
 class ActionTransform(StatefulTransform):
-    """A transform that remembers actions."""
+    """Base class of transforms that remember actions.
+
+    Args:
+        action_key: key of the action.
+        default: default action, as in ``read_action_specs``.
+        keys: further arguments of ``StatefulTransform``.
+    """
 
     def __init__(self, action_key: NestedKey, default: Any, **keys: Any) -> None:
         super().__init__(in_keys_inv=[action_key], **keys)
@@ -81,7 +87,7 @@ class ActionTransform(StatefulTransform):
 
     @property
     def actions(self) -> ActionSpecs:
-        """The environment's action spec, read once."""
+        """Shape, range and default of the actions, read from the environment's specs once."""
         if "_actions" not in self.__dict__:
             self.__dict__["_actions"] = read_action_specs(self.env, self.action_key, self.default)
         return self.__dict__["_actions"]

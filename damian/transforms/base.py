@@ -1,4 +1,4 @@
-"""The base class of transforms with memory: buffers, seeds, and the hooks that subclasses fill in."""
+"""The base class of transforms with memory: buffers, seeds, and the methods that subclasses implement."""
 
 from collections.abc import Sequence
 from typing import Any, NoReturn, cast
@@ -22,29 +22,35 @@ from damian.transforms.order import KeyUsage, check_order, leaf_transforms
 
 
 class StatefulTransform(Transform):
-    """A transform with memory: one row for each world, or for each agent of each world.
+    """Base class of transforms that remember earlier steps of each world, or of each agent of each world.
 
-    An entry under a nested key, such as ``("agents", "observation")``, has a row for each element of the
-    batch size of its innermost TensorDict; an entry at the root has one for each world. The memory is
-    allocated at the first reset and kept in buffers: ``state_dict`` saves it (by reference: copy what you
-    keep, as some of it is written in place), ``to`` moves it, and it travels into worker processes.
+    The memory has M rows. For an entry under a nested key, such as ``("agents", "observation")``, there is a
+    row for each element of the batch size of its innermost TensorDict; for an entry at the root, one for each
+    world. The memory is allocated at the first reset and kept in buffers: ``state_dict`` saves it (by
+    reference; clone the tensors before the next step, as some of them are written in place), ``to`` moves it,
+    and worker processes receive it by pickling.
 
-    A subclass consists of pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before
-    the environment steps) and ``on_step`` (after it). So a whole pipeline compiles into one graph.
+    A subclass implements pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before the
+    environment steps) and ``on_step`` (after it). Thus all transforms of an environment compile into one
+    graph.
 
     Args:
-        seed: of everything that the transform draws; without one, the seed is drawn from torch's global
+        in_keys: keys of the entries that the transform reads, as in TorchRL's ``Transform``.
+        out_keys: keys of the entries that it writes.
+        in_keys_inv: keys of the actions that it reads.
+        out_keys_inv: keys of the actions that it writes.
+        seed: seed of everything that the transform draws. If not given, the seed is drawn from torch's global
             generator at the first reset.
     """
 
     action_keys: Sequence[NestedKey] = ()
-    """Entries that ``on_action`` gets, if they exist."""
+    """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
-    """Entries that ``on_reset`` and ``on_step`` get, if they exist."""
+    """Keys of the entries that are passed to ``on_reset`` and ``on_step``, if they exist."""
     dropped_keys: Sequence[NestedKey] = ()
-    """Entries that are removed from the output."""
+    """Keys of the entries that are removed from the outputs."""
     sent_key: NestedKey | None = None
-    """Flag that says which rows send a message in this step; None if all do."""
+    """Key of the flag that tells which rows send a message in this step; None if all do."""
 
     def __init__(
         self,
@@ -64,19 +70,50 @@ class StatefulTransform(Transform):
     # Pure functions, for subclasses.
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        """Clear the memory of the rows of the mask [M], whose new episodes begin with these entries."""
+        """Begin new episodes.
+
+        Args:
+            memory: memory before the reset.
+            entries: outputs of the reset, as far as ``step_keys`` names them.
+            mask: rows that are reset, [M] bool.
+
+        Returns:
+            The new memory, and the entries to write.
+        """
         return memory, {}
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
-        """Change the entries on their way from the policy to the environment."""
+        """Change entries on their way from the policy to the environment.
+
+        Args:
+            memory: memory before the step.
+            entries: inputs of the step, as far as ``action_keys`` names them.
+
+        Returns:
+            The new memory, and the entries to write.
+        """
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        """Change the entries that the environment outputs after a step."""
+        """Change the outputs of a step.
+
+        Args:
+            memory: memory after ``on_action``.
+            entries: outputs of the step, as far as ``step_keys`` names them.
+
+        Returns:
+            The new memory, and the entries to write.
+        """
         return memory, {}
 
     def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
-        """The memory after a step of the worlds of the mask [B] alone; no other world has sent anything."""
+        """The memory if only some worlds have stepped; the other worlds have sent no message.
+
+        Args:
+            before: memory before the step.
+            after: memory after a step of all worlds.
+            stepped: worlds that have stepped, [B] bool.
+        """
         rows = self.expand_worlds(stepped)
         return {
             name: new if new is before[name] else torch.where(expand_mask(rows, new), new, before[name])
@@ -84,27 +121,39 @@ class StatefulTransform(Transform):
         }
 
     def skipped_worlds(self, entries: Entries) -> Tensor | None:
-        """Worlds [B] that must step once more before a step is output; None for a transform that never
-        asks."""
+        """Worlds that must step once more before the outputs are returned, [B] bool.
+
+        Args:
+            entries: outputs of the step.
+
+        Returns:
+            The mask, or None if the transform never skips steps.
+        """
         return None
 
     def merge_steps(self, entries: Entries, later: Entries, stepped: Tensor) -> Entries:
-        """One output for several steps, once the worlds of the mask [B] have stepped once more."""
+        """Merge the outputs of several steps into those of one step.
+
+        Args:
+            entries: outputs before the latest step.
+            later: outputs of the latest step.
+            stepped: worlds that took the latest step, [B] bool.
+        """
         raise NotImplementedError
 
-    # Called once, for subclasses.
+    # Called at the first reset, for subclasses.
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        """The memory before the first reset, which has these entries."""
+        """Allocate the memory, given the outputs of the first reset."""
         return {}
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
-        """The shape of the rows, at the first reset."""
+        """The shape of the rows, given the outputs of the first reset."""
         return row_shape(tensordict, self.row_key)
 
     @property
     def row_key(self) -> NestedKey:
-        """An entry that has one element for each row."""
+        """Key of an entry whose innermost TensorDict has one element for each row."""
         return self.in_keys[0]
 
     @property
@@ -126,14 +175,16 @@ class StatefulTransform(Transform):
             device = next((value.device for value in self.memory.values()), None)
             mask = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
         change = self.on_reset(self.memory, select_entries(tensordict_reset, self.step_keys), mask)
-        return self._write(tensordict_reset, change)  # TorchRL keeps the entries of the other worlds
+        return self._write(
+            tensordict_reset, change
+        )  # TorchRL restores the entries of the worlds without a reset
 
     def _check_rows(self, tensordict: TensorDictBase) -> None:
         rows = self.find_rows(tensordict)
         if rows != self.rows:
             raise RuntimeError(
-                f"{type(self).__name__} remembers rows of {tuple(self.rows)}, but the environment has "
-                f"{tuple(rows)}: the state of another one was loaded"
+                f"{type(self).__name__} has memory for rows of shape {tuple(self.rows)}, but the environment "
+                f"has {tuple(rows)}: load a state that was saved with the same number of worlds and agents"
             )
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -166,7 +217,7 @@ class StatefulTransform(Transform):
 
     @property
     def has_memory(self) -> bool:
-        """Has there been a reset, which allocates the memory."""
+        """Has the memory been allocated, by a reset or by ``load_state_dict``."""
         return self._rows is not None
 
     @property
@@ -176,20 +227,20 @@ class StatefulTransform(Transform):
         return self._rows
 
     def expand_worlds(self, worlds: Tensor) -> Tensor:
-        """A mask of worlds [B] as a mask of rows [M]."""
+        """Expand a mask of worlds [B] to a mask of rows [M]."""
         return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
     @property
     def memory(self) -> Memory:
-        """Everything that the transform remembers."""
+        """The memory of the transform: its buffers by name."""
         return cast(Memory, dict(self._buffers))
 
     def set_memory(self, memory: Memory) -> None:
-        """Replace the buffers of these names."""
+        """Replace the buffers that have these names."""
         self._buffers.update(memory)
 
     def clear_memory(self) -> None:
-        """Remove the memory: the next reset counts as the first."""
+        """Delete the memory; the next reset counts as the first."""
         self._rows = None
         self._buffers.clear()
 
@@ -198,7 +249,7 @@ class StatefulTransform(Transform):
         return None if self._rows is None else torch.tensor(self._rows, dtype=torch.long)
 
     def set_extra_state(self, state: Tensor | None) -> None:
-        """From ``state_dict``."""
+        """Set the shape of the rows from a ``state_dict``."""
         self._rows = None if state is None else torch.Size(state.tolist())
 
     def _load_from_state_dict(
@@ -209,13 +260,13 @@ class StatefulTransform(Transform):
         }
         saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
         devices = {name: buffer.device for name, buffer in self.memory.items()}
-        # TorchRL also loads states that hold nothing of this transform: then the next reset is the first.
+        # TorchRL also loads states without entries of this transform: the next reset is then the first.
         self.clear_memory()
         self.set_memory({k: v.detach().clone().to(devices.get(k, v.device)) for k, v in saved.items()})
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def clone(self) -> "StatefulTransform":
-        """The same transform, without memory."""
+        """A copy of the transform without memory."""
         copied = super().clone()
         copied.clear_memory()
         return copied
@@ -223,17 +274,22 @@ class StatefulTransform(Transform):
     # Seeds.
 
     def set_seed(self, seed: int | None) -> None:
-        """Draw from new random streams, beginning with the next reset, which counts as the first."""
+        """Set the seed and delete the memory; the next reset counts as the first."""
         self._seed, self._world_seeds = seed, None
         self.clear_memory()
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world its own stream, [B] integers: it draws the same alone as among others."""
+        """Set a seed for each world, [B] integers: a world's draws then do not depend on the other worlds."""
         self._seed, self._world_seeds = None, seeds
         self.clear_memory()
 
     def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
-        """A random stream for each row, [M]."""
+        """A random stream (a seed of the counter-based generator) for each row, [M] long.
+
+        Args:
+            batch: batch size of the worlds.
+            device: device of the streams.
+        """
         n_worlds = batch.numel()
         if self._world_seeds is not None:
             worlds = self._world_seeds.to(device)
@@ -241,28 +297,36 @@ class StatefulTransform(Transform):
             worlds = counter_rng.world_seeds(self._seed, n_worlds, device)
         else:
             worlds = torch.randint(2**32, (n_worlds,)).to(device)
-        each = torch.arange(self.rows.numel() // n_worlds, device=device)
-        return counter_rng.bits(worlds.view(-1, 1), each).flatten()
+        agents = torch.arange(self.rows.numel() // n_worlds, device=device)
+        return counter_rng.bits(worlds.view(-1, 1), agents).flatten()
 
-    # Where the transform may stand.
+    # The place of the transform in an environment.
 
     def set_container(self, container: Any) -> None:
         super().set_container(container)
         while isinstance(container, Compose):
             check_order(leaf_transforms(container))
-            above = container.__dict__.get("_container")
-            container = above() if above is not None else None
+            outer = container.__dict__.get("_container")  # a weak reference
+            container = outer() if outer is not None else None
 
     @property
     def env(self) -> EnvBase:
-        """The environment with the transforms before this one."""
+        """The environment with the transforms before this one.
+
+        Raises:
+            RuntimeError: the transform does not belong to an environment.
+        """
         parent = self.parent
         if parent is None:
             self._refuse()
         return parent
 
     def check(self) -> None:
-        """Refuse to work without an environment that has been reset."""
+        """Make sure that the transform belongs to an environment that has been reset.
+
+        Raises:
+            RuntimeError: it does not.
+        """
         if not self.has_memory or self.container is None:
             self._refuse()
 
@@ -275,6 +339,6 @@ class StatefulTransform(Transform):
     def _refuse(self) -> NoReturn:
         name = type(self).__name__
         raise RuntimeError(
-            f"{name} remembers earlier steps, so it works only on an environment that is reset and "
-            f"stepped: TransformedEnv(env, {name}(...))"
+            f"{name} remembers earlier steps, so it works only in an environment, after a reset: "
+            f"TransformedEnv(env, {name}(...))"
         )

@@ -1,4 +1,4 @@
-"""Entries of TensorDicts: as rows (one for each world, or for each agent of each world)."""
+"""Entries of TensorDicts, viewed as M rows: one for each world, or for each agent of each world."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,38 +8,38 @@ from torch import Tensor
 from torchrl.data import Composite
 
 Memory = dict[str, Tensor]
-"""Everything that a transform remembers, by the name of its buffer."""
+"""The memory of a transform: its buffers by name."""
 
 Entries = dict[NestedKey, Tensor]
 """Entries of a TensorDict, by key."""
 
 Change = tuple[Memory, Entries]
-"""The new memory, and the entries to write."""
+"""The new memory of a transform, and the entries that it writes."""
 
 
 def row_shape(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
-    """The batch size of the TensorDict in which an entry lies."""
+    """The batch size of the TensorDict that directly contains an entry."""
     inner = tensordict.get(key[:-1]) if isinstance(key, tuple) and len(key) > 1 else tensordict
     return inner.batch_size
 
 
 def spec_rows(specs: Composite, key: NestedKey) -> torch.Size:
-    """The batch size of the TensorDict in which an entry lies, by its specs."""
+    """As ``row_shape``, but read from specs."""
     return (specs[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else specs).shape
 
 
 def as_rows(value: Tensor, rows: torch.Size) -> Tensor:
-    """An entry [*rows, ...] as [M, ...]."""
+    """Reshape an entry [*rows, ...] to [M, ...], where M is the number of rows."""
     return value.reshape(rows.numel(), *value.shape[len(rows) :])
 
 
 def from_rows(value: Tensor, rows: torch.Size) -> Tensor:
-    """Rows [M, ...] as an entry [*rows, ...]."""
+    """Reshape [M, ...] to an entry [*rows, ...]."""
     return value.view((*rows, *value.shape[1:]))
 
 
 def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
-    """The entries under those of the keys that exist, detached from their gradients."""
+    """The entries with these keys, as far as they exist, detached from the autograd graph."""
     found = {key: tensordict.get(key, None) for key in keys}
     return {key: value.detach() for key, value in found.items() if value is not None}
 
@@ -47,9 +47,18 @@ def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Ent
 def flag_rows(
     tensordict: TensorDictBase | Mapping[NestedKey, Tensor], name: str, key: NestedKey, rows: torch.Size
 ) -> Tensor | None:
-    """The flag ``name`` (such as ``_reset`` or ``done``) that governs an entry, for each of its rows [M].
+    """The flag ``name``, such as ``_reset`` or ``done``, that applies to the rows of an entry, [M] bool.
 
-    The one nearest to the entry counts, from its own TensorDict outwards; None if there is none.
+    TensorDicts may contain the flag at several levels: the one nearest to the entry applies.
+
+    Args:
+        tensordict: contains the flag.
+        name: name of the flag.
+        key: key of the entry.
+        rows: shape of the entry's rows.
+
+    Returns:
+        The flag of each row, or None if there is no such flag.
     """
     for flag_key in flag_keys(name, key):
         flag = tensordict.get(flag_key, None)
@@ -60,18 +69,24 @@ def flag_rows(
 
 
 def flag_keys(name: str, key: NestedKey) -> list[NestedKey]:
-    """Where a flag may stand that governs an entry, the nearest place first."""
+    """The keys under which a flag that applies to an entry may be found, the nearest to the entry first."""
     path = key[:-1] if isinstance(key, tuple) else ()
     return [(*path[:depth], name) for depth in range(len(path), 0, -1)] + [name]
 
 
 def sibling_key(key: NestedKey, name: NestedKey | None) -> NestedKey | None:
-    """A bare name as a key beside another one: ``age`` sibling_key ``("agents", "observation")``."""
+    """The key of an entry in the same TensorDict as another entry.
+
+    Args:
+        key: key of the other entry, such as ``("agents", "observation")``.
+        name: bare name, such as ``age``, which gives ``("agents", "age")``. A nested key, or None, is
+            returned as it is.
+    """
     if name is None or not isinstance(name, str) or isinstance(key, str):
         return name
     return (*key[:-1], name)
 
 
 def drop_keys(entries: Entries, keys: Sequence[NestedKey]) -> Entries:
-    """The entries under all other keys."""
+    """The entries without those of these keys."""
     return {key: value for key, value in entries.items() if key not in keys}

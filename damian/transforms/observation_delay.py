@@ -1,4 +1,4 @@
-"""Observations that arrive late."""
+"""A transform that delays observations (paper, section 3.4)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,30 +26,39 @@ from damian.transforms.order import KeyUsage
 
 
 class ObservationDelay(StatefulTransform):
-    """Shows what has arrived instead of what is: each step's entries travel as one message.
+    """Delays observations: replaces the current observation by the latest one received, and writes its age.
 
-    After a reset the first message is there at once. Without a delay nothing changes, bit for bit.
+    In each step, the entries ``in_keys`` of a world (or agent) are sent together as one message. The receiver
+    holds a message until another one arrives. After a reset it holds the first message of the episode, which
+    has no delay. With delay 0 the rollout is the same, bit for bit, as without the transform.
 
     Args:
-        delay: a law, steps, or a time (``damian.delays.law_of``); drawn for each world, each agent (under a
-            nested key) and each step.
-        in_keys: entries that travel together, with the same batch size.
-        out_keys: where what has arrived is shown; in place of what is, if not given.
+        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
+            A delay is drawn for each world, each agent (under a nested key) and each step.
+        in_keys: keys of the entries that are sent together; their TensorDicts have the same batch size.
+        out_keys: keys under which the received entries are written; if not given, ``in_keys``, so that the
+            current entries are overwritten.
         loss: probability that a message is lost.
-        order: show what was ``generation``-ated last (its age grows by at most one a step) or what came
-            last (``arrival``).
-        dt: length of a step [s], for laws in time.
-        age_key: where the age of what is shown is written [steps], [..., 1] float; None for nowhere.
-        fresh_key: where is written whether it arrived just now, [..., 1] bool; None for nowhere.
-        delay_key: where the delay of the message sent just now is written [steps], [..., 1]; -1 if it will
-            never arrive. Nothing that an actor may know: a learner's storage needs it.
-        sent_key: which rows send in this step, [...] bool; all of them if not given.
-        seed: of the delays.
+        order: ``generation``: the receiver holds the message that was generated last, so that the age grows
+            by at most one per step. ``arrival``: it holds the message that arrived last.
+        dt: length of a step [s], for delays given as times.
+        age_key: key for the age of the held message [steps], [..., 1] float; None to leave it out.
+        fresh_key: key for a flag, [..., 1] bool: did the held message arrive in this step; None to leave it
+            out.
+        delay_key: key for the delay of the message sent in this step [steps], [..., 1] long, -1 if it never
+            arrives; None to leave it out. An actor must not observe it; back-updating needs it.
+        sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
+        seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
 
-    A bare name for one of the last keys means one sibling_key ``in_keys[0]``.
+    A bare name for one of the last four keys means an entry in the same TensorDict as ``in_keys[0]``.
 
     Raises:
-        InputError: an impossible law.
+        InputError: the delay or the order is not valid.
+
+    Examples:
+        >>> delay = ObservationDelay(Uniform(3, 7), loss=0.1)
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), delay)
+        >>> env.rollout(100)["age"]  # steps since each observation was generated
     """
 
     def __init__(
@@ -78,8 +87,8 @@ class ObservationDelay(StatefulTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        made = [key for key in self.out_keys if key not in self.in_keys]
-        return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=made)
+        created = [key for key in self.out_keys if key not in self.in_keys]
+        return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=created)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))
@@ -87,22 +96,23 @@ class ObservationDelay(StatefulTransform):
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory, delivery = self.line.reset(memory, self._values(entries), mask)
-        return memory, self._shown(delivery)
+        return memory, self._outputs(delivery)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         sent = entries[self.sent_key].reshape(-1) if self.sent_key else None
         memory, delivery = self.line.step(memory, self._values(entries), sent)
-        return memory, self._shown(delivery)
+        return memory, self._outputs(delivery)
 
     def _values(self, entries: Entries) -> list[Tensor]:
         return [as_rows(entries[key], self.rows) for key in self.in_keys]
 
-    def _shown(self, what: Delivery) -> Entries:
-        shown = {key: from_rows(held, self.rows) for key, held in zip(self.out_keys, what.held, strict=True)}
-        flags = {self.age_key: what.age.float(), self.fresh_key: what.fresh}
+    def _outputs(self, delivery: Delivery) -> Entries:
+        pairs = zip(self.out_keys, delivery.held, strict=True)
+        held = {key: from_rows(value, self.rows) for key, value in pairs}
+        flags = {self.age_key: delivery.age.float(), self.fresh_key: delivery.fresh}
         if self.delay_key:
-            flags[self.delay_key] = torch.where(what.delay < self.sampler.lost, what.delay, -1)
-        return shown | {key: flag.view(*self.rows, 1) for key, flag in flags.items() if key is not None}
+            flags[self.delay_key] = torch.where(delivery.delay < self.sampler.lost, delivery.delay, -1)
+        return held | {key: flag.view(*self.rows, 1) for key, flag in flags.items() if key is not None}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):

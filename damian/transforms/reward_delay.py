@@ -1,4 +1,4 @@
-"""Rewards that are paid late, and rewards that look back."""
+"""Transforms that delay rewards, and that sum the latest rewards (paper, section 3.5)."""
 
 from typing import Any
 
@@ -25,10 +25,15 @@ from damian.transforms.order import KeyUsage
 
 
 class RewardTransform(StatefulTransform):
-    """A transform that remembers rewards, as ``past`` [K, M, ...]."""
+    """Base class of transforms that remember rewards, in the buffer ``past`` [K, M, ...].
+
+    Args:
+        reward_key: key of the reward.
+        seed: as in ``StatefulTransform``.
+    """
 
     n_past: int
-    """K."""
+    """Number of rewards that are remembered for each of the M rows, K."""
 
     def __init__(self, reward_key: NestedKey, seed: int | None = None) -> None:
         super().__init__([reward_key], [reward_key], seed=seed)
@@ -57,21 +62,27 @@ class RewardTransform(StatefulTransform):
 
 
 class RewardDelay(RewardTransform):
-    """Pays each reward some steps later; what is still owed when an episode ends is paid with its last step.
+    """Delays rewards: each reward is received some steps after it was earned.
 
-    It must come after whatever ends episodes (such as a ``StepCounter`` with a limit).
-
-    Without a delay nothing changes, bit for bit.
+    Rewards that are received in the same step are added up. In the last step of an episode, all rewards that
+    are still in transit are received, so that none is lost. Hence the transform must come after every
+    transform that ends episodes, such as ``StepCounter(max_steps=100)``. With delay 0 the rollout is the
+    same, bit for bit, as without the transform.
 
     Args:
-        delay: a law without losses, steps, or a time (``damian.delays.law_of``); drawn for each world, each
-            agent (under a nested key) and each step.
-        reward_key: the reward.
-        dt: length of a step [s], for laws in time.
-        seed: of the delays.
+        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
+            The law must not lose rewards. A delay is drawn for each world, each agent (under a nested key)
+            and each step.
+        reward_key: key of the reward.
+        dt: length of a step [s], for delays given as times.
+        seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
 
     Raises:
-        InputError: an impossible law, or one that loses rewards.
+        InputError: the delay is not valid, or its law loses rewards.
+
+    Examples:
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardDelay(Uniform(0, 4)))
+        >>> rollout = env.rollout(200)  # the sum of the rewards is that of the environment
     """
 
     def __init__(
@@ -90,35 +101,42 @@ class RewardDelay(RewardTransform):
         return memory | {"clock": zero, "slot": zero.clone(), "streams": streams, "channel": channel}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        clock, owed = memory["clock"] + 1, memory["past"]
+        clock, in_transit = memory["clock"] + 1, memory["past"]
         reward = as_rows(entries[self.reward_key], self.rows)
         delay, channel = self.sampler(memory["streams"], clock, memory["channel"])
         slot_now = advance_slot(memory["slot"], 1, self.n_past)
-        due = advance_slot(slot_now, delay, self.n_past)
+        arrival = advance_slot(slot_now, delay, self.n_past)
         rows = torch.arange(len(reward), device=delay.device)
-        row, here = (slot * len(reward) + rows for slot in (due, slot_now))
-        flat = owed.flatten(0, 1).index_add(0, row, reward)
-        paid = flat.index_select(0, here)
-        owed = flat.index_fill(0, here, 0).view_as(owed)
+        row, here = (slot * len(reward) + rows for slot in (arrival, slot_now))
+        flat = in_transit.flatten(0, 1).index_add(0, row, reward)
+        received = flat.index_select(0, here)
+        in_transit = flat.index_fill(0, here, 0).view_as(in_transit)
         done = flag_rows(entries, "done", self.reward_key, self.rows)
         if done is not None:
-            over = expand_mask(done, paid)
-            paid = torch.where(over, paid + owed.sum(0), paid)
-            owed = owed.masked_fill(over, 0)
-        memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "past": owed}
-        return memory, {self.reward_key: from_rows(paid, self.rows)}
+            ended = expand_mask(done, received)
+            received = torch.where(ended, received + in_transit.sum(0), received)
+            in_transit = in_transit.masked_fill(ended, 0)
+        memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "past": in_transit}
+        return memory, {self.reward_key: from_rows(received, self.rows)}
 
 
 class CumulativeReward(RewardTransform):
-    """Replaces a reward by the discounted sum of the latest ones (eq. 4 of the paper).
+    """Replaces the reward by the discounted sum of the latest rewards (paper, eq. 4).
 
-    R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode. With one step
+    R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode. With ``steps=1``
     nothing changes.
 
     Args:
-        steps: T, how many rewards are summed up.
-        gamma: in (0, 1].
-        reward_key: the reward.
+        steps: number of rewards in the sum, T.
+        gamma: discount per step, in (0, 1].
+        reward_key: key of the reward.
+
+    Raises:
+        InputError: the number of steps or the discount is not valid.
+
+    Examples:
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), CumulativeReward(5, gamma=0.9))
+        >>> rollout = env.rollout(200)  # each reward is a discounted sum of the last five
     """
 
     def __init__(self, steps: int, gamma: float = 0.9, reward_key: NestedKey = "reward") -> None:

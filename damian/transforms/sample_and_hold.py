@@ -1,4 +1,4 @@
-"""Agents and servers that look at the world less often than it moves."""
+"""A transform for agents and servers whose clocks are slower than the environment's (paper, section 3.6)."""
 
 from collections.abc import Sequence
 
@@ -15,19 +15,26 @@ from damian.transforms.order import KeyUsage
 
 
 class SampleAndHold(StatefulTransform):
-    """Between two ticks entries stay what they were, and actions too (paper, section 3.6).
+    """Samples entries at the ticks of a slow clock, and holds them in between (paper, section 3.6).
 
-    Every episode begins with a tick. With a period of one step nothing changes.
+    The clock ticks every ``period`` steps, and at every reset. Between two ticks, the entries ``in_keys``
+    keep the values of the last tick, and the environment executes the actions ``in_keys_inv`` of the last
+    tick again. With a period of one step nothing changes.
 
     Args:
-        period: steps, or a time.
-        in_keys: entries that are sampled and held, in TensorDicts of the same batch size.
-        in_keys_inv: actions that are held: what is chosen between two ticks is not executed.
-        ready_key: flag that is false between two ticks, [...] bool: no decision is taken.
-        dt: length of a step [s], for a period in time.
+        period: time between two ticks: steps (``4``), or a time (``"2s"``).
+        in_keys: keys of the entries that are sampled and held; their TensorDicts have the same batch size.
+        in_keys_inv: keys of the actions that are held: an action chosen between two ticks is not executed.
+        ready_key: key of a flag, [...] bool, that is set to false between two ticks, as an agent cannot
+            choose then; None to leave it out.
+        dt: length of a step [s], for a period given as a time.
 
     Raises:
-        InputError: an impossible period.
+        InputError: the period is not valid.
+
+    Examples:
+        >>> clock = SampleAndHold(4, ["observation"], ["action"])
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), clock)  # the agent acts in every fourth step
     """
 
     def __init__(
@@ -51,10 +58,10 @@ class SampleAndHold(StatefulTransform):
         return KeyUsage(reads=self.step_keys, delays=self.in_keys, replaces=self.in_keys_inv)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        seen = select_entries(tensordict, self.in_keys)
-        device = seen[self.in_keys[0]].device
+        first = select_entries(tensordict, self.in_keys)
+        device = first[self.in_keys[0]].device
         elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
-        held = {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(seen.values())}
+        held = {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(first.values())}
         specs = self.env.full_action_spec
         acted = {
             f"acted_{i}": as_rows(specs[key].zero(), self.rows) for i, key in enumerate(self.in_keys_inv)
@@ -71,24 +78,24 @@ class SampleAndHold(StatefulTransform):
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         memory = memory | {"elapsed": memory["elapsed"] + 1}
         ticks = self._ticks(memory)
-        memory, shown = self._hold(memory, entries, self.in_keys, "held", ticks)
+        memory, held = self._hold(memory, entries, self.in_keys, "held", ticks)
         if self.ready_key:
             ready = entries[self.ready_key]
-            shown[self.ready_key] = ready & ticks.view_as(ready)
-        return memory, shown
+            held[self.ready_key] = ready & ticks.view_as(ready)
+        return memory, held
 
     def _ticks(self, memory: Memory) -> Tensor:
         """Is this step a tick, [M]."""
         return memory["elapsed"] % self.period == 0
 
     def _hold(
-        self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, take: Tensor
+        self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, sampled: Tensor
     ) -> Change:
-        """Take the entries where they may be taken [M], and show what is held."""
-        shown: Entries = {}
+        """Sample the entries where the mask [M] is true, and output the held values everywhere."""
+        outputs: Entries = {}
         for i, key in enumerate(keys):
             new, old = as_rows(entries[key], self.rows), memory[f"{name}_{i}"]
-            held = torch.where(expand_mask(take, new), new, old)
+            held = torch.where(expand_mask(sampled, new), new, old)
             memory = memory | {f"{name}_{i}": held}
-            shown[key] = from_rows(held, self.rows)
-        return memory, shown
+            outputs[key] = from_rows(held, self.rows)
+        return memory, outputs

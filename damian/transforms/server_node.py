@@ -1,4 +1,4 @@
-"""The server node as a transform: it works on the messages that have arrived."""
+"""The server node as a transform, which uses only messages that have arrived (paper, section 3.4)."""
 
 from collections.abc import Sequence
 
@@ -18,14 +18,21 @@ from damian.world.messages import Messages
 class ServerNode(StatefulTransform):
     """Computes observations, rewards and the task's status from the messages that have arrived.
 
-    It writes the entries that ``UavEnv`` itself writes when nothing is delayed. After a reset the server
-    holds the first message of every UAV, so that the environment's own outputs stay.
+    The transform writes the entries that ``UavEnv`` writes itself when no message is delayed. After a reset
+    the server holds the first message of every UAV, so the outputs of the environment's reset stay as they
+    are. ``damian.make_env`` adds the transform where a scenario delays or loses messages.
 
     Args:
-        server: computes everything.
-        message_key: the messages that the server holds, [B, N, M].
-        dropped_keys: entries that nobody reads later; each costs time at every step.
-        reward_terms: write ``("agents", "reward_terms")`` too.
+        server: server node that does the computations.
+        message_key: key of the packed messages that the server holds, [B, N, M].
+        dropped_keys: keys of entries to remove from the outputs, because nothing reads them later and each
+            one costs time in every step.
+        reward_terms: also write the weighted terms of the reward, ``("agents", "reward_terms")``.
+
+    Examples:
+        >>> env = UavEnv(scenario, num_worlds=64, extras=["message"], messages_only=True)
+        >>> uplink = ObservationDelay(3, [("agents", "message")], [("agents", "received")])
+        >>> env = TransformedEnv(env, Compose(uplink, ServerNode(env.server)))
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Steps that last until some agent can choose again."""
+"""A transform that merges the steps in which no agent can choose an action into one step."""
 
 from collections.abc import Sequence
 
@@ -15,25 +15,29 @@ from damian.transforms.entries import Change, Entries, Memory
 
 
 class SkipUntilReady(StatefulTransform):
-    """One step takes each world to the next instant at which some agent is ready, or its episode ends.
+    """Steps each world until some agent can choose an action again, or the episode ends.
 
-    The result is bit for bit that of stepping until then with actions that no agent executes, but rewards are
-    sums over the skipped steps k = 0, 1, ... of gamma^k r_k, and ``duration`` counts these steps, [B, 1] long
-    (0 after a reset). A learner that discounts the next value by gamma^duration learns in a semi-Markov
-    decision process (Sutton, Precup and Singh, 1999).
+    The outputs equal, bit for bit, those of stepping the environment until then with actions that no agent
+    executes. Only the reward is the sum of gamma^k r_k over the merged steps k = 0, 1, ..., and ``duration``,
+    [B, 1] long, is the number of these steps (0 after a reset). A learner that discounts the next state value
+    by gamma^duration learns in a semi-Markov decision process (Sutton, Precup and Singh, 1999).
 
-    It works only in a ``DelayedEnv`` on a ``UavEnv``, where a world that is ready can stand still, with all
-    of its messages in transit, while others step on. It may stand anywhere among damian's own transforms,
-    which must come first. Transforms of TorchRL that come later see only the long steps: ``StepCounter``
-    counts decisions.
+    The transform works only in a ``DelayedEnv`` on a ``UavEnv``, where worlds with a ready agent can pause,
+    with all of their messages in transit, while the others step on. Its place among damian's own transforms
+    does not matter, but these must come before all others. Transforms of TorchRL that come later process only
+    the merged steps: ``StepCounter`` counts decisions.
 
     Args:
-        gamma: discount within a step, in [0, 1]; with 1, returns are those of the short steps.
-        reward_keys: rewards, which are summed.
-        ready_key: may the agent choose now, [B, N] bool.
+        gamma: discount per merged step, in [0, 1]; with 1, returns are those of the single steps.
+        reward_keys: keys of the rewards to sum.
+        ready_key: key of the flag that tells whether an agent can choose an action now, [B, N] bool.
 
     Raises:
-        InputError: an impossible gamma.
+        InputError: gamma is not in [0, 1].
+
+    Examples:
+        >>> clock = ClockConfig(skip=True)  # adds the transform
+        >>> env = make_env(ScenarioConfig(motion=MotionConfig("polynomial"), clock=clock))
     """
 
     def __init__(
@@ -58,7 +62,7 @@ class SkipUntilReady(StatefulTransform):
         return memory, {keys.DURATION: torch.ones_like(entries[keys.DONE], dtype=torch.long)}
 
     def skipped_worlds(self, entries: Entries) -> Tensor:
-        """Worlds in which no agent is ready and whose episode goes on, [B]."""
+        """Worlds in which no agent is ready and the episode goes on, [B] bool."""
         ready, done = entries[self.ready_key], entries[keys.DONE]
         return ~(ready.flatten(1).any(-1) | done.view(-1))
 
@@ -71,8 +75,8 @@ class SkipUntilReady(StatefulTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         raise RuntimeError(
-            "SkipUntilReady works only in a DelayedEnv on a UavEnv, among the first transforms, all of them "
-            "damian's, and with whole steps: neither '_step' nor 'next' may be among the entries"
+            "SkipUntilReady works only in a DelayedEnv on a UavEnv, before all transforms that are not "
+            "damian's, and only if all worlds step: the TensorDict must contain neither '_step' nor 'next'"
         )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]

@@ -1,4 +1,4 @@
-"""What every transform keeps to, whatever TorchRL does with it: vectors, copies, checkpoints, graphs."""
+"""Every transform works with vectors of environments, copies, checkpoints, graphs and collectors."""
 
 import copy
 import inspect
@@ -12,8 +12,8 @@ from contract import (
     CASES,
     DRAWS,
     LATE,
+    OBSERVATION,
     REWARD,
-    SEEN,
     Drift,
     begun,
     cartpole,
@@ -48,60 +48,60 @@ from damian.transforms import (
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 AGENTS = {name: case for name, case in CASES.items() if case.env in (uavs, unserved)}
 AT_RESET = {name: case for name, case in CASES.items() if "Reward" not in name}
-"""Those whose memory begins at a reset: no reward is there before the first step."""
+"""Cases whose transform reads outputs of a reset; there is no reward before the first step."""
 BATCHED = {name: case for name, case in CASES.items() if case.env is not cartpole}
 in_agents = pytest.mark.parametrize("case", AGENTS.values(), ids=AGENTS)
 
 
-def test_the_contract_covers_every_transform():
+def test_the_cases_cover_every_exported_transform():
     exported = {name: getattr(damian.transforms, name) for name in damian.transforms.__all__}
     concrete = {
         name
-        for name, what in exported.items()
-        if inspect.isclass(what) and issubclass(what, Transform) and what is not StatefulTransform
+        for name, value in exported.items()
+        if inspect.isclass(value) and issubclass(value, Transform) and value is not StatefulTransform
     }
     assert concrete == {name.split(",")[0] for name in CASES}
     assert all(type(case.make()).__name__ == name.split(",")[0] for name, case in CASES.items())
 
 
-# Where a transform may stand.
+# Places in which a transform works.
 
 
 @every_case
-def test_a_single_environment_keeps_to_its_specs(case):
+def test_the_outputs_match_the_specs(case):
     env = case.build()
     check_env_specs(env, break_when_any_done="both")
     assert env.rollout(12, break_when_any_done=False).shape == (*env.batch_size, 12)
 
 
 @every_case
-def test_composed_and_appended_a_transform_does_the_same(case):
+def test_a_transform_does_the_same_in_a_compose_appended_or_around_a_transformed_environment(case):
     variants = [
         case.build(),
         TransformedEnv(case.env(), Compose(case.make())),
         TransformedEnv(case.env()).append_transform(case.make()),
         TransformedEnv(TransformedEnv(case.env()), case.make()),
     ]
-    shown = [onward(env, begun(env)) for env in variants]
-    assert all(all_same(one, shown[0]) for one in shown[1:])
+    outputs = [onward(env, begun(env)) for env in variants]
+    assert all(all_same(one, outputs[0]) for one in outputs[1:])
 
 
 @every_case
-def test_around_a_vector_of_environments_it_works(case):
+def test_a_transform_works_around_a_vector_of_environments(case):
     env = TransformedEnv(SerialEnv(2, case.env), case.make())
     check_env_specs(env, break_when_any_done="both")
     assert env.rollout(12, break_when_any_done=False).shape == (2, *case.env().batch_size, 12)
 
 
 @every_case
-def test_inside_a_vector_of_environments_it_works(case):
+def test_a_transform_works_inside_a_vector_of_environments(case):
     env = SerialEnv(2, case.build)
     check_env_specs(env, break_when_any_done="both")
     assert env.rollout(12, break_when_any_done=False).shape == (2, *case.env().batch_size, 12)
 
 
 @in_agents
-def test_in_worker_processes_it_works(case):
+def test_a_transform_works_in_worker_processes(case):
     env = ParallelEnv(2, case.build, mp_start_method="fork")
     try:
         check_env_specs(env, break_when_any_done="both")
@@ -111,35 +111,37 @@ def test_in_worker_processes_it_works(case):
 
 
 @pytest.mark.parametrize("case", [case for case in AGENTS.values() if case in DRAWS])
-def test_worker_processes_draw_apart_and_the_same_again_from_the_same_seed(case):
-    shown, drawn = [], []
+def test_worker_processes_draw_different_numbers_and_the_same_again_from_the_same_seed(case):
+    outputs, streams = [], []
     for _ in range(2):
         env = ParallelEnv(2, case.build, mp_start_method="fork")
         try:
-            shown.append(onward(env, begun(env, 0, seed=3), 8))
-            drawn.append([v for key, v in flat(env.state_dict()).items() if key.endswith("streams")])
+            outputs.append(onward(env, begun(env, 0, seed=3), 8))
+            streams.append([v for key, v in flat(env.state_dict()).items() if key.endswith("streams")])
         finally:
             env.close()
-    assert all_same(*shown)
-    (one, other), again = drawn
+    assert all_same(*outputs)
+    (one, other), again = streams
     assert not set(one.tolist()) & set(other.tolist())
     assert all(a.equal(b) for a, b in zip((one, other), again, strict=True))
 
 
 @pytest.mark.parametrize("case", [case for case in AGENTS.values() if case.env is uavs])
-def test_around_worker_processes_it_does_what_it_does_around_a_loop(case):
-    shown = []
+def test_a_transform_does_the_same_around_a_parallel_and_a_serial_environment(case):
+    outputs = []
     for vector in (SerialEnv(2, case.env), ParallelEnv(2, case.env, mp_start_method="fork")):
         env = TransformedEnv(vector, case.make())
         try:
-            shown.append(onward(env, begun(env), 8))
+            outputs.append(onward(env, begun(env), 8))
         finally:
             env.close()
-    assert all_same(*shown)
+    assert all_same(*outputs)
 
 
 @pytest.mark.parametrize("processes", [False, True])
-def test_delayed_environments_in_a_vector_draw_apart_and_the_same_again(processes):
+def test_delayed_environments_in_a_vector_draw_different_delays_and_the_same_again_from_the_same_seed(
+    processes,
+):
     vector = ParallelEnv(2, delayed, mp_start_method="fork") if processes else SerialEnv(2, delayed)
     try:
         one, other, again = (delays_of(vector, seed) for seed in (3, 4, 3))
@@ -155,7 +157,7 @@ def delayed():
 
 
 def delays_of(env, seed):
-    """What the messages take after seeding, [2, T, B, N]; torch's generator stands elsewhere each time."""
+    """Delays of messages after seeding, [2, T, B, N]; the state of torch's generator differs at each call."""
     env.set_seed(seed)
     torch.manual_seed(seed + torch.seed() % 1000)
     td, delays = env.reset(), []
@@ -166,7 +168,7 @@ def delays_of(env, seed):
 
 
 @every_case
-def test_outside_an_environment_it_says_what_to_do(case):
+def test_outside_an_environment_the_error_says_what_to_do(case):
     transform = case.make()
     env = case.env()
     td = env.rand_step(env.reset())
@@ -177,7 +179,7 @@ def test_outside_an_environment_it_says_what_to_do(case):
 
 
 def in_a_buffer(transform):
-    """What stores data in a replay buffer that has the transform, and samples it."""
+    """A function that stores data in a replay buffer with the transform, and samples it."""
 
     def use(td):
         data = td.unsqueeze(0).flatten()
@@ -205,12 +207,12 @@ COPIES = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "deepcopy": cop
 @every_case
 @pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
 @pytest.mark.parametrize("n_steps", [0, 5])
-def test_a_copy_in_mid_episode_goes_on_as_the_original(case, copied, n_steps):
+def test_a_copy_made_during_an_episode_continues_like_the_original(case, copied, n_steps):
     env = case.build()
     td = begun(env, n_steps)
     twin = copied(env)
-    there = onward(twin, td.clone())
-    assert all_same(onward(env, td.clone()), there)
+    outputs = onward(twin, td.clone())
+    assert all_same(onward(env, td.clone()), outputs)
 
 
 @every_case
@@ -225,7 +227,7 @@ def test_a_clone_shares_no_memory(case):
 
 
 @every_case
-def test_a_clone_of_an_unused_transform_works(case):
+def test_a_clone_of_a_transform_without_memory_works(case):
     original = case.make()
     env, expected = TransformedEnv(case.env(), original.clone()), case.build()
     assert all_same(onward(env, begun(env)), onward(expected, begun(expected)))
@@ -239,7 +241,7 @@ def test_a_clone_of_an_unused_transform_works(case):
 @pytest.mark.parametrize("n_steps", [0, 5])
 @pytest.mark.parametrize("whole", [True, False], ids=["environment", "transform"])
 @pytest.mark.parametrize("used", [True, False], ids=["used", "fresh"])
-def test_a_loaded_checkpoint_goes_on_bit_for_bit(case, n_steps, whole, used):
+def test_a_loaded_checkpoint_continues_bit_for_bit(case, n_steps, whole, used):
     env = case.build()
     td = begun(env, n_steps)
     transform = case.make()
@@ -248,11 +250,12 @@ def test_a_loaded_checkpoint_goes_on_bit_for_bit(case, n_steps, whole, used):
         transform.reset_parent()
     twin = TransformedEnv(copy.deepcopy(env.base_env), transform)
     saved, into = (env, twin) if whole else (env.transform, twin.transform)
-    into.load_state_dict(through_a_file(saved.state_dict()))
+    into.load_state_dict(saved_and_loaded(saved.state_dict()))
     assert all_same(onward(env, td.clone()), onward(twin, td.clone()))
 
 
-def through_a_file(state):
+def saved_and_loaded(state):
+    """A state after it was saved to a file and loaded from it."""
     file = io.BytesIO()
     torch.save(state, file)
     file.seek(0)
@@ -260,7 +263,7 @@ def through_a_file(state):
 
 
 @every_case
-def test_a_checkpoint_stays_what_it_was(case):
+def test_a_loaded_checkpoint_is_not_changed_by_later_steps(case):
     env = case.build()
     td = begun(env)
     saved = env.transform.state_dict()
@@ -274,7 +277,7 @@ def test_a_checkpoint_stays_what_it_was(case):
 
 
 @every_case
-def test_everything_remembered_is_saved(case):
+def test_all_memory_is_in_the_state_dict(case):
     env = case.build()
     begun(env)
     saved = {value.data_ptr() for value in memory(env.transform)}
@@ -294,21 +297,21 @@ CONSTANT = {"chances", "_boundaries", "_delays", "codes"}
 
 
 @in_agents
-def test_a_step_compiles_as_one_graph_and_does_the_same(case):
+def test_a_step_compiles_into_one_graph_that_does_the_same(case):
     env, twin = case.build(), case.build()
     td, _ = begun(env), begun(twin)
     torch._dynamo.reset()
-    compiled = torch.compile(passed(twin.transform), fullgraph=True, backend="eager")
+    compiled = torch.compile(whole_step(twin.transform), fullgraph=True, backend="eager")
     for _ in range(4):
         td = env.rand_action(td)
         after = env.base_env.step(td)["next"]
-        one, other = passed(env.transform)(td, after.clone()), compiled(td, after.clone())
+        one, other = whole_step(env.transform)(td, after.clone()), compiled(td, after.clone())
         assert same(one, other)
     assert all(a.equal(b) for a, b in zip(memory(env.transform), memory(twin.transform), strict=True))
 
 
-def passed(transform):
-    """A step through a transform: backwards with the action, forwards with what comes of it."""
+def whole_step(transform):
+    """A function that passes the inputs and then the outputs of a step through a transform."""
 
     def step(td, after):
         return transform._step(transform.inv(td), after)
@@ -320,7 +323,7 @@ def passed(transform):
 
 
 @every_case
-def test_a_rollout_with_gradients_keeps_no_graph(case):
+def test_the_autograd_graph_does_not_grow_during_a_rollout(case):
     env = case.build()
     td, weight, sizes = begun(env, 0), torch.ones((), requires_grad=True), []
     for t in range(24):
@@ -334,13 +337,13 @@ def test_a_rollout_with_gradients_keeps_no_graph(case):
 
 
 def nodes(value):
-    """How many operations a tensor's gradient goes through."""
-    found, ahead = set(), [value.grad_fn]
-    while ahead:
-        node = ahead.pop()
+    """Number of nodes in the autograd graph of a tensor."""
+    found, pending = set(), [value.grad_fn]
+    while pending:
+        node = pending.pop()
         if node is not None and node not in found:
             found.add(node)
-            ahead += [before for before, _ in node.next_functions]
+            pending += [before for before, _ in node.next_functions]
     return len(found)
 
 
@@ -348,7 +351,7 @@ def nodes(value):
 
 
 @every_case
-def test_a_collector_gets_what_a_rollout_gives(case):
+def test_a_collector_returns_the_same_data_as_a_rollout(case):
     env, twin = case.build(), case.build()
     for each in (env, twin):
         each.set_seed(0)
@@ -367,20 +370,20 @@ def test_a_collector_gets_what_a_rollout_gives(case):
 
 
 @pytest.mark.parametrize("case", BATCHED.values(), ids=BATCHED)
-def test_partial_resets_leave_the_other_worlds_alone(case):
+def test_a_reset_of_some_worlds_does_not_change_the_others(case):
     env, twin = case.build(), case.build()
     td, _ = begun(env, 2), begun(twin, 2)
-    again = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
-    again[0] = True
-    reset = env.reset(td.clone().set("_reset", again))
+    mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
+    mask[0] = True
+    reset = env.reset(td.clone().set("_reset", mask))
     assert same(reset[1:], td[1:].select(*reset.keys(True, True)))
     torch.manual_seed(0)
     actions = twin.rand_action(td.clone()).select(env.action_key)
-    shown = [each.step(state.clone().update(actions))["next"] for each, state in ((env, reset), (twin, td))]
-    assert same(shown[0][1:], shown[1][1:])
+    outputs = [each.step(state.clone().update(actions))["next"] for each, state in ((env, reset), (twin, td))]
+    assert same(outputs[0][1:], outputs[1][1:])
 
 
-# The order of a chain.
+# The order of transforms.
 
 
 def delay(**options):
@@ -389,7 +392,7 @@ def delay(**options):
 
 WRONG = {
     "a history before an action delay": (lambda: ActionHistory(2), lambda: ActionDelay(LATE)),
-    "a history before a clock of actions": (
+    "a history before a clock that holds actions": (
         lambda: ActionHistory(2),
         lambda: SampleAndHold(2, in_keys_inv=["action"]),
     ),
@@ -401,22 +404,25 @@ WRONG = {
         lambda: ActionHistory(2, append_to="observation"),
         lambda: SampleAndHold(2),
     ),
-    "a history that appends to what is made later": (
+    "a history that appends to an entry that is created later": (
         lambda: ActionHistory(2, append_to="late"),
         lambda: delay(out_keys=["late"]),
     ),
 }
 RIGHT = {
     "a history after an action delay": (lambda: ActionDelay(LATE), lambda: ActionHistory(2)),
-    "a history that appends after a delay": (delay, lambda: ActionHistory(2, append_to="observation")),
+    "a history that appends after an observation delay": (
+        delay,
+        lambda: ActionHistory(2, append_to="observation"),
+    ),
     "a history that appends after a clock": (
         lambda: SampleAndHold(2, in_keys_inv=["action"]),
         lambda: ActionHistory(2, append_to="observation"),
     ),
-    "a clock after a history that stands alone": (lambda: ActionHistory(2), lambda: SampleAndHold(2)),
+    "a clock after a history with its own entry": (lambda: ActionHistory(2), lambda: SampleAndHold(2)),
     "an action delay after an observation delay": (delay, lambda: ActionDelay(LATE)),
-    "sums of late rewards": (lambda: RewardDelay(LATE), lambda: CumulativeReward(3)),
-    "late sums of rewards": (lambda: CumulativeReward(3), lambda: RewardDelay(LATE)),
+    "sums of delayed rewards": (lambda: RewardDelay(LATE), lambda: CumulativeReward(3)),
+    "delayed sums of rewards": (lambda: CumulativeReward(3), lambda: RewardDelay(LATE)),
     "two delays of one observation": (delay, lambda: ObservationDelay(1, age_key=None)),
 }
 
@@ -447,7 +453,7 @@ every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
 @every_way
 @pytest.mark.parametrize("pair", WRONG.values(), ids=WRONG)
-def test_a_wrong_order_is_refused_where_it_comes_about(pair, way):
+def test_a_wrong_order_of_transforms_is_refused_however_they_are_composed(pair, way):
     one, other = (make() for make in pair)
     names = f"{type(one).__name__} must come after {type(other).__name__}"
     with pytest.raises(InputError, match=names):
@@ -456,7 +462,7 @@ def test_a_wrong_order_is_refused_where_it_comes_about(pair, way):
 
 @every_way
 @pytest.mark.parametrize("pair", RIGHT.values(), ids=RIGHT)
-def test_a_right_order_works(pair, way):
+def test_a_right_order_of_transforms_works(pair, way):
     env = way(Drift(), *(make() for make in pair))
     assert env.rollout(6, break_when_any_done=False).shape == (3, 6)
 
@@ -472,11 +478,13 @@ def server():
     return ServerNode(unserved().server)
 
 
-@pytest.mark.parametrize("late", [uplink, lambda: RewardDelay(2, REWARD), lambda: SampleAndHold(2, [SEEN])])
-def test_a_server_node_stands_between_what_it_reads_and_what_reads_it(late):
-    chain = [uplink, server, late] if late is not uplink else [uplink, server]
+@pytest.mark.parametrize(
+    "other", [uplink, lambda: RewardDelay(2, REWARD), lambda: SampleAndHold(2, [OBSERVATION])]
+)
+def test_a_server_node_must_come_after_the_uplink_and_before_transforms_of_its_outputs(other):
+    chain = [uplink, server, other] if other is not uplink else [uplink, server]
     env = TransformedEnv(unserved(), Compose(*(make() for make in chain)))
     assert env.rollout(4).shape == (2, 4)
-    wrong = [server, uplink] if late is uplink else [uplink, late, server]
+    wrong = [server, uplink] if other is uplink else [uplink, other, server]
     with pytest.raises(InputError, match="order of transforms"):
         Compose(*(make() for make in wrong))

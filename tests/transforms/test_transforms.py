@@ -1,4 +1,4 @@
-"""The transforms on any environment: against a slow twin, and the invariants that all of them keep."""
+"""The transforms on many environments: comparisons with plain Python, and properties of all transforms."""
 
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -50,10 +50,11 @@ LAWS = {
     "burst": lambda _: Burst(0.2, 0.3, good=Uniform(0, 1), bad=5, bad_loss=0.0),
     "trace": lambda folder: trace(folder, 4, 0, 7, 1, 0, 2, 9, 0, 0, 3),
 }
-"""None of them loses anything."""
+"""Delay laws that lose no message."""
 
 
 def trace(folder: Any, *delays: Any) -> Trace:
+    """A trace of these delays, in a file of the folder."""
     file = folder / f"{len(delays)}.csv"
     file.write_text("\n".join(map(str, ["delay", *delays])))
     return Trace(str(file))
@@ -65,130 +66,130 @@ def law(request, tmp_path):
 
 
 def delayed(*transforms: StatefulTransform, worlds: Sequence[int] = WORLDS, **options: Any) -> TransformedEnv:
-    """The counting worlds with transforms that draw for each world by itself."""
+    """A ``Counting`` environment with transforms whose draws depend on the names of the worlds."""
     for transform in transforms:
         transform.seed_worlds(torch.tensor(worlds))
     return TransformedEnv(Counting(worlds, N_AGENTS, **options), Compose(*transforms))
 
 
 def streams_of(worlds: Sequence[int]) -> Tensor:
-    """Random streams that the transforms of ``delayed`` draw from, [M]."""
+    """The random streams from which the transforms of ``delayed`` draw, [M]."""
     return counter_rng.bits(torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)).flatten()
 
 
 def choices(worlds: Sequence[int] = WORLDS, n_steps: int = STEPS) -> list[Tensor]:
-    """What each world's agents do, whoever is stepped beside them, [B, N] for each step."""
+    """Actions for each step, [B, N]; those of a world do not depend on the other worlds."""
     names, agents = torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)
     return [counter_rng.bits(names, agents, torch.tensor([t])) % Counting.N_ACTIONS for t in range(n_steps)]
 
 
-def column(shown: Sequence[TensorDictBase], *key: str) -> list:
-    """An entry over time, as nested lists."""
-    return torch.stack([td[key] for td in shown]).tolist()
+def column(outputs: Sequence[TensorDictBase], *key: str) -> list:
+    """An entry of every output, as nested lists."""
+    return torch.stack([td[key] for td in outputs]).tolist()
 
 
-def before(shown: Sequence[TensorDictBase], *key: str) -> list:
-    """An entry as it was when each step's action was chosen."""
-    return column(shown[:-1:2], *key)
+def before(outputs: Sequence[TensorDictBase], *key: str) -> list:
+    """An entry before each step, as nested lists."""
+    return column(outputs[:-1:2], *key)
 
 
-def after(shown: Sequence[TensorDictBase], *key: str) -> list:
-    """An entry as each step showed it."""
-    return column(shown[1::2], *key)
+def after(outputs: Sequence[TensorDictBase], *key: str) -> list:
+    """An entry after each step, as nested lists."""
+    return column(outputs[1::2], *key)
 
 
-# Against the twin.
+# Comparisons with the reference implementations in plain Python.
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "message_sent")])
-def test_everyone_holds_the_message_that_a_loop_over_messages_says(law, order, loss, sent_key):
+def test_every_agent_holds_the_message_that_the_reference_receiver_holds(law, order, loss, sent_key):
     options = {"loss": loss, "order": order, "sent_key": sent_key, "fresh_key": "fresh", "delay_key": "delay"}
     transform = ObservationDelay(law, [OBSERVATION], [("agents", "seen")], **options)
-    shown = play(delayed(transform), choices())
-    sent, message_sent = column(shown, *OBSERVATION), column(shown, "agents", "message_sent")
-    told = {key: column(shown, "agents", key) for key in ("seen", "age", "fresh", "delay")}
+    outputs = play(delayed(transform), choices())
+    observed, message_sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
+    found = {key: column(outputs, "agents", key) for key in ("seen", "age", "fresh", "delay")}
     table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
-    done, lost = column(shown, "done"), transform.sampler.lost
+    done, lost = column(outputs, "done"), transform.sampler.lost
     for row, (w, n) in enumerate(ROWS):
         receiver = Receiver(order)
-        receiver.begin(0, sent[0][w][n])
+        receiver.begin(0, observed[0][w][n])
         for now in range(1, STEPS + 1):
             at, reset = 2 * now - 1, 2 * now
             delay = table[now - 1][row]
-            travels = delay < lost and (sent_key is None or message_sent[at][w][n])
-            fresh = receiver.step(now, sent[at][w][n], delay if travels else None)
+            arrives = delay < lost and (sent_key is None or message_sent[at][w][n])
+            fresh = receiver.step(now, observed[at][w][n], delay if arrives else None)
             expected = [
                 receiver.holds.content,
                 [now - receiver.holds.sent],
                 [fresh],
-                [delay if travels else -1],
+                [delay if arrives else -1],
             ]
-            assert [told[key][at][w][n] for key in told] == expected
+            assert [found[key][at][w][n] for key in found] == expected
             if done[at][w][0]:
-                receiver.begin(now, sent[reset][w][n])
-                expected = [sent[reset][w][n], [0.0], [True], [0]]
-            assert [told[key][reset][w][n] for key in told] == expected
+                receiver.begin(now, observed[reset][w][n])
+                expected = [observed[reset][w][n], [0.0], [True], [0]]
+            assert [found[key][reset][w][n] for key in found] == expected
 
 
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
-def test_everyone_executes_the_action_that_a_loop_over_choices_says(law, loss, sent_key):
+def test_every_agent_executes_the_action_that_the_reference_receiver_holds(law, loss, sent_key):
     default = 5
     options = {"loss": loss, "sent_key": sent_key, "valid_key": "action_valid", "default": default}
     transform, chosen = ActionDelay(law, ACTION, **options), choices()
-    shown = play(delayed(transform), chosen)
-    ready = before(shown, "agents", "ready")
-    seen, done = after(shown, *OBSERVATION), after(shown, "done")
+    outputs = play(delayed(transform), chosen)
+    ready = before(outputs, "agents", "ready")
+    observed, done = after(outputs, *OBSERVATION), after(outputs, "done")
     table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
     for row, (w, n) in enumerate(ROWS):
         receiver = Receiver("generation")
         receiver.begin(0, default)
         for now in range(1, STEPS + 1):
             delay, t = table[now - 1][row], now - 1
-            travels = delay < transform.sampler.lost and (sent_key is None or ready[t][w][n])
-            fresh = receiver.step(now, chosen[t][w, n].item(), delay if travels else None)
-            assert seen[t][w][n][5:] == [receiver.holds.content, fresh or receiver.waits]
+            arrives = delay < transform.sampler.lost and (sent_key is None or ready[t][w][n])
+            fresh = receiver.step(now, chosen[t][w, n].item(), delay if arrives else None)
+            assert observed[t][w][n][5:] == [receiver.holds.content, fresh or receiver.waits]
             if done[t][w][0]:
                 receiver.begin(now, default)
 
 
-def test_continuous_actions_are_held_back_whole():
+def test_continuous_actions_are_delayed():
     chosen = [torch.stack([a / 2 - 1, a % 3 / 10], -1) for a in choices()]
-    shown = play(delayed(ActionDelay(2, ACTION, default=[1.0, 0.5]), continuous=True, ends=0.0), chosen)
+    outputs = play(delayed(ActionDelay(2, ACTION, default=[1.0, 0.5]), continuous=True, ends=0.0), chosen)
     executed = [(a * torch.tensor([1.0, 10.0])).round().sum(-1).tolist() for a in chosen]
-    found = [[[agent[5] for agent in world] for world in step] for step in after(shown, *OBSERVATION)]
+    found = [[[agent[5] for agent in world] for world in step] for step in after(outputs, *OBSERVATION)]
     assert found == [[[6.0] * N_AGENTS] * len(WORLDS)] * 2 + executed[:-2]
 
 
-def rewards_of(shown: Sequence[TensorDictBase]) -> tuple[list, list]:
-    """Rewards, and whether the episode ended with them, [T][B][N]."""
-    return after(shown, *REWARD), after(shown, "done")
+def rewards_of(outputs: Sequence[TensorDictBase]) -> tuple[list, list]:
+    """Rewards [T][B][N][1], and flags of the ends of episodes [T][B][1], as nested lists."""
+    return after(outputs, *REWARD), after(outputs, "done")
 
 
-def test_everyone_is_paid_what_a_loop_over_debts_says_and_nothing_is_lost(law):
+def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law):
     transform = RewardDelay(law, REWARD)
     earned, done = rewards_of(play(Counting(WORLDS, N_AGENTS), choices()))
-    paid, _ = rewards_of(play(delayed(transform), choices()))
+    received, _ = rewards_of(play(delayed(transform), choices()))
     table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
     for row, (w, n) in enumerate(ROWS):
-        purse, owing = Purse(), 0.0
+        purse, in_transit = Purse(), 0.0
         for t in range(STEPS):
-            reward, over = earned[t][w][n][0], done[t][w][0]
-            assert paid[t][w][n][0] == purse.step(t, reward, table[t][row], over)
-            owing += reward - paid[t][w][n][0]
-            assert not over or owing == 0
+            reward, ended = earned[t][w][n][0], done[t][w][0]
+            assert received[t][w][n][0] == purse.step(t, reward, table[t][row], ended)
+            in_transit += reward - received[t][w][n][0]
+            assert not ended or in_transit == 0
 
 
-def test_who_resets_before_the_end_of_an_episode_is_paid_nothing_of_it():
+def test_a_reset_during_an_episode_discards_its_rewards_in_transit():
     env = delayed(RewardDelay(3, REWARD), ends=0.0)
     play(env, choices(n_steps=5))
-    paid, _ = rewards_of(play(env, choices(n_steps=3)))
-    assert paid == [[[[0.0]] * N_AGENTS] * len(WORLDS)] * 3
+    received, _ = rewards_of(play(env, choices(n_steps=3)))
+    assert received == [[[[0.0]] * N_AGENTS] * len(WORLDS)] * 3
 
 
 @pytest.mark.parametrize("steps", [1, 3, 8])
-@pytest.mark.parametrize("gamma", [0.5, 1.0])  # exact in floats
-def test_the_cumulative_reward_is_equation_4(steps, gamma):
+@pytest.mark.parametrize("gamma", [0.5, 1.0])  # their powers are exact in floats
+def test_the_cumulative_reward_equals_equation_4(steps, gamma):
     earned, done = rewards_of(play(Counting(WORLDS, N_AGENTS), choices()))
     found, _ = rewards_of(play(delayed(CumulativeReward(steps, gamma, REWARD)), choices()))
     for w, n in ROWS:
@@ -200,105 +201,104 @@ def test_the_cumulative_reward_is_equation_4(steps, gamma):
 
 
 @pytest.mark.parametrize("period", [1, 2, 3, 5])
-def test_between_two_ticks_what_is_seen_and_done_stays_and_nobody_is_ready(period):
-    chosen, raw = choices(), Counting(WORLDS, N_AGENTS)
+def test_between_two_ticks_entries_and_actions_are_held_and_no_agent_is_ready(period):
+    chosen = choices()
     clock = SampleAndHold(period, [("agents", "message_sent")], [ACTION], ready_key=("agents", "ready"))
-    shown, bare = play(delayed(clock), chosen), play(raw, chosen)
-    ready, seen = column(shown, "agents", "ready"), column(shown, "agents", "message_sent")
-    free, sent, done = (
-        column(bare, *key) for key in (("agents", "ready"), ("agents", "message_sent"), ("done",))
+    outputs, undelayed = play(delayed(clock), chosen), play(Counting(WORLDS, N_AGENTS), chosen)
+    ready, held = column(outputs, "agents", "ready"), column(outputs, "agents", "message_sent")
+    ready_now, sent, done = (
+        column(undelayed, *key) for key in (("agents", "ready"), ("agents", "message_sent"), ("done",))
     )
-    executed = column(shown, *OBSERVATION)
+    executed = column(outputs, *OBSERVATION)
     for w, n in ROWS:
-        elapsed, holds, does = 0, sent[0][w][n], None
+        elapsed, sampled, executes = 0, sent[0][w][n], None
         for t in range(STEPS):
             at, reset = 2 * t + 1, 2 * t + 2
-            does = chosen[t][w, n].item() if elapsed % period == 0 else does
+            executes = chosen[t][w, n].item() if elapsed % period == 0 else executes
             elapsed += 1
             ticks = elapsed % period == 0
-            holds = sent[at][w][n] if ticks else holds
-            expected = [holds, ticks and free[at][w][n]]
-            assert [seen[at][w][n], ready[at][w][n]] == expected
-            assert executed[at][w][n][5] == does
+            sampled = sent[at][w][n] if ticks else sampled
+            expected = [sampled, ticks and ready_now[at][w][n]]
+            assert [held[at][w][n], ready[at][w][n]] == expected
+            assert executed[at][w][n][5] == executes
             if done[at][w][0]:
-                elapsed, holds = 0, sent[reset][w][n]
-                expected = [holds, free[reset][w][n]]
-            assert [seen[reset][w][n], ready[reset][w][n]] == expected
+                elapsed, sampled = 0, sent[reset][w][n]
+                expected = [sampled, ready_now[reset][w][n]]
+            assert [held[reset][w][n], ready[reset][w][n]] == expected
 
 
 @pytest.mark.parametrize("steps", [1, 3])
 @pytest.mark.parametrize("recorded_key", [None, "ready"])
-def test_everyone_remembers_the_actions_that_a_list_of_them_holds(steps, recorded_key):
+def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_key):
     default, chosen = 2, choices()
     history = ActionHistory(steps, ACTION, default=default, recorded_key=recorded_key)
-    shown = play(delayed(history), chosen)
-    found = torch.stack([td["agents", "action_history"] for td in shown])
-    ready, done = before(shown, "agents", "ready"), after(shown, "done")
+    outputs = play(delayed(history), chosen)
+    found = torch.stack([td["agents", "action_history"] for td in outputs])
+    ready, done = before(outputs, "agents", "ready"), after(outputs, "done")
     for w, n in ROWS:
-        select_entries = []
+        recorded = []
         for t in range(STEPS):
-            select_entries += [chosen[t][w, n].item()] * (recorded_key is None or ready[t][w][n])
-            assert found[2 * t + 1, w, n].equal(
-                torch.tensor(last_actions(select_entries, steps, default)) / 6
-            )
-            select_entries = [] if done[t][w][0] else select_entries
-            assert found[2 * t + 2, w, n].equal(
-                torch.tensor(last_actions(select_entries, steps, default)) / 6
-            )
+            recorded += [chosen[t][w, n].item()] * (recorded_key is None or ready[t][w][n])
+            assert found[2 * t + 1, w, n].equal(torch.tensor(last_actions(recorded, steps, default)) / 6)
+            recorded = [] if done[t][w][0] else recorded
+            assert found[2 * t + 2, w, n].equal(torch.tensor(last_actions(recorded, steps, default)) / 6)
 
 
 @pytest.mark.parametrize("recorded_key", [None, "ready"])
-def test_only_actions_that_what_is_shown_cannot_know_of_are_remembered(law, recorded_key):
+def test_with_an_age_key_the_history_contains_only_actions_chosen_since_the_observation(law, recorded_key):
     default, chosen = 2, choices()
     late = ObservationDelay(law, [OBSERVATION])
     history = ActionHistory(3, ACTION, default=default, recorded_key=recorded_key, age_key="age")
-    shown = play(delayed(late, history), chosen)
-    found = torch.stack([td["agents", "action_history"] for td in shown])
-    ages = column(shown, "agents", "age")
-    ready, done = before(shown, "agents", "ready"), after(shown, "done")
+    outputs = play(delayed(late, history), chosen)
+    found = torch.stack([td["agents", "action_history"] for td in outputs])
+    ages = column(outputs, "agents", "age")
+    ready, done = before(outputs, "agents", "ready"), after(outputs, "done")
     for w, n in ROWS:
-        select_entries: list[tuple[int, int]] = []
+        recorded: list[tuple[int, int]] = []
         for t in range(STEPS):
-            select_entries += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
-            latest = last_actions(select_entries, 3, (-STEPS, default))
-            since = t + 1 - ages[2 * t + 1][w][n][0]  # when the message that is shown was generated
-            unknown = [action if at >= since else default for at, action in latest]
-            assert found[2 * t + 1, w, n].equal(torch.tensor(unknown) / 6)
-            select_entries = [] if done[t][w][0] else select_entries
+            recorded += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
+            latest = last_actions(recorded, 3, (-STEPS, default))
+            since = t + 1 - ages[2 * t + 1][w][n][0]  # when the observation was generated
+            expected = [action if at >= since else default for at, action in latest]
+            assert found[2 * t + 1, w, n].equal(torch.tensor(expected) / 6)
+            recorded = [] if done[t][w][0] else recorded
 
 
-def test_the_actions_that_are_remembered_are_the_chosen_ones_not_the_executed():
-    late, history = ActionDelay(3, ACTION), ActionHistory(1, ACTION)
-    shown = play(delayed(late, history, ends=0.0), choices())
-    for later, chosen in zip(shown[1::2], choices(), strict=True):
-        assert later["agents", "action_history"].equal(chosen.unsqueeze(-1) / 6)
+def test_the_history_contains_the_chosen_actions_not_the_executed_ones():
+    delay, history = ActionDelay(3, ACTION), ActionHistory(1, ACTION)
+    outputs = play(delayed(delay, history, ends=0.0), choices())
+    for output, chosen in zip(outputs[1::2], choices(), strict=True):
+        assert output["agents", "action_history"].equal(chosen.unsqueeze(-1) / 6)
 
 
-def test_actions_are_remembered_scaled_by_codes_or_behind_what_is_seen():
+def test_a_history_of_action_codes_is_appended_to_the_observation():
     codes = torch.arange(14.0).view(7, 2)
     coded = delayed(ActionHistory(2, ACTION, codes=codes, append_to=OBSERVATION), ends=0.0)
-    shown, bare = play(coded, choices()), play(Counting(WORLDS, N_AGENTS, ends=0.0), choices())
+    outputs, undelayed = play(coded, choices()), play(Counting(WORLDS, N_AGENTS, ends=0.0), choices())
     for t in range(2, STEPS):
-        seen = shown[2 * t - 1][OBSERVATION]
-        assert seen[..., :7].equal(bare[2 * t - 1][OBSERVATION])
-        assert seen[..., 7:].equal(torch.cat([codes[choices()[t - 2]], codes[choices()[t - 1]]], -1).double())
+        observation = outputs[2 * t - 1][OBSERVATION]
+        assert observation[..., :7].equal(undelayed[2 * t - 1][OBSERVATION])
+        assert observation[..., 7:].equal(
+            torch.cat([codes[choices()[t - 2]], codes[choices()[t - 1]]], -1).double()
+        )
 
 
-# Environments of all kinds.
+# Properties that the transforms have on every kind of environment.
 
 
 class Kind(NamedTuple):
-    """An environment, and its keys."""
+    """An environment, and the keys of its entries."""
 
     make: Callable[[], EnvBase]
     observation: Any = OBSERVATION
     action: Any = ACTION
     reward: Any = REWARD
     steps: int = 30
-    """Enough for an episode to end."""
+    """Number of steps in which an episode ends."""
 
 
 def vmas(**options: Any) -> EnvBase:
+    """A multi-agent environment of VMAS."""
     pytest.importorskip("vmas")
     from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
 
@@ -306,7 +306,7 @@ def vmas(**options: Any) -> EnvBase:
 
 
 def two(name: str, **options: Any) -> EnvBase:
-    """Two environments of Gymnasium side by side, whose episodes end at different steps."""
+    """Two Gymnasium environments side by side, whose episodes end at different steps."""
     return SerialEnv(2, lambda: GymEnv(name, **options))
 
 
@@ -326,20 +326,21 @@ KINDS = {
 kinds = pytest.mark.parametrize("kind", KINDS)
 
 
-def history(env: EnvBase, steps: int) -> list[TensorDictBase]:
-    """Random actions, the same at each call: what was shown before and after each step."""
+def rollout_of(env: EnvBase, steps: int) -> list[TensorDictBase]:
+    """Outputs of every step and every reset under random actions, which are the same at each call."""
     torch.manual_seed(0)
     env.set_seed(0)
-    td, shown = env.reset(), []
+    td, outputs = env.reset(), []
     for _ in range(steps):
         stepped, td = env.step_and_maybe_reset(env.rand_action(td))
-        shown += [stepped.clone(), td.clone()]
-    return shown
+        outputs += [stepped.clone(), td.clone()]
+    return outputs
 
 
 @cache
-def bare_history(kind: str) -> list[TensorDictBase]:
-    return history(KINDS[kind].make(), KINDS[kind].steps)
+def undelayed_rollout_of(kind: str) -> list[TensorDictBase]:
+    """The rollout of an environment without transforms."""
+    return rollout_of(KINDS[kind].make(), KINDS[kind].steps)
 
 
 TRANSFORMS: dict[str, Callable[[Kind, Any], StatefulTransform]] = {
@@ -350,7 +351,7 @@ TRANSFORMS: dict[str, Callable[[Kind, Any], StatefulTransform]] = {
     "action": lambda kind, law: ActionDelay(law, kind.action, seed=1),
     "reward": lambda kind, law: RewardDelay(law, kind.reward, seed=1),
 }
-NOTHING = {
+ZERO_DELAYS = {
     "steps": lambda _: 0,
     "a time": lambda _: "0s",
     "uniform": lambda _: Uniform(0, 0, 0.5),
@@ -361,141 +362,140 @@ NOTHING = {
 }
 
 
-def check_unchanged(shown: list[TensorDictBase], bare: list[TensorDictBase]) -> None:
-    """Everything that the bare environment shows is shown, bit for bit and in the same type."""
-    for some, others in zip(shown, bare, strict=True):
-        assert same(some.select(*others.keys(True, True)), others)
-        assert all(some[key].dtype == value.dtype for key, value in others.items(True, True))
+def check_unchanged(outputs: list[TensorDictBase], undelayed: list[TensorDictBase]) -> None:
+    """Check that the outputs contain those without delay, bit for bit and with the same dtypes."""
+    for one, other in zip(outputs, undelayed, strict=True):
+        assert same(one.select(*other.keys(True, True)), other)
+        assert all(one[key].dtype == value.dtype for key, value in other.items(True, True))
 
 
-EVERY_LAW_ON_ONE = [
-    (kind, nothing)
-    for kind in KINDS
-    for nothing in NOTHING
-    if kind == "counting" or nothing in ("steps", "burst")
+ZERO_DELAY_CASES = [
+    (kind, law) for kind in KINDS for law in ZERO_DELAYS if kind == "counting" or law in ("steps", "burst")
 ]
+"""Every law on one environment, and two laws on the others."""
 
 
-@pytest.mark.parametrize(("kind", "nothing"), EVERY_LAW_ON_ONE)
+@pytest.mark.parametrize(("kind", "zero_delay"), ZERO_DELAY_CASES)
 @pytest.mark.parametrize("transform", TRANSFORMS)
-def test_without_a_delay_nothing_changes(kind, transform, nothing, tmp_path):
-    of = KINDS[kind]
-    late = TRANSFORMS[transform](of, NOTHING[nothing](tmp_path))
-    check_unchanged(history(TransformedEnv(of.make(), late), of.steps), bare_history(kind))
+def test_with_delay_0_nothing_changes(kind, transform, zero_delay, tmp_path):
+    case = KINDS[kind]
+    delay = TRANSFORMS[transform](case, ZERO_DELAYS[zero_delay](tmp_path))
+    check_unchanged(rollout_of(TransformedEnv(case.make(), delay), case.steps), undelayed_rollout_of(kind))
 
 
 @kinds
-def test_a_clock_that_always_ticks_a_window_of_a_step_and_a_memory_change_nothing(kind):
-    of = KINDS[kind]
+def test_a_clock_of_period_1_a_sum_of_one_reward_and_a_history_change_nothing(kind):
+    case = KINDS[kind]
     for transform in (
-        SampleAndHold(1, [of.observation], [of.action]),
-        CumulativeReward(1, 0.5, of.reward),
-        ActionHistory(2, of.action),
+        SampleAndHold(1, [case.observation], [case.action]),
+        CumulativeReward(1, 0.5, case.reward),
+        ActionHistory(2, case.action),
     ):
-        check_unchanged(history(TransformedEnv(of.make(), transform), of.steps), bare_history(kind))
+        check_unchanged(
+            rollout_of(TransformedEnv(case.make(), transform), case.steps), undelayed_rollout_of(kind)
+        )
 
 
 @kinds
 @pytest.mark.parametrize("law", [3, Burst(good=PAPER, bad_loss=0.0)], ids=["constant", "burst"])
-def test_every_delay_keeps_the_specs_of_every_environment(kind, law):
+def test_the_outputs_of_delayed_environments_match_the_specs(kind, law):
     for make in TRANSFORMS.values():
         env = TransformedEnv(KINDS[kind].make(), make(KINDS[kind], law))
         check_env_specs(env, seed=0, break_when_any_done="both")
 
 
 @kinds
-def test_clocks_sums_and_memories_keep_the_specs_of_every_environment(kind):
-    of = KINDS[kind]
+def test_the_outputs_with_clocks_sums_and_histories_match_the_specs(kind):
+    case = KINDS[kind]
     for transform in (
-        SampleAndHold(3, [of.observation], [of.action]),
-        CumulativeReward(4, 0.9, of.reward),
-        ActionHistory(2, of.action),
-        ActionHistory(2, of.action, append_to=of.observation),
+        SampleAndHold(3, [case.observation], [case.action]),
+        CumulativeReward(4, 0.9, case.reward),
+        ActionHistory(2, case.action),
+        ActionHistory(2, case.action, append_to=case.observation),
     ):
-        check_env_specs(TransformedEnv(of.make(), transform), seed=0, break_when_any_done="both")
+        check_env_specs(TransformedEnv(case.make(), transform), seed=0, break_when_any_done="both")
 
 
 @kinds
-def test_all_of_them_together_keep_the_specs_of_every_environment(kind):
-    of = KINDS[kind]
+def test_the_outputs_with_all_transforms_together_match_the_specs(kind):
+    case = KINDS[kind]
     chain = [
-        ActionDelay(2, of.action),
-        ObservationDelay(PAPER, [of.observation], loss=0.1, fresh_key="fresh", delay_key="delay"),
-        RewardDelay(1, of.reward),
-        CumulativeReward(3, 0.9, of.reward),
-        SampleAndHold(2, [of.observation]),
-        ActionHistory(2, of.action, append_to=of.observation),
+        ActionDelay(2, case.action),
+        ObservationDelay(PAPER, [case.observation], loss=0.1, fresh_key="fresh", delay_key="delay"),
+        RewardDelay(1, case.reward),
+        CumulativeReward(3, 0.9, case.reward),
+        SampleAndHold(2, [case.observation]),
+        ActionHistory(2, case.action, append_to=case.observation),
     ]
-    check_env_specs(TransformedEnv(of.make(), Compose(*chain)), seed=0, break_when_any_done="both")
+    check_env_specs(TransformedEnv(case.make(), Compose(*chain)), seed=0, break_when_any_done="both")
 
 
-# No peeking.
+# Causality: no value has an effect before it arrives.
 
 
-def differs(shown: Sequence[TensorDictBase], others: Sequence[TensorDictBase], *key: str) -> Tensor:
-    """In which steps and for whom an entry is another, [T, B, N]."""
-    pairs = zip(shown[1::2], others[1::2], strict=True)
+def differs(outputs: Sequence[TensorDictBase], others: Sequence[TensorDictBase], *key: str) -> Tensor:
+    """Steps and agents at which an entry differs, [T, B, N] bool."""
+    pairs = zip(outputs[1::2], others[1::2], strict=True)
     return torch.stack([(a[key] != b[key]).flatten(2).any(-1) for a, b in pairs])
 
 
-def lasting(first: int, last: int, w: int, n: int, total: int) -> Tensor:
-    """Only one agent's steps first <= t <= last, [T, B, N]."""
-    wanted = torch.zeros(total, len(WORLDS), N_AGENTS, dtype=torch.bool)
-    wanted[first - 1 : last, w, n] = True
-    return wanted
+def only_steps(first: int, last: int, w: int, n: int, total: int) -> Tensor:
+    """A mask that is true only for the steps first <= t <= last of one agent, [T, B, N] bool."""
+    mask = torch.zeros(total, len(WORLDS), N_AGENTS, dtype=torch.bool)
+    mask[first - 1 : last, w, n] = True
+    return mask
 
 
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 @pytest.mark.parametrize("name", ["constant", "uniform", "geometric", "trace"])
-def test_what_a_message_says_changes_nothing_before_it_arrives(name, order, tmp_path):
+def test_a_message_has_no_effect_before_it_arrives(name, order, tmp_path):
     n_steps, arrived = 25, 0
 
     def rollout(tampered: tuple[int, int, int] | None) -> list[TensorDictBase]:
         law = LAWS[name](tmp_path)
-        late = ObservationDelay(law, [OBSERVATION], order=order, delay_key="delay")
-        return play(delayed(late, ends=0.0, tampered=tampered), choices(n_steps=n_steps))
+        delay = ObservationDelay(law, [OBSERVATION], order=order, delay_key="delay")
+        return play(delayed(delay, ends=0.0, tampered=tampered), choices(n_steps=n_steps))
 
     honest = rollout(None)
     for w, n, sent in ((0, 0, 3), (1, 1, 7), (3, 0, 12)):
-        lied = differs(honest, rollout((w, n, sent)), *OBSERVATION)
+        changed = differs(honest, rollout((w, n, sent)), *OBSERVATION)
         arrival = sent + int(honest[2 * sent - 1]["agents", "delay"][w, n])
-        assert not lied[: arrival - 1].any()
-        lied[:, w, n] = False
-        assert not lied.any()
+        assert not changed[: arrival - 1].any()
+        changed[:, w, n] = False
+        assert not changed.any()
         arrived += differs(honest, rollout((w, n, sent)), *OBSERVATION)[arrival - 1, w, n].item()
     assert arrived > 0
 
 
 def test_a_message_is_held_from_its_arrival_until_the_next_one():
     def rollout(tampered: tuple[int, int, int] | None) -> list[TensorDictBase]:
-        late = ObservationDelay(4, [OBSERVATION])
-        return play(delayed(late, ends=0.0, tampered=tampered), choices(n_steps=20))
+        delay = ObservationDelay(4, [OBSERVATION])
+        return play(delayed(delay, ends=0.0, tampered=tampered), choices(n_steps=20))
 
-    assert differs(rollout(None), rollout((2, 1, 6)), *OBSERVATION).equal(lasting(10, 10, 2, 1, 20))
+    assert differs(rollout(None), rollout((2, 1, 6)), *OBSERVATION).equal(only_steps(10, 10, 2, 1, 20))
 
 
-def test_a_choice_changes_nothing_before_it_is_executed():
+def test_an_action_has_no_effect_before_it_is_executed():
     others = choices(n_steps=20)
     others[6][2, 1] += 1  # chosen before the 7th step
     rollouts = [
-        play(delayed(ActionDelay(4, ACTION), ends=0.0), action_valid)
-        for action_valid in (choices(n_steps=20), others)
+        play(delayed(ActionDelay(4, ACTION), ends=0.0), actions) for actions in (choices(n_steps=20), others)
     ]
-    assert differs(*rollouts, *OBSERVATION).equal(lasting(11, 20, 2, 1, 20))
+    assert differs(*rollouts, *OBSERVATION).equal(only_steps(11, 20, 2, 1, 20))
 
 
-def test_a_reward_changes_nothing_before_it_is_paid():
+def test_a_reward_has_no_effect_before_it_is_received():
     def rollout(tampered: tuple[int, int, int] | None) -> list[TensorDictBase]:
         return play(delayed(RewardDelay(4, REWARD), ends=0.0, tampered=tampered), choices(n_steps=20))
 
-    assert differs(rollout(None), rollout((2, 1, 6)), *REWARD).equal(lasting(10, 10, 2, 1, 20))
+    assert differs(rollout(None), rollout((2, 1, 6)), *REWARD).equal(only_steps(10, 10, 2, 1, 20))
 
 
-# Batches.
+# Independence of the worlds.
 
 
-def chain() -> list[StatefulTransform]:
-    """One of each, all of them random where they can be."""
+def one_of_each() -> list[StatefulTransform]:
+    """One transform of each class, with random delays."""
     keys = {"fresh_key": "fresh", "delay_key": "delay"}
     return [
         ActionDelay(Geometric(1, 4), ACTION, loss=0.1, sent_key="ready"),
@@ -509,65 +509,68 @@ def chain() -> list[StatefulTransform]:
     ]
 
 
-def test_worlds_stepped_together_do_what_each_does_alone():
-    together = play(delayed(*chain()), choices())
+def test_a_worlds_outputs_do_not_depend_on_the_other_worlds():
+    together = play(delayed(*one_of_each()), choices())
     assert sum(td["done"].sum().item() for td in together) > 10
     for w, world in enumerate(WORLDS):
-        alone = play(delayed(*chain(), worlds=[world]), choices([world]))
+        alone = play(delayed(*one_of_each(), worlds=[world]), choices([world]))
         assert all_same([td[w : w + 1] for td in together], alone)
 
 
-def test_a_reset_of_some_worlds_touches_only_their_rows():
+def test_a_reset_of_some_worlds_does_not_change_the_others():
     def rollout(mask: Sequence[bool]) -> list[TensorDictBase]:
-        env, shown = delayed(*chain(), ends=0.0), []
+        env, outputs = delayed(*one_of_each(), ends=0.0), []
         td = env.reset()
         for t, action in enumerate(choices(n_steps=30)):
             stepped, td = env.step_and_maybe_reset(td.set(ACTION, action))
-            shown.append(stepped["next"].clone())
+            outputs.append(stepped["next"].clone())
             if t in (4, 6, 15):
                 td = env.reset(td.exclude(ACTION).set("_reset", torch.tensor(mask).unsqueeze(-1)))
-                shown.append(td.exclude("_reset").clone())
-        return shown
+                outputs.append(td.exclude("_reset").clone())
+        return outputs
 
     some = rollout([True, False, False, True])
     every = rollout([True, True, True, True])
     none = rollout([False, False, False, False])
-    for kept, renewed in (((1, 2), none), ((0, 3), every)):
-        for w in kept:
-            assert all_same([td[w] for td in some], [td[w] for td in renewed])
+    for worlds, expected in (((1, 2), none), ((0, 3), every)):
+        for w in worlds:
+            assert all_same([td[w] for td in some], [td[w] for td in expected])
     assert not all_same([td[0] for td in some], [td[0] for td in none])
 
 
-# Delays of actions and of observations.
+# Delays of actions and of observations together.
 
 
 @pytest.mark.parametrize("i", range(4))
 @pytest.mark.parametrize("j", range(4))
-def test_observations_late_by_i_and_actions_by_j_are_observations_late_by_their_sum(i, j):
-    """Katsikopoulos and Engelbrecht (2003): the agent lives the same life, j steps later."""
+def test_delays_of_observations_and_actions_add_up(i, j):
+    """Delays i and j have the same effect as an observation delay i + j (Katsikopoulos, Engelbrecht 2003).
+
+    With both delays, the agent makes the same decisions, but j steps earlier.
+    """
 
     def decide(td: TensorDictBase) -> Tensor:
         return ((td[OBSERVATION] * torch.arange(1.0, 8)).sum(-1) % 7).long()
 
-    def life(env: EnvBase, default_steps: int) -> tuple[Tensor, Tensor, Tensor]:
-        td, seen, executed, rewards = env.reset(), [], [], []
+    def run(env: EnvBase, default_steps: int) -> tuple[Tensor, Tensor, Tensor]:
+        td, observed, executed, rewards = env.reset(), [], [], []
         for t in range(20):
             action = torch.zeros(len(WORLDS), N_AGENTS, dtype=torch.long) if t < default_steps else decide(td)
-            seen.append(td[OBSERVATION])
+            observed.append(td[OBSERVATION])
             stepped, td = env.step_and_maybe_reset(td.set(ACTION, action))
             executed.append(env.base_env.executed)
             rewards.append(stepped["next", *REWARD])
-        return torch.stack(seen), torch.stack(executed), torch.stack(rewards)
+        return torch.stack(observed), torch.stack(executed), torch.stack(rewards)
 
-    both = life(delayed(ActionDelay(j, ACTION), ObservationDelay(i, [OBSERVATION]), ends=0.0), 0)
-    summed = life(delayed(ObservationDelay(i + j, [OBSERVATION]), ends=0.0), j)
+    both = run(delayed(ActionDelay(j, ACTION), ObservationDelay(i, [OBSERVATION]), ends=0.0), 0)
+    summed = run(delayed(ObservationDelay(i + j, [OBSERVATION]), ends=0.0), j)
     assert both[0][: 20 - j].equal(summed[0][j:])
     assert both[1].equal(summed[1])
     assert both[2].equal(summed[2])
     assert len(both[1].unique()) > 3
 
 
-# Actions of every kind.
+# Every kind of action spec.
 
 GROUP = (len(WORLDS), N_AGENTS)
 ACTIONS = {
@@ -581,15 +584,15 @@ ACTIONS = {
 }
 
 
-class Takes(Transform):
-    """Lets an environment of numbered actions take others, which it notes."""
+class ActionRecorder(Transform):
+    """Gives an environment another action spec, records the actions, and passes zeros on."""
 
     def __init__(self, spec: TensorSpec) -> None:
         super().__init__(in_keys_inv=[ACTION])
-        self.spec, self.taken = spec, []
+        self.spec, self.recorded = spec, []
 
     def _inv_call(self, td: TensorDictBase) -> TensorDictBase:
-        self.taken.append(td[ACTION].clone())
+        self.recorded.append(td[ACTION].clone())
         return td.set(ACTION, torch.zeros(GROUP, dtype=torch.long))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -598,20 +601,21 @@ class Takes(Transform):
 
 
 @pytest.mark.parametrize("spec", ACTIONS.values(), ids=ACTIONS)
-def test_actions_of_every_kind_are_delayed_and_remembered(spec):
-    end = Takes(spec)
-    chain = Compose(end, ActionDelay(2, ACTION), ActionHistory(2, ACTION))
-    env = TransformedEnv(Counting(WORLDS, ends=0.0), chain)
+def test_actions_of_every_spec_can_be_delayed_and_recorded(spec):
+    recorder = ActionRecorder(spec)
+    transforms = Compose(recorder, ActionDelay(2, ACTION), ActionHistory(2, ACTION))
+    env = TransformedEnv(Counting(WORLDS, ends=0.0), transforms)
     td, chosen = env.reset(), []
     for _ in range(6):
         td = env.rand_action(td)
         chosen.append(td[ACTION].clone())
         td = env.step_mdp(env.step(td))
-    assert spec.is_in(end.taken[0])
-    assert end.taken[0].equal(end.taken[1])
-    assert all(late.equal(early) for late, early in zip(end.taken[2:], chosen, strict=False))
-    shown = td["agents", "action_history"]
-    assert shown.shape[-1] == 2 * (chosen[0].numel() // len(WORLDS) // N_AGENTS)
+    executed = recorder.recorded
+    assert spec.is_in(executed[0])
+    assert executed[0].equal(executed[1])
+    assert all(late.equal(early) for late, early in zip(executed[2:], chosen, strict=False))
+    history = td["agents", "action_history"]
+    assert history.shape[-1] == 2 * (chosen[0].numel() // len(WORLDS) // N_AGENTS)
     if not isinstance(spec, Unbounded):
-        assert ((shown >= 0) & (shown <= 1)).all()
-    assert shown.dtype == torch.float32
+        assert ((history >= 0) & (history <= 1)).all()
+    assert history.dtype == torch.float32

@@ -1,0 +1,177 @@
+"""``make_env``: the messages that the server holds, the action history, and clocks."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from delayed_envs import DELAYS, PAPER, after_steps, choices, delayed, every_delay
+from helpers import KEEPS_GOING, all_same, both_motions, everything, play, square
+from torch import Tensor
+
+from damian.delays.config import DelayConfig
+from damian.delays.laws import law_of
+from damian.envs.clocks import ClockConfig
+from damian.envs.pipeline import hold_action, make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import UavEnv
+from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED
+from damian.world.messages import Messages
+from damian.world.signal_source import SourceConfig
+
+# The messages that the server holds, and their age of information.
+
+
+@every_delay
+@both_motions
+def test_the_age_of_every_held_message_is_right(delays, motion):
+    delay = DELAYS[delays]["delay"]
+    env = delayed(everything(motion, delay=delay, clock=ClockConfig("2s")), 8)
+    outputs, dt = play(env, choices(env, 30)), env.scenario.clock.dt
+    steps, n_old = torch.zeros(8, 1), 0
+    for stepped, following in zip(outputs[1::2], outputs[2::2], strict=True):
+        steps += 1
+        for td in (stepped, following):
+            age = td[AGE].squeeze(-1)
+            assert Messages.unpack(td[RECEIVED]).time.equal((steps - age) * dt)
+            n_old += (age > 1).sum().item()
+            steps = steps * ~stepped["done"]  # ``following`` is output after the reset
+        assert following[AGE].squeeze(-1)[stepped["done"].squeeze(-1)].sum() == 0
+    assert n_old > 15
+
+
+def test_after_a_reset_the_server_holds_the_first_message_of_every_uav():
+    env = delayed(everything(**DELAYS["everything"]), 8)
+    outputs = play(env, choices(env, 30))
+    after_reset = [outputs[0]]
+    for stepped, following in zip(outputs[1::2], outputs[2::2], strict=True):
+        after_reset.append(following[stepped["done"].squeeze(-1)])
+    assert sum(len(td) for td in after_reset) > 20
+    for td in after_reset:
+        assert td[RECEIVED].equal(td[MESSAGE])
+        assert not td[AGE].any()
+        assert not td["agents", "delay"].any()
+        assert not Messages.unpack(td[RECEIVED]).time.any()
+
+
+def test_if_every_message_is_lost_the_server_holds_the_first_one_for_the_whole_episode():
+    env = delayed(square(episode=KEEPS_GOING, delay=DelayConfig(loss=1.0)))
+    outputs = play(env, choices(env, 10))
+    for t, td in enumerate(outputs[1::2], 1):
+        assert td[RECEIVED].equal(outputs[0][MESSAGE])
+        assert (td[AGE] == t).all()
+        assert (td["agents", "delay"] == -1).all()
+
+
+SILENT = SourceConfig(emission="per_step", emission_probability=0.0)
+
+
+def check_mean(rows: Tensor, exact: float) -> None:
+    """The mean of independent rows lies within four standard errors of the exact mean."""
+    error = rows.std() / math.sqrt(len(rows))
+    assert 0 < error < 0.02
+    assert abs(rows.mean() - exact) < 4 * error
+
+
+def test_the_delay_law_of_the_paper_delays_15_percent_and_the_mean_age_is_the_exact_one():
+    scenario = square(source=SILENT, episode=KEEPS_GOING, delay=DelayConfig(obs=PAPER))
+    env = make_env(scenario, 512, extras=["message"])
+    outputs = play(env, choices(env, 150))
+    delays = after_steps(outputs, ("agents", "delay")).double().view(150, -1)
+    ages = after_steps(outputs, AGE).double().view(150, -1)[20:]
+    check_mean((delays > 0).double().mean(0), 0.15)
+    chances = law_of(PAPER).sampler().chances[0]
+    older = 1 - chances.cumsum(0)[:-1]  # P(D > i)
+    check_mean(ages.mean(0), older.cumprod(0).sum().item())
+
+
+def test_the_action_history_holds_the_chosen_displacements_east_and_north():
+    scenario = square(delay=DelayConfig(act=2, history=2), episode=KEEPS_GOING)
+    env, undelayed = delayed(scenario), UavEnv(square(), 4)
+    actions = choices(env, 6)
+    distance, heading = scenario.actions.table().unbind(-1)
+    displacements = torch.stack([distance * heading.sin(), distance * heading.cos()], -1)
+    codes = (displacements / 200 + 1) / 2
+    outputs = play(env, actions)
+    for t in range(2, 6):
+        expected = torch.cat([codes[actions[t - 1]], codes[actions[t]]], -1)
+        observation = outputs[2 * t + 1][OBSERVATION]
+        assert observation.shape[-1] == undelayed.observation_spec[OBSERVATION].shape[-1] + 4
+        torch.testing.assert_close(observation[..., -4:], expected, rtol=0, atol=1e-6)
+
+
+# Clocks.
+
+
+def with_clocks(motion: str = "instant", act: Any = 0, **clocks: str) -> ScenarioConfig:
+    """A scenario with these clocks in which no UAV hears the source, so that motion counts never restart."""
+    delay = DelayConfig(obs=PAPER, act=act, history=2)
+    options = {"episode": KEEPS_GOING, "delay": delay, "clock": ClockConfig(**clocks)}
+    return everything(motion, source=SILENT, **options)
+
+
+def test_between_two_ticks_of_their_clock_uavs_do_not_act():
+    env = delayed(with_clocks(agents="3s"))
+    td, n_moves = env.reset(), 0
+    for t, action in enumerate(choices(env, 30)):
+        ticks = t % 3 == 0
+        assert (td[READY] == ticks).all()
+        before = env.base_env.state
+        _, following = env.step_and_maybe_reset(td.clone().set(ACTION, action))
+        after = env.base_env.state
+        assert after.motions.equal(before.motions + ticks)
+        if not ticks:
+            assert after.position.equal(before.position)
+            assert after.sent.trail.equal(before.sent.trail)
+            assert after.track.equal(before.track)
+            assert following[OBSERVATION][..., -4:].equal(td[OBSERVATION][..., -4:])  # the action history
+        if t % 3 < 2:
+            assert following[OBSERVATION][..., :-4].equal(td[OBSERVATION][..., :-4])
+        n_moves += (after.position != before.position).any().item()
+        td = following
+    assert n_moves > 5
+
+
+def test_between_two_ticks_of_the_servers_clock_observations_do_not_change():
+    env = delayed(with_clocks(server="4s"))
+    outputs, n_changes = play(env, choices(env, 30)), 0
+    for t, td in enumerate(outputs[2::2], 1):
+        before = outputs[2 * t - 2]
+        if t % 4:
+            assert td[OBSERVATION][..., :-4].equal(before[OBSERVATION][..., :-4])
+            assert td[GLOBAL_OBSERVATION].equal(before[GLOBAL_OBSERVATION])
+        n_changes += (td[GLOBAL_OBSERVATION] != before[GLOBAL_OBSERVATION]).any().item()
+    assert n_changes > 5
+
+
+def test_a_uav_observes_the_latest_broadcast_before_its_own_tick():
+    every_step, sampled = (
+        delayed(with_clocks(**clocks)) for clocks in ({}, {"agents": "4s", "server": "2s"})
+    )
+    holds = torch.full((4, 3), hold_action(every_step.scenario.actions))
+    all_outputs, outputs = play(every_step, lambda t: holds, 20), play(sampled, lambda t: holds, 20)
+    for t in range(21):
+        at_server_tick, at_agent_tick = all_outputs[2 * (t - t % 2)], all_outputs[2 * (t - t % 4)]
+        assert outputs[2 * t][GLOBAL_OBSERVATION].equal(at_server_tick[GLOBAL_OBSERVATION])
+        assert outputs[2 * t][OBSERVATION][..., :-4].equal(at_agent_tick[OBSERVATION][..., :-4])
+
+
+@pytest.mark.parametrize("act", [0, 2, {"law": "geometric", "mean": 2}], ids=["none", "2", "random"])
+@pytest.mark.parametrize(
+    ("motion", "agents"), [("instant", "3s"), ("polynomial", "1s"), ("polynomial", "3s")]
+)
+def test_an_action_chosen_while_not_ready_is_never_executed(act, motion, agents):
+    delay = DelayConfig(obs=1, act=act, history=2)
+    scenario = everything(motion, delay=delay, clock=ClockConfig(agents=agents))
+    rollouts, n_ignored = [], 0
+    for changed in (False, True):
+        env = delayed(scenario)
+        td, outputs = env.reset(), []
+        for action, other in zip(choices(env, 15), choices(env, 16)[1:], strict=True):
+            n_ignored += (~td[READY]).sum().item()
+            chosen = torch.where(td[READY] | (not changed), action, other)
+            stepped, td = env.step_and_maybe_reset(td.set(ACTION, chosen))
+            outputs += [stepped["next"].clone(), td.exclude(ACTION)]
+        rollouts.append(outputs)
+    assert all_same(*rollouts)
+    assert n_ignored > 50
