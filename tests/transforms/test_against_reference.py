@@ -1,0 +1,223 @@
+"""The delay transforms beside slow reference implementations in plain Python."""
+
+from collections.abc import Sequence
+
+import pytest
+import torch
+from delay_twin import Counting, Purse, Receiver, drawn, last_actions, looking_back
+from helpers import play
+from tensordict import TensorDictBase
+from transform_cases import LAWS, (
+    ACTION,
+    N_AGENTS,
+    OBSERVATION,
+    REWARD,
+    ROWS,
+    STEPS,
+    WORLDS,
+    after,
+    before,
+    choices,
+    column,
+    delayed,
+    streams_of,
+)
+
+from damian.transforms import (
+    ActionDelay,
+    ActionHistory,
+    CumulativeReward,
+    ObservationDelay,
+    RewardDelay,
+    SampleAndHold,
+)
+
+
+@pytest.fixture(params=LAWS)
+def law(request, tmp_path):
+    return LAWS[request.param](tmp_path)
+
+
+# Comparisons with the reference implementations in plain Python.
+
+
+@pytest.mark.parametrize("order", ["generation", "arrival"])
+@pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "message_sent")])
+def test_every_agent_holds_the_message_that_the_reference_receiver_holds(law, order, loss, sent_key):
+    options = {"loss": loss, "order": order, "sent_key": sent_key, "fresh_key": "fresh", "delay_key": "delay"}
+    transform = ObservationDelay(law, [OBSERVATION], [("agents", "seen")], **options)
+    outputs = play(delayed(transform), choices())
+    observed, message_sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
+    found = {key: column(outputs, "agents", key) for key in ("seen", "age", "fresh", "delay")}
+    table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
+    done, lost = column(outputs, "done"), transform.sampler.lost
+    for row, (w, n) in enumerate(ROWS):
+        receiver = Receiver(order)
+        receiver.begin(0, observed[0][w][n])
+        for now in range(1, STEPS + 1):
+            at, reset = 2 * now - 1, 2 * now
+            delay = table[now - 1][row]
+            arrives = delay < lost and (sent_key is None or message_sent[at][w][n])
+            fresh = receiver.step(now, observed[at][w][n], delay if arrives else None)
+            expected = [
+                receiver.holds.content,
+                [now - receiver.holds.sent],
+                [fresh],
+                [delay if arrives else -1],
+            ]
+            assert [found[key][at][w][n] for key in found] == expected
+            if done[at][w][0]:
+                receiver.begin(now, observed[reset][w][n])
+                expected = [observed[reset][w][n], [0.0], [True], [0]]
+            assert [found[key][reset][w][n] for key in found] == expected
+
+
+@pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "ready")])
+def test_every_agent_executes_the_action_that_the_reference_receiver_holds(law, loss, sent_key):
+    default = 5
+    options = {"loss": loss, "sent_key": sent_key, "valid_key": "action_valid", "default": default}
+    transform, chosen = ActionDelay(law, ACTION, **options), choices()
+    outputs = play(delayed(transform), chosen)
+    ready = before(outputs, "agents", "ready")
+    observed, done = after(outputs, *OBSERVATION), after(outputs, "done")
+    table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
+    for row, (w, n) in enumerate(ROWS):
+        receiver = Receiver("generation")
+        receiver.begin(0, default)
+        for now in range(1, STEPS + 1):
+            delay, t = table[now - 1][row], now - 1
+            arrives = delay < transform.sampler.lost and (sent_key is None or ready[t][w][n])
+            fresh = receiver.step(now, chosen[t][w, n].item(), delay if arrives else None)
+            assert observed[t][w][n][5:] == [receiver.holds.content, fresh or receiver.waits]
+            if done[t][w][0]:
+                receiver.begin(now, default)
+
+
+def test_continuous_actions_are_delayed():
+    chosen = [torch.stack([a / 2 - 1, a % 3 / 10], -1) for a in choices()]
+    outputs = play(delayed(ActionDelay(2, ACTION, default=[1.0, 0.5]), continuous=True, ends=0.0), chosen)
+    executed = [(a * torch.tensor([1.0, 10.0])).round().sum(-1).tolist() for a in chosen]
+    found = [[[agent[5] for agent in world] for world in step] for step in after(outputs, *OBSERVATION)]
+    assert found == [[[6.0] * N_AGENTS] * len(WORLDS)] * 2 + executed[:-2]
+
+
+def rewards_of(outputs: Sequence[TensorDictBase]) -> tuple[list, list]:
+    """Rewards [T][B][N][1], and flags of the ends of episodes [T][B][1], as nested lists."""
+    return after(outputs, *REWARD), after(outputs, "done")
+
+
+def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law):
+    transform = RewardDelay(law, REWARD)
+    earned, done = rewards_of(play(Counting(WORLDS, N_AGENTS), choices()))
+    received, _ = rewards_of(play(delayed(transform), choices()))
+    table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
+    for row, (w, n) in enumerate(ROWS):
+        purse, in_transit = Purse(), 0.0
+        for t in range(STEPS):
+            reward, ended = earned[t][w][n][0], done[t][w][0]
+            assert received[t][w][n][0] == purse.step(t, reward, table[t][row], ended)
+            in_transit += reward - received[t][w][n][0]
+            assert not ended or in_transit == 0
+
+
+def test_a_reset_during_an_episode_discards_its_rewards_in_transit():
+    env = delayed(RewardDelay(3, REWARD), ends=0.0)
+    play(env, choices(n_steps=5))
+    received, _ = rewards_of(play(env, choices(n_steps=3)))
+    assert received == [[[[0.0]] * N_AGENTS] * len(WORLDS)] * 3
+
+
+@pytest.mark.parametrize("steps", [1, 3, 8])
+@pytest.mark.parametrize("gamma", [0.5, 1.0])  # their powers are exact in floats
+def test_the_cumulative_reward_equals_equation_4(steps, gamma):
+    earned, done = rewards_of(play(Counting(WORLDS, N_AGENTS), choices()))
+    found, _ = rewards_of(play(delayed(CumulativeReward(steps, gamma, REWARD)), choices()))
+    for w, n in ROWS:
+        episode = []
+        for t in range(STEPS):
+            episode.append(earned[t][w][n][0])
+            assert found[t][w][n][0] == looking_back(episode, steps, gamma)
+            episode = [] if done[t][w][0] else episode
+
+
+@pytest.mark.parametrize("period", [1, 2, 3, 5])
+def test_between_two_ticks_entries_and_actions_are_held_and_no_agent_is_ready(period):
+    chosen = choices()
+    clock = SampleAndHold(period, [("agents", "message_sent")], [ACTION], ready_key=("agents", "ready"))
+    outputs, undelayed = play(delayed(clock), chosen), play(Counting(WORLDS, N_AGENTS), chosen)
+    ready, held = column(outputs, "agents", "ready"), column(outputs, "agents", "message_sent")
+    ready_now, sent, done = (
+        column(undelayed, *key) for key in (("agents", "ready"), ("agents", "message_sent"), ("done",))
+    )
+    executed = column(outputs, *OBSERVATION)
+    for w, n in ROWS:
+        elapsed, sampled, executes = 0, sent[0][w][n], None
+        for t in range(STEPS):
+            at, reset = 2 * t + 1, 2 * t + 2
+            executes = chosen[t][w, n].item() if elapsed % period == 0 else executes
+            elapsed += 1
+            ticks = elapsed % period == 0
+            sampled = sent[at][w][n] if ticks else sampled
+            expected = [sampled, ticks and ready_now[at][w][n]]
+            assert [held[at][w][n], ready[at][w][n]] == expected
+            assert executed[at][w][n][5] == executes
+            if done[at][w][0]:
+                elapsed, sampled = 0, sent[reset][w][n]
+                expected = [sampled, ready_now[reset][w][n]]
+            assert [held[reset][w][n], ready[reset][w][n]] == expected
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+@pytest.mark.parametrize("recorded_key", [None, "ready"])
+def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_key):
+    default, chosen = 2, choices()
+    history = ActionHistory(steps, ACTION, default=default, recorded_key=recorded_key)
+    outputs = play(delayed(history), chosen)
+    found = torch.stack([td["agents", "action_history"] for td in outputs])
+    ready, done = before(outputs, "agents", "ready"), after(outputs, "done")
+    for w, n in ROWS:
+        recorded = []
+        for t in range(STEPS):
+            recorded += [chosen[t][w, n].item()] * (recorded_key is None or ready[t][w][n])
+            assert found[2 * t + 1, w, n].equal(torch.tensor(last_actions(recorded, steps, default)) / 6)
+            recorded = [] if done[t][w][0] else recorded
+            assert found[2 * t + 2, w, n].equal(torch.tensor(last_actions(recorded, steps, default)) / 6)
+
+
+@pytest.mark.parametrize("recorded_key", [None, "ready"])
+def test_with_an_age_key_the_history_contains_only_actions_chosen_since_the_observation(law, recorded_key):
+    default, chosen = 2, choices()
+    late = ObservationDelay(law, [OBSERVATION])
+    history = ActionHistory(3, ACTION, default=default, recorded_key=recorded_key, age_key="age")
+    outputs = play(delayed(late, history), chosen)
+    found = torch.stack([td["agents", "action_history"] for td in outputs])
+    ages = column(outputs, "agents", "age")
+    ready, done = before(outputs, "agents", "ready"), after(outputs, "done")
+    for w, n in ROWS:
+        recorded: list[tuple[int, int]] = []
+        for t in range(STEPS):
+            recorded += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
+            latest = last_actions(recorded, 3, (-STEPS, default))
+            since = t + 1 - ages[2 * t + 1][w][n][0]  # when the observation was generated
+            expected = [action if at >= since else default for at, action in latest]
+            assert found[2 * t + 1, w, n].equal(torch.tensor(expected) / 6)
+            recorded = [] if done[t][w][0] else recorded
+
+
+def test_the_history_contains_the_chosen_actions_not_the_executed_ones():
+    delay, history = ActionDelay(3, ACTION), ActionHistory(1, ACTION)
+    outputs = play(delayed(delay, history, ends=0.0), choices())
+    for output, chosen in zip(outputs[1::2], choices(), strict=True):
+        assert output["agents", "action_history"].equal(chosen.unsqueeze(-1) / 6)
+
+
+def test_a_history_of_action_codes_is_appended_to_the_observation():
+    codes = torch.arange(14.0).view(7, 2)
+    coded = delayed(ActionHistory(2, ACTION, codes=codes, append_to=OBSERVATION), ends=0.0)
+    outputs, undelayed = play(coded, choices()), play(Counting(WORLDS, N_AGENTS, ends=0.0), choices())
+    for t in range(2, STEPS):
+        observation = outputs[2 * t - 1][OBSERVATION]
+        assert observation[..., :7].equal(undelayed[2 * t - 1][OBSERVATION])
+        assert observation[..., 7:].equal(
+            torch.cat([codes[choices()[t - 2]], codes[choices()[t - 1]]], -1).double()
+        )

@@ -1,0 +1,128 @@
+"""Orders of transforms in which one would undo or miss the work of another are refused."""
+
+import pytest
+from contract import (
+    LATE,
+    OBSERVATION,
+    REWARD,
+    Drift,
+    unserved,
+)
+from torchrl.envs import Compose, RewardSum, TransformedEnv
+
+from damian.common.errors import InputError
+from damian.transforms import (
+    ActionDelay,
+    ActionHistory,
+    CumulativeReward,
+    ObservationDelay,
+    RewardDelay,
+    SampleAndHold,
+    ServerNode,
+)
+
+# The order of transforms.
+
+
+def delay(**options):
+    return ObservationDelay(LATE, **options)
+
+
+WRONG = {
+    "a history before an action delay": (lambda: ActionHistory(2), lambda: ActionDelay(LATE)),
+    "a history before a clock that holds actions": (
+        lambda: ActionHistory(2),
+        lambda: SampleAndHold(2, in_keys_inv=["action"]),
+    ),
+    "an observation delay after a history that appends": (
+        lambda: ActionHistory(2, append_to="observation"),
+        delay,
+    ),
+    "a clock after a history that appends": (
+        lambda: ActionHistory(2, append_to="observation"),
+        lambda: SampleAndHold(2),
+    ),
+    "a history that appends to an entry that is created later": (
+        lambda: ActionHistory(2, append_to="late"),
+        lambda: delay(out_keys=["late"]),
+    ),
+}
+RIGHT = {
+    "a history after an action delay": (lambda: ActionDelay(LATE), lambda: ActionHistory(2)),
+    "a history that appends after an observation delay": (
+        delay,
+        lambda: ActionHistory(2, append_to="observation"),
+    ),
+    "a history that appends after a clock": (
+        lambda: SampleAndHold(2, in_keys_inv=["action"]),
+        lambda: ActionHistory(2, append_to="observation"),
+    ),
+    "a clock after a history with its own entry": (lambda: ActionHistory(2), lambda: SampleAndHold(2)),
+    "an action delay after an observation delay": (delay, lambda: ActionDelay(LATE)),
+    "sums of delayed rewards": (lambda: RewardDelay(LATE), lambda: CumulativeReward(3)),
+    "delayed sums of rewards": (lambda: CumulativeReward(3), lambda: RewardDelay(LATE)),
+    "two delays of one observation": (delay, lambda: ObservationDelay(1, age_key=None)),
+}
+
+
+def appended_inside(env, one, other):
+    inner = Compose(RewardSum())
+    env = TransformedEnv(env, Compose(one, inner))
+    inner.append(other)
+    return env
+
+
+WAYS = {
+    "Compose": lambda env, one, other: TransformedEnv(env, Compose(one, other)),
+    "nested first": lambda env, one, other: TransformedEnv(env, Compose(RewardSum(), Compose(one), other)),
+    "nested second": lambda env, one, other: TransformedEnv(env, Compose(one, Compose(other))),
+    "append": lambda env, one, other: TransformedEnv(env, one).append_transform(other),
+    "append nested": lambda env, one, other: TransformedEnv(env, Compose(one)).append_transform(
+        Compose(RewardSum(), other)
+    ),
+    "append inside": appended_inside,
+    "insert": lambda env, one, other: TransformedEnv(env, other).insert_transform(0, one),
+    "around a transformed environment": lambda env, one, other: TransformedEnv(
+        TransformedEnv(env, one), other
+    ),
+}
+every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+
+
+@every_way
+@pytest.mark.parametrize("pair", WRONG.values(), ids=WRONG)
+def test_a_wrong_order_of_transforms_is_refused_however_they_are_composed(pair, way):
+    one, other = (make() for make in pair)
+    names = f"{type(one).__name__} must come after {type(other).__name__}"
+    with pytest.raises(InputError, match=names):
+        way(Drift(), one, other)
+
+
+@every_way
+@pytest.mark.parametrize("pair", RIGHT.values(), ids=RIGHT)
+def test_a_right_order_of_transforms_works(pair, way):
+    env = way(Drift(), *(make() for make in pair))
+    assert env.rollout(6, break_when_any_done=False).shape == (3, 6)
+
+
+MESSAGE, RECEIVED = ("agents", "message"), ("agents", "received")
+
+
+def uplink():
+    return ObservationDelay(LATE, [MESSAGE], [RECEIVED])
+
+
+def server():
+    return ServerNode(unserved().server)
+
+
+@pytest.mark.parametrize(
+    "other", [uplink, lambda: RewardDelay(2, REWARD), lambda: SampleAndHold(2, [OBSERVATION])]
+)
+def test_a_server_node_must_come_after_the_uplink_and_before_transforms_of_its_outputs(other):
+    chain = [uplink, server, other] if other is not uplink else [uplink, server]
+    env = TransformedEnv(unserved(), Compose(*(make() for make in chain)))
+    assert env.rollout(4).shape == (2, 4)
+    wrong = [server, uplink] if other is uplink else [uplink, other, server]
+    with pytest.raises(InputError, match="order of transforms"):
+        Compose(*(make() for make in wrong))
