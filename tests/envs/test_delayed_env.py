@@ -268,7 +268,7 @@ def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, cha
     for env in (one_by_one, at_once, graph):
         env.append_transform(RewardSum([REWARD], [("agents", "episode_reward")]))
         env.append_transform(StepCounter())
-    actions = choices(one_by_one, 30)
+    actions = choices(one_by_one, 18)
     expected = play(one_by_one, actions)
     assert all_same(expected, play(at_once, actions))
     assert all_same(expected, play(graph, actions))

@@ -272,6 +272,7 @@ def test_only_a_recurrent_actor_learns_to_repeat_an_earlier_observation(rnn):
 # The recipes.
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]", "logger=csv"]
+TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ TRAINED = [
     "model.hidden=[16]",
     "eval_episodes=8",
     "episode.max_steps=10",
+    "region.lattice_step=60",
     "logger=csv",
     "seed=3",
     "delay.obs=1",

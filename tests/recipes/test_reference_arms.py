@@ -242,6 +242,7 @@ def test_back_updating_does_not_change_the_privileged_observation():
 # On the command line.
 
 TINY = ["frames=200", "worlds=4", "learner.steps=16", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
+TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
 SAC = ["learner=sac", "learner.warm_up=100", "learner.buffer_steps=1000", "learner.updates=1"]
 
 

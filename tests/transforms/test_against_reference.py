@@ -7,8 +7,9 @@ import torch
 from delay_twin import Counting, Purse, Receiver, drawn, last_actions, looking_back
 from helpers import play
 from tensordict import TensorDictBase
-from transform_cases import LAWS, (
+from transform_cases import (
     ACTION,
+    LAWS,
     N_AGENTS,
     OBSERVATION,
     REWARD,
