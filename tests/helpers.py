@@ -175,9 +175,9 @@ def play(
     return shown
 
 
-def told(shown: TensorDictBase) -> Messages:
+def sent_messages(output: TensorDictBase) -> Messages:
     """The messages in an environment's output, unpacked into their fields."""
-    return Messages.unpack(shown["agents", "message"])
+    return Messages.unpack(output["agents", "message"])
 
 
 def same(one: TensorDictBase, other: TensorDictBase) -> bool:
@@ -229,14 +229,14 @@ def random_worlds(
     return worlds
 
 
-def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, ServerContext]:
+def messages_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, ServerContext]:
     """The messages [B, N] and the server context of the twin's worlds."""
 
     def column(read: Callable[[Uav], Any], dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.tensor([[read(uav) for uav in uavs] for _, uavs in worlds], dtype=dtype)
 
     place = column(lambda uav: uav.place)
-    snapshot = Messages(
+    messages = Messages(
         time=torch.zeros(place.shape[:-1]),
         position=place,
         target=place,
@@ -257,7 +257,7 @@ def snapshot_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, Server
         footprints=None,
         points=torch.zeros(1, 2),
     )
-    return snapshot, server
+    return messages, server
 
 
 MOTIONS = {
@@ -332,13 +332,13 @@ def learning(model: ModelConfig, settle: int = 0, **changed: Any) -> LearningSet
     return setup._replace(**changed)
 
 
-def check_refused(recipe: Callable[[], Any], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Assert that a recipe ends with exit code 2 and one error line on stderr that contains ``told``."""
+def check_refused(recipe: Callable[[], Any], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Assert that a recipe ends with exit code 2 and one error line on stderr that contains ``message``."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as stopped:
         recipe()
     error = capsys.readouterr().err
     assert stopped.value.code == 2
-    assert told in error
+    assert message in error
     assert error.startswith("error: ")
     assert error.count("\n") == 1

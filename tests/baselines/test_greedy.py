@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import clock, everything, told, walking
+from helpers import clock, everything, sent_messages, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -54,7 +54,7 @@ def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
         distance, heading = worlds.scenario.actions.table()[action].unbind(-1)
     else:
         distance, heading = action[:, 0] * 300.0, action[:, 1] * 2 * torch.pi
-    target = told(td).position[0] + displacement(distance, heading)
+    target = sent_messages(td).position[0] + displacement(distance, heading)
     points = worlds.simulation.airspace.points[0]
     return points[torch.cdist(target, points).argmin(-1)]
 
@@ -62,7 +62,7 @@ def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
 def detection(env: DelayedEnv, place: list[float], ago: float = 0.0, now: float = 9.0) -> TensorDictBase:
     """A reset's output, changed to time ``now`` [s], with the second UAV's detection ``ago`` [s] earlier."""
     td = env.reset()
-    held = told(td)
+    held = sent_messages(td)
     second = torch.tensor([False, True, False])
     detected = torch.where(second.unsqueeze(-1), torch.tensor(place), 0.0).expand_as(held.position)
     times = torch.where(second, now - ago, -1.0).expand_as(held.time)
@@ -77,7 +77,7 @@ def detection(env: DelayedEnv, place: list[float], ago: float = 0.0, now: float 
 def test_all_uavs_fly_to_the_latest_detection_and_the_uav_that_made_it_stays(actions):
     env = field(actions=actions)
     td = detection(env, [200.0, 200.0])
-    place = told(td).position[0, 1]
+    place = sent_messages(td).position[0, 1]
     distance = torch.linalg.vector_norm(landing_points(env, td) - place, dim=-1)
     assert (distance <= env.uav_env.simulation.radius).all()
     assert distance[1] == 0
@@ -95,7 +95,7 @@ def test_an_old_detection_still_counts_for_a_static_source_but_not_for_a_moving_
 def test_a_source_just_lost_is_searched_for_around_the_silent_footprint_and_not_in_it():
     env = field(source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
     td = detection(env, [200.0, 200.0], ago=2.0)
-    distance = torch.linalg.vector_norm(landing_points(env, td)[1] - told(td).position[0, 1])
+    distance = torch.linalg.vector_norm(landing_points(env, td)[1] - sent_messages(td).position[0, 1])
     assert env.uav_env.simulation.radius < distance < 3 * env.uav_env.simulation.radius
 
 
@@ -103,7 +103,7 @@ def test_a_source_just_lost_is_searched_for_around_the_silent_footprint_and_not_
 def test_before_any_detection_every_uav_flies_to_fresh_ground_nearest_to_itself(task):
     env = field(reward=task)
     td = env.reset()
-    start, end = told(td).position[0], landing_points(env, td)
+    start, end = sent_messages(td).position[0], landing_points(env, td)
     distance = torch.cdist(end, start)
     assert (distance.diagonal() > env.uav_env.simulation.radius).all()
     assert torch.equal(distance.argmin(-1), torch.arange(3))
@@ -113,7 +113,7 @@ def test_before_any_detection_every_uav_flies_to_fresh_ground_nearest_to_itself(
 def test_a_uav_flies_as_near_as_it_can_to_a_source_beyond_its_reach(kind):
     env = field(actions=replace(FINE, kind=kind))
     td, place = detection(env, [380.0, 380.0]), torch.tensor([380.0, 380.0])
-    start, end = told(td).position[0, 0], landing_points(env, td)[0]
+    start, end = sent_messages(td).position[0, 0], landing_points(env, td)[0]
     assert (start - place).norm() > 300 + env.uav_env.simulation.radius
     assert (start - place).norm() - (end - place).norm() > 250
 
@@ -135,7 +135,7 @@ def test_without_a_reward_for_the_source_no_uav_flies_to_it(sections, seeks):
 
 def test_fresh_ground_is_nearest_to_the_uav_and_outside_its_latest_footprints():
     env = make_env(everything(), 4, extras=["message"])
-    policy, held = Greedy(env.uav_env), told(env.rollout(4, random_policy(env))["next"][:, -1])
+    policy, held = Greedy(env.uav_env), sent_messages(env.rollout(4, random_policy(env))["next"][:, -1])
     assert (held.trail[..., 0] != held.trail[..., 1]).any()
     points, trails = policy.points.flatten(0, 1).tolist(), held.trail.tolist()
     ground = policy.points[held.trail[:, 0, 0] // policy.points.shape[1]]
@@ -155,7 +155,7 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
     torch.manual_seed(seed)
     places, times = 400 * torch.rand(2, 2, 3, 2), 8.0 + torch.randint(2, (2, 3))
     detected = torch.minimum(torch.tensor([-1.0, 0.0, 5.0, 9.0])[torch.randint(4, (2, 3))], times)
-    held = told(env.reset())._replace(time=times, position=places[0], spotted=detected == times)
+    held = sent_messages(env.reset())._replace(time=times, position=places[0], spotted=detected == times)
     held = held._replace(detected_time=detected, detected_position=places[1])
     ground = policy.points[[0, 0]]
     likely, recent = policy.believe(held, ground, torch.full((2, 1), 9.0))
@@ -185,7 +185,7 @@ def test_uavs_fly_where_their_footprints_hold_most_fresh_ground_by_the_shortest_
     env = make_env(scenario, 8, extras=["message"])
     policy, radius = Greedy(env.uav_env), env.uav_env.simulation.radius
     td = env.rollout(4, random_policy(env))["next"][:, -1]
-    held, legal = told(td), td["agents", "action_mask"]
+    held, legal = sent_messages(td), td["agents", "action_mask"]
     region = held.trail[:, 0, 0] // policy.points.shape[1]
     assert len(region.unique()) == 3
     fresh, chosen = policy.fresh(held, policy.points[region]), greedy_policy(env)(td)["agents", "action"]
@@ -216,7 +216,7 @@ def test_no_uav_flies_further_than_a_continuous_action_reaches():
 def test_the_policy_takes_the_time_of_the_newest_message_as_the_current_time():
     env = field(source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
     td = detection(env, [200.0, 200.0], 8)
-    held, flying = told(td), torch.tensor([True, False, False])
+    held, flying = sent_messages(td), torch.tensor([True, False, False])
     older = held._replace(time=torch.where(flying, 1.0, held.time)).pack()
     ends = [landing_points(env, each) for each in (td, td.clone().set(("agents", "message"), older))]
     assert torch.equal(ends[0][1:], ends[1][1:])

@@ -22,8 +22,8 @@ from helpers import (
     go,
     one_uav,
     random_actions,
+    sent_messages,
     square,
-    told,
     walking,
 )
 
@@ -43,7 +43,7 @@ def test_success_needs_a_share_of_the_uavs_to_spot_the_source_at_once(share, nee
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
         output = act(env, random_actions(env, generator))
-        enough = told(output).spotted.sum(-1, keepdim=True) >= needed
+        enough = sent_messages(output).spotted.sum(-1, keepdim=True) >= needed
         assert enough.any()
         assert not enough.all()
         assert output["success"].equal(enough)
@@ -98,11 +98,11 @@ def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_co
         episode = EpisodeConfig(max_steps=None, end_with_source=terminates)
         env = fresh(one_uav(source=source, episode=episode))
         output = go(env, HERE)
-        assert told(output).spotted.item()
+        assert sent_messages(output).spotted.item()
         assert not output["done"].item()
         output = go(env, HERE)
         assert output["terminated"].item() == terminates
-        assert not told(output).spotted.item()
+        assert not sent_messages(output).spotted.item()
 
 
 def test_a_persistent_task_never_ends():
@@ -240,7 +240,7 @@ def test_an_intermittent_source_is_spotted_as_often_as_it_emits():
         level_db=160.0, position=[100.0, 100.0], emission="per_step", emission_probability=0.3
     )
     env = fresh(square(source=source, episode=KEEPS_GOING), num_worlds=400)
-    spotted = torch.stack([told(act(env, torch.zeros(400, 3).long())).spotted for _ in range(25)])
+    spotted = torch.stack([sent_messages(act(env, torch.zeros(400, 3).long())).spotted for _ in range(25)])
     assert spotted.any(-1).equal(spotted.all(-1))
     assert spotted.float().mean().item() == pytest.approx(0.3, abs=0.02)
     # Emissions differ between worlds and between steps.

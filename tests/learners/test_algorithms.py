@@ -47,11 +47,18 @@ def config(learner: str, rnn: str, kind: str, motion: str, aware: str) -> TrainC
     )
 
 
+KINDS, MOTIONS = ("discrete", "continuous"), ("instant", "polynomial")
+
+
 @pytest.mark.parametrize("aware", AWARE)
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("learner", "rnn"), [("mappo", "none"), ("sac", "none"), ("mappo", "gru")])
-def test_every_combination_learns_and_is_evaluated(tmp_path, learner, rnn, kind, motion, aware):
+def test_every_learner_trains_with_every_kind_of_action_and_awareness_and_is_evaluated(
+    tmp_path, learner, rnn, kind, aware
+):
+    motion = MOTIONS[
+        (KINDS.index(kind) + list(AWARE).index(aware)) % 2
+    ]  # each motion with each of the others
     train(config(learner, rnn, kind, motion, aware), tmp_path)
     with (tmp_path / "metrics.csv").open(newline="") as file:
         *_, last = csv.DictReader(file)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import twin
-from helpers import SCALE, TIME_SCALE, random_worlds, snapshot_of
+from helpers import SCALE, TIME_SCALE, messages_of, random_worlds
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,7 +21,7 @@ shares = st.sampled_from([0.0, 0.3, 0.7, 1.0])
 
 def check_features(worlds, newest=False):
     """Compare every feature with the twin's."""
-    messages, server = snapshot_of(worlds)
+    messages, server = messages_of(worlds)
     ours = observe(messages, server._replace(newest=newest), NAMES)
     for b, (now, uavs) in enumerate(worlds):
         for name, values in twin.features(uavs, now, SCALE, TIME_SCALE, newest=newest).items():
@@ -46,7 +46,7 @@ def test_features_are_right_when_no_uav_or_every_uav_has_detected_or_spots_the_s
 
 
 def test_before_any_detection_all_features_of_the_source_are_1():
-    messages, server = snapshot_of(random_worlds(0, 3, 0.0, 0.0))
+    messages, server = messages_of(random_worlds(0, 3, 0.0, 0.0))
     names = ["source_distance", "source_bearing", "source_drift", "source_time"]
     assert all((value == 1).all() for value in observe(messages, server, names).values())
 
@@ -57,7 +57,7 @@ def one_world(*places, **changed):
     uavs[0].heard_at, uavs[0].heard_from = 5.0, places[0]
     for name, value in changed.items():
         setattr(uavs[-1], name, value)
-    return snapshot_of([(10.0, uavs)])
+    return messages_of([(10.0, uavs)])
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_bearing_and_drift_have_no_rounding_errors_at_the_estimated_position_of_
         for uav in uavs:
             uav.place = uav.heard_from = uavs[0].place
             uav.track = 0.0
-    features = observe(*snapshot_of(worlds), ["source_bearing", "source_drift"])
+    features = observe(*messages_of(worlds), ["source_bearing", "source_drift"])
     assert (features["source_bearing"] == 0).all()
     assert (features["source_drift"] == 0.5).all()
 
@@ -98,21 +98,21 @@ def test_the_source_is_estimated_at_the_mean_position_of_the_latest_detections()
 
 def test_every_feature_but_the_distances_to_other_uavs_has_one_value_per_uav():
     for n_agents in (1, 3, 7):
-        features = observe(*snapshot_of(random_worlds(0, n_agents, 0.5, 0.5)), NAMES)
+        features = observe(*messages_of(random_worlds(0, n_agents, 0.5, 0.5)), NAMES)
         for name, value in features.items():
             width = (n_agents - 1,) if name == "agent_distances" else ()
             assert value.shape == (4, n_agents, *width), name
 
 
 def test_only_the_named_features_are_computed():
-    messages, server = snapshot_of(random_worlds(0, 3, 0.5, 0.5))
+    messages, server = messages_of(random_worlds(0, 3, 0.5, 0.5))
     assert observe(messages, server, ["spotted"]).keys() == {"spotted"}
     with pytest.raises(ValueError, match="footprint tables"):
         observe(messages, server, ["coverage"])
 
 
 def test_messages_may_have_any_leading_dimensions():
-    messages, server = snapshot_of(random_worlds(0, 3, 0.5, 0.5))
+    messages, server = messages_of(random_worlds(0, 3, 0.5, 0.5))
     expected = stack(observe(messages, server, NAMES), NAMES)
     deep = Messages(*[field.unflatten(0, (2, 2)) for field in messages])
     now, scale = (x.unflatten(0, (2, 2)) for x in (server.now, server.scale))
@@ -125,7 +125,7 @@ def test_messages_may_have_any_leading_dimensions():
 
 
 def test_an_observation_contains_its_features_in_the_configured_order():
-    messages, server = snapshot_of(random_worlds(0, 3, 1.0, 0.5))
+    messages, server = messages_of(random_worlds(0, 3, 1.0, 0.5))
     names = ["spotted", "agent_distances", "source_distance"]
     features = observe(messages, server, names)
     vector = stack(features, names)
@@ -142,7 +142,7 @@ def test_with_ctde_the_actor_observes_local_features_and_the_critic_all():
 
 
 def test_the_actor_observes_the_age_of_the_uavs_message_and_the_critic_does_not():
-    messages, server = snapshot_of(random_worlds(0, 3, 1.0, 0.5))
+    messages, server = messages_of(random_worlds(0, 3, 1.0, 0.5))
     delayed = messages._replace(time=server.now.unsqueeze(-1) - torch.tensor([0.0, 4.0, 25.0]))
     age = observe(delayed, server, ["age"])["age"]
     torch.testing.assert_close(age, torch.tensor([0.0, 0.4, 1.0]).expand_as(age), rtol=0, atol=1e-5)

@@ -25,8 +25,8 @@ from helpers import (
     one_uav,
     random_actions,
     same,
+    sent_messages,
     square,
-    told,
     usecase,
 )
 
@@ -89,14 +89,14 @@ def test_uavs_stand_on_landing_points_of_their_own_inside_the_region(n_agents, k
 
 
 def test_uavs_start_on_different_points_or_on_one_or_on_the_given_ones():
-    apart = told(UavEnv(square(), num_worlds=64).reset()).position
+    apart = sent_messages(UavEnv(square(), num_worlds=64).reset()).position
     assert (torch.cdist(apart, apart) + 1e9 * torch.eye(3)).min() > 1
     region = RegionConfig(kind="vertices", vertices=SQUARE, start_together=True)
     together = UavEnv(square(region=region), num_worlds=64).reset()
-    place = told(together).position
+    place = sent_messages(together).position
     assert torch.cdist(place, place).max() == 0
     assert len({tuple(p) for p in place[:, 0].tolist()}) > 10
-    given = told(UavEnv(usecase(2)).reset()).position
+    given = sent_messages(UavEnv(usecase(2)).reset()).position
     expected = [pytest.approx([62.85586449, -119.2183645], abs=1e-4)] * 3
     assert given[0].tolist() == expected
 
@@ -147,7 +147,7 @@ def test_a_uav_in_flight_sends_no_new_message():
         assert not output["agents", "message_sent"].item()
         assert output["agents", "message"].equal(before)
         output = go(env, HERE)
-    message = told(output)
+    message = sent_messages(output)
     assert output["agents", "message_sent"].item()
     assert message.time.item() == math.ceil(duration)
     assert message.position[0, 0].equal(env.simulation.points[env.state.goal.item()])
@@ -167,7 +167,7 @@ def test_a_uav_in_flight_does_not_detect_the_source():
         output = go(env, HERE)
         distance = torch.linalg.vector_norm(env.state.position[0, 0, :2] - env.state.source[0])
         near |= bool(distance < 10)
-        assert not told(output).spotted.item()
+        assert not sent_messages(output).spotted.item()
     assert near
     assert env.state.motions.item() == 1  # a detection would have set it to 0
 
@@ -177,7 +177,7 @@ def test_an_action_of_distance_0_holds_and_counts_as_a_motion():
     place = env.state.goal.clone()
     output = go(env, HERE, HERE, HERE)
     assert env.state.goal.equal(place)
-    assert told(output).motions.item() == 3
+    assert sent_messages(output).motions.item() == 3
 
 
 def test_a_uav_whose_target_lies_outside_the_region_holds():
@@ -193,7 +193,7 @@ def test_motions_count_from_the_latest_detection():
     env = fresh(one_uav(source=SourceConfig(level_db=130.0, position=[160.0, 100.0])))
     counted = []
     for action in (HERE, EAST, HERE, WEST, WEST, EAST):
-        message = told(go(env, action))
+        message = sent_messages(go(env, action))
         counted.append((message.spotted.item(), message.motions.item()))
     assert counted == [(False, 1), (True, 2), (True, 1), (False, 1), (False, 2), (True, 3)]
 

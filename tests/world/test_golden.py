@@ -22,7 +22,7 @@ from golden_records import (
     recorded,
     set_state,
 )
-from helpers import DATA, GOLDEN, act, nearest, told, usecase
+from helpers import DATA, GOLDEN, act, nearest, sent_messages, usecase
 
 from damian.envs.uav_env import UavEnv
 from damian.world.motion import MotionConfig
@@ -58,7 +58,7 @@ def test_recorded_actions_lead_to_the_recorded_points(case, compared, reasons):
     records = recorded(case, EPISODES, PERSISTENT, CUMULATIVE)
     env = ready_env(usecase(case), len(records))
     set_state(env, records, [transition.places for transition in records])
-    after = told(act(env, column(records, "actions")))
+    after = sent_messages(act(env, column(records, "actions")))
     counts = Counter()
     for world, transition in enumerate(records):
         for uav, place in enumerate(transition.after["positions"]):
@@ -76,7 +76,7 @@ def test_a_uav_whose_nearest_point_is_its_own_holds(case, expected):
     records = recorded(case, EPISODES, PERSISTENT, CUMULATIVE)
     env = ready_env(usecase(case), len(records))
     set_state(env, records, [transition.places for transition in records])
-    after = told(act(env, column(records, "actions")))
+    after = sent_messages(act(env, column(records, "actions")))
     held = 0
     for world, transition in enumerate(records):
         for uav, place in enumerate(transition.places):
@@ -92,7 +92,7 @@ def test_recorded_points_give_the_recorded_detections_and_numbers_of_motions(cas
     records = recorded(case, EPISODES, PERSISTENT, CUMULATIVE)
     env = ready_env(usecase(case), len(records))
     set_state(env, records, [transition.after["positions"] for transition in records])
-    spotted = told(act(env, torch.zeros(len(records), env.n_agents).long())).spotted
+    spotted = sent_messages(act(env, torch.zeros(len(records), env.n_agents).long())).spotted
     theirs = column(records, "spotting_true").bool()
     assert spotted.equal(theirs)
     assert theirs.numel() == n_flags

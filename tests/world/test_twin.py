@@ -15,7 +15,7 @@ from helpers import (
     everything,
     fresh,
     random_actions,
-    told,
+    sent_messages,
 )
 
 from damian.envs.scenario import ScenarioConfig
@@ -114,7 +114,7 @@ def test_rollouts_equal_those_of_the_twin(n_agents, kind, since, estimate):
                     continue
                 rewards = world.step(moves[b].tolist())
                 places = [list(uav.place) for uav in world.uavs]
-                assert told(output).position[b].tolist() == places
+                assert sent_messages(output).position[b].tolist() == places
                 check_observation(world, output["agents", "global_observation"][b])
                 ours = output["agents", "reward"][b, :, 0].tolist()
                 assert ours == pytest.approx(rewards, abs=1e-4)
