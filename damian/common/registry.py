@@ -4,11 +4,12 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 from damian.common.errors import InputError
 
 T = TypeVar("T")
+Component = TypeVar("Component")
 
 
 class Registry(Generic[T]):
@@ -27,17 +28,17 @@ class Registry(Generic[T]):
         self.kind, self._problem = kind, problem
         self._components: dict[str, T] = {}
 
-    def register(self, name: str) -> Callable[[T], T]:
+    def register(self, name: str) -> Callable[[Component], Component]:
         """Decorator that adds a component under a name.
 
         Raises:
             ValueError: the name is taken, or looks like a path.
         """
 
-        def add(component: T) -> T:
+        def add(component: Component) -> Component:
             if name in self._components or ":" in name:
                 raise ValueError(f"{self.kind} {name}: the name is taken, or looks like a path")
-            self._components[name] = component
+            self._components[name] = cast(T, component)
             return component
 
         return add
