@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from damian.envs.scenario import ScenarioConfig
     from damian.envs.uav_env import UavEnv
     from damian.replay.backupdate import BackupdateStorage
+    from damian.server.features import feature
+    from damian.server.reward_terms import reward_term
     from damian.transforms import (
         ActionDelay,
         ActionHistory,
@@ -34,6 +36,8 @@ _MODULES = {
     "damian.envs.scenario": ["ScenarioConfig"],
     "damian.envs.uav_env": ["UavEnv"],
     "damian.replay.backupdate": ["BackupdateStorage"],
+    "damian.server.features": ["feature"],
+    "damian.server.reward_terms": ["reward_term"],
     "damian.transforms": [
         "ActionDelay",
         "ActionHistory",
@@ -65,7 +69,9 @@ __all__ = [
     "Trace",
     "UavEnv",
     "Uniform",
+    "feature",
     "make_env",
+    "reward_term",
 ]
 
 

@@ -27,6 +27,7 @@ class Registry(Generic[T]):
     def __init__(self, kind: str, problem: Callable[[Any], str | None] = lambda _: None) -> None:
         self.kind, self._problem = kind, problem
         self._components: dict[str, T] = {}
+        self._imported: dict[str, T] = {}
 
     def register(self, name: str) -> Callable[[Component], Component]:
         """Decorator that adds a component under a name.
@@ -53,14 +54,16 @@ class Registry(Generic[T]):
         Raises:
             InputError: there is none.
         """
-        if isinstance(name, str) and name in self._components:
-            return self._components[name]
+        for known in (self._components, self._imported):
+            if isinstance(name, str) and name in known:
+                return known[name]
         if not isinstance(name, str) or ":" not in name:
             known = ", ".join(self._components)
             raise InputError(f"{key}: {name} is not one of {known}, nor a path such as package.module:Name")
         component = _imported(name, key)
         if problem := self._problem(component):
             raise InputError(f"{key}: {name} {problem}")
+        self._imported[name] = component
         return component
 
     def __iter__(self) -> Iterator[str]:

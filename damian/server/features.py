@@ -7,32 +7,17 @@ these are the latest messages sent or the latest received.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from damian.common import checks
+from damian.common.registry import Registry
 from damian.common.tensors import gather_rows
 from damian.world.battery import BatteryConfig, observed
 from damian.world.coverage import FootprintTables, covered_share
 from damian.world.messages import Messages
-
-LOCAL = ("battery", "spotted")
-"""Features of a UAV itself (Table 2)."""
-GLOBAL = (
-    "source_distance",
-    "source_bearing",
-    "source_drift",
-    "source_time",
-    "agent_distances",
-    "coverage",
-    "mean_distance",
-    "mean_distance_not_spotting",
-    "mean_distance_spotting",
-    "spotting_agents",
-)
-"""Features that the server computes from the messages of all UAVs (Table 2)."""
 
 
 @dataclass
@@ -40,11 +25,11 @@ class ObservationConfig:
     """Which features the actor and the critic observe."""
 
     local_features: list[str] = field(default_factory=lambda: ["spotted"])
-    """Features of the UAV itself, from ``LOCAL``."""
+    """Features of the UAV itself: battery, spotted, or ``package.module:feature`` of one's own."""
     global_features: list[str] = field(
         default_factory=lambda: ["source_distance", "source_bearing", "source_time"]
     )
-    """Features that the server computes from the messages of all UAVs, from ``GLOBAL``."""
+    """Features that the server computes from the messages of all UAVs (Table 2, or of one's own)."""
     ctde: bool = False
     """Centralised training, decentralised execution: the actor observes only the local features."""
     time_scale: float | None = None
@@ -66,10 +51,9 @@ class ObservationConfig:
     """Number of each UAV's latest landing points whose footprints the coverage counts."""
 
     def __post_init__(self) -> None:
-        for name in self.local_features:
-            checks.one_of("observation.local_features", name, LOCAL)
-        for name in self.global_features:
-            checks.one_of("observation.global_features", name, GLOBAL)
+        for scope in ("local", "global"):
+            for name in getattr(self, f"{scope}_features"):
+                check_feature(f"observation.{scope}_features", name, scope)
         if self.time_scale is not None:
             checks.above("observation.time_scale", self.time_scale, 0.0, "s")
         checks.above("observation.age_scale", self.age_scale, 0.0, "s")
@@ -129,13 +113,14 @@ def observe(messages: Messages, context: ServerContext, names: list[str]) -> dic
     Raises:
         ValueError: ``coverage`` is among the names, but the context has no footprint tables.
     """
-    view = FeatureCache(messages, context)
-    return {name: _FEATURES[name](view) for name in names}
+    cache = FeatureCache(messages, context)
+    return {name: FEATURES.get(name, "feature").compute(cache) for name in names}
 
 
 def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
     """Observation vector in the order of ``names``, [*, N, F]."""
-    columns = [features[n] if n == "agent_distances" else features[n].unsqueeze(-1) for n in names]
+    vectors = {name for name in names if FEATURES.get(name, "feature").vector}
+    columns = [features[name] if name in vectors else features[name].unsqueeze(-1) for name in names]
     return torch.cat(columns, -1)
 
 
@@ -156,6 +141,57 @@ class FeatureCache:
     def scale(self) -> Tensor:
         """Largest vertex distance of the region [m], [*, 1]."""
         return self.context.scale.unsqueeze(-1)
+
+
+class Feature(NamedTuple):
+    """How a feature is computed, and who may observe it."""
+
+    compute: Callable[[FeatureCache], Tensor]
+    """From messages [*, N] to values in [0, 1], [*, N] or, for a vector, [*, N, K]."""
+    scope: str
+    """``local`` (of the UAV itself), ``global`` (of all UAVs) or ``actor`` (never for the critic)."""
+    vector: bool = False
+    """Does it have several values, [*, N, K]."""
+
+
+def feature(scope: str, vector: bool = False) -> Callable[[Callable[[FeatureCache], Tensor]], Feature]:
+    """Decorator that makes a feature of a function.
+
+    The function reads ``cache.messages`` (fields [*, N]) and ``cache.context`` (time, scales, landing
+    points), and must be pure, batched over * and, for ``env.compile()``, free of branches on data.
+    ``cache(other)`` shares an intermediate result between features.
+
+    Examples:
+        >>> @feature("local")
+        ... def track(cache):  # in lab.py, used as observation.local_features=[spotted,lab:track]
+        ...     return cache.messages.track / (2 * math.pi)
+    """
+    return lambda compute: Feature(compute, scope, vector)
+
+
+def _not_a_feature(found: Any) -> str | None:
+    return None if isinstance(found, Feature) else "is no feature: decorate the function with damian.feature"
+
+
+FEATURES = Registry[Feature]("feature", _not_a_feature)
+"""Features by name (Table 2); one's own as ``package.module:name``."""
+
+
+def check_feature(key: str, name: str, scope: str) -> None:
+    """Require a feature of a scope.
+
+    Raises:
+        InputError: there is no such feature, or it has another scope.
+    """
+    if name in FEATURES or ":" not in str(name):
+        checks.one_of(key, name, feature_names(scope))
+    found = FEATURES.get(name, key)
+    checks.require(found.scope == scope, key, name, f"is a {found.scope} feature, not a {scope} one")
+
+
+def feature_names(scope: str) -> list[str]:
+    """Names of the registered features of a scope, in the order of Table 2."""
+    return [name for name, found in FEATURES.items() if found.scope == scope]
 
 
 def _has_detected(v: FeatureCache) -> Tensor:
@@ -198,26 +234,36 @@ def _pairwise(v: FeatureCache) -> Tensor:
     return torch.linalg.vector_norm(offset, dim=-1) / v.scale.unsqueeze(-1)
 
 
+@FEATURES.register("source_distance")
+@feature("global")
 def _source_distance(v: FeatureCache) -> Tensor:
     return torch.where(v(_any_has_detected), v(_raw_source_distance).clamp(max=1), 1.0)
 
 
+@FEATURES.register("source_bearing")
+@feature("global")
 def _source_bearing(v: FeatureCache) -> Tensor:
     return torch.where(v(_any_has_detected), torch.remainder(v(_bearing) / (2 * math.pi), 1.0), 1.0)
 
 
+@FEATURES.register("source_drift")
+@feature("global")
 def _source_drift(v: FeatureCache) -> Tensor:
     """((bearing - track) wrapped to [-pi, pi) + pi) / 2 pi: 0.5 if the UAV flies straight at the source."""
     turn = (v(_bearing) - v.messages.track) / (2 * math.pi)
     return torch.where(v(_any_has_detected), torch.remainder(turn + 0.5, 1.0), 1.0)
 
 
+@FEATURES.register("source_time")
+@feature("global")
 def _source_time(v: FeatureCache) -> Tensor:
     latest = v.messages.detected_time.amax(-1, keepdim=True)
     since = (v.context.now.unsqueeze(-1) - latest) / v.context.time_scale
     return torch.where(v(_any_has_detected), since.clamp(max=1), 1.0).expand_as(v.messages.time)
 
 
+@FEATURES.register("agent_distances")
+@feature("global", vector=True)
 def _agent_distances(v: FeatureCache) -> Tensor:
     n = v.messages.time.shape[-1]
     others = [[j for j in range(n) if j != i] for i in range(n)]
@@ -226,6 +272,8 @@ def _agent_distances(v: FeatureCache) -> Tensor:
     return pairwise.gather(-1, index.expand(*pairwise.shape[:-1], n - 1)).clamp(max=1)
 
 
+@FEATURES.register("coverage")
+@feature("global")
 def _coverage(v: FeatureCache) -> Tensor:
     if v.context.footprints is None:
         raise ValueError("coverage needs the footprint tables")
@@ -233,11 +281,15 @@ def _coverage(v: FeatureCache) -> Tensor:
     return covered_share(v.context.footprints, trail, gather_rows(v.context.points, trail))
 
 
+@FEATURES.register("mean_distance")
+@feature("global")
 def _mean_distance(v: FeatureCache) -> Tensor:
     n = v.messages.time.shape[-1]
     return (v(_pairwise).sum(-1) / max(n - 1, 1)).clamp(max=1)
 
 
+@FEATURES.register("mean_distance_not_spotting")
+@feature("global")
 def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
     """Mean distance to the other UAVs that do not spot; 0 for a spotting UAV, or if there are no others."""
     silent = (~v.messages.spotted).to(v.scale.dtype)
@@ -246,6 +298,8 @@ def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
     return (total / others.clamp(min=1)).clamp(max=1)
 
 
+@FEATURES.register("mean_distance_spotting")
+@feature("global")
 def _mean_distance_spotting(v: FeatureCache) -> Tensor:
     """Mean distance of the spotting UAVs to the source; 0 if no UAV spots."""
     spotting = v.messages.spotted.to(v.scale.dtype)
@@ -254,24 +308,31 @@ def _mean_distance_spotting(v: FeatureCache) -> Tensor:
     return mean.clamp(max=1).expand_as(spotting)
 
 
+@FEATURES.register("spotting_agents")
+@feature("global")
 def _spotting_agents(v: FeatureCache) -> Tensor:
     """Share of the UAVs that spot the source, N_ss / N."""
     spotting = v.messages.spotted.to(v.scale.dtype)
     return spotting.mean(-1, keepdim=True).expand_as(spotting)
 
 
+@FEATURES.register("battery")
+@feature("local")
 def _battery(v: FeatureCache) -> Tensor:
     return observed(v.messages.battery, v.context.battery) / 100
 
 
+@FEATURES.register("spotted")
+@feature("local")
 def _spotted(v: FeatureCache) -> Tensor:
     return v.messages.spotted.to(v.scale.dtype)
 
 
+@FEATURES.register("age")
+@feature("actor")
 def _age(v: FeatureCache) -> Tensor:
     return (v.messages.age(v.context.now) / v.context.age_scale).clamp(max=1)
 
 
-_FEATURES: dict[str, Callable[[FeatureCache], Tensor]] = {
-    name: globals()[f"_{name}"] for name in (*GLOBAL, *LOCAL, "age")
-}
+LOCAL, GLOBAL = tuple(feature_names("local")), tuple(feature_names("global"))
+"""Names of the built-in features of the UAV itself, and of all UAVs (Table 2)."""

@@ -4,15 +4,17 @@
 configuration and its tag in the logs have the same name.
 """
 
+import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from damian.common import checks
+from damian.server.reward_terms import Counters, custom_term
 from damian.server.termination import Status
 
 INDIVIDUAL = ("coverage", "spotted", "battery")
@@ -77,8 +79,17 @@ class RewardConfig:
     """Divide the bonus by the elapsed steps of the episode (use case 2: 2 / steps)."""
     penalty: float = 0.0
     """Subtracted from the reward of every UAV when an episode ends without success."""
+    custom: list[Any] = field(default_factory=list)
+    """Terms of one's own (``damian.reward_term``), each as ``{term: package.module:name, weight: 0.1}`` with
+    any parameters of the term beside its weight."""
 
     def __post_init__(self) -> None:
+        self._custom = {term.name: term for term in map(custom_term, self.custom)}
+        taken = {*INDIVIDUAL, *SYSTEM} & {*self._custom}
+        once = len(self._custom) == len(self.custom) and not taken
+        checks.require(
+            once, "reward.custom", [*self._custom], "must differ from each other and the built-in terms"
+        )
         for name in (*INDIVIDUAL, *SYSTEM, "individual", "system", "bonus", "penalty"):
             value = getattr(self, name)
             checks.require(math.isfinite(value), f"reward.{name}", value, "is not a finite weight")
@@ -89,21 +100,29 @@ class RewardConfig:
     def terms(self) -> list[str]:
         """Names of the terms whose weight is not 0."""
         individual = [n for n in INDIVIDUAL if getattr(self, n) * self.individual != 0]
-        return individual + [n for n in SYSTEM if getattr(self, n) * self.system != 0]
+        system = [n for n in SYSTEM if getattr(self, n) * self.system != 0]
+        return [*individual, *system, *(name for name in self._custom if self.weight(name) != 0)]
+
+    @property
+    def features(self) -> list[str]:
+        """Names of the features that these terms read; a built-in term reads the feature of its name."""
+        read = ([name] if name not in self._custom else self._custom[name].reads for name in self.terms)
+        return list(dict.fromkeys(itertools.chain(*read)))
 
     def weight(self, name: str) -> float:
         """The weight of a term in the total reward (eq. 8)."""
+        if name in self._custom:
+            term = self._custom[name]
+            return term.weight * (self.individual if term.scope == "individual" else self.system)
         group = self.individual if name in INDIVIDUAL else self.system
         return getattr(self, name) * group
 
-
-class Counters(NamedTuple):
-    """Counts that rewards depend on besides the features."""
-
-    steps: Tensor
-    """Elapsed steps of the episode, [*]."""
-    motions: Tensor
-    """Motions since each UAV last spotted the source, [*, N]."""
+    def value(self, name: str, features: dict[str, Tensor], counters: Counters) -> Tensor:
+        """A term before it is weighted, [*, N]."""
+        if name in self._custom:
+            term = self._custom[name]
+            return term.compute(features, counters, **term.parameters)
+        return _TERMS[name](features[name], counters, self)
 
 
 def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig) -> dict[str, Tensor]:
@@ -117,9 +136,7 @@ def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig
     Returns:
         Each term whose weight is not 0, [*, N].
     """
-    return {
-        name: config.weight(name) * _TERMS[name](features[name], counters, config) for name in config.terms
-    }
+    return {name: config.weight(name) * config.value(name, features, counters) for name in config.terms}
 
 
 def final_reward(ended: Status, counters: Counters, config: RewardConfig) -> Tensor:

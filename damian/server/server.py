@@ -14,7 +14,8 @@ from torch import Tensor
 from damian.common.errors import InputError
 from damian.common.tensors import gather_rows
 from damian.server.features import ObservationConfig, ServerContext, observe, stack
-from damian.server.rewards import Counters, RewardConfig, final_reward, reward
+from damian.server.reward_terms import Counters
+from damian.server.rewards import RewardConfig, final_reward, reward
 from damian.server.termination import EpisodeConfig, Status, status
 from damian.world.airspace import Airspace
 from damian.world.battery import BatteryConfig
@@ -85,7 +86,7 @@ class Server:
             )
         self.observation, self.reward, self.episode, self.battery = observation, reward, episode, battery
         self.dt, self.time_scale = dt, time_scale
-        self._names = sorted({*observation.actor, *observation.critic, *reward.terms})
+        self._names = sorted({*observation.actor, *observation.critic, *reward.features})
         self._scale = airspace.scale
         self._max_points = airspace.max_points
         self._points = airspace.points.flatten(0, 1)

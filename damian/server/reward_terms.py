@@ -1,0 +1,100 @@
+"""Reward terms of one's own: a function of features and counters, with parameters beside its weight."""
+
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.common.registry import Registry
+
+
+class Counters(NamedTuple):
+    """Counts that rewards depend on besides the features."""
+
+    steps: Tensor
+    """Elapsed steps of the episode, [*]."""
+    motions: Tensor
+    """Motions since each UAV last spotted the source, [*, N]."""
+
+
+class RewardTerm(NamedTuple):
+    """A function that computes a reward term, and what it needs."""
+
+    compute: Callable[..., Tensor]
+    """From features by name, each [*, N], and counters to the term before it is weighted, [*, N]."""
+    reads: Sequence[str]
+    """Names of the features that it reads."""
+    scope: str
+    """``individual`` (weighted by w_a of eq. 8) or ``system`` (by w_s)."""
+
+
+def reward_term(
+    reads: Sequence[str], scope: str = "individual"
+) -> Callable[[Callable[..., Tensor]], RewardTerm]:
+    """Decorator that makes a reward term of a function.
+
+    The function gets features by name, each [*, N], and ``Counters``; its keyword-only arguments are
+    parameters that a configuration may set. It must be pure, batched over * and, for ``env.compile()``, free
+    of branches on data.
+
+    Args:
+        reads: names of the features that it reads, built-in or of one's own (``package.module:name``).
+        scope: ``individual`` or ``system``.
+
+    Examples:
+        >>> # in lab.py, used as reward.custom=[{term: lab:low_battery, weight: -1, below: 0.5}]
+        >>> @reward_term(reads=["battery"])
+        ... def low_battery(features, counters, *, below=0.3):
+        ...     return (features["battery"] < below).float()
+    """
+    return lambda compute: RewardTerm(compute, tuple(reads), scope)
+
+
+def _not_a_term(found: Any) -> str | None:
+    return None if isinstance(found, RewardTerm) else "is no reward term: decorate it with damian.reward_term"
+
+
+REWARD_TERMS = Registry[RewardTerm]("reward term", _not_a_term)
+"""Reward terms of one's own, by name or as ``package.module:name``."""
+
+
+class CustomTerm(NamedTuple):
+    """A reward term as a configuration uses it."""
+
+    name: str
+    """Key of the term in logs: the function's name."""
+    weight: float
+    """Weight of the term within its scope."""
+    compute: Callable[..., Tensor]
+    reads: Sequence[str]
+    scope: str
+    parameters: Mapping[str, Any]
+    """Keyword arguments of ``compute``."""
+
+
+def custom_term(written: Any) -> CustomTerm:
+    """Read ``{term: package.module:name, weight: 0.1, ...}``.
+
+    Raises:
+        InputError: the term does not exist, has no such parameter, or its weight is no finite number.
+    """
+    key = "reward.custom"
+    if not isinstance(written, Mapping) or "term" not in written:
+        raise InputError(f"{key}: {written} is not {{term: package.module:name, weight: 0.1}}")
+    path = written["term"]
+    term = REWARD_TERMS.get(path, f"{key}.term")
+    weight = written.get("weight", 1.0)
+    finite = isinstance(weight, int | float) and math.isfinite(weight)
+    checks.require(finite, f"{key}.weight", weight, f"is not a finite weight of {path}")
+    parameters = {str(name): value for name, value in written.items() if name not in ("term", "weight")}
+    accepted = inspect.signature(term.compute).parameters.values()
+    known = [each.name for each in accepted if each.kind is inspect.Parameter.KEYWORD_ONLY]
+    for name, value in parameters.items():
+        problem = f"is no parameter of {path}, which has {', '.join(known) or 'none'}"
+        checks.require(name in known, f"{key}.{name}", value, problem)
+    name = path.rpartition(":")[2]
+    return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)

@@ -1,0 +1,132 @@
+"""The files of examples/extending run from outside the package, and a mistake in them is one clear line."""
+
+import csv
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import evaluate
+import pytest
+import torch
+import train
+from helpers import check_refused, everything
+from shared.launch import launch
+
+from damian import make_env
+from damian.delays.config import DelayConfig
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
+
+EXAMPLES = Path(__file__).parents[1] / "examples" / "extending"
+TINY = ["frames=128", "worlds=4", "learner.steps=16", "eval_episodes=3", "model.hidden=[8]", "logger=csv"]
+TINY += ["region.lattice_step=60", "episode.max_steps=12"]
+
+LAW = ["delay.obs={law: law:Satellite, hop: 2s, extra: 0.3}"]
+FEATURES = [
+    "observation.local_features=[spotted,features:heading]",
+    "observation.global_features=[features:spread]",
+]
+LOW, TOGETHER = (
+    "{term: rewards:low_battery, weight: -0.2, below: 0.5}",
+    "{term: rewards:together, weight: 0.1}",
+)
+REWARDS = ["scenario=energy", f"reward.custom=[{LOW}, {TOGETHER}]"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """An empty folder with a copy of the examples, from which programs are started."""
+    for file in EXAMPLES.glob("*.py"):
+        shutil.copy(file, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def run(folder, monkeypatch) -> Callable[..., Path]:
+    """Run a recipe with overrides; returns its run folder."""
+
+    def run_recipe(*overrides: str, program=train, name: str = "run") -> Path:
+        monkeypatch.setattr(sys, "argv", ["program", *overrides, f"hydra.run.dir={name}"])
+        launch(program.main)
+        return folder / name
+
+    return run_recipe
+
+
+@pytest.mark.parametrize("overrides", [LAW, FEATURES, REWARDS], ids=["law", "features", "rewards"])
+def test_an_extension_is_trained_with_and_its_policy_evaluated(run, overrides):
+    first = run(*TINY, *overrides)
+    second = run(f"checkpoint={first}", "seed=1", program=evaluate, name="evaluated")
+    assert (second / "result.csv").is_file()
+
+
+def test_a_reward_term_of_ones_own_has_its_column(run):
+    with (run(*TINY, *REWARDS) / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {"reward/low_battery", "reward/together", "reward/battery"} <= rows[0].keys()
+    assert any(float(row["reward/together"]) > 0 for row in rows)
+
+
+@pytest.mark.parametrize("compiles", [False, True])
+def test_extensions_do_the_same_compiled_and_back_updated_steps_know_them(folder, compiles):
+    scenario = everything(
+        observation=ObservationConfig(["spotted", "features:heading"], ["features:spread", "source_time"]),
+        reward=RewardConfig(custom=[{"term": "rewards:together", "weight": 0.5}]),
+        delay=DelayConfig(obs={"law": "law:Satellite", "hop": 1, "extra": 0.5}),
+    )
+    env, other = (make_env(scenario, 4, seed=2, extras=["message", "reward_terms"]) for _ in range(2))
+    other = other.compile(backend="eager") if compiles else other
+    torch.manual_seed(0)
+    one = env.rollout(12, break_when_any_done=False)
+    torch.manual_seed(0)
+    two = other.rollout(12, break_when_any_done=False)
+    assert all(one[key].equal(two[key]) for key in one.keys(True, True))
+    assert env.server.reward.terms[-1] == "together"
+    together = one["next", "agents", "reward_terms", "together"]
+    spread = 1 - one["next", "agents", "global_observation"][..., 0]
+    torch.testing.assert_close(together, 0.5 * spread)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["delay.obs={law: law:Satelite}"], "delay.obs.law: law:Satelite: the module law has no Satelite"),
+        (["delay.obs={law: laws:Satellite}"], "delay.obs.law: laws:Satellite: No module named 'laws'"),
+        (
+            ["delay.obs={law: law:Satellite, hops: 2}"],
+            "delay.obs.hops: 2 is no setting of the law law:Satellite",
+        ),
+        (["delay.obs={law: law:Satellite, extra: 2}"], "delay.obs.extra: 2 is not between 0 and 1"),
+        (
+            ["delay.obs={law: features:heading}"],
+            "delay.obs.law: features:heading is no dataclass derived from",
+        ),
+        (
+            ["observation.local_features=[features:spread]"],
+            "features:spread is a global feature, not a local one",
+        ),
+        (
+            ["observation.local_features=[rewards:together]"],
+            "rewards:together is no feature: decorate the function",
+        ),
+        (
+            ["reward.custom=[rewards:together]"],
+            "reward.custom: rewards:together is not {term: package.module:name",
+        ),
+        (
+            ["reward.custom=[{term: rewards:low_battery, bellow: 1}]"],
+            "reward.custom.bellow: 1 is no parameter of",
+        ),
+        (
+            ["reward.custom=[{term: rewards:together, weight: x}]"],
+            "reward.custom.weight: x is not a finite weight",
+        ),
+        (["reward.custom=[{term: law:Satellite}]"], "reward.custom.term: law:Satellite is no reward term"),
+    ],
+)
+def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
+    before = {path.name for path in folder.iterdir()} | {"__pycache__"}
+    check_refused(lambda: run(*TINY, *overrides), message, capsys)
+    assert {path.name for path in folder.iterdir()} <= before
