@@ -2,6 +2,8 @@
 
 import ast
 import itertools
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -106,3 +108,10 @@ def test_every_public_name_exists_and_is_loaded_on_demand():
     assert all(getattr(damian, name).__name__ == name for name in damian.__all__)
     with pytest.raises(AttributeError, match="no attribute nothing"):
         _ = damian.nothing
+
+
+def test_the_transforms_load_without_the_world_of_the_uavs():
+    heavy = ["shapely", "hydra", "omegaconf", "matplotlib", "damian.world", "damian.server", "damian.envs"]
+    code = f"import sys, damian.transforms; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
