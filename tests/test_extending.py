@@ -10,13 +10,15 @@ import evaluate
 import pytest
 import torch
 import train
-from helpers import check_refused, everything
+from helpers import act, check_refused, everything, one_uav
 from shared.launch import launch
 
-from damian import make_env
+from damian import UavEnv, make_env
 from damian.delays.config import DelayConfig
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
+from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "extending"
 TINY = ["frames=128", "worlds=4", "learner.steps=16", "eval_episodes=3", "model.hidden=[8]", "logger=csv"]
@@ -32,6 +34,13 @@ LOW, TOGETHER = (
     "{term: rewards:together, weight: 0.1}",
 )
 REWARDS = ["scenario=energy", f"reward.custom=[{LOW}, {TOGETHER}]"]
+REGION = [
+    "region=vertices",
+    "region.kind=region:yard",
+    "region.options={side: 200}",
+    "region.lattice_step=40",
+]
+MOTION = ["motion=polynomial", "motion.kind=motion:WindyFlight", "motion.options={wind: 4, bearing: 0}"]
 
 
 @pytest.fixture
@@ -55,7 +64,11 @@ def run(folder, monkeypatch) -> Callable[..., Path]:
     return run_recipe
 
 
-@pytest.mark.parametrize("overrides", [LAW, FEATURES, REWARDS], ids=["law", "features", "rewards"])
+@pytest.mark.parametrize(
+    "overrides",
+    [LAW, FEATURES, REWARDS, REGION, MOTION],
+    ids=["law", "features", "rewards", "region", "motion"],
+)
 def test_an_extension_is_trained_with_and_its_policy_evaluated(run, overrides):
     first = run(*TINY, *overrides)
     second = run(f"checkpoint={first}", "seed=1", program=evaluate, name="evaluated")
@@ -124,9 +137,47 @@ def test_extensions_do_the_same_compiled_and_back_updated_steps_know_them(folder
             "reward.custom.weight: x is not a finite weight",
         ),
         (["reward.custom=[{term: law:Satellite}]"], "reward.custom.term: law:Satellite is no reward term"),
+        (["region.kind=region:park"], "region.kind: region:park: the module region has no park"),
+        (
+            ["region.kind=law:Satellite"],
+            "region.kind: law:Satellite is no function (config, rng) -> list[Region]",
+        ),
+        (
+            ["region.kind=region:yard", "region.options={side: -1}"],
+            "region.options.side: -1.0 m is not above 0 m",
+        ),
+        (["motion.kind=motion:Windy"], "motion.kind: motion:Windy: the module motion has no Windy"),
+        (["motion.kind=law:Satellite"], "motion.kind: law:Satellite is no class derived from"),
+        (
+            [*MOTION[:2], "motion.options={wind: 40}"],
+            "motion.options.wind: 40.0 m/s is not between 0 and 18 m/s",
+        ),
     ],
 )
 def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
     before = {path.name for path in folder.iterdir()} | {"__pycache__"}
     check_refused(lambda: run(*TINY, *overrides), message, capsys)
     assert {path.name for path in folder.iterdir()} <= before
+
+
+def test_head_wind_makes_flights_longer_and_tail_wind_shorter(folder):
+    durations = {}
+    for bearing in (0, 180):  # where the wind comes from
+        motion = MotionConfig("motion:WindyFlight", max_speed=20.0, options={"wind": 5, "bearing": bearing})
+        env = UavEnv(one_uav(motion=motion), extras=[])
+        env.reset()
+        act(env, torch.tensor([[[0.9, 0.25]]]))  # 90 m to the east: across the wind
+        across = env.state.cruise.item()
+        act(env, torch.tensor([[[0.5, 0.0]]]))
+        while not env.simulation.ready(env.state).all():
+            act(env, torch.tensor([[[0.0, 0.0]]]))
+        act(env, torch.tensor([[[0.5, 0.0]]]))  # 50 m to the north
+        durations[bearing] = across, env.state.cruise.item()
+    assert durations[0][0] == pytest.approx(durations[180][0], rel=1e-4)
+    assert durations[0][1] == pytest.approx(durations[180][1] * (20 + 5) / (20 - 5), rel=1e-4)
+
+
+def test_a_region_of_ones_own_is_flown_over(folder):
+    env = UavEnv(everything(region=RegionConfig("region:yard", options={"side": 200.0}, lattice_step=40.0)))
+    assert env.simulation.airspace.regions[0].name == "L-shaped yard"
+    assert env.simulation.airspace.regions[0].polygon.area == pytest.approx(0.75 * 200**2)

@@ -6,7 +6,7 @@ level, landing (paper, eq. 1). Each phase follows a polynomial time law of degre
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,7 +25,8 @@ class MotionConfig:
     """How UAVs move."""
 
     kind: str = "instant"
-    """``instant``: a UAV is at its target when the step ends; ``polynomial``: flights take several steps."""
+    """``instant``: a UAV is at its target when the step ends; ``polynomial``: flights take several steps;
+    ``package.module:Class``: a ``MotionModel`` of one's own."""
     degree: int = 5
     """Degree of the time law of each phase: 3, 5 or 7."""
     max_speed: float = 5.0
@@ -41,8 +42,12 @@ class MotionConfig:
     level_separation: float = 0.5
     """Vertical distance between the flight levels of two UAVs [m]."""
 
+    options: Any = None
+    """Settings of a motion model of one's own, as a mapping."""
+
     def __post_init__(self) -> None:
-        checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
+        if ":" not in self.kind:  # ``damian.world.vehicles`` imports one's own
+            checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
         checks.one_of("motion.degree", self.degree, [3, 5, 7])
         checks.in_range("motion.max_speed", self.max_speed, 1e-3, unit="m/s")
         checks.in_range("motion.max_acceleration", self.max_acceleration, 1e-3, unit="m/s^2")

@@ -41,7 +41,7 @@ class Simulation:
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         drawn = draw_initial_conditions(config, self.airspace, rng)
         self.walk = drawn.walk
-        self.vehicles = MOTION_MODELS[config.motion.kind](config, self.airspace, dt)
+        self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         self.initial = self._initial_state(drawn, trail, seed)
         self.layout = StateLayout(self.initial)

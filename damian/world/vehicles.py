@@ -1,11 +1,13 @@
 """Motion models: how UAVs move between landing points, how long this takes, and how batteries change."""
 
+import inspect
 from abc import ABC, abstractmethod
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from damian.common.registry import Registry
 from damian.common.tensors import gather_rows, tree_where
 from damian.world.airspace import Airspace, nearest_points
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
@@ -108,6 +110,18 @@ class MotionModel(ABC):
         return state._replace(battery=(state.battery - drain + gain).clamp(0, 100))
 
 
+def _not_a_model(found: Any) -> str | None:
+    good = isinstance(found, type) and issubclass(found, MotionModel) and not inspect.isabstract(found)
+    return (
+        None if good else "is no class derived from damian.world.vehicles.MotionModel with all of its methods"
+    )
+
+
+MOTION_MODELS = Registry[type[MotionModel]]("motion model", _not_a_model)
+"""Motion models by ``motion.kind``; one's own as ``package.module:Class``."""
+
+
+@MOTION_MODELS.register("instant")
 class InstantMotion(MotionModel):
     """A UAV is at its target when the step ends (paper, section 5: no action delay)."""
 
@@ -141,6 +155,7 @@ class InstantMotion(MotionModel):
         return action_valid
 
 
+@MOTION_MODELS.register("polynomial")
 class PolynomialFlight(MotionModel):
     """Takeoff, cruise and landing take time (paper, eq. 1); the UAV then senses before it chooses again."""
 
@@ -195,10 +210,6 @@ class PolynomialFlight(MotionModel):
     def duration(self, state: State) -> Tensor:
         """Duration of the latest flight [s], [B, N]; 0 if the UAV held."""
         return 2 * state.vertical + state.cruise
-
-
-MOTION_MODELS: dict[str, type[MotionModel]] = {"instant": InstantMotion, "polynomial": PolynomialFlight}
-"""Motion models by ``motion.kind``."""
 
 
 def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:

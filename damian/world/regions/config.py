@@ -1,10 +1,14 @@
 """Settings of the region, of its landing points, and of the positions where the UAVs start."""
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from damian.common import checks
+from damian.common.registry import Registry
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geojson import read_geojson
 from damian.world.regions.polygon import polygon_from_vertices, random_polygon
@@ -16,7 +20,8 @@ class RegionConfig:
     """Region, landing points and start positions (paper, section 3.2)."""
 
     kind: str = "random"
-    """Origin of the region: ``random``, ``vertices``, ``fir`` (Eurocontrol table) or ``geojson``."""
+    """Origin of the region: ``random``, ``vertices``, ``fir`` (Eurocontrol table), ``geojson``, or
+    ``package.module:function`` of one's own."""
     min_area: float = 100_000.0
     """Smallest area of a random region [m^2]."""
     max_area: float = 200_000.0
@@ -46,14 +51,17 @@ class RegionConfig:
     start_together: bool = False
     """Whether all UAVs start on the same drawn landing point."""
 
+    options: Any = None
+    """Settings of a region source of one's own, as a mapping."""
+
     def __post_init__(self) -> None:
-        checks.one_of("region.kind", self.kind, ["random", "vertices", "fir", "geojson"])
+        REGION_SOURCES.get(self.kind, "region.kind")
         checks.above("region.min_area", self.min_area, 0.0, "m^2")
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
         checks.in_range("region.pool", self.pool, 1)
         checks.in_range("region.initial_conditions", self.initial_conditions, self.pool, 1e6)
         checks.require(
-            self.pool == 1 or self.kind == "random",
+            self.pool == 1 or self.kind == "random" or ":" in self.kind,
             "region.pool",
             self.pool,
             f"means nothing with region.kind={self.kind}: only random regions are drawn",
@@ -76,12 +84,37 @@ class RegionConfig:
         Raises:
             InputError: the file cannot be read, or the vertices form no valid polygon.
         """
-        if self.kind == "fir":
-            return [read_fir(self.path, self.id)]
-        if self.kind == "geojson":
-            return [read_geojson(self.path, self.index, self.where)]
-        if self.kind == "vertices":
-            polygons = [polygon_from_vertices(self.vertices, "region.vertices")]
-        else:
-            polygons = [random_polygon(rng, self.min_area, self.max_area) for _ in range(self.pool)]
-        return [Region(p, f"{self.kind} region {i}", None, None) for i, p in enumerate(polygons)]
+        return REGION_SOURCES.get(self.kind, "region.kind")(self, rng)
+
+
+RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]
+"""From the settings and a random generator to the regions, of which each episode flies over one."""
+
+
+def _not_a_source(found: Any) -> str | None:
+    return None if inspect.isfunction(found) else "is no function (config, rng) -> list[Region]"
+
+
+REGION_SOURCES = Registry[RegionSource]("region source", _not_a_source)
+"""Region sources by ``region.kind``; one's own as ``package.module:function``."""
+
+
+@REGION_SOURCES.register("random")
+def _random_regions(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+    polygons = [random_polygon(rng, config.min_area, config.max_area) for _ in range(config.pool)]
+    return [Region(polygon, f"random region {i}") for i, polygon in enumerate(polygons)]
+
+
+@REGION_SOURCES.register("vertices")
+def _region_of_vertices(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+    return [Region(polygon_from_vertices(config.vertices, "region.vertices"), "vertices region 0")]
+
+
+@REGION_SOURCES.register("fir")
+def _region_of_fir_table(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+    return [read_fir(config.path, config.id)]
+
+
+@REGION_SOURCES.register("geojson")
+def _region_of_geojson(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+    return [read_geojson(config.path, config.index, config.where)]

@@ -1,0 +1,23 @@
+"""A region source of one's own: an L-shaped yard.
+
+    cd examples/extending
+    python ../../recipes/train.py region=vertices region.kind=region:yard "region.options={side: 300}"
+
+A source is a function from the settings and a random generator to regions; polygons are in local metres, x
+east, y north. It may return several regions, of which each episode flies over one.
+"""
+
+import numpy as np
+import shapely
+
+from damian.common import checks
+from damian.world.regions.config import RegionConfig
+from damian.world.regions.region import Region
+
+
+def yard(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
+    """An L whose outer sides are ``side`` metres long, at the origin."""
+    side = float((config.options or {}).get("side", 300.0))
+    checks.above("region.options.side", side, 0.0, "m")
+    square = shapely.box(-side / 2, -side / 2, side / 2, side / 2)
+    return [Region(square.difference(shapely.box(0, 0, side, side)), "L-shaped yard")]
