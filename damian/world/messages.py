@@ -87,4 +87,6 @@ _COLUMNS: list[Column] = [
 def _read(part: Tensor, column: Column) -> Tensor:
     """A field [*, N] or [*, N, width] from its packed numbers [*, N, width]."""
     field = part.squeeze(-1) if column.width == 1 else part
+    if column.dtype == torch.float32:
+        return field
     return field > 0.5 if column.dtype == torch.bool else field.to(column.dtype)
