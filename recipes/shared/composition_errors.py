@@ -47,6 +47,8 @@ def one_line(error: BaseException) -> str:
 
 def _no_such_option(group: str, option: str) -> str:
     folder = Path(CONF) / group
+    if not folder.is_dir():
+        return no_such_key(group)
     options = sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
     return f"{group}: {option} is not one of {', '.join(options)}"
 

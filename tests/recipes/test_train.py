@@ -93,6 +93,11 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, ca
         (["learner.name=sac"], "learner.name: sac is not the learner of these settings"),
         (["algo=sac"], "algo: no such key; since damian 0.2 it is learner"),
         (["mappo.lr=1"], "mappo: no such key; since damian 0.2 it is learner"),
+        (["+usecase=2"], "usecase: no such key; since damian 0.2 it is scenario=paper/usecase1"),
+        (
+            ["+delaybench=tracking"],
+            "delaybench: no such key; since damian 0.2 it is scenario=delaybench/tracking",
+        ),
         (
             ["region.situations=1"],
             "region.situations: no such key; since damian 0.2 it is region.initial_cond",
