@@ -56,7 +56,7 @@ def _no_such_option(group: str, option: str) -> str:
 def _gives_group_no_name(override: str) -> bool:
     """Does an override set a group to a number or null, which Hydra refuses without naming the group?"""
     match = re.fullmatch(r"\+?(\w+)=([\d,.]+|null)", override)
-    return match is not None and (Path(CONF) / match[1]).is_dir()
+    return match is not None and (match[1] in _RENAMED or (Path(CONF) / match[1]).is_dir())
 
 
 def _not_an_option(override: str) -> str:
