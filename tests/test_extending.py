@@ -64,22 +64,23 @@ def run(folder, monkeypatch) -> Callable[..., Path]:
     return run_recipe
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [LAW, FEATURES, REWARDS, REGION, MOTION],
-    ids=["law", "features", "rewards", "region", "motion"],
-)
-def test_an_extension_is_trained_with_and_its_policy_evaluated(run, overrides):
+def check_trained_and_evaluated(run: Callable[..., Path], *overrides: str) -> dict[str, str]:
+    """Train and evaluate with extensions; returns the last row of the metrics."""
     first = run(*TINY, *overrides)
     second = run(f"checkpoint={first}", "seed=1", program=evaluate, name="evaluated")
     assert (second / "result.csv").is_file()
+    with (first / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))[-1]
 
 
-def test_a_reward_term_of_ones_own_has_its_column(run):
-    with (run(*TINY, *REWARDS) / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert {"reward/low_battery", "reward/together", "reward/battery"} <= rows[0].keys()
-    assert any(float(row["reward/together"]) > 0 for row in rows)
+def test_a_law_features_and_reward_terms_of_ones_own_are_trained_with_and_logged(run):
+    last = check_trained_and_evaluated(run, *REWARDS, *LAW, *FEATURES)
+    assert {"reward/low_battery", "reward/together", "reward/battery"} <= last.keys()
+    assert float(last["reward/together"]) > 0
+
+
+def test_a_region_and_a_motion_model_of_ones_own_are_trained_in(run):
+    check_trained_and_evaluated(run, *REGION, *MOTION)
 
 
 @pytest.mark.parametrize("compiles", [False, True])
