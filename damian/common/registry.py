@@ -54,13 +54,13 @@ class Registry(Generic[T]):
         Raises:
             InputError: there is none.
         """
-        for known in (self._components, self._imported):
-            if isinstance(name, str) and name in known:
-                return known[name]
+        for components in (self._components, self._imported):
+            if isinstance(name, str) and name in components:
+                return components[name]
         if not isinstance(name, str) or ":" not in name:
             known = ", ".join(self._components)
             raise InputError(f"{key}: {name} is not one of {known}, nor a path such as package.module:Name")
-        component = _imported(name, key)
+        component = _import_path(name, key)
         if problem := self._problem(component):
             raise InputError(f"{key}: {name} {problem}")
         self._imported[name] = component
@@ -78,7 +78,7 @@ class Registry(Generic[T]):
         yield from self._components.items()
 
 
-def _imported(path: str, key: str) -> Any:
+def _import_path(path: str, key: str) -> Any:
     """The object at ``package.module:Name``.
 
     Raises:
