@@ -9,7 +9,7 @@ PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 .PHONY: train test test-deep test-slow bench check format clean
 
 train: $(VENV)/base
-	$(PY) recipes/train.py $(ARGS)
+	$(VENV)/bin/damian train $(ARGS)
 
 test: $(VENV)/test
 	$(PY) -m pytest -n 2 $(ARGS)
@@ -22,7 +22,7 @@ test-slow: $(VENV)/test
 	$(PY) -m pytest -m slow $(ARGS)
 
 bench: $(VENV)/bench
-	$(PY) recipes/bench.py $(ARGS)
+	$(VENV)/bin/damian bench $(ARGS)
 
 check: $(VENV)/dev
 	$(VENV)/bin/ruff format --check .

@@ -1,8 +1,8 @@
 """Draw where the server believes the UAVs to be, and where they are, in one episode of the random policy.
 
-    python recipes/belief.py
-    python recipes/belief.py delay=paper scenario=tracking agents=2 seed=1
-    python recipes/belief.py delay.obs=3 delay.loss=0.2 motion=polynomial
+    damian belief
+    damian belief delay=paper scenario=tracking agents=2 seed=1
+    damian belief delay.obs=3 delay.loss=0.2 motion=polynomial
 
 Every override of recipes/train.py may be given, except resume. The run folder gets config.yaml, belief.png (a
 map, the positions over time, the age of information) and belief.csv (a row for each time and UAV).
@@ -17,8 +17,6 @@ import hydra
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from shared.launch import launch, perform, prepare, reported, save_config
-from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -29,6 +27,10 @@ from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.evaluation.belief_figure import Beliefs, plot_beliefs
 from damian.world.messages import Messages
+
+from .shared.known_settings import CONF
+from .shared.launch import launch, perform, prepare, reported, save_config
+from .shared.settings import TrainConfig
 
 TABLE, FIGURE = "belief.csv", "belief.png"
 POSITIONS = ("true_east_m", "true_north_m", "believed_east_m", "believed_north_m")
@@ -113,5 +115,10 @@ def main(composed: DictConfig) -> None:
     perform(*prepare(composed), show)
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """Run the program with the words of the command line."""
     launch(main)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,7 +1,7 @@
 """Measure the speed of the environment and of training beside VMAS, the cost of delays, scaling, and memory.
 
-    python recipes/bench.py            (a few minutes)
-    python recipes/bench.py --quick    (seconds; only checks that everything runs)
+    damian bench            (a few minutes)
+    damian bench --quick    (seconds; only checks that everything runs)
 
 Everything runs on one CPU thread. Environments take random actions in TorchRL's ``rollout``; training is
 measured by ``bench_training.py``. The measured environments take turns, so that a busy machine slows all of
@@ -18,10 +18,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from bench_training import HEADER, training
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from shared.settings import CONF, TrainConfig
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
@@ -38,6 +36,10 @@ from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
+
+from .bench_training import HEADER, training
+from .shared.known_settings import CONF
+from .shared.settings import TrainConfig
 
 RIVAL, BARE = "VMAS discovery", "bare"
 COMPILED_TOO = (BARE, "whole chain", "every transform")
@@ -297,5 +299,10 @@ def main() -> None:
     print(f"written to {target}")
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """Run the program with the words of the command line."""
     main()
+
+
+if __name__ == "__main__":
+    run()

@@ -13,8 +13,6 @@ from typing import NamedTuple, cast
 
 import torch
 from hydra import compose, initialize_config_dir
-from shared.launch import checked
-from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -26,10 +24,14 @@ from torchrl.modules.distributions import NormalParamExtractor
 from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.utils import ValueEstimators
 from tqdm import tqdm
-from train import learning_env, make_collector, make_learner, ticks
 
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.schedule import SystemClock
+
+from .shared.known_settings import CONF
+from .shared.launch import checked
+from .shared.settings import TrainConfig
+from .train import learning_env, make_collector, make_learner, ticks
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}

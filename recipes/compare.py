@@ -1,9 +1,9 @@
 """Train and evaluate several arms with several seeds over tasks and delays, and compare their results.
 
-    python recipes/compare.py experiment=usecase2 seeds=10 processes=2
-    python recipes/compare.py experiment=delaybench "tasks=[tracking]" "arms=[undelayed,naive,both]"
-    python recipes/compare.py experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
-    python recipes/compare.py experiment=usecase2 report_only=true
+    damian compare experiment=usecase2 seeds=10 processes=2
+    damian compare experiment=delaybench "tasks=[tracking]" "arms=[undelayed,naive,both]"
+    damian compare experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
+    damian compare experiment=usecase2 report_only=true
 
 An experiment is a file of conf/experiment that lists tasks, delays and arms. An arm is one way to train or to
 fly: naive, with an action history, with back-updating, and so on. Each run has its own folder,
@@ -21,23 +21,24 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from evaluate import fly
 from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig
-from shared.composition_errors import COMPOSITION_ERRORS, one_line
-from shared.launch import checked, launch, reported
-from shared.parallel import LOG, Run, check_stored, perform_all
-from shared.settings import CONF
-from train import train
 
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.evaluation.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison
 from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
 from damian.evaluation.run_folder import read_metrics
+
+from .evaluate import fly
+from .shared.composition_errors import COMPOSITION_ERRORS, one_line
+from .shared.known_settings import CONF
+from .shared.launch import checked, launch, reported
+from .shared.parallel import LOG, Run, check_stored, perform_all
+from .train import train
 
 ALL_RESULTS, TABLE, MARKDOWN, FIGURE = "results.csv", "table.csv", "table.md", "figure.png"
 SEEDS, EPISODES = 10, 100
@@ -219,7 +220,7 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
     quoted = [f'"{word}"' if re.search(r"[^\w=.,+/-]", word) else word for word in overrides]
     missing = [run.name for run in runs if not run.finished]
     notes = [
-        f"`{' '.join(['python recipes/compare.py', *quoted])}`",
+        f"`{' '.join(['damian compare', *quoted])}`",
         f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {episodes} episodes per evaluation",
         f"Mean over seeds [95 % interval: stratified bootstrap over seeds]; J: {config.score} of the "
         f"{config.policy} policy; seen: as the server perceived it, else as it truly was; age in steps",
@@ -257,5 +258,10 @@ def main(composed: DictConfig) -> None:
         sys.exit(1)
 
 
+def run() -> None:
+    """Run the program with the words of the command line."""
+    launch(main, "compare")
+
+
 if __name__ == "__main__":
-    launch(main, CompareConfig)
+    run()

@@ -1,8 +1,8 @@
 """Evaluate a trained policy: as it was trained, or with more UAVs, other delays or another region.
 
-    python recipes/train.py hydra.run.dir=runs/first
-    python recipes/evaluate.py checkpoint=runs/first agents=10 delay=paper
-    python recipes/evaluate.py -m checkpoint=runs/first delay.obs=0,2,4,8
+    damian train hydra.run.dir=runs/first
+    damian evaluate checkpoint=runs/first agents=10 delay=paper
+    damian evaluate -m checkpoint=runs/first delay.obs=0,2,4,8
 
 The overrides of the training run apply too, unless the command line gives others. The features of the actor's
 observation must stay the same. The run folder gets config.yaml, result.csv and result.md: success, steps and
@@ -13,15 +13,17 @@ from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
-from shared.launch import launch, load, perform, prepare, reported, save_config
-from shared.settings import CONF, TrainConfig
 from torchrl.checkpoint import Checkpoint
 from torchrl.modules import ProbabilisticActor
-from train import make_eval_env, report
 
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.learners.networks import make_actor
+
+from .shared.known_settings import CONF
+from .shared.launch import launch, load, perform, prepare, reported, save_config
+from .shared.settings import TrainConfig
+from .train import make_eval_env, report
 
 
 def fly(config: TrainConfig, folder: Path) -> None:
@@ -51,5 +53,10 @@ def main(composed: DictConfig) -> None:
     perform(*prepare(composed), fly)
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """Run the program with the words of the command line."""
     launch(main)
+
+
+if __name__ == "__main__":
+    run()

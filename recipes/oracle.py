@@ -1,8 +1,8 @@
 """Evaluate a trained policy under delay, with some messages known on time: which late messages cost how much.
 
-    python recipes/train.py scenario=tracking hydra.run.dir=runs/undelayed
-    python recipes/oracle.py checkpoint=runs/undelayed delay=paper
-    python recipes/oracle.py checkpoint=runs/undelayed delay.obs=4 agents=5
+    damian train scenario=tracking hydra.run.dir=runs/undelayed
+    damian oracle checkpoint=runs/undelayed delay=paper
+    damian oracle checkpoint=runs/undelayed delay.obs=4 agents=5
 
 The policy acts on messages that have not arrived yet, so its results are a reference that no real system can
 reach (regime R3). The overrides of the training run apply too, unless the command line gives others. The run
@@ -14,10 +14,7 @@ from pathlib import Path
 
 import hydra
 import torch
-from evaluate import stored
 from omegaconf import DictConfig
-from shared.launch import launch, perform, prepare, reported, save_config
-from shared.settings import CONF, TrainConfig
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import StepCounter
@@ -29,6 +26,11 @@ from damian.evaluation.metrics import evaluate
 from damian.evaluation.run_folder import save_results
 from damian.server.server import Server
 from damian.world.messages import Messages
+
+from .evaluate import stored
+from .shared.known_settings import CONF
+from .shared.launch import launch, perform, prepare, reported, save_config
+from .shared.settings import TrainConfig
 
 ALL = Messages._fields
 PLACE = ("position", "target", "track", "trail")
@@ -83,5 +85,10 @@ def main(composed: DictConfig) -> None:
     perform(*prepare(composed), foresee)
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """Run the program with the words of the command line."""
     launch(main)
+
+
+if __name__ == "__main__":
+    run()

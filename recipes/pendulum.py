@@ -1,7 +1,7 @@
 """Apply the delay transforms to another environment: SAC on Gymnasium's Pendulum-v1 with late observations.
 
-    python recipes/pendulum.py --jobs 2                  (a quarter of an hour on two free cores)
-    python recipes/pendulum.py --seeds 0 --steps 10000 --delay 3 --out runs/pendulum3
+    damian pendulum --jobs 2                  (a quarter of an hour on two free cores)
+    damian pendulum --seeds 0 --steps 10000 --delay 3 --out runs/pendulum3
 
 Three arms are trained for each seed: undelayed; naive, whose observations are late; and history, which also
 observes the agent's latest actions. The undelayed policy is also evaluated under several delays. The run
@@ -247,5 +247,10 @@ def main(words: Sequence[str] | None = None) -> None:
     print(f"{table(runs, folder)}\nwritten to {folder}")
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """Run the program with the words of the command line."""
     main()
+
+
+if __name__ == "__main__":
+    run()

@@ -1,11 +1,11 @@
 """Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a greedy (scripted) one.
 
-    python recipes/train.py agents=3 scenario=spotting motion=polynomial seed=1
-    python recipes/train.py scenario=paper/usecase2 delay=paper aware=both
-    python recipes/train.py learner=sac scenario=tracking actions=continuous
-    python recipes/train.py -m seed=0,1,2 agents=3,5
-    python recipes/train.py hydra.run.dir=runs/first
-    python recipes/train.py resume=runs/first frames=600000
+    damian train agents=3 scenario=spotting motion=polynomial seed=1
+    damian train scenario=paper/usecase2 delay=paper aware=both
+    damian train learner=sac scenario=tracking actions=continuous
+    damian train -m seed=0,1,2 agents=3,5
+    damian train hydra.run.dir=runs/first
+    damian train resume=runs/first frames=600000
 
 ``--help`` lists the groups of settings, ``--cfg job`` all keys. The run folder, runs/DATE_TIME unless
 hydra.run.dir names another one, gets config.yaml, metrics.csv (a row for each update), TensorBoard events,
@@ -22,8 +22,6 @@ from typing import cast
 import hydra
 import torch
 from omegaconf import DictConfig
-from shared.launch import launch, load, perform, prepare, reported, save_config, stored_config
-from shared.settings import CONF, TrainConfig
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.collectors import Collector
@@ -56,6 +54,10 @@ from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.server.server import Server
 from damian.world.messages import Messages
+
+from .shared.known_settings import CONF
+from .shared.launch import launch, load, perform, prepare, reported, save_config, stored_config
+from .shared.settings import TrainConfig
 
 
 @dataclass
@@ -233,5 +235,10 @@ def main(composed: DictConfig) -> None:
     perform(*prepare(composed), train)
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """Run the program with the words of the command line."""
     launch(main)
+
+
+if __name__ == "__main__":
+    run()

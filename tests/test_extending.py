@@ -6,15 +6,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import evaluate
 import pytest
 import torch
-import train
 from helpers import act, check_refused, everything, one_uav
-from shared.launch import launch
 
 from damian import UavEnv, make_env
 from damian.delays.config import DelayConfig
+from damian.recipes import evaluate, train
+from damian.recipes.shared.launch import launch
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.world.motion import MotionConfig

@@ -58,9 +58,10 @@ class LearningSetup(NamedTuple):
 
 @dataclass
 class LearnerConfig:
-    """Settings that all learners share; ``name`` selects the learner."""
+    """Settings that all learners share."""
 
     name: str = ""
+    """Name of the learner; the group ``learner`` sets it."""
     lr: float = 3e-4
     """Learning rate of Adam."""
     gamma: float = 0.95

@@ -1,7 +1,7 @@
 """Features of one's own: the heading of a UAV, and how far the fleet is from being together.
 
     cd examples/extending
-    python ../../recipes/train.py scenario=tracking \
+    damian train scenario=tracking \
         "observation.local_features=[spotted,features:heading]" \
         "observation.global_features=[source_distance,source_bearing,features:spread]"
 

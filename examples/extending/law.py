@@ -1,7 +1,7 @@
 """A delay law of one's own: a satellite link that now and then needs one more hop.
 
     cd examples/extending
-    python ../../recipes/train.py "delay.obs={law: law:Satellite, hop: 2s, extra: 0.2}" aware=both
+    damian train "delay.obs={law: law:Satellite, hop: 2s, extra: 0.2}" aware=both
 
 A law is a frozen dataclass derived from ``damian.Law``. ``sampler`` returns the probability of each delay in
 steps.

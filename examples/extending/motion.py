@@ -1,7 +1,7 @@
 """A motion model of one's own: flights against the wind take longer.
 
     cd examples/extending
-    python ../../recipes/train.py motion=polynomial motion.kind=motion:WindyFlight "motion.options={wind: 4}"
+    damian train motion=polynomial motion.kind=motion:WindyFlight "motion.options={wind: 4}"
 
 A model derives from ``MotionModel``, or from one that exists. Its methods are pure functions of the worlds'
 ``State``.

@@ -1,7 +1,7 @@
 """A region source of one's own: an L-shaped yard.
 
     cd examples/extending
-    python ../../recipes/train.py region=vertices region.kind=region:yard "region.options={side: 300}"
+    damian train region=vertices region.kind=region:yard "region.options={side: 300}"
 
 A source is a function from the settings and a random generator to regions; polygons are in local metres, x
 east, y north. It may return several regions, of which each episode flies over one.

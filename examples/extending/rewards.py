@@ -1,9 +1,9 @@
 """Reward terms of one's own: a price for a low battery, and a reward for staying together.
 
     cd examples/extending
-    python ../../recipes/train.py scenario=energy \
+    damian train scenario=energy \
         "reward.custom=[{term: rewards:low_battery, weight: -0.2, below: 0.5}]"
-    python ../../recipes/train.py "reward.custom=[{term: rewards:together, weight: 0.1}]"
+    damian train "reward.custom=[{term: rewards:together, weight: 0.1}]"
 
 A term reads features by name and returns a value for each UAV, [*, N]; its keyword-only arguments are
 parameters. Its name is its column in metrics.csv: ``reward/low_battery``.

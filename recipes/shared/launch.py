@@ -21,8 +21,10 @@ from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
-from shared.composition_errors import COMPOSITION_ERRORS, no_such_key, one_line, set_schema
-from shared.settings import LEARNERS, TrainConfig
+
+from .composition_errors import COMPOSITION_ERRORS, one_line
+from .misspelt import no_such_key, set_program
+from .settings import LEARNERS, TrainConfig
 
 Program = Callable[[TrainConfig, Path], None]
 """The work of a recipe: takes a checked configuration and the run folder to fill."""
@@ -202,9 +204,14 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
     return checked_main
 
 
-def launch(main: Callable[[], Any], schema: type = TrainConfig) -> None:
-    """Run a Hydra application; overrides that Hydra refuses end with one line on stderr and exit code 2."""
-    set_schema(schema)
+def launch(main: Callable[[], Any], program: str = "train") -> None:
+    """Run a Hydra application; overrides that Hydra refuses end with one line on stderr and exit code 2.
+
+    Args:
+        main: the application.
+        program: name of its file in conf/.
+    """
+    set_program(program)
     _composed.clear()
     try:
         main()

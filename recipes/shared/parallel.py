@@ -21,9 +21,10 @@ from tqdm import tqdm
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
-from shared.composition_errors import one_line
-from shared.launch import Program, perform, stored_config
-from shared.settings import TrainConfig
+
+from .composition_errors import one_line
+from .launch import Program, perform, stored_config
+from .settings import TrainConfig
 
 LOG = "log.txt"
 _SPAWN = multiprocessing.get_context("spawn")

@@ -5,7 +5,6 @@ import re
 import zlib
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
-from pathlib import Path
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
@@ -21,9 +20,6 @@ from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import SacConfig
 from damian.learners.schedule import SystemClock
-
-CONF = str(Path(__file__).parents[2] / "conf")
-"""Absolute path of the configuration files; Hydra would look for a relative one beside the calling module."""
 
 LEARNERS: dict[str, type[LearnerConfig]] = {config().name: config for config in (MappoConfig, SacConfig)}
 """The settings class of each learner, by ``learner.name``."""

@@ -6,16 +6,16 @@ import math
 import pytest
 import torch
 from helpers import square
-from shared.settings import TrainConfig
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
-from train import learning_env, spotting, ticks
 
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
 from damian.learners.schedule import SystemClock
+from damian.recipes.shared.settings import TrainConfig
+from damian.recipes.train import learning_env, spotting, ticks
 from damian.server.termination import EpisodeConfig
 from damian.world.messages import Messages
 

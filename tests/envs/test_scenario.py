@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from shared.launch import unknown_keys
 
 from damian.common.errors import InputError
 from damian.envs.scenario import ScenarioConfig
+from damian.recipes.shared.launch import unknown_keys
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
 

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import pytest
 from helpers import everything
-from shared.settings import LoggerConfig, TrainConfig
-from train import learning_env, make_learner, train
 
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
@@ -15,6 +13,8 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
+from damian.recipes.shared.settings import LoggerConfig, TrainConfig
+from damian.recipes.train import learning_env, make_learner, train
 from damian.replay.backupdate import BackupdateStorage
 
 AWARE = {

@@ -5,13 +5,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import evaluate as evaluate_recipe
-import oracle
 import pytest
 import torch
-import train
 from helpers import check_refused, everything, learning
-from shared.launch import launch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Categorical, Composite, TensorDictReplayBuffer, Unbounded
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
@@ -26,6 +22,9 @@ from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, mappo_loss
 from damian.learners.networks import ModelConfig, make_actor
 from damian.learners.recurrent import add_recurrent_state
+from damian.recipes import evaluate as evaluate_recipe
+from damian.recipes import oracle, train
+from damian.recipes.shared.launch import launch
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig

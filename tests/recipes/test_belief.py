@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from belief import main
 from helpers import check_refused
 from matplotlib.image import imread
 from omegaconf import OmegaConf
-from shared.launch import launch
+
+from damian.recipes.belief import main
+from damian.recipes.shared.launch import launch
 
 UNDELAYED = ["delay.obs=0", "delay.loss=0"]
 FLYING = ["motion=polynomial", "clock.simulation=1s"]

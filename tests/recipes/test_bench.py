@@ -3,10 +3,19 @@
 import importlib.util
 from dataclasses import replace
 
-from bench import QUICK, delayed, scenarios, step_times
-from bench_training import ARMS, HEADER, RIVAL, RIVALS, Seconds, arm_config, median, rows, training
-
 from damian.envs.pipeline import has_message_delay
+from damian.recipes.bench import QUICK, delayed, scenarios, step_times
+from damian.recipes.bench_training import (
+    ARMS,
+    HEADER,
+    RIVAL,
+    RIVALS,
+    Seconds,
+    arm_config,
+    median,
+    rows,
+    training,
+)
 
 
 def test_arms_differ_in_delay_and_awareness_only():

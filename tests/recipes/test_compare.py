@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from compare import CompareConfig, main
 from helpers import check_refused
-from shared.launch import launch
-from shared.settings import CONF
 
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison
 from damian.evaluation.report import markdown, plot_curves, plot_norms
 from damian.evaluation.statistics import interquartile_mean
+from damian.recipes.compare import main
+from damian.recipes.shared.known_settings import CONF
+from damian.recipes.shared.launch import launch
 
 SMALL = [
     "frames=16",
@@ -46,7 +46,7 @@ def compare(tmp_path, monkeypatch):
 
     def run_recipe(*overrides: str) -> Path:
         monkeypatch.setattr(sys, "argv", ["compare.py", *overrides])
-        launch(main, CompareConfig)
+        launch(main, "compare")
         return tmp_path / "runs" / "usecase2"
 
     return run_recipe

@@ -7,11 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import train
-from evaluate import main
 from helpers import check_refused
 from omegaconf import OmegaConf
-from shared.launch import launch
+
+from damian.recipes import train
+from damian.recipes.evaluate import main
+from damian.recipes.shared.launch import launch
 
 TRAINED = [
     "frames=64",

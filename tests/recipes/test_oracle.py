@@ -2,16 +2,15 @@
 
 import sys
 
-import oracle
 import pytest
 import torch
-import train
 from helpers import both_motions, everything
-from shared.launch import launch
 from torchrl.envs import StepCounter
 
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
+from damian.recipes import oracle, train
+from damian.recipes.shared.launch import launch
 from damian.world.messages import Messages
 
 TINY = ["frames=64", "worlds=4", "learner.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]

@@ -4,12 +4,13 @@ import csv
 import json
 from pathlib import Path
 
-import pendulum
 import pytest
 import torch
-from pendulum import ARMS, Run, evaluate_under, main, make_env, make_learner, train
 from torch import nn
 from tqdm import tqdm
+
+from damian.recipes import pendulum
+from damian.recipes.pendulum import ARMS, Run, evaluate_under, main, make_env, make_learner, train
 
 TINY = ["--seeds", "4", "--steps", "1002", "--episodes", "2", "--hidden", "8", "--delay", "3"]
 

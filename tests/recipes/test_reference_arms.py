@@ -23,12 +23,9 @@ from helpers import (
     same,
     square,
 )
-from shared.launch import launch
-from shared.settings import TrainConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
-from train import learning_env, main, make_learner
 
 from damian.delays.config import DelayConfig
 from damian.delays.laws import Held, law_of
@@ -41,6 +38,9 @@ from damian.keys import GLOBAL_OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig, make_critic
 from damian.learners.sac import Sac, SacConfig
+from damian.recipes.shared.launch import launch
+from damian.recipes.shared.settings import TrainConfig
+from damian.recipes.train import learning_env, main, make_learner
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 

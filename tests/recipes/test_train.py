@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from helpers import check_refused
 from omegaconf import OmegaConf
-from shared.launch import launch, stored_config
-from shared.settings import TrainConfig
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint
-from train import main
 
 from damian.envs.pipeline import make_env
 from damian.learners.networks import make_actor, make_critic
+from damian.recipes.shared.launch import launch, stored_config
+from damian.recipes.shared.settings import TrainConfig
+from damian.recipes.train import main
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate

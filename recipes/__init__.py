@@ -1,0 +1,1 @@
+"""The programs of DAMIAN, which the command ``damian`` runs; installed, they are ``damian.recipes``."""

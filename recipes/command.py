@@ -1,0 +1,68 @@
+"""The command ``damian``: runs one of the programs of this folder.
+
+    damian train agents=3 delay.obs=3
+    damian --help
+
+A misspelt setting is answered before TorchRL, which takes seconds to import, is loaded.
+"""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from .shared.known_settings import help_text
+from .shared.misspelt import check_words
+
+PROGRAMS = {
+    "train": "train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one",
+    "evaluate": "evaluate a trained policy, also in another scenario or under other delays",
+    "compare": "train and evaluate several arms with several seeds, and compare them with intervals",
+    "oracle": "evaluate a policy that knows some messages on time: which delay costs how much",
+    "belief": "draw where the server believes the UAVs to be, and where they are",
+    "pendulum": "apply the delay transforms to another environment: SAC on Pendulum-v1",
+    "bench": "measure the speed of environment and training beside VMAS",
+}
+"""What each program does, by its name; the program is the module of this name."""
+SETTINGS = {"train": "train", "evaluate": "train", "oracle": "train", "belief": "train", "compare": "compare"}
+"""Programs with settings of the form KEY=VALUE, and whose settings these are."""
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the program that the first word names with the other words.
+
+    Args:
+        words: the command line without ``damian``; ``sys.argv`` if not given.
+    """
+    name, *words = (sys.argv[1:] if words is None else words) or ["--help"]
+    if name in ("-h", "--help"):
+        print(usage())
+        return
+    if name == "--version":
+        print(import_module("damian").__version__)
+        return
+    if name not in PROGRAMS:
+        sys.exit(_refuse(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}"))
+    if name in SETTINGS:
+        if {"-h", "--help"} & {*words}:
+            print(help_text(name, SETTINGS[name], [word for word in words if not word.startswith("-")]))
+            return
+        if problem := check_words(SETTINGS[name], words):
+            sys.exit(_refuse(problem))
+    sys.argv = [f"damian {name}", *words]
+    import_module(f".{name}", __package__).run()
+
+
+def usage() -> str:
+    """The programs, one per line."""
+    width = max(map(len, PROGRAMS))
+    programs = [f"  {name:{width}}  {what}" for name, what in PROGRAMS.items()]
+    return "\n".join(["damian PROGRAM [GROUP=OPTION] [KEY=VALUE] ...", "", *programs, "", MORE])
+
+
+MORE = "damian PROGRAM --help explains a program's settings, damian --version prints the version."
+
+
+def _refuse(problem: str) -> int:
+    """Print an error, and return the exit code of wrong input."""
+    print(f"error: {problem}", file=sys.stderr)
+    return 2
