@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from damian.envs.pipeline import make_env
     from damian.envs.scenario import ScenarioConfig
     from damian.envs.uav_env import UavEnv
+    from damian.learners.base import LearnerConfig, LearningSetup
     from damian.replay.backupdate import BackupdateStorage
     from damian.server.features import feature
     from damian.server.reward_terms import reward_term
@@ -35,6 +36,7 @@ _MODULES = {
     "damian.envs.pipeline": ["make_env"],
     "damian.envs.scenario": ["ScenarioConfig"],
     "damian.envs.uav_env": ["UavEnv"],
+    "damian.learners.base": ["LearnerConfig", "LearningSetup"],
     "damian.replay.backupdate": ["BackupdateStorage"],
     "damian.server.features": ["feature"],
     "damian.server.reward_terms": ["reward_term"],
@@ -61,6 +63,8 @@ __all__ = [
     "DelayConfig",
     "Geometric",
     "Law",
+    "LearnerConfig",
+    "LearningSetup",
     "ObservationDelay",
     "RewardDelay",
     "SampleAndHold",

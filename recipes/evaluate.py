@@ -18,7 +18,6 @@ from torchrl.modules import ProbabilisticActor
 
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
-from damian.learners.networks import make_actor
 
 from .shared.known_settings import CONF
 from .shared.launch import launch, load, perform, prepare, reported, save_config
@@ -42,7 +41,7 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
     env = make_eval_env(config)
-    actor = make_actor(env, config.model)
+    actor = config.learner.make_actor(env, config.model)
     load(Checkpoint(actor=actor), Path(config.checkpoint), "checkpoint")
     return env, actor
 

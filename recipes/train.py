@@ -80,7 +80,7 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment of the training, [B], with what the learner and the logs need."""
     messages = config.backupdates or config.clock.trigger is not None
     privileged = config.critic == "privileged"
-    extras = ["reward_terms", *["message"] * messages, *["privileged"] * privileged]
+    extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *config.learner.reads}
     env = make_env(config.train_scenario, config.worlds, config.seed, config.device, extras)
     if config.compile:
         env.compile()
@@ -174,10 +174,14 @@ def train(config: TrainConfig, folder: Path) -> None:
     if interrupt.asked:
         sys.exit(f"interrupted; continue with resume={folder}")
     random = report(config, folder, make_eval_env(config), learner.actor)
-    plot_learning_curve(
-        log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {config.learner.name.upper()}"
-    )
+    plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {learner_title(config)}")
     print(f"learning curve: {folder / FIGURE}")
+
+
+def learner_title(config: TrainConfig) -> str:
+    """Name of the learner for titles: MAPPO, SAC, or the class of one's own."""
+    module, _, name = config.learner.name.partition(":")
+    return name or module.upper()
 
 
 def same_learner(config: TrainConfig) -> bool:

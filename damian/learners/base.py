@@ -1,7 +1,7 @@
 """The interface of a learner: its settings, its actor, and its updates from collected batches."""
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, is_dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import ReplayBuffer
@@ -10,17 +10,27 @@ from torchrl.modules import ProbabilisticActor
 
 from damian import keys
 from damian.common import checks
-from damian.learners.networks import ModelConfig
+from damian.common.registry import Registry
+from damian.learners.networks import ModelConfig, make_actor
 
 
 class Learner(Protocol):
     """A learner updates its actor from batches as they are collected."""
 
     actor: ProbabilisticActor
-    """The policy that the collector and the evaluations use."""
+    """The policy that the collector uses; ``LearnerConfig.make_actor`` makes an equal one for evaluations."""
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Update from a batch [B, T] of consecutive steps; returns the numbers to log, by name."""
+        """Update the networks.
+
+        Args:
+            batch: consecutive steps [B, T] of the environment, with the entries of ``damian.keys`` that the
+                environment outputs, the extras that the learner's settings name in ``reads``, and what the
+                actor has written.
+
+        Returns:
+            Numbers to log, by name.
+        """
         ...
 
     def components(self) -> dict[str, Any]:
@@ -58,16 +68,25 @@ class LearningSetup(NamedTuple):
 
 @dataclass
 class LearnerConfig:
-    """Settings that all learners share."""
+    """Settings of a learner, which make it; those that all learners share.
+
+    A learner of one's own has a dataclass derived from this class, with fields for its own settings, that
+    implements ``make``. The settings ``learner=package.module:Name learner.lr=1e-3`` choose it.
+    """
 
     name: str = ""
-    """Name of the learner; the group ``learner`` sets it."""
+    """Name of the learner, or the path of its settings' class; the group ``learner`` sets it."""
     lr: float = 3e-4
     """Learning rate of Adam."""
     gamma: float = 0.95
     """Discount factor per step."""
     steps: int = 32
     """Steps per world between two updates, unless ``clock.system`` sets the period."""
+
+    reads: ClassVar[tuple[str, ...]] = ()
+    """Optional outputs of the environment that the learner needs in its batches: ``message``, ``state``,
+    ``reward_terms`` or ``privileged`` (``damian.make_env``); and ``hindsight``: with back-updating, stored
+    steps then also hold the newest message that has arrived since (``keys.HINDSIGHT``)."""
 
     def __post_init__(self) -> None:
         checks.above("learner.lr", self.lr, 0.0)
@@ -83,8 +102,30 @@ class LearnerConfig:
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         """Environment steps, over all worlds, that the replay buffer must hold; None if none is needed."""
-        raise NotImplementedError
+        return None
 
     def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> Learner:
-        """Build the learner for an environment."""
+        """Build the learner for an environment.
+
+        Args:
+            env: environment of the training, with batch size [B].
+            setup: properties of the run.
+            buffer: replay buffer of ``buffer_size`` steps, on a ``TimeStorage``, or with back-updating on a
+                ``BackupdateStorage``, which corrects what is stored; None if ``buffer_size`` is None.
+        """
         raise NotImplementedError
+
+    def make_actor(self, env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
+        """Build an actor as the learner has it, for evaluations, which load its weights."""
+        return make_actor(env, model)
+
+
+def _not_a_learner(found: Any) -> str | None:
+    good = isinstance(found, type) and issubclass(found, LearnerConfig) and is_dataclass(found)
+    if good and found.make is not LearnerConfig.make:
+        return None
+    return "is no dataclass derived from damian.LearnerConfig with a method make"
+
+
+LEARNERS = Registry[type[LearnerConfig]]("learner", _not_a_learner)
+"""Settings classes of learners, by name; one's own as ``package.module:Name``."""

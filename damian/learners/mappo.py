@@ -15,7 +15,7 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 
 from damian import keys
 from damian.common import checks
-from damian.learners.base import LearnerConfig, LearningSetup
+from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.networks import make_actor, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
 from damian.replay.backupdate import BackupdateStorage
@@ -33,6 +33,7 @@ LOSS_KEYS: list[NestedKey] = [
 """Entries of a step that the loss reads, beside the critic's observation."""
 
 
+@LEARNERS.register("mappo")
 @dataclass
 class MappoConfig(LearnerConfig):
     """Multi-agent PPO (Yu et al. 2022) with one shared policy."""

@@ -16,7 +16,7 @@ from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 from damian import keys
 from damian.common import checks
 from damian.keys import next_key
-from damian.learners.base import LearnerConfig, LearningSetup
+from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.networks import make_action_value, make_actor
 from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
@@ -25,6 +25,7 @@ LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha")
 """Numbers that a round of updates logs, by their names in TorchRL's losses."""
 
 
+@LEARNERS.register("sac")
 @dataclass
 class SacConfig(LearnerConfig):
     """Soft actor-critic (Haarnoja et al. 2018; discrete: Christodoulou 2019) with one shared policy."""

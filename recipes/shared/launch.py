@@ -21,10 +21,11 @@ from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
+from damian.learners.base import LEARNERS
 
 from .composition_errors import COMPOSITION_ERRORS, one_line
 from .misspelt import no_such_key, set_program
-from .settings import LEARNERS, TrainConfig
+from .settings import TrainConfig
 
 Program = Callable[[TrainConfig, Path], None]
 """The work of a recipe: takes a checked configuration and the run folder to fill."""
@@ -146,7 +147,8 @@ def stored_config(folder: Path, key: str) -> DictConfig:
         saved = cast(DictConfig, OmegaConf.load(file))
         if "algo" in saved:
             raise InputError("damian 0.1 wrote it, and settings have other names since: train again")
-        schema = OmegaConf.structured(TrainConfig(learner=LEARNERS[saved.learner.name]()))
+        learner = LEARNERS.get(saved.learner.name, "learner")(name=saved.learner.name)
+        schema = OmegaConf.structured(TrainConfig(learner=learner))
         return cast(DictConfig, OmegaConf.merge(schema, saved))
     except Exception as error:  # a damaged file can raise anything
         raise InputError(f"{key}: {file}: {one_line(error)}") from None

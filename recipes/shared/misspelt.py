@@ -28,6 +28,15 @@ def set_program(program: str) -> None:
     _programs[:] = dict.fromkeys([program, "train"])
 
 
+_learner_keys: list[str] = []
+"""Keys of a learner of the user's own, if one is chosen."""
+
+
+def set_learner_keys(keys: Sequence[str]) -> None:
+    """Set the keys of a learner of the user's own, which are suggested for a misspelt key of it."""
+    _learner_keys[:] = keys
+
+
 def check_words(program: str, words: Sequence[str]) -> str | None:
     """What is wrong with the keys and options of a command line, as far as a quick look can tell.
 
@@ -79,6 +88,8 @@ def no_such_key(key: str) -> str:
     renamed = RENAMED.get(key, RENAMED.get(group))
     if renamed:
         return f"{key}: no such key; since damian 0.2 it is {renamed}"
-    matches = (difflib.get_close_matches(key, known_settings(name), n=1, cutoff=0.75) for name in _programs)
+    own = _learner_keys if group == "learner" else []
+    known = [own] if own else [[*known_settings(name)] for name in _programs]
+    matches = (difflib.get_close_matches(key, keys, n=1, cutoff=0.75) for keys in known)
     nearest = next(filter(None, matches), [])
     return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in nearest)

@@ -3,26 +3,25 @@
 import os
 import re
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.resources import files
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
-from hydra.core.config_store import ConfigStore
+from hydra.core.config_store import ConfigNode, ConfigStore
 from omegaconf import MISSING, OmegaConf
 
 from damian import keys
 from damian.common import checks
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
-from damian.learners.base import LearnerConfig, LearningSetup
+from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
-from damian.learners.sac import SacConfig
+from damian.learners.sac import SacConfig  # noqa: F401 (registers the learner)
 from damian.learners.schedule import SystemClock
 
-LEARNERS: dict[str, type[LearnerConfig]] = {config().name: config for config in (MappoConfig, SacConfig)}
-"""The settings class of each learner, by ``learner.name``."""
+from .misspelt import set_learner_keys
 
 
 @dataclass
@@ -40,7 +39,7 @@ class TrainConfig(ScenarioConfig):
     """All settings of ``recipes/train.py``, beside those of the scenario."""
 
     learner: LearnerConfig = field(default_factory=MappoConfig)
-    """``MappoConfig`` or ``SacConfig``."""
+    """Settings of the learner: ``MappoConfig``, ``SacConfig``, or a class of one's own."""
     model: ModelConfig = field(default_factory=ModelConfig)
     """Networks of actor and critic."""
     critic: str = "server"
@@ -82,7 +81,7 @@ class TrainConfig(ScenarioConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        matches = type(self.learner) is LEARNERS.get(self.learner.name)
+        matches = type(self.learner) is LEARNERS.get(self.learner.name, "learner")
         should = f"is not the learner of these settings: choose one with learner={'|'.join(LEARNERS)}"
         checks.require(matches, "learner.name", self.learner.name, should)
         checks.one_of("critic", self.critic, ("server", "privileged"))
@@ -190,6 +189,22 @@ _SCHEMA.learner = MISSING  # the group ``learner`` fills it in
 _STORE.store(name="schema", node=_SCHEMA)
 for _name, _config in LEARNERS.items():
     _STORE.store(group="schema/learner", name=_name, node=_config)
+
+
+class _OwnLearners(dict[str, ConfigNode]):
+    """The options ``package.module:Name`` of Hydra's group ``learner``, imported when they are chosen."""
+
+    def __contains__(self, option: object) -> bool:
+        return ":" in str(option) or super().__contains__(option)
+
+    def __getitem__(self, option: str) -> ConfigNode:
+        path = option.removesuffix(".yaml")
+        settings = LEARNERS.get(path, "learner")
+        set_learner_keys([f"learner.{field.name}" for field in fields(settings)])
+        return ConfigNode(option, OmegaConf.structured(settings(name=path)), "learner", None, "damian")
+
+
+_STORE.repo["learner"] = _OwnLearners()
 OmegaConf.register_new_resolver("shipped", lambda name: str(files("damian") / "data" / name))
 
 

@@ -8,10 +8,11 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 import damian
+from damian.learners.base import LEARNERS
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.compare import CompareConfig
 from damian.recipes.shared.known_settings import groups, known_settings
-from damian.recipes.shared.settings import LEARNERS, TrainConfig
+from damian.recipes.shared.settings import TrainConfig
 
 
 def keys_of(config: DictConfig, path: str = "") -> set[str]:
@@ -39,7 +40,7 @@ def refusal(capsys, *words: str) -> str:
 def test_the_settings_read_from_the_source_are_those_of_the_dataclasses():
     configs = [
         OmegaConf.structured(TrainConfig),
-        *(OmegaConf.create({"learner": make()}) for make in LEARNERS.values()),
+        *(OmegaConf.create({"learner": make()}) for _, make in LEARNERS.items()),
     ]
     assert set(known_settings("train")) == set().union(*map(keys_of, configs))
     assert set(known_settings("compare")) > set(OmegaConf.structured(CompareConfig))
