@@ -296,7 +296,7 @@ def main() -> None:
     target = Path("runs/bench.md")
     target.parent.mkdir(exist_ok=True)
     target.write_text("\n".join(report))
-    print(f"written to {target}")
+    print(f"results: {target}")
 
 
 def run() -> None:

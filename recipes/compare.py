@@ -254,6 +254,7 @@ def main(composed: DictConfig) -> None:
         sys.exit(1)
     report(config, runs, folder)
     print((folder / MARKDOWN).read_text())
+    print(f"results: {folder}")
     if failed:
         sys.exit(1)
 

@@ -244,7 +244,7 @@ def main(words: Sequence[str] | None = None) -> None:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    print(f"{table(runs, folder)}\nwritten to {folder}")
+    print(f"{table(runs, folder)}\nresults: {folder}")
 
 
 def run() -> None:

@@ -59,6 +59,9 @@ from .shared.known_settings import CONF
 from .shared.launch import launch, load, perform, prepare, reported, save_config, stored_config
 from .shared.settings import TrainConfig
 
+MEANING = "sampled: actions are drawn from the policy's distribution; mode: the most likely action is taken."
+"""Line under the table of an evaluation."""
+
 
 @dataclass
 class Progress:
@@ -228,7 +231,8 @@ def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.M
 
     random = fly(random_policy(env))
     rows = {SAMPLED: fly(actor), MODE: fly(actor, False), RANDOM: random, GREEDY: fly(greedy_policy(env))}
-    table = save_results(rows, folder, config.episode.success_share is not None, has_message_delay(config))
+    can_succeed, late = config.episode.success_share is not None, has_message_delay(config)
+    table = save_results(rows, folder, can_succeed, late, MEANING)
     print(f"\n{table}\n")
     return random
 

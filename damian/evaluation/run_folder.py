@@ -129,13 +129,22 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
     plt.close(figure)
 
 
-def save_results(rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool) -> str:
+def save_results(
+    rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool, note: str = ""
+) -> str:
     """Write evaluations by policy to ``result.csv`` and, as a Markdown table, to ``result.md``.
 
+    Args:
+        rows: evaluations by name of the policy.
+        folder: the run folder.
+        can_succeed: as for ``results_table``.
+        late: as for ``results_table``.
+        note: a line under the table.
+
     Returns:
-        the table; for the arguments see ``results_table``.
+        the table, with the note.
     """
-    table = results_table(rows, can_succeed, late)
+    table = results_table(rows, can_succeed, late) + (f"\n\n{note}" if note else "")
     (folder / TABLE).write_text(table + "\n")
     # A run with a ``result.csv`` counts as finished, so that the file must appear complete or not at all.
     unfinished = folder / f"{RESULTS}.part"

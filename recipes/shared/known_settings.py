@@ -59,13 +59,19 @@ def known_settings(program: str) -> dict[str, Setting]:
     return known
 
 
-def groups() -> dict[str, list[str]]:
-    """Options of every group of conf/, by the group's name."""
-    folders = [path for path in Path(CONF).iterdir() if path.is_dir() and path.name != "hydra"]
-    return {
-        folder.name: sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
-        for folder in folders
-    }
+def groups(own_folder: str | None = None) -> dict[str, list[str]]:
+    """Options of every group of conf/, by the group's name.
+
+    Args:
+        own_folder: a folder with configuration files of the user's own, whose options come first.
+    """
+    options: dict[str, list[str]] = {}
+    for root in map(Path, filter(None, [own_folder, CONF])):
+        for folder in (path for path in root.glob("*") if path.is_dir() and path.name != "hydra"):
+            files = sorted(folder.rglob("*.yaml"))
+            names = [str(file.relative_to(folder).with_suffix("")) for file in files]
+            options.setdefault(folder.name, []).extend(names)
+    return options
 
 
 def help_text(recipe: str, program: str, keys: Sequence[str] = ()) -> str:
@@ -105,6 +111,8 @@ def _settings(module: str, name: str, path: str = "") -> Iterator[tuple[str, Set
         if not isinstance(part, ast.AnnAssign) or not isinstance(part.target, ast.Name):
             continue
         key, kind = path + part.target.id, ast.unparse(part.annotation)
+        if kind.startswith("ClassVar"):
+            continue
         chosen = [class_path.partition(":") for class_path in CHOICES.get(kind, [])]
         sections = [(module, name) for module, _, name in chosen] or [_find(module, kind)]
         default = "" if sections[0] or part.value is None else _default(part.value)

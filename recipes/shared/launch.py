@@ -21,9 +21,12 @@ from torchrl.checkpoint import Checkpoint
 
 from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
+from damian.evaluation.run_record import new_record, timed, write_record
 from damian.learners.base import LEARNERS
 
+from .command_line import config_dir, prepared
 from .composition_errors import COMPOSITION_ERRORS, one_line
+from .inheritance import changes, check_policy_fits, inherited
 from .misspelt import no_such_key, set_program
 from .settings import TrainConfig
 
@@ -54,12 +57,28 @@ def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
     if (folder / CONFIG).exists():
         remedy = f"choose another folder, or continue the run with resume={folder}"
         raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
-    if composed.checkpoint is not None:
-        overrides = inherited(Path(composed.checkpoint), overrides)
+    stored = None if composed.checkpoint is None else stored_run(Path(composed.checkpoint))
+    if stored:
+        overrides = inherited(stored, overrides)
         composed = composed_with(str(hydra.job.config_name), overrides)
     config = checked(composed)
     config.overrides = overrides
+    if stored:
+        check_policy_fits(config, stored)
+        if changed := changes(config, stored):
+            print(f"changed since the training: {changed}")
     return config, folder
+
+
+def stored_run(folder: Path) -> TrainConfig | None:
+    """The checked configuration of the run in a folder; None if there is no run.
+
+    Raises:
+        InputError: the run's configuration cannot be read.
+    """
+    if not (folder / CONFIG).is_file():
+        return None  # loading the checkpoint will report what is missing
+    return cast(TrainConfig, OmegaConf.to_object(stored_config(folder, "checkpoint")))
 
 
 def composed_with(config_name: str, overrides: Sequence[str]) -> DictConfig:
@@ -74,33 +93,13 @@ def composed_with(config_name: str, overrides: Sequence[str]) -> DictConfig:
         raise InputError(one_line(error)) from error
 
 
-def inherited(folder: Path, overrides: Sequence[str]) -> list[str]:
-    """The given overrides, preceded by those of the run in a folder that they do not replace.
-
-    Raises:
-        InputError: the run's configuration cannot be read.
-    """
-    if not (folder / CONFIG).is_file():
-        return list(overrides)  # loading the checkpoint will report what is missing
-    given = [_key(override) for override in overrides]
-    saved = cast(list[str], OmegaConf.to_container(stored_config(folder, "checkpoint"))["overrides"])  # type: ignore
-    return [old for old in saved if not any(_replaces(key, _key(old)) for key in given)] + list(overrides)
-
-
-def _key(override: str) -> str:
-    return override.lstrip("+~").partition("=")[0]
-
-
-def _replaces(given: str, key: str) -> bool:
-    """Does an override of ``given``, a key or a group, replace an earlier override of ``key``?"""
-    return key == given or key.startswith(f"{given}.")
-
-
 def perform(config: TrainConfig, folder: Path, program: Program) -> None:
     """Run a program with the threads and the seed of its configuration."""
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
-    program(config, folder)
+    with timed(folder):
+        program(config, folder)
+    print(f"results: {folder}")
 
 
 def checked(composed: DictConfig) -> Any:
@@ -127,9 +126,12 @@ def unknown_keys(composed: Any, config: Any, path: str = "") -> list[str]:
 
 
 def save_config(config: TrainConfig, folder: Path) -> None:
-    """Write the resolved configuration into the run folder."""
+    """Write the resolved configuration into the run folder, and the record of versions and machine."""
     folder.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(OmegaConf.structured(config), folder / CONFIG)
+    is_gpu = config.device.startswith("cuda")
+    device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
+    write_record(folder, new_record(device, config.threads, config_dir(sys.argv)))
 
 
 def stored_config(folder: Path, key: str) -> DictConfig:
@@ -215,6 +217,7 @@ def launch(main: Callable[[], Any], program: str = "train") -> None:
     """
     set_program(program)
     _composed.clear()
+    sys.argv[1:] = prepared(sys.argv[1:])
     try:
         main()
     except COMPOSITION_ERRORS as error:

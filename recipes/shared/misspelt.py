@@ -2,8 +2,10 @@
 
 import difflib
 import re
+import sys
 from collections.abc import Sequence
 
+from .command_line import CONFIG_DIR, config_dir
 from .known_settings import groups, known_settings
 
 RENAMED = {
@@ -16,7 +18,7 @@ RENAMED = {
     "region.situations": "region.initial_conditions",
 }
 """Keys and groups of damian 0.1, and those that replaced them."""
-_OWN_FILES = ("--config-dir", "-cd", "--config-path", "-cp")
+_OWN_FILES = (*CONFIG_DIR, "--config-path", "-cp")
 """Options of Hydra with which a user adds configuration files of his own."""
 
 _programs: list[str] = ["train"]
@@ -48,7 +50,7 @@ def check_words(program: str, words: Sequence[str]) -> str | None:
         One line, or None: then Hydra and the settings' own checks decide.
     """
     set_program(program)
-    known, options = known_settings(program), groups()
+    known, options = known_settings(program), groups(config_dir(words))
     own_files = any(word.startswith(_OWN_FILES) for word in words)
     own_learner = own_files or any(re.match(r"learner=.*:", word) for word in words)
     for word in words:
@@ -76,7 +78,7 @@ def _is_known(key: str, known: dict) -> bool:
 
 def no_such_option(group: str, option: str) -> str:
     """The message for an unknown option of a group, or for an unknown group."""
-    options = groups().get(group)
+    options = groups(config_dir(sys.argv)).get(group)
     return f"{group}: {option} is not one of {', '.join(options)}" if options else no_such_key(group)
 
 

@@ -4,7 +4,6 @@ import os
 import re
 import zlib
 from dataclasses import dataclass, field, fields, replace
-from importlib.resources import files
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
@@ -205,7 +204,6 @@ class _OwnLearners(dict[str, ConfigNode]):
 
 
 _STORE.repo["learner"] = _OwnLearners()
-OmegaConf.register_new_resolver("shipped", lambda name: str(files("damian") / "data" / name))
 
 
 def _plain(name: str) -> str:

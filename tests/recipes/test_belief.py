@@ -44,8 +44,10 @@ def table(folder: Path) -> dict[str, np.ndarray]:
 
 
 def printed_lines(capsys) -> list[str]:
-    """The lines that the recipe has printed."""
-    return capsys.readouterr().out.splitlines()
+    """The lines that the recipe has printed, without the last one, which names the run folder."""
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert last.startswith("results: ")
+    return lines
 
 
 @pytest.mark.parametrize(
@@ -53,7 +55,7 @@ def printed_lines(capsys) -> list[str]:
 )
 def test_a_run_folder_holds_configuration_table_and_figure(run, capsys, overrides):
     folder = run(*overrides, "episode.max_steps=10")
-    assert {path.name for path in folder.iterdir()} == {"config.yaml", "belief.csv", "belief.png"}
+    assert {path.name for path in folder.iterdir()} == {"config.yaml", "run.json", "belief.csv", "belief.png"}
     assert [line.split(":")[0] for line in printed_lines(capsys)] == [
         "mean age",
         "late messages",

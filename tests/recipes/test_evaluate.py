@@ -1,17 +1,19 @@
 """The evaluation recipe, run by its command line: a trained policy with other UAVs, regions and delays."""
 
 import csv
+import json
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import check_refused
 from omegaconf import OmegaConf
 
-from damian.recipes import train
-from damian.recipes.evaluate import main
+import damian
+from damian.recipes import evaluate, train
 from damian.recipes.shared.launch import launch
 
 TRAINED = [
@@ -43,10 +45,13 @@ def fly(trained, tmp_path, monkeypatch) -> Callable[..., Path]:
     """Evaluate the policy of a run in an empty folder; returns the folder with the results."""
     monkeypatch.chdir(tmp_path)
 
-    def run_recipe(*overrides: str, of: Path | str | None = trained, folder: str = "flown") -> Path:
+    def run_recipe(
+        *overrides: str, of: Path | str | None = trained, folder: str = "flown", program=evaluate
+    ) -> Path:
         policy = [f"checkpoint={of}"] if of else []
-        monkeypatch.setattr(sys, "argv", ["evaluate.py", *overrides, *policy, f"hydra.run.dir={folder}"])
-        launch(main)
+        words = [*(TRAINED if program is train else []), *overrides, *policy, f"hydra.run.dir={folder}"]
+        monkeypatch.setattr(sys, "argv", ["evaluate.py", *words])
+        launch(program.main)
         return tmp_path / folder
 
     return run_recipe
@@ -62,7 +67,7 @@ def results(folder: Path) -> dict[str, dict[str, float]]:
 
 def test_without_overrides_the_evaluation_after_the_training_is_repeated(fly, trained, capsys):
     folder = fly()
-    assert {path.name for path in folder.iterdir()} == {"config.yaml", "result.csv", "result.md"}
+    assert {path.name for path in folder.iterdir()} == {"config.yaml", "result.csv", "result.md", "run.json"}
     assert (folder / "result.md").read_text().strip() in capsys.readouterr().out
     again, before = results(folder), results(trained)
     assert again.keys() == before.keys() == {"trained, sampled", "trained, mode", "random", "greedy"}
@@ -110,6 +115,26 @@ def test_a_new_option_of_a_group_replaces_the_keys_of_the_run_in_this_group(fly)
     assert OmegaConf.load(folder / "config.yaml").delay.obs.law == "uniform"
 
 
+def test_a_policy_keeps_its_action_history_under_another_delay_and_the_changes_are_printed(fly, capsys):
+    first = fly("delay.history=2", "delay.obs=1", of=None, folder="first", program=train)
+    capsys.readouterr()
+    config = OmegaConf.load(fly("delay=paper", of=first) / "config.yaml")
+    assert (config.delay.history, config.delay.obs.law) == (2, "uniform")
+    assert "changed since the training: delay.obs: 1 -> {" in capsys.readouterr().out
+
+
+def test_the_folder_records_versions_machine_commit_and_wall_time(fly, capsys):
+    folder = fly()
+    record = json.loads((folder / "run.json").read_text())
+    assert record["damian"] == damian.__version__
+    assert record["packages"]["torch"] == torch.__version__
+    assert record["wall_time_s"] > 0
+    assert record["machine"]["cores"] >= 1
+    assert len(record["commit"].partition("+")[0]) == 40
+    assert capsys.readouterr().out.strip().splitlines()[-1] == f"results: {folder}"
+    assert str(Path(damian.__file__).parent) not in (folder / "config.yaml").read_text()
+
+
 def test_a_resumed_run_is_evaluated_with_its_own_overrides(fly, trained, tmp_path, monkeypatch):
     resumed = shutil.copytree(trained, tmp_path / "resumed")
     monkeypatch.setattr(sys, "argv", ["train.py", f"resume={resumed}", "frames=96"])
@@ -119,7 +144,7 @@ def test_a_resumed_run_is_evaluated_with_its_own_overrides(fly, trained, tmp_pat
 
 def test_a_checkpoint_may_be_in_a_folder_of_a_sweep(fly, trained, tmp_path):
     swept = shutil.copytree(trained, tmp_path / "agents=3,seed=3")
-    assert OmegaConf.load(fly(of=f"'{swept}'") / "config.yaml").delay.obs == 1
+    assert OmegaConf.load(fly(of=swept) / "config.yaml").delay.obs == 1
 
 
 def test_the_same_seed_gives_the_same_results_and_another_one_others(fly):
@@ -131,10 +156,12 @@ def test_the_same_seed_gives_the_same_results_and_another_one_others(fly):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["model.hidden=[8]"], "size mismatch for module.0.module.0.weight"),
-        (["observation.local_features=[battery,spotted]"], "size mismatch for module.0.module.0.weight"),
-        (["delay.history=2"], "size mismatch for module.0.module.0.weight"),
-        (["actions=continuous"], "checkpoint: "),
+        (["model.hidden=[8]"], "model.hidden: the policy was trained with [16], so it cannot fly with [8]"),
+        (["observation.local_features=[battery,spotted]"], "was trained with ['spotted'], so it cannot fly"),
+        (["delay.history=2"], "delay.history: the policy was trained with 0, so it cannot fly with 2"),
+        (["actions.distances=[0,30]"], "number of actions.distances: the policy was trained with"),
+        (["actions=continuous"], "actions.kind: the policy was trained with 'discrete'"),
+        (["observation.age=true"], "observation.age: the policy was trained with False"),
         (["agent=3"], "agent: no such key; did you mean agents?"),
         (["delay.obs=-3"], "delay.obs: -3 is neither whole steps such as 3 nor a time"),
         (["agents=60"], "leaves room for 39 flight levels"),

@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ class RegionConfig:
     vertices: list = field(default_factory=list)
     """Polygon corners [x, y] in metres, for ``kind=vertices``."""
     path: str = ""
-    """File to read, for ``kind=fir`` and ``kind=geojson``."""
+    """File to read, for ``kind=fir`` and ``kind=geojson``; ``damian:fir.csv`` is the table of the package."""
     id: str = ""
     """Airspace ID of the region in the FIR table."""
     index: int | None = None
@@ -112,9 +113,15 @@ def _region_of_vertices(config: RegionConfig, rng: np.random.Generator) -> list[
 
 @REGION_SOURCES.register("fir")
 def _region_of_fir_table(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
-    return [read_fir(config.path, config.id)]
+    return [read_fir(_file(config.path), config.id)]
 
 
 @REGION_SOURCES.register("geojson")
 def _region_of_geojson(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
-    return [read_geojson(config.path, config.index, config.where)]
+    return [read_geojson(_file(config.path), config.index, config.where)]
+
+
+def _file(path: str) -> str:
+    """The file of a path; one that begins with ``damian:`` is among the package's own."""
+    shipped = path.removeprefix("damian:")
+    return path if shipped == path else str(files("damian") / "data" / shipped)

@@ -1,0 +1,98 @@
+"""The record of a run: with which versions, on which machine and for how long it was made."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import damian
+
+RECORD = "run.json"
+PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy", "shapely")
+"""Packages whose versions a record names."""
+
+
+def new_record(device: str, threads: int, config_dir: str | None) -> dict[str, Any]:
+    """What is known when a run begins.
+
+    Args:
+        device: name of the device of all tensors.
+        threads: number of torch's threads.
+        config_dir: folder with configuration files of the user's own, if there is one.
+    """
+    return {
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "config_dir": config_dir and str(Path(config_dir).resolve()),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "damian": damian.__version__,
+        "commit": commit(),
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in PACKAGES},
+        "machine": {
+            "system": platform.platform(),
+            "processor": processor(),
+            "cores": os.cpu_count(),
+            "threads": threads,
+            "device": device,
+        },
+    }
+
+
+def commit() -> str | None:
+    """The commit of DAMIAN's source if it is a git checkout, with ``+changes`` if files were changed."""
+    folder = Path(damian.__file__).parents[1]
+    if not (folder / ".git").exists():
+        return None
+    git = ["git", "-C", str(folder)]
+    try:
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        status = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return head.stdout.strip() + ("+changes" if status.stdout.strip() else "")
+
+
+def processor() -> str:
+    """The name of the processor."""
+    cpus = Path("/proc/cpuinfo")
+    lines = cpus.read_text().splitlines() if cpus.exists() else []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
+def write_record(folder: Path, record: dict[str, Any]) -> None:
+    """Write the record into a run folder; a resumed run keeps the wall time of its earlier part."""
+    record["wall_time_s"] = read_record(folder).get("wall_time_s", 0.0)
+    _write(folder, record)
+
+
+@contextmanager
+def timed(folder: Path) -> Iterator[None]:
+    """Add the wall time of what is done inside to the record of the run folder, however it ends."""
+    begin = time.monotonic()
+    try:
+        yield
+    finally:
+        if record := read_record(folder):
+            record["wall_time_s"] = round(record["wall_time_s"] + time.monotonic() - begin, 1)
+            _write(folder, record)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """The record of a run; empty if there is none that can be read."""
+    try:
+        return json.loads((folder / RECORD).read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def _write(folder: Path, record: dict[str, Any]) -> None:
+    (folder / RECORD).write_text(json.dumps(record, indent=2) + "\n")

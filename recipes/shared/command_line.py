@@ -1,0 +1,46 @@
+"""The words of a command line, before Hydra reads them."""
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from damian.evaluation.run_record import read_record
+
+CONFIG_DIR = ("--config-dir", "-cd")
+"""Hydra's option for a folder with configuration files of one's own."""
+
+
+def config_dir(words: Sequence[str]) -> str | None:
+    """The folder with configuration files of one's own, if one is given."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        name, equals, value = word.partition("=")
+        if name in CONFIG_DIR:
+            return value if equals else following
+    return None
+
+
+def prepared(words: Sequence[str]) -> list[str]:
+    """The words with what Hydra needs and a person should not have to write.
+
+    Folders of runs get quotes if they have ``=`` or ``,`` in their names, as those of a sweep do. A policy
+    that was trained with configuration files of one's own is evaluated with the same files.
+    """
+    folders = [match[1] for word in words if (match := re.fullmatch(r"checkpoint=(.*)", word))]
+    words = [_quoted(word) for word in words]
+    if config_dir(words) is None:
+        words += [f"--config-dir={folder}" for folder in _config_dirs(folders)]
+    return words
+
+
+def _quoted(word: str) -> str:
+    key, _, value = word.partition("=")
+    is_folder = key in ("checkpoint", "resume") and re.search(r"[=,]", value) and Path(value).is_dir()
+    return f"{key}='{value}'" if is_folder else word
+
+
+def _config_dirs(folders: Sequence[str]) -> Iterator[str]:
+    """The folders with configuration files that runs were trained with."""
+    for folder in map(Path, folders):
+        used = read_record(folder).get("config_dir")
+        if used and Path(used).is_dir():
+            yield used

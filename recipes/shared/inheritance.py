@@ -1,0 +1,87 @@
+"""A run that takes the policy of another one: the settings that it keeps, and those that must not change."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from damian.common.errors import InputError
+from damian.common.text_files import show
+from damian.envs.scenario import ScenarioConfig
+
+from .settings import TrainConfig
+
+KEPT = ("delay.history",)
+"""Settings of the observation, which a new option of their group (``delay=paper``) does not replace."""
+
+
+def inherited(stored: TrainConfig, overrides: Sequence[str]) -> list[str]:
+    """The given overrides, preceded by those of a stored run that they do not replace."""
+    given = [_key(override) for override in overrides]
+    kept = [old for old in stored.overrides if not any(_replaces(key, _key(old)) for key in given)]
+    return kept + list(overrides)
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _replaces(given: str, key: str) -> bool:
+    """Does an override of ``given``, a key or a group, replace an earlier override of ``key``?"""
+    return key == given or (key.startswith(f"{given}.") and key not in KEPT)
+
+
+def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
+    """Check that a policy can fly in another scenario than the one that it was trained in.
+
+    Raises:
+        InputError: its observations, actions or layers would differ; the message names the setting.
+    """
+    new, old = _shape(config), _shape(stored)
+    for key, value in new.items():
+        if value != old[key]:
+            trained, asked = show(old[key]), show(value)
+            raise InputError(f"{key}: the policy was trained with {trained}, so it cannot fly with {asked}")
+
+
+def _shape(config: TrainConfig) -> dict[str, Any]:
+    """What the sizes of a policy's networks follow from, by setting."""
+    observation, actions, model = config.observation, config.actions, config.model
+    discrete = actions.kind == "discrete"
+    return {
+        "observation.ctde": observation.ctde,
+        "observation.local_features": [*observation.local_features],
+        "observation.global_features": [] if observation.ctde else [*observation.global_features],
+        "observation.age": observation.age,
+        "delay.history": config.delay.history,
+        "actions.kind": actions.kind,
+        "number of actions.distances": discrete and len(actions.distances),
+        "number of actions.headings": discrete and len(actions.headings),
+        **{f"model.{field.name}": getattr(model, field.name) for field in fields(model)},
+    }
+
+
+def changes(config: TrainConfig, stored: TrainConfig) -> str:
+    """The settings of the scenario that differ between a stored run and a new one, on one line."""
+    names = {field.name for field in fields(ScenarioConfig)}
+    old, new = ({k: v for k, v in _settings(each) if k.split(".")[0] in names} for each in (stored, config))
+    differ = [key for key in new if old[key] != new[key]]
+    return ", ".join(f"{key}: {show(old[key])} -> {show(new[key])}" for key in differ)
+
+
+def _settings(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every setting of nested dataclasses by its dotted key."""
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            yield from _settings(value, f"{path}{field.name}.")
+        else:
+            yield f"{path}{field.name}", value
+
+
+def leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every dotted key of nested dictionaries with its value."""
+    if isinstance(node, dict) and node:
+        for key, value in node.items():
+            yield from leaves(value, f"{path}.{key}" if path else key)
+    else:
+        yield path, node
