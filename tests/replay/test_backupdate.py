@@ -69,6 +69,17 @@ def test_latest_arrived_equals_a_loop_over_messages(loss, order):
                     assert latest[t, b, i] == max(arrived, default=start - 1)
 
 
+def test_steps_from_the_middle_of_an_episode_give_the_same_even_if_the_held_message_is_much_older():
+    generator = torch.Generator().manual_seed(4)
+    n_older = 0
+    for _ in range(20):
+        log, _ = random_log(30, 0.8, "generation", generator)
+        window = MessageLog(*(part[15:] for part in log))
+        assert latest_arrived(window)[LONGEST:].equal(latest_arrived(log)[15 + LONGEST :])
+        n_older += int((window.age[LONGEST:] > LONGEST + 1).sum())
+    assert n_older > 100
+
+
 def test_no_message_that_arrives_after_the_time_of_learning_is_used():
     log, _ = random_log(16, 0.2, "generation", torch.Generator().manual_seed(2))
     now = 9
