@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import SamplerWithoutReplacement, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 
+from damian import keys
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
@@ -262,6 +263,23 @@ def test_the_actors_observations_and_actions_stay():
     begins, key = delayed["step_count"].squeeze(-1) == 0, ("agents", "global_observation")
     assert begins[:, 1:].any()
     assert corrected[key][begins].equal(delayed[key][begins])
+
+
+@pytest.mark.parametrize("motion", ["instant", "polynomial"])
+def test_a_learner_can_be_told_what_the_server_held_and_what_it_knows_in_hindsight(motion):
+    scenario = everything(motion, episode=PERSISTENT, delay=DelayConfig(obs=RANDOM_DELAY))
+    env = make_env(scenario, 4, extras=EXTRAS)
+    env.append_transform(StepCounter())
+    recompute = server_recompute(env.server, reward_terms=True, actor=True)
+    storage = BackupdateStorage(64 * 4, recompute, LONGEST, env=env, hindsight_key=keys.HINDSIGHT)
+    replay, delayed = TensorDictReplayBuffer(storage=storage), rollout(scenario, 39)
+    for part in delayed.split(13, 1):
+        replay.extend(part)
+    after = in_order(replay, 39)["next"]
+    assert after[keys.RECEIVED].equal(delayed["next", "agents", "received"].transpose(0, 1))
+    settled = 39 - LONGEST
+    assert after[keys.HINDSIGHT][:settled].equal(after[keys.MESSAGE][:settled])
+    assert not after[keys.RECEIVED][:settled].equal(after[keys.MESSAGE][:settled])
 
 
 def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened():
