@@ -69,6 +69,9 @@ ADVANTAGE = (AGENTS, "advantage")
 """Advantage of the action."""
 BACKUPDATED = (AGENTS, "backupdated")
 """Did back-updating replace the message that the server held at this step, [T, B, N, 1] bool."""
+HINDSIGHT = (AGENTS, "hindsight")
+"""Under ``"next"``, if a back-updating storage gets this key: the newest message sent by that step that has
+arrived by now, packed, [T, B, N, M]."""
 VALID = "valid"
 """False where, by the messages that have arrived since, the episode had already ended, [T, B, 1] bool."""
 RESET_AFTER = "reset_after"

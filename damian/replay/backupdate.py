@@ -1,50 +1,65 @@
 """A replay-buffer storage that corrects stored steps as late messages arrive (paper, section 3.4)."""
 
-from collections.abc import Callable
 from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from damian import keys
+from damian.common import checks
+from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.keys import next_key
 from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
+from damian.replay.step_keys import (
+    ENDS,
+    Recompute,
+    StepKeys,
+    check_recompute,
+    check_steps,
+    example_steps,
+)
 from damian.replay.time_storage import TimeStorage
-
-Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
-"""Function from steps [T, B], and the newest messages that the server can hold after each step, [T, B, N, M],
-to the entries after the steps, by key.
-
-``("next", "done")``, ``("next", "terminated")`` and ``("next", "truncated")`` [T, B, 1] must be among them.
-"""
-
-OBSERVATIONS = ("observation", "global_observation")
-"""Entries of the agents that a step outputs and the next step reads."""
 
 
 class BackupdateStorage(TimeStorage):
-    """Keeps steps in order of time, and corrects them as late messages arrive.
+    """Keeps steps in order of time, and corrects them as late messages arrive (docs/backupdating.md).
 
     Whenever steps are written, the storage recomputes them, and the earlier steps that a late message may
     still concern, from all messages that have arrived by the last step. The entries that ``recompute``
-    returns replace the stored ones; recomputed observations also replace those before the next step of the
-    same episode. All other entries stay, such as the actor's observation, action and log-probability.
+    returns replace the stored ones. Where the steps have such an entry before the step too, as observations
+    are, it becomes that after the previous step of the same episode; ``done``, ``terminated`` and
+    ``truncated`` before a step stay. All other entries stay, such as the actor's action and log-probability.
 
-    The storage adds three entries: ``valid`` [T, B, 1], false where the episode had ended already, as the
-    server knows now; ``reset_after`` [T, B, 1], true where the environment was reset (such a step is
-    truncated if the task had not ended after all); ``(group, "backupdated")`` [T, B, N, 1], true where a late
-    message replaced the one that the server held.
+    The storage adds: ``valid`` [T, B, 1], false where the episode had ended already, as the receiver knows
+    now; ``reset_after`` [T, B, 1], true where the environment was reset (such a step is truncated if the task
+    had not ended after all); ``backupdated`` beside ``delay_key``, [T, B, 1] or [T, B, N, 1], true where a
+    late message replaced the one that the receiver held; and the messages of ``hindsight_key``.
+
+    The entries of messages are at the root (one sender in each world: [T, B, M], delay and age [T, B, 1]) or
+    in a group of N agents ([T, B, N, M], delay and age [T, B, N, 1]). ``ObservationDelay`` writes all but the
+    message.
 
     Args:
         max_size: T times B; T must be at least the steps of a batch plus twice ``longest``.
         recompute: computes the entries that depend on messages (for UAVs ``server_recompute``).
         longest: longest delay of a message [steps].
-        group: the TensorDict of the agents, which has ``message``, ``received``, ``delay``, ``age`` and,
-            before and after the step, the observations that ``recompute`` returns.
+        env: environment of the steps, with its transforms: its specs and what ``recompute`` returns for two
+            steps of zeros are checked at once. If not given, the first steps that are written are checked.
+        message_key: the message sent in each step; its entry, and the next three, are under ``"next"``.
+        received_key: the message that the receiver held after the step.
+        delay_key: delay of the message sent in the step [steps], -1 if it never arrives.
+        age_key: age of the message that the receiver held [steps].
         step_count_key: earlier steps of the episode, [T, B, 1] (``StepCounter``); 0 where it begins.
+        hindsight_key: if given, the entry ``("next", hindsight_key)`` is added: the newest message sent by
+            that step that has arrived by now, as ``received_key`` in shape.
         options: of ``LazyTensorStorage``.
+
+    Raises:
+        InputError: with ``env``: its steps lack an entry, or ``recompute`` returns something else than it
+            should.
     """
 
     def __init__(
@@ -53,13 +68,29 @@ class BackupdateStorage(TimeStorage):
         recompute: Recompute,
         longest: int,
         *,
-        group: str = keys.AGENTS,
+        env: EnvBase | None = None,
+        message_key: NestedKey = keys.MESSAGE,
+        received_key: NestedKey = keys.RECEIVED,
+        delay_key: NestedKey = keys.DELAY,
+        age_key: NestedKey = keys.AGE,
         step_count_key: NestedKey = keys.STEP_COUNT,
+        hindsight_key: NestedKey | None = None,
         **options: Any,
     ) -> None:
+        checks.whole("longest", longest, 0, unit="steps")
         super().__init__(max_size, **options)
-        self.recompute, self.longest, self.group = recompute, longest, group
-        self.step_count_key = step_count_key
+        self.recompute, self.longest = recompute, longest
+        self.step_keys = StepKeys(
+            unravel_key(message_key),
+            unravel_key(received_key),
+            unravel_key(delay_key),
+            unravel_key(age_key),
+            unravel_key(step_count_key),
+            None if hindsight_key is None else unravel_key(hindsight_key),
+        )
+        self._checked = False
+        if env is not None:
+            self._check_once(example_steps(env))
 
     def set(  # type: ignore[override]
         self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True
@@ -67,49 +98,71 @@ class BackupdateStorage(TimeStorage):
         """Write steps [T, B] at the indices ``cursor`` of the first dimension, and back-update.
 
         Raises:
-            ValueError: the storage is too small for the batch, or a message is later than ``longest``.
+            InputError: an entry is missing or misshapen, the storage is too small for the batch, or a message
+                is later than ``longest``.
         """
-        self._check(data)
-        done = data[next_key(keys.DONE)]
-        data = data.copy().update({keys.VALID: torch.ones_like(done), keys.RESET_AFTER: done.clone()})
-        delay = data["next", self.group, "delay"]
-        data[self.group, "backupdated"] = torch.zeros_like(delay, dtype=torch.bool)
-        super().set(cursor, data, set_cursor=set_cursor)
+        self._check_once(data[:2])
+        self._check_times(data)
+        super().set(cursor, self._with_added_entries(data), set_cursor=set_cursor)
         self.backupdate(len(data) + self.longest)
 
-    def _check(self, data: TensorDictBase) -> None:
+    def _check_once(self, steps: TensorDictBase) -> None:
+        """Check the entries of a few steps, and what ``recompute`` returns for them, if not done before."""
+        if self._checked:
+            return
+        steps = steps if self.device == "auto" else steps.to(self.device)
+        check_steps(steps, self.step_keys)
+        check_recompute(self.recompute, self._with_added_entries(steps), self.step_keys)
+        self._checked = True
+
+    def _check_times(self, data: TensorDictBase) -> None:
         needs, n_worlds = len(data) + 2 * self.longest, data.shape[1]
         if self.max_size < needs * n_worlds:
-            raise ValueError(
+            raise InputError(
                 f"max_size: {self.max_size} is too little for batches of {len(data)} steps and delays of "
                 f"up to {self.longest} steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}"
             )
-        longest = int(data["next", self.group, "delay"].max())
+        longest = int(data[next_key(self.step_keys.delay)].max())
         if longest > self.longest:
-            raise ValueError(f"longest: a message takes {longest} steps, more than {self.longest} steps")
+            raise InputError(f"longest: a message takes {longest} steps, more than {self.longest} steps")
 
-    def receive(self, world: Tensor, agent: Tensor, steps_ago: Tensor, message: Tensor) -> None:
+    def _with_added_entries(self, data: TensorDictBase) -> TensorDictBase:
+        """Copy of steps [T, B], with the entries that the storage adds, before any back-updating."""
+        done, delay = data[ENDS[0]], data[next_key(self.step_keys.delay)]
+        data = data.copy().update({keys.VALID: torch.ones_like(done), keys.RESET_AFTER: done.clone()})
+        data[self.step_keys.backupdated] = torch.zeros_like(delay, dtype=torch.bool)
+        if self.step_keys.hindsight is not None:
+            data[next_key(self.step_keys.hindsight)] = data[next_key(self.step_keys.received)].clone()
+        return data
+
+    def receive(self, world: Tensor, agent: Tensor | None, steps_ago: Tensor, message: Tensor) -> None:
         """Add messages from outside the environment, such as those of real UAVs, and back-update.
 
         The messages count as arriving after the latest stored step.
 
         Args:
             world: index of each sender's world, [K].
-            agent: index of each sender in its world, [K].
+            agent: index of each sender in its world, [K]; not used if the messages are at the root.
             steps_ago: steps from the generation of each message to the latest stored step, [K].
             message: packed messages, [K, M].
 
         Raises:
-            ValueError: a message is older than the longest delay, or than the stored steps.
+            InputError: a message is older than the longest delay, or than the stored steps, or ``agent`` is
+                missing.
         """
         oldest, newest = int(steps_ago.max()), int(steps_ago.min())
         reach = min(self.longest, cast(int, self._len_along_dim0) - 1)
         if newest < 0 or oldest > reach:
-            raise ValueError(f"steps_ago: {newest} to {oldest} is not between 0 and {reach} steps")
+            raise InputError(f"steps_ago: {newest} to {oldest} is not between 0 and {reach} steps")
+        sent, delay = (self.steps[next_key(key)] for key in (self.step_keys.message, self.step_keys.delay))
         index = self.latest(oldest + 1).flip(0)[steps_ago]
-        after = cast(TensorDictBase, self._storage["next", self.group])
-        after["message"][index, world, agent] = message
-        after["delay"][index, world, agent, 0] = steps_ago
+        rows = [index, world]
+        if sent.dim() == 4:
+            if agent is None:
+                raise InputError(f"agent: None is not the index of a sender in a group of {sent.shape[2]}")
+            rows.append(agent)
+        sent[(*rows,)] = message
+        delay[(*rows, 0)] = steps_ago
         self.backupdate(oldest + 1)
 
     def backupdate(self, n_steps: int) -> None:
@@ -123,36 +176,48 @@ class BackupdateStorage(TimeStorage):
         self._bump_mutation_revision()
 
     def recomputed(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
-        """The corrected entries of consecutive steps [T, B], as the server knows after the last step."""
-        group, begins = self.group, steps[self.step_count_key].squeeze(-1) == 0
-        agents = cast(TensorDictBase, steps["next", group])
+        """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step."""
+        names, begins = self.step_keys, steps[self.step_keys.step_count].squeeze(-1) == 0
         log = MessageLog(
-            sent=agents["message"],
-            delay=agents["delay"].squeeze(-1),
-            held=agents["received"],
-            age=agents["age"].squeeze(-1).long(),
+            sent=steps[next_key(names.message)],
+            delay=steps[next_key(names.delay)].squeeze(-1),
+            held=steps[next_key(names.received)],
+            age=steps[next_key(names.age)].squeeze(-1).long(),
         )
         latest = latest_arrived(log)
-        after = self.recompute(steps, latest)
-        done, terminated, truncated = map(next_key, (keys.DONE, keys.TERMINATED, keys.TRUNCATED))
+        after = {unravel_key(key): value for key, value in self.recompute(steps, latest).items()}
+        done, terminated, truncated = ENDS
         reset = steps[keys.RESET_AFTER]
-        after[truncated] = after[truncated] | (reset & ~after[terminated])
-        after[done] = after[done] | reset
+        if done in after:
+            after[truncated] = after[truncated] | (reset & ~after[terminated])
+            after[done] = after[done] | reset
         already_ended = ~steps[keys.VALID][0].squeeze(-1) & ~begins[0]
-        over = ended_before(after[done].squeeze(-1), begins, already_ended)
-        no_previous = begins.clone()
-        no_previous[0] = True  # the step before the first one is not among these steps
-        before = {
-            (group, name): _shift(after["next", group, name], steps[group, name], no_previous)
-            for name in OBSERVATIONS
-            if ("next", group, name) in after
+        ended = after[done] if done in after else steps[done]
+        over = ended_before(ended.squeeze(-1), begins, already_ended)
+        added: dict[NestedKey, Tensor] = {
+            names.backupdated: (latest != log.held).any(-1, keepdim=True),
+            keys.VALID: ~over.unsqueeze(-1),
         }
-        replaced = (latest != log.held).any(-1, keepdim=True)
-        return {**after, **before, (group, "backupdated"): replaced, keys.VALID: ~over.unsqueeze(-1)}
+        if names.hindsight is not None:
+            added[next_key(names.hindsight)] = latest
+        return {**after, **_before(steps, after, begins), **added}
 
 
-def _shift(after: Tensor, before: Tensor, no_previous: Tensor) -> Tensor:
-    """Observations before each step [T, B, ...]: those after the previous step, or, where the mask
-    ``no_previous`` [T, B] is true, ``before``."""
-    previous = torch.cat([after[:1], after[:-1]])
-    return torch.where(expand_mask(no_previous, before), before, previous)
+def _before(steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor) -> dict[NestedKey, Tensor]:
+    """Entries before each step, as far as the steps have them: those after the previous step.
+
+    Args:
+        steps: stored steps, [T, B]; their entries stay where there is no previous step.
+        after: corrected entries after each step, under ``"next"``.
+        begins: whether the episode begins with the step, [T, B].
+    """
+    no_previous = begins.clone()
+    no_previous[0] = True  # the step before the first one is not among these steps
+    before: dict[NestedKey, Tensor] = {}
+    for next_, value in after.items():
+        key = unravel_key(next_[1:])
+        stored = None if next_ in ENDS else steps.get(key, None)
+        if stored is not None:
+            previous = torch.cat([value[:1], value[:-1]])
+            before[key] = torch.where(expand_mask(no_previous, stored), stored, previous)
+    return before

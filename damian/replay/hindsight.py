@@ -35,7 +35,8 @@ def latest_arrived(log: MessageLog, now: int | None = None) -> Tensor:
     """
     steps = _steps(log.delay)
     arrived = (log.delay >= 0) & (steps + log.delay <= (len(steps) - 1 if now is None else now))
-    newest = torch.where(arrived, steps, -1).cummax(0).values
+    none = torch.iinfo(steps.dtype).min  # older than any held message, even one older than these steps
+    newest = torch.where(arrived, steps, none).cummax(0).values
     # With ``order=arrival`` the server may have held a newer message at an earlier step.
     newest_held, held_at = (steps - log.age).cummax(0)
     # A message of an earlier episode is never newer than the held one.

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from damian import keys
 from damian.keys import next_key
-from damian.replay.backupdate import Recompute
+from damian.replay.step_keys import Recompute
 from damian.server.server import Server
 from damian.world.messages import Messages
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import SamplerWithoutReplacement, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 
+from damian import keys
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
@@ -67,6 +68,17 @@ def test_latest_arrived_equals_a_loop_over_messages(loss, order):
                     start = max(s for s in range(t + 1) if begins[s, b, i])
                     arrived = [g for g in range(start, t + 1) if 0 <= log.delay[g, b, i] <= now - g]
                     assert latest[t, b, i] == max(arrived, default=start - 1)
+
+
+def test_steps_from_the_middle_of_an_episode_give_the_same_even_if_the_held_message_is_much_older():
+    generator = torch.Generator().manual_seed(4)
+    n_older = 0
+    for _ in range(20):
+        log, _ = random_log(30, 0.8, "generation", generator)
+        window = MessageLog(*(part[15:] for part in log))
+        assert latest_arrived(window)[LONGEST:].equal(latest_arrived(log)[15 + LONGEST :])
+        n_older += int((window.age[LONGEST:] > LONGEST + 1).sum())
+    assert n_older > 100
 
 
 def test_no_message_that_arrives_after_the_time_of_learning_is_used():
@@ -251,6 +263,23 @@ def test_the_actors_observations_and_actions_stay():
     begins, key = delayed["step_count"].squeeze(-1) == 0, ("agents", "global_observation")
     assert begins[:, 1:].any()
     assert corrected[key][begins].equal(delayed[key][begins])
+
+
+@pytest.mark.parametrize("motion", ["instant", "polynomial"])
+def test_a_learner_can_be_told_what_the_server_held_and_what_it_knows_in_hindsight(motion):
+    scenario = everything(motion, episode=PERSISTENT, delay=DelayConfig(obs=RANDOM_DELAY))
+    env = make_env(scenario, 4, extras=EXTRAS)
+    env.append_transform(StepCounter())
+    recompute = server_recompute(env.server, reward_terms=True, actor=True)
+    storage = BackupdateStorage(64 * 4, recompute, LONGEST, env=env, hindsight_key=keys.HINDSIGHT)
+    replay, delayed = TensorDictReplayBuffer(storage=storage), rollout(scenario, 39)
+    for part in delayed.split(13, 1):
+        replay.extend(part)
+    after = in_order(replay, 39)["next"]
+    assert after[keys.RECEIVED].equal(delayed["next", "agents", "received"].transpose(0, 1))
+    settled = 39 - LONGEST
+    assert after[keys.HINDSIGHT][:settled].equal(after[keys.MESSAGE][:settled])
+    assert not after[keys.RECEIVED][:settled].equal(after[keys.MESSAGE][:settled])
 
 
 def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened():

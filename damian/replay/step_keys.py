@@ -1,0 +1,131 @@
+"""What a ``BackupdateStorage`` needs of stored steps and of ``recompute``, and checks of both."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from damian import keys
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.keys import next_key
+from damian.transforms.entries import sibling_key
+
+Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
+"""Function from steps [T, B], and the newest message that the receiver can hold after each step, [T, B, M] or
+[T, B, N, M], to entries after the steps, by key, such as ``{("next", "reward"): reward}``.
+
+Each entry has the shape and dtype of the stored one. ``("next", "done")``, ``("next", "terminated")`` and
+``("next", "truncated")`` [T, B, 1] are all among them, or none of them: then the stored ends stay.
+"""
+
+ENDS = tuple(map(next_key, (keys.DONE, keys.TERMINATED, keys.TRUNCATED)))
+"""Keys of the flags that end an episode after a step."""
+
+
+class StepKeys(NamedTuple):
+    """Keys of the entries that the storage reads and writes; all but ``step_count`` are under ``"next"``."""
+
+    message: NestedKey
+    received: NestedKey
+    delay: NestedKey
+    age: NestedKey
+    step_count: NestedKey
+    hindsight: NestedKey | None
+
+    @property
+    def backupdated(self) -> NestedKey:
+        """The flag beside ``delay`` that the storage adds, but not under ``"next"``."""
+        return cast(NestedKey, sibling_key(self.delay, "backupdated"))
+
+
+def example_steps(env: EnvBase) -> TensorDictBase:
+    """Two steps [2, B] of zeros with the entries that ``env`` outputs; B is 1 if it has no batch size.
+
+    Raises:
+        InputError: the batch size of ``env`` has more than one dimension.
+    """
+    worlds = list(env.batch_size)
+    checks.require(len(worlds) < 2, "env", f"the batch size {worlds}", "is not [] or [B]")
+    return env.fake_tensordict().expand(2, *(worlds or [1])).clone()
+
+
+def check_steps(steps: TensorDictBase, step_keys: StepKeys) -> None:
+    """Check that steps [T, B] have every entry that the storage needs.
+
+    Raises:
+        InputError: an entry is missing or has another shape; the line says which one, and how to get it.
+    """
+    message, received, delay, age, step_count, hindsight = step_keys
+    remedy = "the environment must output it; that of UAVs does with make_env(..., extras=['message'])"
+    holds = "the message sent in each step, [T, B, M] or [T, B, N, M]"
+    shape = list(_find(steps, "message_key", next_key(message), holds, remedy).shape)
+    should = f"has the shape {shape}, which is not [T, B, M] or [T, B, N, M]"
+    checks.require(len(shape) in (3, 4), "message_key", next_key(message), should)
+    rows = "T, B, N" if len(shape) == 4 else "T, B"
+    add_delay = (
+        f"add ObservationDelay(delay, [{message!r}], [{received!r}], age_key={age!r}, delay_key={delay!r})"
+    )
+    held = f"the message that the receiver holds after each step, [{rows}, M]"
+    lateness = f"the delay of the message sent in each step [steps], [{rows}, 1]"
+    oldness = f"the age of the message that the receiver holds [steps], [{rows}, 1]"
+    count, end = "the number of earlier steps in the episode, [T, B, 1]", "the end of an episode, [T, B, 1]"
+    collected = "store steps as a rollout or a collector returns them"
+    for name, key, holds, expected, remedy in (
+        ("received_key", next_key(received), held, shape, add_delay),
+        ("delay_key", next_key(delay), lateness, [*shape[:-1], 1], add_delay),
+        ("age_key", next_key(age), oldness, [*shape[:-1], 1], add_delay),
+        ("step_count_key", step_count, count, [*shape[:2], 1], "add StepCounter()"),
+        ("done", ENDS[0], end, [*shape[:2], 1], collected),
+    ):
+        _require_shape(steps, name, key, _find(steps, name, key, holds, remedy).shape, expected)
+    if hindsight is not None:
+        free = next_key(hindsight) not in steps.keys(True)
+        checks.require(free, "hindsight_key", next_key(hindsight), "is an entry of the steps already")
+
+
+def check_recompute(recompute: Recompute, steps: TensorDictBase, step_keys: StepKeys) -> None:
+    """Check what ``recompute`` returns for steps [T, B].
+
+    Raises:
+        InputError: it is not a dict of entries after the steps, each with the shape and dtype of the stored
+            one, and with all three ends or none.
+    """
+    entries = recompute(steps, steps[next_key(step_keys.received)])
+    should = "is not a dict of entries by key, such as {('next', 'reward'): reward}"
+    checks.require(isinstance(entries, dict), "recompute", f"a {type(entries).__name__}", should)
+    recorded = {next_key(key) for key in step_keys[:4]}
+    returned = {unravel_key(key): value for key, value in entries.items()}
+    for key, value in returned.items():
+        should = "is not after the step: its key must begin with 'next'"
+        checks.require(key[0] == "next", "recompute", key, should)
+        should = (
+            "tells what was known at the time, and must stay: with hindsight_key, late messages are stored"
+        )
+        checks.require(key not in recorded, "recompute", key, should)
+        remedy = "StepCounter(max_steps=...) adds it" if key == ENDS[2] else "the environment must output it"
+        stored = _find(steps, "recompute", key, "which it returns", remedy)
+        checks.require(isinstance(value, Tensor), "recompute", key, f"is a {type(value).__name__}, no tensor")
+        _require_shape(steps, "recompute", key, value.shape, stored.shape)
+        should = f"has the dtype {value.dtype}, not {stored.dtype}"
+        checks.require(value.dtype == stored.dtype, "recompute", key, should)
+    missing = [key for key in ENDS if key not in returned]
+    should = f"is missing: return {ENDS[0]}, {ENDS[1]} and {ENDS[2]}, or none of them"
+    checks.require(len(missing) in (0, len(ENDS)), "recompute", missing and missing[0], should)
+
+
+def _find(steps: TensorDictBase, name: str, key: NestedKey, holds: str, remedy: str) -> Any:
+    """The entry with this key."""
+    value = steps.get(key, None)
+    if value is None:
+        raise InputError(f"{name}: the steps have no {key}, {holds}: {remedy}")
+    return value
+
+
+def _require_shape(steps: TensorDictBase, name: str, key: NestedKey, got: Any, expected: Any) -> None:
+    """Require that an entry of these steps, or its replacement, has the expected shape."""
+    n_steps, n_worlds = steps.shape
+    should = f"has the shape {list(got)}, not {list(expected)} (T = {n_steps} steps of B = {n_worlds} worlds)"
+    checks.require(list(got) == list(expected), name, key, should)

@@ -1,0 +1,135 @@
+"""An environment without UAVs, whose receiver gets messages late, at the root or in a group of agents."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, ReplayBuffer, Unbounded
+from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEnv
+
+from damian.delays.laws import Uniform
+from damian.keys import next_key
+from damian.replay.backupdate import BackupdateStorage
+from damian.transforms import ObservationDelay
+
+LONGEST, WORLDS, AGENTS, LIMIT = 5, 3, 2, 12
+GROUPS = [(), ("agents",)]
+ENDS = ("done", "terminated", "truncated")
+both_layouts = pytest.mark.parametrize("group", GROUPS, ids=["root", "group"])
+
+
+def key(group: tuple[str, ...], name: str) -> NestedKey:
+    return (*group, name) if group else name
+
+
+def outcome(group: tuple[str, ...], message: Tensor, elapsed: Tensor) -> dict[NestedKey, Tensor]:
+    """What a receiver concludes from messages [*, 2] or [*, N, 2] after ``elapsed`` [*, 1] steps."""
+    alarm = message[..., 1] < 0.1
+    terminated = alarm.any(-1, keepdim=True) if group else alarm.unsqueeze(-1)
+    truncated = (elapsed >= LIMIT) & ~terminated
+    steps = elapsed.unsqueeze(-1) if group else elapsed
+    return {
+        key(group, "observation"): torch.cat([3 * message, message[..., :1]], -1),
+        key(group, "reward"): message[..., 1:] + steps,
+        **dict(zip(ENDS, (terminated | truncated, terminated, truncated), strict=True)),
+    }
+
+
+class Remote(EnvBase):
+    """Each message is the sender's random number of the step, behind one that no other message has."""
+
+    def __init__(self, group: tuple[str, ...]) -> None:
+        super().__init__(batch_size=[WORLDS])
+        self.group, self.shape_of_rows = group, (WORLDS, *[AGENTS] * bool(group))
+        self.n_sent, self.elapsed = 0, torch.zeros(WORLDS, 1, dtype=torch.long)
+
+        def spec(width: int) -> Composite | Unbounded:
+            return Unbounded((*self.shape_of_rows, width))
+
+        entries = {"message": spec(2), "observation": spec(3)}
+        self.observation_spec = self._nested(entries)
+        self.observation_spec["world"] = Unbounded((WORLDS,))
+        self.reward_spec = self._nested({"reward": spec(1)})
+        self.action_spec = Bounded(0.0, 1.0, (WORLDS, 1))
+        flag = Unbounded((WORLDS, 1), dtype=torch.bool)
+        self.done_spec = Composite({name: flag.clone() for name in ENDS}, shape=[WORLDS])
+
+    def _nested(self, entries: dict[str, Any]) -> Composite:
+        inner = Composite(entries, shape=self.shape_of_rows)
+        return Composite({self.group[0]: inner}, shape=[WORLDS]) if self.group else inner
+
+    def _outputs(self, *left_out: str) -> TensorDict:
+        self.n_sent += 1
+        n_rows = torch.Size(self.shape_of_rows).numel()
+        number = (100.0 * self.n_sent + torch.arange(n_rows)).view(self.shape_of_rows)
+        message = torch.stack([number, torch.rand(self.shape_of_rows)], -1)
+        entries = {key(self.group, "message"): message, "world": torch.arange(WORLDS).float()}
+        entries |= outcome(self.group, message, self.elapsed)
+        agents = {"agents": TensorDict({}, self.shape_of_rows)} if self.group else {}
+        outputs = TensorDict(agents, [WORLDS])
+        for name, value in entries.items():
+            if name not in left_out:
+                outputs[name] = value
+        return outputs
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        self.elapsed = self.elapsed * 0 if tensordict is None else self.elapsed * ~tensordict["_reset"]
+        return self._outputs(key(self.group, "reward"), *ENDS)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.elapsed = self.elapsed + 1
+        return self._outputs()
+
+    def _set_seed(self, seed: int | None) -> None:
+        torch.manual_seed(seed or 0)
+
+
+class Receiver(Transform):
+    """Replaces the outputs by those that follow from the messages received."""
+
+    def __init__(self, group: tuple[str, ...]) -> None:
+        super().__init__()
+        self.group = group
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        held = next_tensordict[key(self.group, "received")]
+        for name, value in outcome(self.group, held, next_tensordict["step_count"]).items():
+            next_tensordict[name] = value
+        return next_tensordict
+
+
+def make_env(group: tuple[str, ...], loss: float = 0.1, order: str = "generation") -> TransformedEnv:
+    sent, received = key(group, "message"), key(group, "received")
+    law = Uniform(0, LONGEST)
+    delay = ObservationDelay(law, [sent], [received], loss=loss, order=order, delay_key="delay", seed=3)
+    return TransformedEnv(Remote(group), Compose(delay, StepCounter(), Receiver(group)))
+
+
+def rollout(env: TransformedEnv, n_steps: int) -> TensorDictBase:
+    torch.manual_seed(1)
+    return env.rollout(n_steps, break_when_any_done=False)
+
+
+def recompute_of(group: tuple[str, ...]) -> Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]:
+    def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
+        entries = outcome(group, messages, steps["next", "step_count"])
+        return {next_key(name): value for name, value in entries.items()}
+
+    return recompute
+
+
+def make_storage(group: tuple[str, ...], recompute: Any = None, **options: Any) -> BackupdateStorage:
+    names = {f"{name}_key": key(group, name) for name in ("message", "received", "delay", "age")}
+    recompute = recompute or recompute_of(group)
+    return BackupdateStorage(80 * WORLDS, recompute, LONGEST, **{**names, **options})
+
+
+def stored(storage: BackupdateStorage, steps: TensorDictBase, parts: int = 1) -> TensorDictBase:
+    """Write steps [B, T] in several parts; returns them as stored, [T, B]."""
+    buffer = ReplayBuffer(storage=storage)
+    for part in steps.split(steps.shape[1] // parts, 1):
+        buffer.extend(part)
+    return storage[storage.latest()]

@@ -1,0 +1,184 @@
+"""Back-updating without UAVs, against a slow twin: messages at the root or in a group, and hindsight."""
+
+import pytest
+import torch
+from remote import (
+    AGENTS,
+    ENDS,
+    LIMIT,
+    LONGEST,
+    WORLDS,
+    both_layouts,
+    key,
+    make_env,
+    make_storage,
+    recompute_of,
+    rollout,
+    stored,
+)
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
+
+from damian.common.errors import InputError
+from damian.delays.laws import Uniform
+from damian.keys import next_key
+from damian.replay.backupdate import BackupdateStorage
+from damian.transforms import ObservationDelay
+
+
+class Twin:
+    """What a receiver knows of the stored steps [T, B] of one world after the last of them, step by step."""
+
+    def __init__(self, steps: TensorDictBase, world: int, group: tuple[str, ...]) -> None:
+        self.steps, self.group, self.T = steps[:, world], group, len(steps)
+        self.senders = [(i,) for i in range(AGENTS)] if group else [()]
+        self.start = [t - int(self.steps["step_count"][t]) for t in range(self.T)]
+        self.newest = [[self._newest(t, row) for row in self.senders] for t in range(self.T)]
+        self.terminated, self.truncated, self.valid, over = [], [], [], False
+        for t in range(self.T):
+            over = over and t != self.start[t]
+            self.valid.append(not over)
+            elapsed = t - self.start[t] + 1
+            terminated = any(self.message(t, row)[1] < 0.1 for row in self.senders)
+            reset = bool(self.steps["next", "done"][t])
+            self.terminated.append(terminated)
+            self.truncated.append((elapsed >= LIMIT or reset) and not terminated)
+            over = over or terminated or elapsed >= LIMIT or reset
+
+    def _newest(self, t: int, row: tuple[int, ...]) -> int:
+        """The step after which the newest message was sent; the step before the episode, if at its reset."""
+        delay = self.steps[next_key(key(self.group, "delay"))]
+        arrived = [g for g in range(self.start[t], t + 1) if 0 <= delay[(g, *row)] <= self.T - 1 - g]
+        return max(arrived, default=self.start[t] - 1)
+
+    def message(self, t: int, row: tuple[int, ...]) -> list[float]:
+        g, name = self.newest[t][self.senders.index(row)], key(self.group, "message")
+        at_reset = g < self.start[t]
+        return (
+            self.steps[name][(g + 1, *row)] if at_reset else self.steps[next_key(name)][(g, *row)]
+        ).tolist()
+
+    def observation(self, t: int, row: tuple[int, ...]) -> list[float]:
+        number, draw = self.message(t, row)
+        return [3 * number, 3 * draw, number]
+
+    def observation_before(self, t: int, row: tuple[int, ...]) -> list[float]:
+        if t == self.start[t]:
+            return self.steps[key(self.group, "observation")][(t, *row)].tolist()
+        return self.observation(t - 1, row)
+
+    def reward(self, t: int, row: tuple[int, ...]) -> float:
+        return self.message(t, row)[1] + t - self.start[t] + 1
+
+    def replaced(self, t: int, row: tuple[int, ...]) -> bool:
+        age = int(self.steps[next_key(key(self.group, "age"))][(t, *row)])
+        return self.newest[t][self.senders.index(row)] > t - age
+
+
+@both_layouts
+@pytest.mark.parametrize("order", ["generation", "arrival"])
+@pytest.mark.parametrize("parts", [1, 5])
+def test_stored_steps_become_what_a_slow_twin_says(group, order, parts):
+    collected = rollout(make_env(group, order=order), 60)
+    steps = collected.transpose(0, 1)
+    hindsight = key(group, "hindsight")
+    after = stored(make_storage(group, hindsight_key=hindsight), collected, parts)
+    named = {name: after[next_key(key(group, name))] for name in ("observation", "reward", "hindsight")}
+    before, replaced = after[key(group, "observation")], after[key(group, "backupdated")]
+    for world in range(WORLDS):
+        twin = Twin(steps, world, group)
+        for name, right in (("terminated", twin.terminated), ("truncated", twin.truncated)):
+            assert after["next", name][:, world, 0].tolist() == right
+        done = [a or b for a, b in zip(twin.terminated, twin.truncated, strict=True)]
+        assert after["next", "done"][:, world, 0].tolist() == done
+        assert after["valid"][:, world, 0].tolist() == twin.valid
+        for t in range(60):
+            for row in twin.senders:
+                at = (t, world, *row)
+                assert named["observation"][at].tolist() == pytest.approx(twin.observation(t, row))
+                assert before[at].tolist() == pytest.approx(twin.observation_before(t, row))
+                assert named["reward"][at].item() == pytest.approx(twin.reward(t, row))
+                assert named["hindsight"][at].tolist() == twin.message(t, row)
+                assert replaced[at].item() == twin.replaced(t, row)
+    assert after["reset_after"].equal(steps["next", "done"])
+    assert not after["valid"].all()
+    assert 0.2 < replaced.float().mean() < 0.9
+
+
+@both_layouts
+def test_what_was_known_at_the_time_stays_beside_hindsight(group):
+    collected = rollout(make_env(group), 40)
+    after = stored(make_storage(group, hindsight_key=key(group, "hindsight")), collected, 4)
+    names = {next_key(key(group, name)) for name in ("message", "received", "delay", "age")}
+    for name in names | set(ENDS) | {key(group, "received"), "action", "step_count", ("next", "step_count")}:
+        assert after[name].equal(collected[name].transpose(0, 1)), name
+    held, hindsight, sent = (
+        after[next_key(key(group, name))] for name in ("received", "hindsight", "message")
+    )
+    assert (hindsight == held).any()
+    assert (hindsight[..., 0] > held[..., 0]).any()  # numbers of messages grow
+    assert (hindsight[..., 0] >= held[..., 0]).all()
+    assert (hindsight[..., 0] <= sent[..., 0]).all()
+
+
+def test_without_hindsight_key_no_entry_is_added():
+    after = stored(make_storage(()), rollout(make_env(()), 20))
+    added = {"valid", "reset_after", "backupdated"}
+    assert set(after.keys(True, True)) - added == set(make_env(()).fake_tensordict().keys(True, True))
+
+
+@both_layouts
+def test_the_ends_stay_if_recompute_returns_none(group):
+    reward = next_key(key(group, "reward"))
+
+    def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
+        return {reward: recompute_of(group)(steps, messages)[reward]}
+
+    collected = rollout(make_env(group), 40)
+    after, full = (stored(make_storage(group, f), collected, 4) for f in (recompute, None))
+    for name in ENDS:
+        assert after["next", name].equal(collected["next", name].transpose(0, 1))
+    assert after["valid"].all()
+    assert after["reset_after"].equal(after["next", "done"])
+    assert after[reward].equal(full[reward])
+    assert not after[reward].equal(collected[reward].transpose(0, 1))
+    name = key(group, "observation")
+    assert after[name].equal(collected[name].transpose(0, 1))
+
+
+@both_layouts
+def test_messages_from_elsewhere_count_as_arrived(group):
+    collected = rollout(make_env(group, loss=0.5), 30)
+    delay_key, message_key = next_key(key(group, "delay")), next_key(key(group, "message"))
+    lost = (collected[delay_key][:, -LONGEST - 1 :] < 0).squeeze(-1).nonzero()
+    world, agent, ago = lost[:, 0], lost[:, 2] if group else None, LONGEST - lost[:, 1]
+    rows = (world, 29 - ago, *([agent] if group else []))
+    assert len(lost) > 4
+    arrived, message = collected.clone(), collected[message_key][rows]
+    arrived[delay_key][(*rows, 0)] = ago
+    expected = stored(make_storage(group), arrived)
+    collected[message_key][rows] = 0.0
+    storage = make_storage(group)
+    stored(storage, collected)
+    storage.receive(world, agent, ago, message)
+    after = storage[storage.latest()]
+    assert all(after[name].equal(expected[name]) for name in expected.keys(True, True))
+    if group:
+        with pytest.raises(InputError, match="agent: None is not the index of a sender in a group of 2"):
+            storage.receive(world, None, ago, message)
+
+
+def test_a_single_gymnasium_environment_can_be_stored_with_hindsight_alone():
+    delay = ObservationDelay(Uniform(3, 7), ["observation"], ["received"], delay_key="delay", seed=0)
+    env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(delay, StepCounter()))
+    names = {"message_key": "observation", "received_key": "received", "hindsight_key": "hindsight"}
+    storage = BackupdateStorage(
+        100, lambda steps, messages: {}, 7, env=env, delay_key="delay", age_key="age", **names
+    )
+    after = stored(storage, env.rollout(60).unsqueeze(0))["next"].squeeze(1)
+    arrived = torch.arange(60).unsqueeze(-1) + after["delay"] <= 59
+    true, held, hindsight = (after[name] for name in ("observation", "received", "hindsight"))
+    assert arrived.sum() > 50
+    assert torch.where(arrived, hindsight == true, True).all()
+    assert not torch.where(arrived, held == true, True).any(-1).all()

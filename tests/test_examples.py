@@ -1,0 +1,53 @@
+"""The examples run from any folder, and do what their text says; docs/backupdating.md shows the same code."""
+
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "examples" / "backupdating.py"
+
+
+def test_back_updated_rewards_and_ends_are_the_true_ones_wherever_the_message_has_arrived(capsys):
+    example = runpy.run_path(str(EXAMPLE))
+    steps, collected = example["main"]()
+    after, n_steps = steps["next"], len(steps)
+    arrived = torch.arange(n_steps).view(-1, 1, 1) + after["delay"] < n_steps
+    assert n_steps - 7 < arrived.sum() / steps.shape[1] < n_steps
+    truth = example["judge"](after["message"])
+    for name in ("reward", "terminated"):
+        assert after[name][arrived].equal(truth[name][arrived])
+    assert not collected[arrived].equal(truth["reward"][arrived])
+    first_end = truth["terminated"][:60].long().cumsum(0)
+    over = (first_end - truth["terminated"][:60].long()) > 0
+    first_episode = steps["step_count"][:60] == torch.arange(60).view(-1, 1, 1)
+    assert over[first_episode].any()
+    assert steps["valid"][:60][first_episode].equal(~over[first_episode])
+    printed = re.findall(r"mean error of the (.*): (\S+)", capsys.readouterr().out)
+    errors = {name: float(value) for name, value in printed}
+    assert errors["reward after back-updating"] < 0.05 * errors["reward as collected"]
+    assert errors["message in hindsight"] < 0.05 * errors["message that the room held"]
+
+
+def test_the_example_runs_as_a_program_from_another_folder(tmp_path):
+    code = (
+        f"import runpy, sys; sys.path.insert(0, {str(ROOT)!r}); "
+        f"runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert "mean error of the reward after back-updating" in done.stdout
+
+
+def test_the_document_shows_the_examples_code():
+    def lines(text: str) -> str:
+        return "\n".join(line.strip() for line in text.splitlines())
+
+    blocks = re.findall(r"```python\n(.*?)\n```", (ROOT / "docs" / "backupdating.md").read_text(), re.DOTALL)
+    assert len(blocks) == 3
+    assert all(lines(block) in lines(EXAMPLE.read_text()) for block in blocks)
