@@ -83,7 +83,8 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment of the training, [B], with what the learner and the logs need."""
     messages = config.backupdates or config.clock.trigger is not None
     privileged = config.critic == "privileged"
-    extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *config.learner.reads}
+    reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
+    extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
     env = make_env(config.train_scenario, config.worlds, config.seed, config.device, extras)
     if config.compile:
         env.compile()
@@ -105,7 +106,9 @@ def make_buffer(config: TrainConfig, server: Server, size: int) -> ReplayBuffer:
     if not config.backupdates:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
     recompute = server_recompute(server, actor=config.recompute_actor)
-    storage = BackupdateStorage(size, recompute, config.longest_delay, device=config.device)
+    hindsight = keys.HINDSIGHT if "hindsight" in config.learner.reads else None
+    options = {"hindsight_key": hindsight, "device": config.device}
+    storage = BackupdateStorage(size, recompute, config.longest_delay, **options)
     return ReplayBuffer(storage=storage)
 
 

@@ -66,6 +66,10 @@ class LearningSetup(NamedTuple):
         return self.longest_delay if self.settle else 0
 
 
+READABLE = ("message", "state", "reward_terms", "privileged", "hindsight")
+"""What a learner may name in ``LearnerConfig.reads``."""
+
+
 @dataclass
 class LearnerConfig:
     """Settings of a learner, which make it; those that all learners share.
@@ -92,6 +96,8 @@ class LearnerConfig:
         checks.above("learner.lr", self.lr, 0.0)
         checks.in_range("learner.gamma", self.gamma, 0.0, 1.0)
         checks.in_range("learner.steps", self.steps, 1)
+        for name in self.reads:
+            checks.one_of(f"{type(self).__name__}.reads", name, READABLE)
 
     def check(self, setup: LearningSetup) -> None:
         """Check that this learner can learn in such a run.

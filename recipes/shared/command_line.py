@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from damian.evaluation.run_record import read_record
@@ -12,7 +13,7 @@ CONFIG_DIR = ("--config-dir", "-cd")
 
 def config_dir(words: Sequence[str]) -> str | None:
     """The folder with configuration files of one's own, if one is given."""
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in pairwise([*words, ""]):
         name, equals, value = word.partition("=")
         if name in CONFIG_DIR:
             return value if equals else following

@@ -1,0 +1,90 @@
+"""The documents keep their word: their Python runs, their commands exist, their links lead somewhere."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+import damian
+from damian.delays.delay_line import DelayLine
+from damian.delays.samplers import Sampler
+from damian.recipes.command import PROGRAMS, SETTINGS
+from damian.recipes.shared.misspelt import check_words
+from damian.replay.hindsight import MessageLog, latest_arrived
+
+ROOT = Path(damian.__file__).parents[1]
+DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "RESULTS.md", "CHANGELOG.md")]
+DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
+FILES = [*DOCUMENTS, *(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.py")]
+FILES += sorted((ROOT / "recipes").glob("*.py"))
+NEVER = 9
+"""A delay that ends after the documents' example."""
+
+
+def test_the_readmes_python_runs(capsys):
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    exec(block.replace("num_worlds=1024", "num_worlds=4"), {})
+    reward, age = map(float, capsys.readouterr().out.replace("tensor(", "").replace(")", "").split())
+    assert 0 <= reward <= 1
+    assert 3 < age < 8
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
+def test_every_command_that_a_file_names_exists(file):
+    text = file.read_text().replace("\\\n", "")
+    for line in re.findall(r"(?:^[ #]*|`)damian ([a-z]+ [^`\n|]*)", text, re.MULTILINE):
+        command = re.split(r"  +[#(]", line)[0]  # an explanation stands behind some spaces
+        name, *words = shlex.split(command, comments=True)
+        assert name in PROGRAMS, line
+        own = [word for word in words if "=" in word and "FOLDER" not in word and "NAME" not in word]
+        if name in SETTINGS and "--help" not in words:
+            assert check_words(SETTINGS[name], own) is None, line
+
+
+@pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: file.name)
+def test_every_file_that_a_document_links_to_exists(file):
+    links = re.findall(r"\]\(([^)#:]+)\)|src=\"([^\"]+)\"", file.read_text())
+    assert all((file.parent / (link or image)).exists() for link, image in links)
+
+
+def test_the_citation_names_this_version():
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == damian.__version__
+
+
+def test_the_delay_models_table_is_what_the_delay_line_and_back_updating_do():
+    text = (ROOT / "docs" / "concepts.md").read_text()
+    rows = re.search(r"\| step \| 0 .*?\n\n", text, re.DOTALL)[0].strip().splitlines()
+    cells = {row.split("|")[1].strip(): [c.strip() for c in row.split("|")[2:-1]] for row in rows}
+    delays = [NEVER if d == "lost" else int(d) for d in cells["its delay [steps]"][1:]]
+    held, age = hold_messages(delays)
+    assert [f"m{m}" for m in held] == cells["the server holds"]
+    assert [str(a) for a in age] == cells["age of information [steps]"]
+    sent = torch.arange(1, 8).float().view(7, 1, 1)  # steps 1 to 7: the last message arrives at step 7
+    log = MessageLog(
+        sent,
+        torch.tensor([*delays, 0]).view(7, 1).masked_fill(torch.tensor([*delays, 0]).view(7, 1) == NEVER, -1),
+        torch.tensor([*held[1:], 7]).float().view(7, 1, 1),
+        torch.tensor([*age[1:], 0]).view(7, 1),
+    )
+    known = [f"m{int(m)}" for m in latest_arrived(log).flatten()[:6]]
+    assert known == cells["back-updated at step 7"][1:]
+
+
+def hold_messages(delays: list[int]) -> tuple[list[int], list[int]]:
+    """Numbers and ages of the messages that a receiver holds, if message 0 is there from the start."""
+
+    class Listed(Sampler):
+        def forward(self, streams, clock, memory):
+            return torch.tensor([delays[int(clock) - 1]]), memory
+
+    line = DelayLine(Listed([[1 / NEVER] * NEVER]), "generation")
+    memory = line.init_memory([torch.zeros(1)], torch.zeros(1, dtype=torch.long))
+    held, age = [0], [0]
+    for number in range(1, len(delays) + 1):
+        memory, delivery = line.step(memory, [torch.tensor([float(number)])], None)
+        held.append(int(delivery.held[0]))
+        age.append(int(delivery.age))
+    return held, age
