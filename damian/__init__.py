@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from damian.delays.config import DelayConfig
     from damian.delays.laws import Burst, Constant, Geometric, Law, Trace, Uniform
+    from damian.delays.samplers import ContextSampler, MessageContext
     from damian.envs.clocks import ClockConfig
     from damian.envs.pipeline import make_env
     from damian.envs.scenario import ScenarioConfig
@@ -32,6 +33,7 @@ __version__ = "0.2.0"
 _MODULES = {
     "damian.delays.config": ["DelayConfig"],
     "damian.delays.laws": ["Burst", "Constant", "Geometric", "Law", "Trace", "Uniform"],
+    "damian.delays.samplers": ["ContextSampler", "MessageContext"],
     "damian.envs.clocks": ["ClockConfig"],
     "damian.envs.pipeline": ["make_env"],
     "damian.envs.scenario": ["ScenarioConfig"],
@@ -59,12 +61,14 @@ __all__ = [
     "Burst",
     "ClockConfig",
     "Constant",
+    "ContextSampler",
     "CumulativeReward",
     "DelayConfig",
     "Geometric",
     "Law",
     "LearnerConfig",
     "LearningSetup",
+    "MessageContext",
     "ObservationDelay",
     "RewardDelay",
     "SampleAndHold",

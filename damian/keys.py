@@ -38,6 +38,9 @@ AGE = (AGENTS, "age")
 """Age of information: steps since the message that the server holds was generated, [B, N, 1]."""
 DELAY = (AGENTS, "delay")
 """Delay of the message sent in this step [steps], -1 if it never arrives, [B, N, 1]; never for an actor."""
+POSITION = (AGENTS, "position")
+"""True position of each UAV at this instant, east and north [m], [B, N, 2]; for delay laws, never for an
+actor."""
 STATE = "state"
 """The simulator's true state, [B, S]: for drawing and for reference arms, never for an actor."""
 SOURCE_OVER = "source_over"

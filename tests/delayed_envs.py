@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from context_law import Crowd
 from helpers import random_actions
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -28,6 +29,7 @@ DELAYS = {
         "delay": DelayConfig(obs=PAPER, act={"law": "uniform", "high": 2}, history=2),
         "clock": ClockConfig(agents="2s", server="4s"),
     },
+    "context": {"delay": DelayConfig(obs=Crowd(), act=Crowd(column=1), rew=Crowd(loses=False), loss=0.1)},
 }
 every_delay = pytest.mark.parametrize("delays", DELAYS)
 

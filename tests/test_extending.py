@@ -12,6 +12,7 @@ from helpers import act, check_refused, everything, one_uav
 
 from damian import UavEnv, make_env
 from damian.delays.config import DelayConfig
+from damian.envs.clocks import ClockConfig
 from damian.recipes import evaluate, train
 from damian.recipes.shared.launch import launch
 from damian.server.features import ObservationConfig
@@ -24,6 +25,7 @@ TINY = ["frames=128", "worlds=4", "learner.steps=16", "eval_episodes=3", "model.
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]
 
 LAW = ["delay.obs={law: law:Satellite, hop: 2s, extra: 0.3}"]
+LAW += ["delay.act={law: law:Distance, antenna: [0, 20], speed: 40, reach: 90}"]
 FEATURES = [
     "observation.local_features=[spotted,features:heading]",
     "observation.global_features=[features:spread]",
@@ -87,7 +89,10 @@ def test_extensions_do_the_same_compiled_and_back_updated_steps_know_them(folder
     scenario = everything(
         observation=ObservationConfig(["spotted", "features:heading"], ["features:spread", "source_time"]),
         reward=RewardConfig(custom=[{"term": "rewards:together", "weight": 0.5}]),
-        delay=DelayConfig(obs={"law": "law:Satellite", "hop": 1, "extra": 0.5}),
+        delay=DelayConfig(
+            obs={"law": "law:Distance", "antenna": [30, 0], "speed": 40, "capacity": 2, "reach": 60},
+            act={"law": "law:Satellite", "hop": 1, "extra": 0.5},
+        ),
     )
     env, other = (make_env(scenario, 4, seed=2, extras=["message", "reward_terms"]) for _ in range(2))
     other = other.compile(backend="eager") if compiles else other
@@ -102,6 +107,55 @@ def test_extensions_do_the_same_compiled_and_back_updated_steps_know_them(folder
     torch.testing.assert_close(together, 0.5 * spread)
 
 
+def test_each_delay_of_distance_is_that_of_its_message(folder):
+    law = {"law": "law:Distance", "antenna": [30, -40], "speed": 40, "capacity": 2, "reach": 90, "longest": 3}
+    scenario = everything("polynomial", delay=DelayConfig(obs=law), clock=ClockConfig("2s"))
+    rollout = make_env(scenario, 8, extras=["message"]).rollout(30, break_when_any_done=False)[
+        "next", "agents"
+    ]
+    sent, delay = rollout["message_sent"], rollout["delay"].squeeze(-1)
+    east, north = rollout["position"].double().unbind(-1)
+    metres = ((east - 30) ** 2 + (north + 40) ** 2).sqrt()
+    expected = (metres / 80 + sent.sum(-1, keepdim=True) // 2).ceil().clamp(max=3).long()
+    arrives = sent & (delay >= 0)
+    assert delay[arrives].equal(expected[arrives])
+    assert arrives[sent & (metres < 89)].all()
+    assert 0.3 < arrives[sent & (metres > 91)].double().mean() < 0.7
+    assert len(delay[arrives].unique()) > 2
+
+
+BROKEN = """
+from dataclasses import dataclass
+from damian import ContextSampler, Law
+
+@dataclass(frozen=True)
+class Broken(Law):
+    reads: str = "position"
+    shape: int = 1
+
+    def sampler(self, dt=1.0, loss=0.0, key="delay"):
+        return ContextSampler(self.delays, 3, loss, reads=[self.reads])
+
+    def delays(self, context):
+        return context.time[: self.shape]
+"""
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("reads: altitude", "reads altitude, but a law can read only position"),
+        (
+            "shape: 2",
+            "Broken.delays: a tensor of torch.float32 and shape (2,) is not one number of steps per",
+        ),
+    ],
+)
+def test_a_mistake_in_a_law_that_sees_the_context_is_one_clear_line(run, folder, capsys, setting, message):
+    (folder / "broken.py").write_text(BROKEN)
+    check_refused(lambda: run(*TINY, f"delay.obs={{law: broken:Broken, {setting}}}"), message, capsys)
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -112,6 +166,9 @@ def test_extensions_do_the_same_compiled_and_back_updated_steps_know_them(folder
             "delay.obs.hops: 2 is no setting of the law law:Satellite",
         ),
         (["delay.obs={law: law:Satellite, extra: 2}"], "delay.obs.extra: 2 is not between 0 and 1"),
+        (["delay.obs={law: law:Distance, antenna: [3]}"], "delay.obs.antenna: [3] is not [x, y] in metres"),
+        (["delay.obs={law: law:Distance, speed: 0}"], "delay.obs.speed: 0 m/s is not above 0 m/s"),
+        (["delay.rew={law: law:Distance}"], "loses messages, but no reward may be lost"),
         (
             ["delay.obs={law: features:heading}"],
             "delay.obs.law: features:heading is no dataclass derived from",

@@ -3,10 +3,15 @@
 from dataclasses import dataclass
 from typing import Any
 
+from damian import keys
 from damian.common import checks
 from damian.common.text_files import show
 from damian.delays.delay_line import ORDERS
 from damian.delays.laws import LONGEST, LOSES, Held, Law, law_of
+from damian.delays.samplers import Sampler
+
+CONTEXT_KEYS = {"position": keys.POSITION}
+"""What a law of a scenario may read in the context of a message: keys of the entries by name."""
 
 
 @dataclass
@@ -49,14 +54,25 @@ class DelayConfig:
         law = law_of(self.obs, "delay.obs")
         return Held(law) if self.hold == "max" else law
 
+    def reads(self, dt: float) -> set[str]:
+        """Names of the entries that the laws read in the contexts of messages."""
+        return {name for sampler in self._samplers(dt).values() for name in sampler.reads}
+
     def check(self, dt: float) -> None:
         """Check that every law is valid for steps of ``dt`` seconds.
 
         Raises:
-            InputError: a law is invalid, or the reward delay loses rewards.
+            InputError: a law is invalid or reads what there is not, or the reward delay loses rewards.
         """
-        samplers = {
-            name: law_of(getattr(self, name), f"delay.{name}").sampler(dt, key=f"delay.{name}")
-            for name in ("obs", "act", "rew")
-        }
+        samplers = self._samplers(dt)
+        for name, sampler in samplers.items():
+            for read in sampler.reads:
+                should = f"reads {read}, but a law can read only {', '.join(CONTEXT_KEYS)}"
+                checks.require(read in CONTEXT_KEYS, f"delay.{name}", show(getattr(self, name)), should)
         checks.require(not samplers["rew"].loses, "delay.rew", show(self.rew), LOSES)
+
+    def _samplers(self, dt: float) -> dict[str, Sampler]:
+        """The samplers of the laws, by the name of the setting."""
+        names = ("obs", "act", "rew")
+        laws = {name: law_of(getattr(self, name), f"delay.{name}") for name in names}
+        return {name: law.sampler(dt, key=f"delay.{name}") for name, law in laws.items()}

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from damian.common.tensors import expand_mask
-from damian.delays.samplers import Sampler
+from damian.delays.samplers import MessageContext, Sampler
 
 Memory = dict[str, Tensor]
 """State of a delay line, by name."""
@@ -81,13 +81,20 @@ class DelayLine:
         zero = torch.zeros_like(memory["generated_at"])
         return memory, Delivery(values, zero, zero == 0, zero)
 
-    def step(self, memory: Memory, values: list[Tensor], sent: Tensor | None) -> tuple[Memory, Delivery]:
+    def step(
+        self,
+        memory: Memory,
+        values: list[Tensor],
+        sent: Tensor | None,
+        context: MessageContext | None = None,
+    ) -> tuple[Memory, Delivery]:
         """Send one message per sender, and deliver the messages that arrive in this step.
 
         Args:
             memory: the memory before the step.
             values: values of the messages, [M, ...] each.
             sent: mask of the messages that are really sent, [M] bool; all of them if not given.
+            context: circumstances of the messages; needed only if the sampler sees them.
 
         Returns:
             The memory after the step, and what the receivers then hold.
@@ -95,7 +102,7 @@ class DelayLine:
         clock, generated_at = memory["clock"] + 1, memory["generated_at"]
         n_slots, n_senders = self.sampler.lost, len(generated_at)
         slot_now = advance_slot(memory["slot"], 1, n_slots)
-        delay, channel = self.sampler(memory["streams"], clock, memory["channel"])
+        delay, channel = self.sampler(memory["streams"], clock, memory["channel"], context)
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
         arrival = torch.where(delay < n_slots, advance_slot(slot_now, delay, n_slots), n_slots)

@@ -1,14 +1,15 @@
 """Delay laws: probability distributions of message delays, in steps (``3``) or time (``"3s"``, ``"0.5m"``).
 
 ``Law.sampler`` turns a law into a table from which delays are drawn, with one hash and one search per
-message. The transforms that delay observations, actions and rewards are in ``damian.transforms``.
+message, or into a function of the message's context (``ContextSampler``). The transforms that delay
+observations, actions and rewards are in ``damian.transforms``.
 """
 
 import csv
 import io
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,10 @@ LOST = "lost"
 
 @dataclass(frozen=True)
 class Law(ABC):
-    """Distribution of message delays; the delay does not depend on the message's content."""
+    """Distribution of message delays.
+
+    A delay may depend on the circumstances under which the message is sent (``ContextSampler``).
+    """
 
     @abstractmethod
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
@@ -149,6 +153,8 @@ class Burst(Law):
             inner = law_of(getattr(self, name), inner_key).sampler(
                 dt, getattr(self, f"{name}_loss"), inner_key
             )
+            problem = "depends on the context of the message, which a burst does not know"
+            checks.require(not inner.sees_context, inner_key, show(getattr(self, name)), problem)
             memoryless = len(inner.chances) == 1 and not isinstance(inner, Recorded)
             checks.require(memoryless, inner_key, show(getattr(self, name)), "is not a memoryless law")
             states.append(inner.chances[0].tolist()[:-1])
@@ -211,7 +217,7 @@ def law_of(written: Any, key: str = "delay") -> Law:
         return Constant(_number(written))
     kind = written.get("law")
     law = LAWS.get(kind, f"{key}.law")
-    values = {k: str(v) if k == "path" else _number(v) for k, v in written.items() if k != "law"}
+    values = {k: str(v) if k == "path" else _plain(v) for k, v in written.items() if k != "law"}
     names = [field.name for field in fields(law)]
     for name, value in values.items():
         problem = f"is no setting of the law {kind}, which has {', '.join(names)}"
@@ -258,6 +264,12 @@ def _number(written: Any) -> Any:
     """Convert a string of digits to an int: Hydra and CSV files may pass whole steps as strings."""
     text = written.strip() if isinstance(written, str) else ""
     return int(text) if text.isdecimal() and len(text) < 10 else written
+
+
+def _plain(written: Any) -> Any:
+    """Convert the strings of digits in a setting, and any kind of list to a ``list``."""
+    is_list = isinstance(written, Sequence) and not isinstance(written, str)
+    return [_plain(value) for value in written] if is_list else _number(written)
 
 
 def _certain(steps: int) -> list[float]:

@@ -1,9 +1,32 @@
-"""Samplers that draw one delay per message: a hash and a table search, without a random generator."""
+"""Samplers that draw one delay per message, from a table or by a function of the message's context."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from damian.common import checks, counter_rng
+from damian.common.errors import InputError
+
+
+class MessageContext(NamedTuple):
+    """Circumstances of M messages at the instant at which they are sent; nothing in it lies in the future."""
+
+    sender: Tensor
+    """Index of the sender among the agents of its world, [M] long; 0 if a world has one agent."""
+    receiver: Tensor
+    """Index of the receiver among the agents of its world, [M] long; -1 for the server or the environment."""
+    n_sending: Tensor
+    """Number of senders of the same world that send a message in this step, [M] long."""
+    time: Tensor
+    """Time since the episode began [s], [M]."""
+    uniform: Tensor
+    """A random number in [0, 1) for each message, [M]; the same again for the same seed."""
+    dt: float
+    """Length of a step [s]."""
+    entries: dict[str, Tensor]
+    """The entries that the law reads, by name, [M, ...] each; ``position`` is east and north [m], [M, 2]."""
 
 
 class Sampler(nn.Module):
@@ -16,6 +39,10 @@ class Sampler(nn.Module):
         loss: probability that a message is lost, whatever its delay.
     """
 
+    sees_context: bool = False
+    """Whether a delay depends on the message's context."""
+    reads: tuple[str, ...] = ()
+    """Names of the entries that the context must contain."""
     chances: Tensor
     _boundaries: Tensor
 
@@ -53,13 +80,16 @@ class Sampler(nn.Module):
         """Draw the initial state of each sender's channel [M] from its random stream [M]."""
         return (counter_rng.uniform(streams) < self._bad_share).long()
 
-    def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Draw the delays [M] of the messages sent at ``clock``, and the channels' next states [M].
 
         Args:
             streams: random stream of each sender, [M].
             clock: step, [M] or a scalar.
             memory: state of each channel, [M].
+            context: circumstances of the messages; needed only if ``sees_context``.
         """
         if self.certain is not None:
             return torch.full_like(streams, self.certain), memory
@@ -92,7 +122,9 @@ class Recorded(Sampler):
     def initial_state(self, streams: Tensor) -> Tensor:
         return counter_rng.bits(streams) % len(self._delays)
 
-    def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
         delay = self._delays[memory]
         if self._loss:
             delay = torch.where(counter_rng.uniform(streams, clock) < self._loss, self.lost, delay)
@@ -110,11 +142,79 @@ class HeldSampler(Sampler):
         arrival_chances = (1 - drawn.chances[:, -1]).tolist()
         super().__init__([[0.0] * drawn.longest + [chance] for chance in arrival_chances])
         self.drawn = drawn
+        self.sees_context, self.reads = drawn.sees_context, drawn.reads
         self.certain = None if self.loses else self.longest
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return self.drawn.initial_state(streams)
 
-    def forward(self, streams: Tensor, clock: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        delay, memory = self.drawn(streams, clock, memory)
+    def forward(
+        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
+        delay, memory = self.drawn(streams, clock, memory, context)
         return torch.where(delay < self.lost, self.longest, self.lost), memory
+
+
+class ContextSampler(Sampler):
+    """Computes each delay from the context of the message, by a function of one's own.
+
+    Args:
+        delay_fn: pure function of a ``MessageContext`` that returns the delays [steps], [M]; they are rounded
+            up and cut to ``longest``, and a message of negative delay is lost. A method of the law can be
+            pickled, as worker processes need; it must have no branches on data.
+        longest: longest delay [steps].
+        loss: probability that a message is lost, whatever its delay.
+        loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, so that the
+            sampler can delay rewards, none of which may be lost.
+        reads: names of the entries that ``delay_fn`` reads, such as ``position``.
+
+    Raises:
+        InputError: an argument is invalid.
+
+    Examples:
+        >>> ContextSampler(lambda context: context.n_sending // 4, longest=5, loses=False)
+    """
+
+    def __init__(
+        self,
+        delay_fn: Callable[[MessageContext], Tensor],
+        longest: int,
+        loss: float = 0.0,
+        *,
+        loses: bool = True,
+        reads: Sequence[str] = (),
+    ) -> None:
+        checks.whole("longest", longest, 0, unit="steps")
+        checks.require(not isinstance(reads, str), "reads", reads, "is not a list of names")
+        # The table holds the worst case, because the true chances depend on the contexts: it serves only to
+        # tell the longest delay, and whether messages can be lost.
+        super().__init__([[0.0] * longest + [float(not loses)]], loss=loss)
+        self.certain = None
+        self.sees_context, self.reads = True, tuple(reads)
+        self._delay_fn, self._loss, self._loses = delay_fn, loss, loses
+
+    def forward(
+        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
+        if context is None:
+            raise ValueError("context: it is missing, but the delays of a ContextSampler depend on it")
+        delay = self._delay_fn(context)
+        self._check(delay, streams.shape)
+        arrives = delay >= 0  # false for nan too
+        steps = torch.where(arrives, delay, 0).ceil().clamp(max=self.longest).long()
+        if self._loses:
+            steps = torch.where(arrives, steps, self.lost)
+        if self._loss:  # by a draw that is independent of ``context.uniform``
+            draw = counter_rng.uniform(streams, clock, torch.zeros_like(clock))
+            steps = torch.where(draw < self._loss, self.lost, steps)
+        return steps, memory
+
+    def _check(self, delay: Any, shape: torch.Size) -> None:
+        """Require a number of steps for each message."""
+        found = type(delay).__name__
+        if isinstance(delay, Tensor):
+            if delay.shape == shape and delay.dtype != torch.bool:
+                return
+            found = f"a tensor of {delay.dtype} and shape {tuple(delay.shape)}"
+        name = getattr(self._delay_fn, "__qualname__", type(self._delay_fn).__name__)
+        raise InputError(f"{name}: {found} is not one number of steps per message, shape {tuple(shape)}")

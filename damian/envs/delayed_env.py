@@ -140,10 +140,12 @@ class DelayedEnv(TransformedEnv):
     ) -> tuple[PackedState, list[Memory], Outputs]:
         """One step of the worlds and of the leading stateful transforms; a pure function.
 
-        If there is a mask ``stepped`` [B], only its worlds send messages: the others will make this step
-        later, and messages in transit are written in place.
+        If there is a mask ``stepped`` [B], only its worlds send messages and actions: the others will make
+        this step later, and what is in transit is written in place.
         """
         (stateful, _), memories = self._split_transforms(), list(memories)
+        if stepped is not None:
+            entries = _mask_sent(stepped, stateful, entries)
         for i, transform in reversed(list(enumerate(stateful))):
             memories[i], changed = transform.on_action(memories[i], entries)
             entries = entries | changed
@@ -219,7 +221,7 @@ class DelayedEnv(TransformedEnv):
                 yield module
 
 
-def _mask_sent(stepped: Tensor, transforms: Sequence[StatefulTransform], outputs: Outputs) -> Outputs:
-    """The outputs with the message flags of all worlds outside the mask ``stepped`` [B] cleared."""
-    flags = [transform.sent_key for transform in transforms if transform.sent_key in outputs]
-    return outputs | {key: outputs[key] & expand_mask(stepped, outputs[key]) for key in flags}
+def _mask_sent(stepped: Tensor, transforms: Sequence[StatefulTransform], entries: Entries) -> Entries:
+    """The entries with the flags of what is sent cleared in all worlds outside the mask ``stepped`` [B]."""
+    flags = [transform.sent_key for transform in transforms if transform.sent_key in entries]
+    return entries | {key: entries[key] & expand_mask(stepped, entries[key]) for key in flags}

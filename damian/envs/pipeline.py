@@ -9,6 +9,7 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
+from damian.delays.config import CONTEXT_KEYS
 from damian.delays.laws import law_of
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
@@ -51,6 +52,7 @@ def make_env(
     problem = "skips steps, but back-updating and evaluation need the messages of every step"
     checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
     delayed = has_message_delay(scenario)
+    needed = {*(["message"] if delayed else []), *scenario.delay.reads(scenario.clock.dt)}
     simulation = make_simulation(scenario, seed)
     server = make_server(scenario, simulation)
     env = UavEnv(
@@ -58,7 +60,7 @@ def make_env(
         num_worlds,
         seed,
         device,
-        {*extras, "message"} if delayed else extras,
+        {*extras, *needed},
         simulation=simulation,
         server=server,
         messages_only=delayed,
@@ -88,7 +90,13 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
     law, hold = law_of(delay.act, "delay.act"), hold_action(scenario.actions)
     return [
         ActionDelay(
-            law, keys.ACTION, default=hold, dt=clock.dt, sent_key="ready", valid_key=keys.ACTION_VALID
+            law,
+            keys.ACTION,
+            default=hold,
+            dt=clock.dt,
+            sent_key="ready",
+            valid_key=keys.ACTION_VALID,
+            context_keys=CONTEXT_KEYS,
         )
     ]
 
@@ -106,6 +114,7 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         sent_key=keys.MESSAGE_SENT,
         age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
         delay_key=keys.DELAY if output_messages else None,
+        context_keys=CONTEXT_KEYS,
     )
     dropped = [] if output_messages else [keys.MESSAGE, keys.RECEIVED, keys.MESSAGE_SENT]
     return [uplink, ServerNode(server, dropped_keys=dropped, reward_terms="reward_terms" in extras)]
@@ -116,7 +125,8 @@ def reward_transforms(scenario: ScenarioConfig) -> list[Transform]:
     delay, dt = scenario.delay, scenario.clock.dt
     transforms: list[Transform] = []
     if has_delay(delay.rew, dt):
-        transforms.append(RewardDelay(law_of(delay.rew, "delay.rew"), keys.REWARD, dt=dt))
+        law = law_of(delay.rew, "delay.rew")
+        transforms.append(RewardDelay(law, keys.REWARD, dt=dt, context_keys=CONTEXT_KEYS))
     if delay.reward_window > 1:
         transforms.append(CumulativeReward(delay.reward_window, delay.reward_discount, keys.REWARD))
     return transforms

@@ -26,7 +26,8 @@ Outputs = dict[NestedKey, Tensor]
 """Entries that a step or a reset outputs, by key."""
 
 EXTRAS = ("message", "state", "reward_terms")
-"""Default optional outputs; a further one, ``privileged``, is only for reference experiments."""
+"""Default optional outputs; further ones are ``position``, for delay laws, and ``privileged``, only for
+reference experiments."""
 
 _DONE = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
 
@@ -45,6 +46,7 @@ class UavEnv(EnvBase):
     - ``observation``, ``global_observation``: features of the actor [B, N, F] and of the critic [B, N, G];
     - ``message``: the latest message of each UAV, [B, N, M] (``Messages.unpack`` names its fields), and
       ``message_sent``: whether it was sent in this step, [B, N];
+    - ``position``: true position of each UAV, east and north [m], which delay laws may read, [B, N, 2];
     - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, and the true
       offset from the UAV to the source (east, north, over the region's size, in [-1, 1]), [B, N, G + 2];
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
@@ -60,8 +62,8 @@ class UavEnv(EnvBase):
         num_worlds: number of parallel environments, B.
         seed: of the regions and initial conditions drawn at construction, and of the worlds' random streams.
         device: of all tensors.
-        extras: which of ``message``, ``state``, ``reward_terms`` and (reference experiments only)
-            ``privileged`` are output; each costs time. Delays need ``message``.
+        extras: which of ``message``, ``state``, ``reward_terms``, ``position`` and (reference experiments
+            only) ``privileged`` are output; each costs time. Delays need ``message``.
         simulation: the physics; built from the scenario and the seed if not given.
         server: computes observations, rewards and ends of episodes from messages; built from the scenario and
             the simulation if not given.
@@ -221,6 +223,8 @@ class UavEnv(EnvBase):
             outputs[keys.ACTION_MASK] = self.simulation.action_mask(state)
         if "message" in self.extras:
             outputs |= {keys.MESSAGE: state.sent.pack(), keys.MESSAGE_SENT: state.message_sent}
+        if "position" in self.extras:
+            outputs[keys.POSITION] = state.position[..., :2]
         if "privileged" in self.extras:
             outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, features)
         if self.scenario.episode.end_with_source:

@@ -1,5 +1,6 @@
 """A transform that delays actions (paper, section 3.3)."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from tensordict import NestedKey, TensorDictBase
@@ -8,6 +9,7 @@ from torch import Tensor
 from damian.delays.delay_line import DelayLine
 from damian.delays.laws import law_of
 from damian.transforms.action_specs import ActionTransform
+from damian.transforms.context import ContextReader
 from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows, sibling_key
 from damian.transforms.order import KeyUsage
 
@@ -32,12 +34,14 @@ class ActionDelay(ActionTransform):
         valid_key: key of a flag that is written for the environment, [...] bool: true if the action is
             executed for the first time, or is the default. The environment must read it itself; a
             ``SerialEnv`` passes it on, a ``ParallelEnv`` only if its specs name it.
+        context_keys: key of each entry that the law may read, by the name that the law gives it
+            (``ContextSampler``). The policy's input and the outputs of a reset must have the entry.
         seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
 
-    A bare name for ``sent_key`` or ``valid_key`` means an entry in the same TensorDict as the action.
+    A bare name for one of the last three keys means an entry in the same TensorDict as the action.
 
     Raises:
-        InputError: the delay is not valid.
+        InputError: the delay is not valid, or its law reads what has no key.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))
@@ -54,13 +58,17 @@ class ActionDelay(ActionTransform):
         dt: float = 1.0,
         sent_key: NestedKey | None = None,
         valid_key: NestedKey | None = None,
+        context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
     ) -> None:
         super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed)
-        self.sampler = law_of(delay).sampler(dt, loss)
+        law = law_of(delay)
+        self.sampler = law.sampler(dt, loss)
         self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
-        self.action_keys = [self.action_key, *([self.sent_key] if self.sent_key else [])]
+        self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
+        sent_keys = [self.sent_key] if self.sent_key else []
+        self.action_keys = [self.action_key, *sent_keys, *self.contexts.keys.values()]
 
     @property
     def key_usage(self) -> KeyUsage:
@@ -69,7 +77,8 @@ class ActionDelay(ActionTransform):
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         initial = self.actions.initial
         streams = self.streams(tensordict.batch_size, initial.device)
-        return self.line.init_memory([initial], streams) | {"initial": initial}
+        memory = self.line.init_memory([initial], streams) | {"initial": initial}
+        return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory, _ = self.line.reset(memory, [memory["initial"]], mask)
@@ -78,7 +87,8 @@ class ActionDelay(ActionTransform):
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         chosen = as_rows(entries[self.action_key], self.rows)
         sent = entries[self.sent_key].reshape(-1) if self.sent_key in entries else None
-        memory, delivery = self.line.step(memory, [chosen], sent)
+        context = self.contexts.read(memory, entries, sent, self.rows)
+        memory, delivery = self.line.step(memory, [chosen], sent, context)
         executed: Entries = {self.action_key: from_rows(delivery.held[0], self.rows)}
         if self.valid_key:
             default = memory["generated_at"] == memory["reset_at"]

@@ -1,6 +1,6 @@
 """A transform that delays observations (paper, section 3.4)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from damian.common import checks
 from damian.delays.delay_line import ORDERS, DelayLine, Delivery
 from damian.delays.laws import law_of
 from damian.transforms.base import StatefulTransform
+from damian.transforms.context import ContextReader
 from damian.transforms.entries import (
     Change,
     Entries,
@@ -48,12 +49,14 @@ class ObservationDelay(StatefulTransform):
         delay_key: key for the delay of the message sent in this step [steps], [..., 1] long, -1 if it never
             arrives; None to leave it out. An actor must not observe it; back-updating needs it.
         sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
+        context_keys: key of each entry that the law may read, by the name that the law gives it
+            (``ContextSampler``).
         seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
 
-    A bare name for one of the last four keys means an entry in the same TensorDict as ``in_keys[0]``.
+    A bare name for one of the last five keys means an entry in the same TensorDict as ``in_keys[0]``.
 
     Raises:
-        InputError: the delay or the order is not valid.
+        InputError: the delay or the order is not valid, or the law reads what has no key.
 
     Examples:
         >>> delay = ObservationDelay(Uniform(3, 7), loss=0.1)
@@ -74,16 +77,20 @@ class ObservationDelay(StatefulTransform):
         fresh_key: NestedKey | None = None,
         delay_key: NestedKey | None = None,
         sent_key: NestedKey | None = None,
+        context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
     ) -> None:
         checks.one_of("order", order, ORDERS)
         super().__init__(in_keys, out_keys or in_keys, seed=seed)
-        self.sampler = law_of(delay).sampler(dt, loss)
+        law = law_of(delay)
+        self.sampler = law.sampler(dt, loss)
         self.line = DelayLine(self.sampler, order)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
-        self.step_keys = [*self.in_keys, *([self.sent_key] if self.sent_key else [])]
+        self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.row_key)
+        sent_keys = [self.sent_key] if self.sent_key else []
+        self.step_keys = [*self.in_keys, *sent_keys, *self.contexts.keys.values()]
 
     @property
     def key_usage(self) -> KeyUsage:
@@ -92,7 +99,8 @@ class ObservationDelay(StatefulTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))
-        return self.line.init_memory(values, self.streams(tensordict.batch_size, values[0].device))
+        memory = self.line.init_memory(values, self.streams(tensordict.batch_size, values[0].device))
+        return self.contexts.init_memory(memory, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory, delivery = self.line.reset(memory, self._values(entries), mask)
@@ -100,7 +108,8 @@ class ObservationDelay(StatefulTransform):
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         sent = entries[self.sent_key].reshape(-1) if self.sent_key else None
-        memory, delivery = self.line.step(memory, self._values(entries), sent)
+        context = self.contexts.read(memory, entries, sent, self.rows)
+        memory, delivery = self.line.step(memory, self._values(entries), sent, context)
         return memory, self._outputs(delivery)
 
     def _values(self, entries: Entries) -> list[Tensor]:

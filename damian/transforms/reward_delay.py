@@ -1,5 +1,6 @@
 """Transforms that delay rewards, and that sum the latest rewards (paper, section 3.5)."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from damian.common.tensors import expand_mask
 from damian.delays.delay_line import advance_slot
 from damian.delays.laws import LOSES, law_of
 from damian.transforms.base import StatefulTransform
+from damian.transforms.context import ContextReader
 from damian.transforms.entries import (
     Change,
     Entries,
@@ -75,10 +77,12 @@ class RewardDelay(RewardTransform):
             and each step.
         reward_key: key of the reward.
         dt: length of a step [s], for delays given as times.
+        context_keys: key of each entry that the law may read, by the name that the law gives it
+            (``ContextSampler``). A bare name means an entry in the same TensorDict as the reward.
         seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
 
     Raises:
-        InputError: the delay is not valid, or its law loses rewards.
+        InputError: the delay is not valid, or its law loses rewards or reads what has no key.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardDelay(Uniform(0, 4)))
@@ -86,24 +90,46 @@ class RewardDelay(RewardTransform):
     """
 
     def __init__(
-        self, delay: Any, reward_key: NestedKey = "reward", *, dt: float = 1.0, seed: int | None = None
+        self,
+        delay: Any,
+        reward_key: NestedKey = "reward",
+        *,
+        dt: float = 1.0,
+        context_keys: Mapping[str, NestedKey] | None = None,
+        seed: int | None = None,
     ) -> None:
         super().__init__(reward_key, seed)
-        self.sampler = law_of(delay).sampler(dt)
+        law = law_of(delay)
+        self.sampler = law.sampler(dt)
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
+        self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)
+        self.step_keys = [*self.step_keys, *self.contexts.keys.values()]
+
+    @property
+    def key_usage(self) -> KeyUsage:
+        return super().key_usage._replace(reads=list(self.contexts.keys.values()))
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         memory = super().init_memory(tensordict)
         streams = self.streams(tensordict.batch_size, memory["past"].device)
         channel = self.sampler.initial_state(streams)
         zero = torch.zeros_like(streams)
-        return memory | {"clock": zero, "slot": zero.clone(), "streams": streams, "channel": channel}
+        memory = memory | {"clock": zero, "slot": zero.clone(), "streams": streams, "channel": channel}
+        if not self.sampler.sees_context:
+            return memory
+        return self.contexts.init_memory(memory | {"reset_at": zero.clone()}, tensordict, self.rows)
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        if self.sampler.sees_context:
+            memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
+        return super().on_reset(memory, entries, mask)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         clock, in_transit = memory["clock"] + 1, memory["past"]
         reward = as_rows(entries[self.reward_key], self.rows)
-        delay, channel = self.sampler(memory["streams"], clock, memory["channel"])
+        context = self.contexts.read(memory, entries, None, self.rows)
+        delay, channel = self.sampler(memory["streams"], clock, memory["channel"], context)
         slot_now = advance_slot(memory["slot"], 1, self.n_past)
         arrival = advance_slot(slot_now, delay, self.n_past)
         rows = torch.arange(len(reward), device=delay.device)

@@ -13,7 +13,10 @@ from matplotlib import pyplot as plt
 
 HERE = Path(__file__).parent
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
-ARMS = {"both": "past actions and back-updating", "back-updating, own messages": "back-updating and its own messages"}
+ARMS = {
+    "both": "past actions and back-updating",
+    "back-updating, own messages": "back-updating and its own messages",
+}
 COLOURS = ("#0072B2", "#D55E00")
 
 

@@ -1,15 +1,20 @@
-"""A delay law of one's own: a satellite link that now and then needs one more hop.
+"""Delay laws of one's own: a satellite link with one more hop now and then, and a radio link to an antenna.
 
     cd examples/extending
     damian train "delay.obs={law: law:Satellite, hop: 2s, extra: 0.2}" aware=both
+    damian train "delay.obs={law: law:Distance, antenna: [0, 0], speed: 40, reach: 300}" aware=both
 
 A law is a frozen dataclass derived from ``damian.Law``. ``sampler`` returns the probability of each delay in
-steps.
+steps (``Satellite``), or a function of the circumstances under which messages are sent (``Distance``).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from damian import Law
+import torch
+from torch import Tensor
+
+from damian import ContextSampler, Law, MessageContext
 from damian.common import checks
 from damian.delays.laws import Delay, in_steps
 from damian.delays.samplers import Sampler
@@ -31,3 +36,36 @@ class Satellite(Law):
         chances[hop] += 1 - self.extra
         chances[2 * hop] += self.extra
         return Sampler([chances], loss=loss)
+
+
+@dataclass(frozen=True)
+class Distance(Law):
+    """A delay grows with the distance to an antenna, and with the number of UAVs that send in this step."""
+
+    antenna: Sequence[float] = (0.0, 0.0)
+    """Place of the antenna, east and north [m]."""
+    speed: float = 50.0
+    """Distance over which a message is relayed per second [m/s]."""
+    capacity: int = 4
+    """As many messages at once delay each other by one step."""
+    reach: float = 1000.0
+    """Distance beyond which half of the messages are lost [m]."""
+    longest: Delay = 20
+    """Longest delay: steps, or a time such as ``20s``."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        checks.place(f"{key}.antenna", self.antenna)
+        checks.above(f"{key}.speed", self.speed, 0.0, "m/s")
+        checks.whole(f"{key}.capacity", self.capacity, 1, unit="messages")
+        checks.above(f"{key}.reach", self.reach, 0.0, "m")
+        return ContextSampler(
+            self.delays, in_steps(f"{key}.longest", self.longest, dt), loss, reads=["position"]
+        )
+
+    def delays(self, context: MessageContext) -> Tensor:
+        """Delay of each of M messages [steps], [M]; it is rounded up, and a negative one is a loss."""
+        position = context.entries["position"]
+        distance = torch.linalg.vector_norm(position - position.new_tensor(self.antenna), dim=-1)
+        steps = distance / (self.speed * context.dt) + context.n_sending // self.capacity
+        lost = (distance > self.reach) & (context.uniform < 0.5)
+        return torch.where(lost, -1.0, steps)

@@ -261,7 +261,8 @@ def test_an_action_delay_of_j_steps_has_the_effect_of_j_more_steps_of_observatio
 def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, changed):
     scenario = everything(motion, **changed)
     at_once, graph = delayed(scenario), delayed(scenario).compile(backend="eager")
-    uav_env = UavEnv(scenario, 4, extras=EXTRAS, messages_only=at_once.base_env.messages_only)
+    base = at_once.base_env
+    uav_env = UavEnv(scenario, 4, extras=base.extras, messages_only=base.messages_only)
     one_by_one = TransformedEnv(uav_env, make_transforms(scenario, uav_env.server, EXTRAS))
     for number, transform in enumerate(one_by_one.transform):
         transform.set_seed(7919 * (number + 1))

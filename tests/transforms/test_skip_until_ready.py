@@ -1,11 +1,12 @@
 """A merged step equals, bit for bit, the single steps in which no UAV is ready to choose an action."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 import torch
+from context_law import Crowd
 from helpers import everything, same, square
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -14,6 +15,8 @@ from torchrl.envs.utils import check_env_specs
 
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
+from damian.delays.laws import Law
+from damian.delays.samplers import ContextSampler, MessageContext, Sampler
 from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -34,6 +37,7 @@ DELAYS: dict[str, dict[str, Any]] = {
     "messages by arrival": {"delay": DelayConfig(obs=LATE, order="arrival", history=2)},
     "bursts": {"delay": DelayConfig(obs=BURST)},
     "actions": {"delay": DelayConfig(act=LATE, obs=LATE, history=2)},
+    "laws that see the context": {"delay": DelayConfig(obs=Crowd(), act=Crowd(), rew=Crowd(loses=False))},
     "rewards": {"delay": DelayConfig(rew=LATE, reward_window=3)},
     "slow clocks": {"clock": ClockConfig(agents="2s", server="4s"), "delay": DelayConfig(obs=LATE)},
     "all of it": {
@@ -168,6 +172,22 @@ def test_an_episode_may_end_while_no_uav_is_ready():
 
 def test_resets_of_some_worlds_during_episodes_give_the_same_outputs():
     check_equal(flights("messages, lost ones, history"), interrupted={1: 2, 2: 4})
+
+
+@dataclass(frozen=True)
+class SlowStart(Law):
+    """The first messages of an episode take longest."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        return ContextSampler(self.delays, 6, loss, loses=False)
+
+    def delays(self, context: MessageContext) -> Tensor:
+        return torch.where(context.time == 0, 6, 1)
+
+
+def test_no_action_of_a_paused_world_arrives_in_its_next_episode():
+    scenario = replace(flights("nothing"), delay=DelayConfig(act=SlowStart()))
+    check_equal(scenario, interrupted={0: 3, 1: 2, 2: 4})
 
 
 def test_discounted_sums_of_rewards_are_equal():

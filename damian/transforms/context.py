@@ -1,0 +1,114 @@
+"""The context of delayed messages, for delay laws that see who sends, from where, when, and how many do."""
+
+from collections.abc import Mapping
+from typing import cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+
+from damian.common import checks, counter_rng
+from damian.common.errors import InputError
+from damian.delays.laws import Law
+from damian.delays.samplers import MessageContext, Sampler
+from damian.transforms.entries import Entries, Memory, as_rows, select_entries, sibling_key
+
+
+class ContextReader:
+    """Builds the context of the messages that a transform delays; does nothing if their law sees none.
+
+    The memory of the transform must hold ``streams``, ``channel``, ``clock`` and ``reset_at`` (as in
+    ``DelayLine``); ``init_memory`` adds ``agents``: 0, 1, ..., N - 1.
+
+    Args:
+        law: of the delays; errors name it.
+        sampler: of the law.
+        context_keys: keys of the entries that the law may read, by name.
+        dt: length of a step [s].
+        beside: key of the delayed entry; a bare name in ``context_keys`` means an entry beside it.
+        before_step: the messages are sent before the environment steps, as actions are.
+
+    Raises:
+        InputError: the law reads a name that has no key.
+    """
+
+    def __init__(
+        self,
+        law: Law,
+        sampler: Sampler,
+        context_keys: Mapping[str, NestedKey] | None,
+        dt: float,
+        beside: NestedKey,
+        before_step: bool = False,
+    ) -> None:
+        known = dict(context_keys or {})
+        self.keys: dict[str, NestedKey] = {}
+        """Keys of the entries that the law reads, by name."""
+        for name in sampler.reads:
+            should = f"has no key for {name}, which the law {type(law).__name__} reads"
+            checks.require(name in known, "context_keys", known, should)
+            self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(known[name])))
+        self._law_name, self._sampler, self._dt = type(law).__name__, sampler, dt
+        self._since_clock = 0 if before_step else 1
+
+    def init_memory(self, memory: Memory, tensordict: TensorDictBase, rows: torch.Size) -> Memory:
+        """Add what the contexts need to the memory, and try the law once.
+
+        Args:
+            memory: of the transform, M rows.
+            tensordict: outputs of the first reset.
+            rows: shape of the rows.
+
+        Raises:
+            InputError: an entry is missing or has another shape, or the law does not return M delays.
+        """
+        if not self._sampler.sees_context:
+            return memory
+        streams = memory["streams"]
+        n_agents = rows.numel() // tensordict.batch_size.numel()
+        memory = memory | {"agents": torch.arange(n_agents, device=streams.device)}
+        context = self.read(memory, select_entries(tensordict, list(self.keys.values())), None, rows)
+        try:
+            self._sampler(streams, memory["clock"], memory["channel"], context)
+        except KeyError as error:
+            raise InputError(
+                f"{self._law_name}: it raised KeyError: {error}; the entries of a context are those that the "
+                f"sampler declares with reads={list(self.keys)}"
+            ) from error
+        return memory
+
+    def read(
+        self, memory: Memory, entries: Entries, sent: Tensor | None, rows: torch.Size
+    ) -> MessageContext | None:
+        """The context of the messages of this step, or None if the law sees none.
+
+        Args:
+            memory: before the step.
+            entries: contain those that the law reads, [*rows, ...].
+            sent: mask of the messages that are really sent, [M] bool; all of them if not given.
+            rows: shape of the rows.
+        """
+        if not self._sampler.sees_context:
+            return None
+        agents, streams, clock = memory["agents"], memory["streams"], memory["clock"]
+        n_sending = torch.full_like(streams, len(agents))
+        if sent is not None:
+            by_world = sent.view(-1, len(agents))
+            n_sending = by_world.sum(-1, keepdim=True).expand_as(by_world).reshape(-1)
+        return MessageContext(
+            sender=agents.repeat(len(streams) // len(agents)),
+            receiver=torch.full_like(streams, -1),
+            n_sending=n_sending,
+            time=(clock + self._since_clock - memory["reset_at"]) * self._dt,
+            uniform=counter_rng.uniform(streams, clock + 1),
+            dt=self._dt,
+            entries={name: self._entry(entries, key, name, rows) for name, key in self.keys.items()},
+        )
+
+    def _entry(self, entries: Entries, key: NestedKey, name: str, rows: torch.Size) -> Tensor:
+        """An entry as [M, ...]."""
+        checks.require(key in entries, f"context_keys.{name}", key, "is missing from the TensorDict")
+        shape = tuple(entries[key].shape)
+        should = f"has shape {shape}, but messages are sent by rows of shape {tuple(rows)}"
+        checks.require(shape[: len(rows)] == tuple(rows), f"context_keys.{name}", key, should)
+        return as_rows(entries[key], rows)
