@@ -4,6 +4,7 @@ Steps are pure functions of (state, action) over tensors, so that a step compile
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -48,6 +49,14 @@ class Simulation:
         self.initial = self._initial_state(drawn, trail, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state without the sensors: pickle does not find a function behind its decorator."""
+        return self.__dict__ | {"sensors": {}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.sensors = sensors_of(self.config.sensors)
 
     def to(self, device: torch.device) -> "Simulation":
         """Move all tensors to a device, in place."""

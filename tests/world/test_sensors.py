@@ -1,10 +1,11 @@
 """Readings of one's own sensors equal those of a plain loop, and change nothing else in a message."""
 
+import pickle
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import both_motions, everything, play, random_actions, same
+from helpers import act, both_motions, everything, play, random_actions, same
 from hypothesis import given
 from hypothesis import strategies as st
 from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
@@ -112,6 +113,15 @@ def test_worlds_with_sensors_stepped_together_equal_worlds_stepped_alone(motion)
         for step, (single, every) in enumerate(zip(one, shown, strict=True)):
             for key in single.keys(True, True):
                 assert single[key].equal(every[key][b : b + 1]), (step, key)
+
+
+def test_a_pickled_environment_with_sensors_continues_in_the_same_way():
+    env, generator = UavEnv(sensing(), num_worlds=3), torch.Generator().manual_seed(0)
+    env.reset()
+    copy = pickle.loads(pickle.dumps(env))
+    for _ in range(3):
+        action = random_actions(env, generator)
+        assert same(act(env, action), act(copy, action))
 
 
 # Mistakes.
