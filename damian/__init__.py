@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         SampleAndHold,
         ServerNode,
     )
+    from damian.world.sensors import sensor
 
 __version__ = "0.2.0"
 
@@ -51,6 +52,7 @@ _MODULES = {
         "SampleAndHold",
         "ServerNode",
     ],
+    "damian.world.sensors": ["sensor"],
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
@@ -80,6 +82,7 @@ __all__ = [
     "feature",
     "make_env",
     "reward_term",
+    "sensor",
 ]
 
 

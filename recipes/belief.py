@@ -26,7 +26,6 @@ from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.evaluation.belief_figure import Beliefs, plot_beliefs
-from damian.world.messages import Messages
 
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported, save_config
@@ -59,7 +58,7 @@ def beliefs(outputs: TensorDictBase, env: UavEnv) -> Beliefs:
     sent = cast(Tensor, outputs[keys.MESSAGE_SENT]).clone()
     sent[0] = False  # the server holds the first message from the reset on
     delay = outputs.get(keys.DELAY, torch.zeros_like(sent[..., None], dtype=torch.long))
-    held = Messages.unpack(outputs.get(keys.RECEIVED, message))
+    held = env.server.messages(outputs.get(keys.RECEIVED, message))
     dt, steps = env.scenario.clock.dt, torch.arange(len(state), dtype=torch.float64)
     positions = state[:, : 3 * env.n_agents].unflatten(-1, (env.n_agents, 3))[..., :2]
     return Beliefs(

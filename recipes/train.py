@@ -53,7 +53,6 @@ from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.server.server import Server
-from damian.world.messages import Messages
 
 from .shared.known_settings import CONF
 from .shared.launch import launch, load, perform, prepare, reported, save_config, stored_config
@@ -129,15 +128,15 @@ def ticks(collector: Collector, clock: SystemClock) -> Iterator[TensorDictBase]:
             continue
         batch = cast(TensorDictBase, torch.cat(parts, 1)) if len(parts) > 1 else part  # type: ignore[arg-type]
         if clock.change:
-            clock.tick(spotting(batch))
+            clock.tick(spotting(batch, cast(DelayedEnv, collector.env).server))
         parts = []
         yield batch
 
 
-def spotting(batch: TensorDictBase) -> torch.Tensor:
+def spotting(batch: TensorDictBase, server: Server) -> torch.Tensor:
     """Which UAVs spot the source at the end of a batch [B, T], by what the server holds, [B, N] bool."""
     after = cast(TensorDictBase, batch["next"][:, -1])
-    return Messages.unpack(after.get(keys.RECEIVED, after[keys.MESSAGE])).spotted
+    return server.messages(after.get(keys.RECEIVED, after[keys.MESSAGE])).spotted
 
 
 def train(config: TrainConfig, folder: Path) -> None:

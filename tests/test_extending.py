@@ -44,6 +44,39 @@ REGION = [
 MOTION = ["motion=polynomial", "motion.kind=motion:WindyFlight", "motion.options={wind: 4, bearing: 0}"]
 
 
+SENSOR = [
+    "sensors=[{sensor: sensor:wind, strength: 3}]",
+    "observation.local_features=[spotted,sensor:wind_felt]",
+]
+MISTAKES = """
+from damian import feature, sensor
+
+@sensor(width=3)
+def three(state, world):
+    return state.battery
+
+@feature("local", width=2)
+def single(cache):
+    return cache.messages.track
+
+@feature("local")
+def smelt(cache):
+    return cache.reading("odour")
+"""
+NO_RANGE = """
+from damian import feature
+
+@feature("local", low=1.0)
+def narrow(cache):
+    return cache.messages.track
+"""
+
+
+def feature_in(module: str, name: str) -> str:
+    """The override with which a feature is observed."""
+    return f"observation.local_features=[{module}:{name}]"
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """An empty folder with a copy of the examples, from which programs are started."""
@@ -82,6 +115,48 @@ def test_a_law_features_and_reward_terms_of_ones_own_are_trained_with_and_logged
 
 def test_a_region_and_a_motion_model_of_ones_own_are_trained_in(run):
     check_trained_and_evaluated(run, *REGION, *MOTION)
+
+
+def test_a_sensor_and_a_feature_that_reads_it_are_trained_with(run):
+    check_trained_and_evaluated(run, *SENSOR, "delay=paper", "aware=both", "motion=polynomial")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["sensors=[sensors:wind]"],
+            "sensors.sensor: sensors:wind: No module named 'sensors'; sensors must be",
+        ),
+        (
+            ["sensors=[features:heading]"],
+            "sensors.sensor: features:heading is no sensor: decorate the function",
+        ),
+        (
+            ["sensors=[{sensor: sensor:wind, strenght: 3}]"],
+            "sensors.strenght: 3 is no parameter of sensor:wind, which has strength, noise",
+        ),
+        (["sensors=[sensor:wind, sensor:wind]"], "sensors: sensor:wind has the name of another sensor"),
+        (SENSOR[1:], "sensors: wind, which a feature reads, is missing: no sensor is given"),
+        (
+            [*SENSOR[:1], feature_in("mistakes", "smelt")],
+            "sensors: odour, which a feature reads, is not one of wind",
+        ),
+        ([feature_in("mistakes", "single")], "feature mistakes:single: shape ["),
+        (["sensors=[mistakes:three]"], "sensors: three returns values of shape ["),
+        (
+            [feature_in("no_range", "narrow")],
+            "no_range:narrow: importing it raised InputError: range of a feature: low=1.0, high=1.0 are not",
+        ),
+    ],
+)
+def test_a_mistake_in_a_sensor_or_in_what_a_feature_declares_is_one_clear_line(
+    run, folder, capsys, overrides, message
+):
+    (folder / "mistakes.py").write_text(MISTAKES)
+    (folder / "no_range.py").write_text(NO_RANGE)
+    check_refused(lambda: run(*TINY, *overrides), message, capsys)
+    assert not (folder / "run").exists()
 
 
 @pytest.mark.parametrize("compiles", [False, True])

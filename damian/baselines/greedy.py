@@ -50,6 +50,7 @@ class Greedy:
     def __init__(self, worlds: UavEnv) -> None:
         scenario, simulation = worlds.scenario, worlds.simulation
         source, terms = scenario.source, {*scenario.reward.terms} - {"coverage", "battery", "mean_distance"}
+        self.unpack = worlds.server.messages
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
@@ -69,7 +70,7 @@ class Greedy:
             age: their age [steps], [B, N, 1]; 0 if not given.
             mask: legal discrete actions, [B, N, A]; all if not given.
         """
-        held = Messages.unpack(message)
+        held = self.unpack(message)
         region = held.trail[:, 0, 0] // self.points.shape[1]
         ground = self.points[region]
         weight = self.fresh(held, ground)

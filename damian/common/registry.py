@@ -1,11 +1,13 @@
 """Components by name, or by the path of a class or function of one's own: ``package.module:Name``."""
 
 import importlib
+import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar, cast
 
+from damian.common import checks
 from damian.common.errors import InputError
 
 T = TypeVar("T")
@@ -58,13 +60,33 @@ class Registry(Generic[T]):
             if isinstance(name, str) and name in components:
                 return components[name]
         if not isinstance(name, str) or ":" not in name:
-            known = ", ".join(self._components)
-            raise InputError(f"{key}: {name} is not one of {known}, nor a path such as package.module:Name")
+            known = f"one of {', '.join(self._components)}, nor " if self._components else ""
+            raise InputError(f"{key}: {name} is not {known}a path such as package.module:Name")
         component = _import_path(name, key)
         if problem := self._problem(component):
             raise InputError(f"{key}: {name} {problem}")
         self._imported[name] = component
         return component
+
+    def read(self, written: Any, key: str, entry: str) -> tuple[str, T, dict[str, Any]]:
+        """Read ``{entry: package.module:name, parameter: value, ...}``.
+
+        Args:
+            written: what the configuration says.
+            key: of the setting, for errors.
+            entry: key under which the component stands.
+
+        Returns:
+            The name or path of the component, the component, and the parameters.
+
+        Raises:
+            InputError: it is no such mapping, or there is no such component.
+        """
+        if not isinstance(written, Mapping) or entry not in written:
+            raise InputError(f"{key}: {written} is not {{{entry}: package.module:name, parameter: value}}")
+        path = written[entry]
+        parameters = {str(name): value for name, value in written.items() if name != entry}
+        return path, self.get(path, f"{key}.{entry}"), parameters
 
     def __iter__(self) -> Iterator[str]:
         """Registered names, in order of registration."""
@@ -76,6 +98,27 @@ class Registry(Generic[T]):
     def items(self) -> Iterator[tuple[str, T]]:
         """Registered names and components."""
         yield from self._components.items()
+
+
+def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str) -> None:
+    """Require that the given parameters are keyword-only arguments of a function, and that none is missing.
+
+    Args:
+        function: the function of a component.
+        given: parameters by name.
+        path: name or path of the component, for errors.
+        key: of the setting, for errors.
+
+    Raises:
+        InputError: the function has no such parameter, or one without a default is not given.
+    """
+    accepted = inspect.signature(function).parameters.values()
+    known = {each.name: each for each in accepted if each.kind is inspect.Parameter.KEYWORD_ONLY}
+    for name, value in given.items():
+        problem = f"is no parameter of {path}, which has {', '.join(known) or 'none'}"
+        checks.require(name in known, f"{key}.{name}", value, problem)
+    missing = [name for name, each in known.items() if each.default is each.empty and name not in given]
+    checks.require(not missing, key, path, f"needs a value for {', '.join(missing)}")
 
 
 def _import_path(path: str, key: str) -> Any:

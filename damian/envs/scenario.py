@@ -84,4 +84,5 @@ def make_server(scenario: ScenarioConfig, simulation: Simulation) -> Server:
         radius=simulation.radius,
         dt=scenario.clock.dt,
         time_scale=scenario.time_scale,
+        readings={name: sensor.width for name, sensor in simulation.sensors.items()},
     )

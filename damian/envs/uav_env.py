@@ -9,6 +9,7 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
+from torch.nn.functional import pad
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
@@ -18,12 +19,16 @@ from damian.common import counter_rng
 from damian.common.compiling import compiled
 from damian.common.tensors import gather_rows, tree_map
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
+from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
 from damian.world.simulation import Simulation
 from damian.world.state import INITIAL_CONDITION, PackedState, State
 
 Outputs = dict[NestedKey, Tensor]
 """Entries that a step or a reset outputs, by key."""
+
+Bounds = dict[NestedKey, tuple[Tensor, Tensor]]
+"""Lowest and highest values of each column of an observation, [N, F] each, by key."""
 
 EXTRAS = ("message", "state", "reward_terms")
 """Default optional outputs; further ones are ``position``, for delay laws, and ``privileged``, only for
@@ -44,7 +49,7 @@ class UavEnv(EnvBase):
     - ``action_mask``: legal discrete actions, [B, N, A] (if ``actions.mask``);
     - ``ready``: whether the UAV can choose an action now, [B, N];
     - ``observation``, ``global_observation``: features of the actor [B, N, F] and of the critic [B, N, G];
-    - ``message``: the latest message of each UAV, [B, N, M] (``Messages.unpack`` names its fields), and
+    - ``message``: the latest message of each UAV, [B, N, M] (``server.messages`` names its fields), and
       ``message_sent``: whether it was sent in this step, [B, N];
     - ``position``: true position of each UAV, east and north [m], which delay laws may read, [B, N, 2];
     - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, and the true
@@ -93,8 +98,10 @@ class UavEnv(EnvBase):
         self.extras, self.messages_only = frozenset(extras), messages_only
         self.simulation = simulation or make_simulation(self.scenario, seed)
         self.server = server or make_server(self.scenario, self.simulation)
-        self._reset_outputs = self._outputs_at_reset(self.simulation.initial)
-        self._make_specs()
+        initial = self.simulation.initial
+        features = self.server.checked_features(initial.sent, initial.steps)
+        self._reset_outputs = self._outputs_at_reset(initial, features)
+        self._make_specs(self._bounds(features))
         self.set_seed(seed)
         self._step_fn = self._masked_step_fn = self.step_fn
         self._reset_fn = self.reset_fn
@@ -173,7 +180,7 @@ class UavEnv(EnvBase):
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         self.worlds, outputs = self._reset_fn(self.worlds, mask.view(-1))
-        return self.to_tensordict(outputs)  # TorchRL keeps the entries of the other worlds
+        return self.to_tensordict(outputs)
 
     # Pure functions of the state, which can be compiled.
 
@@ -181,13 +188,17 @@ class UavEnv(EnvBase):
         """Begin new episodes in the worlds of the mask [B].
 
         Returns:
-            The worlds, and the outputs with which the current episode of every world began.
+            The worlds, and the outputs with which the new episodes begin. TorchRL keeps the entries of the
+            other worlds.
         """
         if torch.compiler.is_compiling():  # a graph allows no shapes that depend on data
             fresh = self.simulation.next_episode(worlds)
             worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
         else:
             worlds = self.simulation.reset(worlds, mask)
+        if self.simulation.sensors:  # a table cannot hold first readings, which differ in every episode
+            state = self.simulation.layout.unpack(worlds)
+            return worlds, self._outputs_at_reset(state, self.server.features(state.sent, state.steps))
         condition = worlds.integers[:, INITIAL_CONDITION]
         return worlds, {k: table.index_select(0, condition) for k, table in self._reset_outputs.items()}
 
@@ -243,9 +254,14 @@ class UavEnv(EnvBase):
         to_source = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
         return torch.cat([global_observation, to_source.clamp(-1, 1)], -1)
 
-    def _outputs_at_reset(self, initial: State) -> Outputs:
-        """Outputs of a reset to each of the Q initial conditions, tables [Q, ...] by key."""
-        outputs = self._state_outputs(initial, self.server.features(initial.sent, initial.steps))
+    def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
+        """Outputs of a reset, [B, ...] by key, or tables [Q, ...] for each of the Q initial conditions.
+
+        Args:
+            initial: first states of episodes.
+            features: features of their messages.
+        """
+        outputs = self._state_outputs(initial, features)
         if "reward_terms" in self.extras:
             zero = torch.zeros_like(initial.track)
             outputs |= {(*keys.REWARD_TERMS, name): zero for name in self.scenario.reward.terms}
@@ -264,11 +280,22 @@ class UavEnv(EnvBase):
         root[keys.AGENTS] = TensorDict(agents, shape, device=self.device)
         return TensorDict(root, self.batch_size, device=self.device)
 
-    def _make_specs(self) -> None:
+    def _bounds(self, features: Features) -> Bounds:
+        """The bounds that the features declare, and [-1, 1] for the privileged offset to the source."""
+        low, high = (self.server.observations(limit) for limit in feature_bounds(features))
+        actor, critic = ((lowest[0], highest[0]) for lowest, highest in zip(low, high, strict=True))
+        privileged = pad(critic[0], [0, 2], value=-1.0), pad(critic[1], [0, 2], value=1.0)
+        return {
+            keys.OBSERVATION: actor,
+            keys.GLOBAL_OBSERVATION: critic,
+            keys.PRIVILEGED_OBSERVATION: privileged,
+        }
+
+    def _make_specs(self, bounds: Bounds) -> None:
         worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
         ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in _DONE}
         observations: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}
-        self.observation_spec = self._specs_of(observations)
+        self.observation_spec = self._specs_of(observations, bounds)
         config = self.scenario.actions
         if config.kind == "discrete":
             action = Categorical(config.n_actions, shape=agents, device=self.device)
@@ -283,10 +310,11 @@ class UavEnv(EnvBase):
         )
         self.done_spec = self._specs_of(ends)
 
-    def _specs_of(self, tables: Outputs) -> Composite:
-        """Specs of outputs, derived from examples with any number of rows."""
+    def _specs_of(self, tables: Outputs, bounds: Bounds | None = None) -> Composite:
+        """Specs of outputs, derived from examples with any number of rows and the bounds of observations."""
         shape = torch.Size((*self.batch_size, self.n_agents))
-        levels = _levels({key: self._spec_of(key, table) for key, table in tables.items()})
+        limits = bounds or {}
+        levels = _levels({key: self._spec_of(table, limits.get(key)) for key, table in tables.items()})
         root, agents = levels.pop((), {}), levels.pop((keys.AGENTS,), {})
         for path, level in levels.items():
             agents[path[-1]] = Composite(level, shape=shape, device=self.device)
@@ -294,13 +322,13 @@ class UavEnv(EnvBase):
             root[keys.AGENTS] = Composite(agents, shape=shape, device=self.device)
         return Composite(root, shape=self.batch_size, device=self.device)
 
-    def _spec_of(self, key: NestedKey, table: Tensor) -> TensorSpec:
+    def _spec_of(self, table: Tensor, bounds: tuple[Tensor, Tensor] | None) -> TensorSpec:
         shape = torch.Size((*self.batch_size, *table.shape[1:]))
         if table.dtype == torch.bool:
             return Binary(shape[-1], shape=shape, dtype=torch.bool, device=self.device)
-        if key in (keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.PRIVILEGED_OBSERVATION):
-            low = -1.0 if key == keys.PRIVILEGED_OBSERVATION else 0.0
-            return Bounded(low, 1.0, shape=shape, dtype=table.dtype, device=self.device)
+        if bounds is not None:
+            low, high = (limit.expand(shape) for limit in bounds)
+            return Bounded(low, high, shape=shape, dtype=table.dtype, device=self.device)
         return Unbounded(shape, dtype=table.dtype, device=self.device)
 
 

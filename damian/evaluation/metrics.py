@@ -13,7 +13,6 @@ from damian import keys
 from damian.envs.delayed_env import DelayedEnv
 from damian.learners.recurrent import add_recurrent_state
 from damian.server.server import Server
-from damian.world.messages import Messages
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
     horizon, next_step = rollout.shape[1], cast(TensorDictBase, rollout["next"])
     elapsed = torch.arange(1, horizon + 1, device=rollout.device).expand(rollout.shape)
     message = next_step[keys.MESSAGE]
-    truth = server(Messages.unpack(message), elapsed, next_step.get(keys.SOURCE_OVER, None))
+    truth = server(server.messages(message), elapsed, next_step.get(keys.SOURCE_OVER, None))
     in_episode = _up_to_first_end(next_step[keys.DONE].squeeze(-1))
     in_true_episode = in_episode & _up_to_first_end(truth.status.terminated)
     success, true_success = (
@@ -76,7 +75,7 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
         torch.where(succeeded | (not can_succeed), counted.sum(-1), horizon)
         for succeeded, counted in ((success, in_episode), (true_success, in_true_episode))
     )
-    held = Messages.unpack(next_step.get(keys.RECEIVED, message))
+    held = server.messages(next_step.get(keys.RECEIVED, message))
     age = held.age(elapsed * server.dt) / server.dt
     late, lost = _message_shares(next_step, in_episode)
     return Evaluation(

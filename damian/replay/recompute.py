@@ -8,7 +8,6 @@ from damian import keys
 from damian.keys import next_key
 from damian.replay.step_keys import Recompute
 from damian.server.server import Server
-from damian.world.messages import Messages
 
 
 def server_recompute(server: Server, reward_terms: bool = False, actor: bool = False) -> Recompute:
@@ -27,7 +26,7 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
         elapsed = steps[next_key(keys.STEP_COUNT)].squeeze(-1)
         source_over = steps.get(next_key(keys.SOURCE_OVER), None)
-        outputs = server(Messages.unpack(messages), elapsed, source_over)
+        outputs = server(server.messages(messages), elapsed, source_over)
         entries: dict[NestedKey, Tensor] = {
             keys.GLOBAL_OBSERVATION: outputs.global_observation,
             keys.REWARD: outputs.reward.unsqueeze(-1),

@@ -15,8 +15,9 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.registry import Registry
 from damian.common.tensors import gather_rows
-from damian.world.battery import BatteryConfig, observed
-from damian.world.coverage import FootprintTables, covered_share
+from damian.server.feature_cache import FeatureCache, ServerContext
+from damian.world.battery import observed
+from damian.world.coverage import covered_share
 from damian.world.messages import Messages
 
 
@@ -78,29 +79,8 @@ class ObservationConfig:
         return [*self.global_features, *self.local_features]
 
 
-class ServerContext(NamedTuple):
-    """What the server knows besides the messages."""
-
-    now: Tensor
-    """Current time [s], [*]."""
-    scale: Tensor
-    """Largest vertex distance of the region [m], [*]."""
-    time_scale: float
-    """Times are divided by this [s]."""
-    battery: BatteryConfig
-    """Gives the resolution with which battery levels are observed."""
-    footprints: FootprintTables | None
-    """For the feature ``coverage``; None if it is not needed."""
-    points: Tensor
-    """Landing points by flat id, [R*L, 2] metres."""
-    age_scale: float
-    """Ages are divided by this [s]."""
-    newest: bool = False
-    """Estimate the source's position from only the newest detections (``ObservationConfig.estimate``)."""
-
-
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
-    """Features by name (Table 2), each scaled to [0, 1].
+    """Features by name (Table 2, and of one's own).
 
     Args:
         messages: one message of each of N UAVs, [*, N].
@@ -108,10 +88,12 @@ def observe(messages: Messages, context: ServerContext, names: list[str]) -> dic
         names: features to compute.
 
     Returns:
-        Each feature [*, N]; but ``agent_distances`` [*, N, N-1], to the other UAVs in index order.
+        Each feature [*, N], in [0, 1] if it is one of Table 2; but ``agent_distances`` [*, N, N-1], to the
+        other UAVs in index order, and features of one's own in the shape and range that they declare.
 
     Raises:
         ValueError: ``coverage`` is among the names, but the context has no footprint tables.
+        InputError: a feature reads a sensor that does not exist.
     """
     cache = FeatureCache(messages, context)
     return {name: FEATURES.get(name, "feature").compute(cache) for name in names}
@@ -119,54 +101,86 @@ def observe(messages: Messages, context: ServerContext, names: list[str]) -> dic
 
 def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
     """Observation vector in the order of ``names``, [*, N, F]."""
-    vectors = {name for name in names if FEATURES.get(name, "feature").vector}
-    columns = [features[name] if name in vectors else features[name].unsqueeze(-1) for name in names]
+    single = {name for name in names if FEATURES.get(name, "feature").width == 1}
+    columns = [features[name].unsqueeze(-1) if name in single else features[name] for name in names]
     return torch.cat(columns, -1)
 
 
-class FeatureCache:
-    """Messages, and intermediate results that several features share, each computed once and on demand."""
+def feature_bounds(features: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Lowest and highest possible values of features, each in the shape of the feature."""
+    found = {name: FEATURES.get(name, "feature") for name in features}
+    low = {name: torch.full(values.shape, found[name].low) for name, values in features.items()}
+    high = {name: torch.full(values.shape, found[name].high) for name, values in features.items()}
+    return low, high
 
-    def __init__(self, messages: Messages, context: ServerContext) -> None:
-        self.messages, self.context = messages, context
-        self._shared: dict[Callable, Tensor] = {}
 
-    def __call__(self, compute: Callable[["FeatureCache"], Tensor]) -> Tensor:
-        """The result of ``compute(self)``, from the cache after the first call."""
-        if compute not in self._shared:
-            self._shared[compute] = compute(self)
-        return self._shared[compute]
+def check_shapes(features: dict[str, Tensor], shape: torch.Size) -> None:
+    """Require that features of messages [*, N] have the shapes that they declare.
 
-    @property
-    def scale(self) -> Tensor:
-        """Largest vertex distance of the region [m], [*, 1]."""
-        return self.context.scale.unsqueeze(-1)
+    Args:
+        features: values by name.
+        shape: the shape [*, N].
+
+    Raises:
+        InputError: a feature has another shape.
+    """
+    for name, values in features.items():
+        width = FEATURES.get(name, "feature").width
+        last = [] if width == 1 else ["K" if width is None else width]
+        actual = list(values.shape)
+        good = actual[: len(shape)] == [*shape] and len(actual) == len(shape) + len(last)
+        good = good and (width in (1, None) or actual[-1] == width)
+        expected = ", ".join(map(str, [*shape, *last]))
+        problem = f"is not [{expected}], as its width={width} asks for"
+        checks.require(good, f"feature {name}", f"shape {actual}", problem)
 
 
 class Feature(NamedTuple):
-    """How a feature is computed, and who may observe it."""
+    """How a feature is computed, its shape and range, and who may observe it."""
 
     compute: Callable[[FeatureCache], Tensor]
-    """From messages [*, N] to values in [0, 1], [*, N] or, for a vector, [*, N, K]."""
+    """From messages [*, N] to values [*, N] or, if it has several for each UAV, [*, N, width]."""
     scope: str
     """``local`` (of the UAV itself), ``global`` (of all UAVs) or ``actor`` (never for the critic)."""
-    vector: bool = False
-    """Does it have several values, [*, N, K]."""
+    width: int | None = 1
+    """Number of values for each UAV; None if it depends on the number of UAVs."""
+    low: float = 0.0
+    """Lowest possible value."""
+    high: float = 1.0
+    """Highest possible value."""
 
 
-def feature(scope: str, vector: bool = False) -> Callable[[Callable[[FeatureCache], Tensor]], Feature]:
+def feature(
+    scope: str, width: int | None = 1, low: float = 0.0, high: float = 1.0
+) -> Callable[[Callable[[FeatureCache], Tensor]], Feature]:
     """Decorator that makes a feature of a function.
 
-    The function reads ``cache.messages`` (fields [*, N]) and ``cache.context`` (time, scales, landing
-    points), and must be pure, batched over * and, for ``env.compile()``, free of branches on data.
-    ``cache(other)`` shares an intermediate result between features.
+    The function reads ``cache.messages`` (fields [*, N]), ``cache.reading`` (the sensors of one's own) and
+    ``cache.context`` (time, scales, landing points), and must be pure, batched over * and, for
+    ``env.compile()``, free of branches on data. ``cache(other)`` shares an intermediate result between
+    features.
+
+    Args:
+        scope: ``local`` (follows from the UAV's own message) or ``global`` (from the messages of all UAVs).
+        width: number of values for each UAV. With 1 the function returns [*, N], with more [*, N, width];
+            None if the number depends on the number of UAVs, as with the distances to the other UAVs.
+        low: lowest possible value.
+        high: highest possible value. Networks learn best from values about 1 in size.
+
+    Raises:
+        InputError: there is no such scope, the width is not positive, or the range is empty or not finite.
 
     Examples:
         >>> @feature("local")
         ... def track(cache):  # in lab.py, used as observation.local_features=[spotted,lab:track]
         ...     return cache.messages.track / (2 * math.pi)
     """
-    return lambda compute: Feature(compute, scope, vector)
+    checks.one_of("scope of a feature", scope, ("local", "global", "actor"))
+    if width is not None:
+        checks.whole("width of a feature", width, 1)
+    good = math.isfinite(low) and math.isfinite(high) and low < high
+    checks.require(good, "range of a feature", f"low={low}, high={high}", "are not finite with low < high")
+    return lambda compute: Feature(compute, scope, width, low, high)
 
 
 def _not_a_feature(found: Any) -> str | None:
@@ -263,7 +277,7 @@ def _source_time(v: FeatureCache) -> Tensor:
 
 
 @FEATURES.register("agent_distances")
-@feature("global", vector=True)
+@feature("global", width=None)
 def _agent_distances(v: FeatureCache) -> Tensor:
     n = v.messages.time.shape[-1]
     others = [[j for j in range(n) if j != i] for i in range(n)]

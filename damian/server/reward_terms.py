@@ -1,6 +1,5 @@
 """Reward terms of one's own: a function of features and counters, with parameters beside its weight."""
 
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -8,8 +7,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.errors import InputError
-from damian.common.registry import Registry
+from damian.common.registry import Registry, check_parameters
 
 
 class Counters(NamedTuple):
@@ -25,7 +23,8 @@ class RewardTerm(NamedTuple):
     """A function that computes a reward term, and what it needs."""
 
     compute: Callable[..., Tensor]
-    """From features by name, each [*, N], and counters to the term before it is weighted, [*, N]."""
+    """From features by name, each [*, N] or [*, N, width], and counters to the term before it is weighted,
+    [*, N]."""
     reads: Sequence[str]
     """Names of the features that it reads."""
     scope: str
@@ -37,9 +36,10 @@ def reward_term(
 ) -> Callable[[Callable[..., Tensor]], RewardTerm]:
     """Decorator that makes a reward term of a function.
 
-    The function gets features by name, each [*, N], and ``Counters``; its keyword-only arguments are
-    parameters that a configuration may set. It must be pure, batched over * and, for ``env.compile()``, free
-    of branches on data.
+    The function gets features by name, and ``Counters``; its keyword-only arguments are parameters that a
+    configuration may set. A feature has the shape and the range that it declares: [*, N] in [0, 1] unless it
+    says otherwise, and [*, N, width] if it has several values. The function returns [*, N], and must be pure,
+    batched over * and, for ``env.compile()``, free of branches on data.
 
     Args:
         reads: names of the features that it reads, built-in or of one's own (``package.module:name``).
@@ -83,18 +83,10 @@ def custom_term(written: Any) -> CustomTerm:
         InputError: the term does not exist, has no such parameter, or its weight is no finite number.
     """
     key = "reward.custom"
-    if not isinstance(written, Mapping) or "term" not in written:
-        raise InputError(f"{key}: {written} is not {{term: package.module:name, weight: 0.1}}")
-    path = written["term"]
-    term = REWARD_TERMS.get(path, f"{key}.term")
-    weight = written.get("weight", 1.0)
+    path, term, parameters = REWARD_TERMS.read(written, key, "term")
+    weight = parameters.pop("weight", 1.0)
     finite = isinstance(weight, int | float) and math.isfinite(weight)
     checks.require(finite, f"{key}.weight", weight, f"is not a finite weight of {path}")
-    parameters = {str(name): value for name, value in written.items() if name not in ("term", "weight")}
-    accepted = inspect.signature(term.compute).parameters.values()
-    known = [each.name for each in accepted if each.kind is inspect.Parameter.KEYWORD_ONLY]
-    for name, value in parameters.items():
-        problem = f"is no parameter of {path}, which has {', '.join(known) or 'none'}"
-        checks.require(name in known, f"{key}.{name}", value, problem)
+    check_parameters(term.compute, parameters, path, key)
     name = path.rpartition(":")[2]
     return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)

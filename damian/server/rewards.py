@@ -129,7 +129,7 @@ def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig
     """Weighted reward terms by name (eq. 6 and 7); their sum is the reward (eq. 8).
 
     Args:
-        features: as ``observe`` returns them, each [*, N].
+        features: as ``observe`` returns them; those of the built-in terms [*, N].
         counters: steps [*] and motions [*, N].
         config: weights of the terms.
 

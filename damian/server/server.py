@@ -5,15 +5,18 @@ Every formula exists once: the environment calls the server with the latest mess
 time of learning.
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.tensors import gather_rows
-from damian.server.features import ObservationConfig, ServerContext, observe, stack
+from damian.server.feature_cache import ServerContext
+from damian.server.features import ObservationConfig, check_shapes, observe, stack
 from damian.server.reward_terms import Counters
 from damian.server.rewards import RewardConfig, final_reward, reward
 from damian.server.termination import EpisodeConfig, Status, status
@@ -63,6 +66,7 @@ class Server:
         radius: radius of a UAV's footprint [m].
         dt: length of a step [s].
         time_scale: times are divided by this [s].
+        readings: width of each reading that messages carry, by name, in their order; none if not given.
 
     Raises:
         InputError: there are more landing points than a message can number.
@@ -79,6 +83,7 @@ class Server:
         radius: float,
         dt: float,
         time_scale: float,
+        readings: Mapping[str, int] | None = None,
     ) -> None:
         if airspace.points.shape[:2].numel() >= MAX_EXACT_INTEGER:
             raise InputError(
@@ -86,6 +91,10 @@ class Server:
             )
         self.observation, self.reward, self.episode, self.battery = observation, reward, episode, battery
         self.dt, self.time_scale = dt, time_scale
+        widths = readings or {}
+        firsts = itertools.accumulate(widths.values(), initial=0)
+        self._readings = {name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)}
+        self._n_readings = sum(widths.values())
         self._names = sorted({*observation.actor, *observation.critic, *reward.features})
         self._scale = airspace.scale
         self._max_points = airspace.max_points
@@ -102,6 +111,10 @@ class Server:
         if self._footprints is not None:
             self._footprints = self._footprints.to(device)
         return self
+
+    def messages(self, rows: Tensor) -> Messages:
+        """Messages from their packed rows [*, N, M], with the readings of all sensors."""
+        return Messages.unpack(rows, self._n_readings)
 
     def __call__(self, messages: Messages, steps: Tensor, source_over: Tensor | None = None) -> ServerOutputs:
         """Observations, rewards and status of messages.
@@ -133,8 +146,23 @@ class Server:
             points=self._points,
             age_scale=self.observation.age_scale,
             newest=self.observation.estimate == "newest",
+            readings=self._readings,
         )
         return observe(messages, context, names or self._names)
+
+    def checked_features(self, messages: Messages, steps: Tensor) -> Features:
+        """The features of ``features``, whose shapes and those of the reward terms are checked.
+
+        Raises:
+            InputError: a feature or a reward term has another shape than it declares, or reads a sensor that
+                does not exist.
+        """
+        features, shape = self.features(messages, steps), messages.track.shape
+        check_shapes(features, shape)
+        for name, term in reward(features, Counters(steps, messages.motions), self.reward).items():
+            problem = f"is not {list(shape)}, one value for each UAV"
+            checks.require(term.shape == shape, f"reward term {name}", f"shape {list(term.shape)}", problem)
+        return features
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
         """Observations of the actors [*, N, F] and of the critic [*, N, G]."""
@@ -162,8 +190,8 @@ class Server:
         if on_time is None:
             on_time = torch.eye(n_agents, dtype=torch.bool, device=received.device)
         timely = torch.where(on_time.unsqueeze(-1), sent.unsqueeze(-3), received.unsqueeze(-3))
-        known = Messages.unpack(received.unsqueeze(-3).expand_as(timely))  # [*, N receivers, N senders]
-        timely = Messages.unpack(timely)._asdict()
+        known = self.messages(received.unsqueeze(-3).expand_as(timely))  # [*, N receivers, N senders]
+        timely = self.messages(timely)._asdict()
         known = known._replace(**{name: timely[name] for name in fields})
         features = self.features(known, steps.unsqueeze(-1).expand(received.shape[:-1]), names)
         return stack(features, names).diagonal(dim1=-3, dim2=-2).movedim(-1, -2)

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from damian.common import checks
 from damian.common.tensors import expand_mask, gather_rows
@@ -123,6 +123,20 @@ class ActionHistory(ActionTransform):
         flat = old.dtype.is_floating_point and len(old.shape) == len(self.actions.rows) + 1
         should = "is not a vector of floats, so no actions can be appended to it; use out_key instead"
         checks.require(flat, "append_to", key, should)
-        shape = torch.Size((*old.shape[:-1], old.shape[-1] + width))
-        observation_spec[key] = Unbounded(shape, dtype=old.dtype, device=device)
+        observation_spec[key] = self._appended(old, width)
         return observation_spec
+
+    def _appended(self, old: TensorSpec, width: int) -> TensorSpec:
+        """The spec ``old`` with ``width`` more columns for the history; bounded if all of them are."""
+        shape = torch.Size((*old.shape[:-1], old.shape[-1] + width))
+        if not isinstance(old, Bounded) or (self.codes is None and not self.actions.bounded):
+            return Unbounded(shape, dtype=old.dtype, device=old.device)
+        if self.codes is None:
+            lowest, highest = torch.zeros(width), torch.ones(width)
+        else:
+            lowest, highest = (code.repeat(self.steps) for code in self.codes.aminmax(dim=0))
+        low, high = (
+            torch.cat([bound, added.to(bound).expand(*shape[:-1], width)], -1)
+            for bound, added in ((old.low, lowest), (old.high, highest))
+        )
+        return Bounded(low, high, shape=shape, dtype=old.dtype, device=old.device)

@@ -23,6 +23,8 @@ class ActionSpecs(NamedTuple):
     """Lower bound of each number of an action."""
     width: Tensor
     """Upper minus lower bound of each number of an action; 1 where actions have no bounds, or are one-hot."""
+    bounded: bool
+    """Whether (action - low) / width lies in [0, 1] for every number of an action."""
 
 
 def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs:
@@ -49,19 +51,20 @@ def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs
     return ActionSpecs(rows, as_rows(initial, rows), *_range(spec, rows))
 
 
-def _range(spec: TensorSpec, rows: torch.Size) -> tuple[Tensor, Tensor]:
-    """Lower bound and width of the range of each number of an action."""
+def _range(spec: TensorSpec, rows: torch.Size) -> tuple[Tensor, Tensor, bool]:
+    """Lower bound and width of the range of each number of an action, and whether all have a range."""
     if isinstance(spec, MultiCategorical):  # before Categorical, of which it is a subclass
         width = spec.nvec.view(-1, spec.shape[-1])[0] - 1
-        return torch.zeros_like(width), width.clamp(min=1).to(spec.device)
+        return torch.zeros_like(width), width.clamp(min=1).to(spec.device), True
     if isinstance(spec, Categorical):
         width = torch.tensor(max(spec.n - 1, 1), device=spec.device)
-        return torch.zeros_like(width), width
+        return torch.zeros_like(width), width, True
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
         low, high = (as_rows(bound, rows)[0] for bound in (spec.low, spec.high))
         bounded = (high - low).isfinite()
-        return torch.where(bounded, low, 0), torch.where(bounded, high - low, 1)
-    return torch.zeros((), device=spec.device), torch.ones((), device=spec.device)
+        return torch.where(bounded, low, 0), torch.where(bounded, high - low, 1), bool(bounded.all())
+    one_hot = isinstance(spec, OneHot)
+    return torch.zeros((), device=spec.device), torch.ones((), device=spec.device), one_hot
 
 
 class ActionTransform(StatefulTransform):

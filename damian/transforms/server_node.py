@@ -12,7 +12,6 @@ from damian.server.server import Server
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import Change, Entries, Memory
 from damian.transforms.order import KeyUsage
-from damian.world.messages import Messages
 
 
 class ServerNode(StatefulTransform):
@@ -71,7 +70,7 @@ class ServerNode(StatefulTransform):
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
         steps = elapsed.view(self.rows)
-        outputs = self.server(Messages.unpack(received), steps, entries.get(keys.SOURCE_OVER))
+        outputs = self.server(self.server.messages(received), steps, entries.get(keys.SOURCE_OVER))
         if self.own_key:
             own = self.server.observe_with_timely_messages(received, entries[self.own_key], steps)
             outputs = outputs._replace(observation=own)

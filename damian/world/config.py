@@ -1,6 +1,7 @@
 """Settings of the simulated world: UAVs, region, motion, signal source, batteries and actions."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig, flight_levels
 from damian.world.regions.config import RegionConfig
+from damian.world.sensors import sensors_of
 from damian.world.signal_source import SourceConfig
 
 FLIGHT_LEVEL_M = 30.48
@@ -27,10 +29,14 @@ class WorldConfig:
     source: SourceConfig = field(default_factory=SourceConfig)
     battery: BatteryConfig = field(default_factory=BatteryConfig)
     actions: ActionConfig = field(default_factory=ActionConfig)
+    sensors: list[Any] = field(default_factory=list)
+    """Sensors of one's own (``damian.sensor``), whose readings the messages carry: each
+    ``package.module:name``, or ``{sensor: package.module:name, ...}`` with parameters of the sensor."""
 
     def __post_init__(self) -> None:
         checks.in_range("agents", self.agents, 1)
         flight_levels(self.motion, self.agents)
+        sensors_of(self.sensors)  # refuses what is no sensor
         starts = self.region.start_positions
         checks.require(
             starts is None or len(starts) == self.agents,

@@ -1,7 +1,7 @@
 """The messages that UAVs send to the server node: their fields, and each message as one row of numbers.
 
 To add a field, declare it in ``Messages`` and fill it in ``Simulation._sense``; packing, delays and replay
-follow from the declaration.
+follow from the declaration. Values that a sensor of one's own reads (``damian.sensor``) lie in ``readings``.
 """
 
 from typing import Annotated, NamedTuple, get_type_hints
@@ -17,7 +17,7 @@ class Column(NamedTuple):
     """How a field of a message is packed."""
 
     width: int | None = 1
-    """Number of columns; None for all columns that the other fields leave (one field at most)."""
+    """Number of columns; None if it depends on the settings."""
     dtype: torch.dtype = torch.float32
     """Type of the unpacked field."""
 
@@ -49,25 +49,38 @@ class Messages(NamedTuple):
     """Position of the UAV at its latest detection, east, north [m]."""
     trail: Annotated[Tensor, Column(None, torch.long)]
     """Flat ids of the UAV's last landing points, newest first, [*, N, window]."""
+    readings: Annotated[Tensor, Column(None)]
+    """Readings of the sensors of one's own, beside each other in the order of the settings, [*, N, K]."""
 
     @classmethod
-    def blank(cls, trail: Tensor) -> "Messages":
+    def blank(cls, trail: Tensor, n_readings: int = 0) -> "Messages":
         """Messages of zeros, without a detection, with the landing points ``trail`` [*, N, window]."""
-        width = sum(column.width or 0 for column in _COLUMNS) + trail.shape[-1]
-        blank = cls.unpack(torch.zeros(*trail.shape[:-1], width))
+        width = _FIXED + trail.shape[-1] + n_readings
+        blank = cls.unpack(torch.zeros(*trail.shape[:-1], width), n_readings)
         return blank._replace(detected_time=blank.detected_time - 1, trail=trail)
 
     def pack(self) -> Tensor:
-        """Messages as rows of M numbers, fields in order, [*, N, M] float32."""
+        """Messages as rows of M numbers, fields in order, [*, N, M] float32.
+
+        Integers up to ``MAX_EXACT_INTEGER`` come through exactly, and floats with about seven digits.
+        """
         fields = zip(self, _COLUMNS, strict=True)
         parts = [(field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields]
         return torch.cat(parts, -1)
 
     @classmethod
-    def unpack(cls, rows: Tensor) -> "Messages":
-        """Messages from their rows [*, N, M]; float fields are views of the rows."""
-        rest = rows.shape[-1] - sum(column.width or 0 for column in _COLUMNS)
-        parts = rows.split([column.width or rest for column in _COLUMNS], -1)
+    def unpack(cls, rows: Tensor, n_readings: int = 0) -> "Messages":
+        """Messages from their rows; float fields are views of the rows.
+
+        A row does not tell where the trail ends, so ``Server.messages``, which knows it, is the way to unpack
+        the messages of an environment.
+
+        Args:
+            rows: packed messages, [*, N, M].
+            n_readings: number of columns of readings, K.
+        """
+        window = rows.shape[-1] - _FIXED - n_readings
+        parts = rows.split([*(column.width for column in _COLUMNS[:-2]), window, n_readings], -1)
         return cls._make(_read(part, column) for part, column in zip(parts, _COLUMNS, strict=True))
 
     def age(self, now: Tensor) -> Tensor:
@@ -82,6 +95,8 @@ class Messages(NamedTuple):
 _COLUMNS: list[Column] = [
     hint.__metadata__[0] for hint in get_type_hints(Messages, include_extras=True).values()
 ]
+_FIXED = sum(column.width or 0 for column in _COLUMNS)
+"""Number of columns of all fields but the last two, the trail and the readings."""
 
 
 def _read(part: Tensor, column: Column) -> Tensor:

@@ -4,6 +4,7 @@ Steps are pure functions of (state, action) over tensors, so that a step compile
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from damian.world.config import WorldConfig
 from damian.world.initial import InitialConditions, draw_initial_conditions
 from damian.world.landing import Candidates, assign_landing_points
 from damian.world.messages import Messages
+from damian.world.sensors import sensors_of
 from damian.world.signal_source import footprint_radius, locate
 from damian.world.state import EPISODE, SEED, PackedState, State, StateLayout
 from damian.world.vehicles import MOTION_MODELS
@@ -36,6 +38,7 @@ class Simulation:
     def __init__(self, config: WorldConfig, dt: float, trail: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.config, self.dt = config, dt
+        self.sensors = sensors_of(config.sensors)
         self.radius = footprint_radius(config.source)
         self.airspace = config.airspace(rng)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
@@ -46,6 +49,14 @@ class Simulation:
         self.initial = self._initial_state(drawn, trail, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state without the sensors: pickle does not find a function behind its decorator."""
+        return self.__dict__ | {"sensors": {}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.sensors = sensors_of(self.config.sensors)
 
     def to(self, device: torch.device) -> "Simulation":
         """Move all tensors to a device, in place."""
@@ -74,7 +85,8 @@ class Simulation:
         condition = counter_rng.bits(seed, episode) % self.n_initial_conditions
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)
         kept = torch.stack([seed, episode], 1)  # SEED and EPISODE are the first two columns
-        return fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
+        fresh = fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
+        return self._read_anew(fresh) if self.sensors else fresh
 
     def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
         """Simulate one step of ``dt``; actions of UAVs that are not ready change nothing.
@@ -128,6 +140,7 @@ class Simulation:
         """Move the source, let UAVs on the ground detect it, and send messages."""
         now = (state.steps * self.dt).to(state.track.dtype)
         place, emits, over = self._source(state, now)
+        state = state._replace(source=place, source_over=over)
         on_ground = self.vehicles.on_ground(state)
         position = state.position[..., :2]
         squared_distance = (position - place.unsqueeze(-2)).square().sum(-1)
@@ -144,10 +157,9 @@ class Simulation:
             detected_time=torch.where(spotted, times, state.sent.detected_time),
             detected_position=torch.where(spotted.unsqueeze(-1), position, state.sent.detected_position),
             trail=self._trail(state, on_ground, action_valid),
+            readings=self._readings(state),
         )
         return state._replace(
-            source=place,
-            source_over=over,
             message_sent=on_ground,
             motions=torch.where(spotted, 0, state.motions),
             sent=self.vehicles.latest_messages(on_ground, messages, state.sent),
@@ -159,6 +171,17 @@ class Simulation:
         longer = torch.cat([state.goal.unsqueeze(-1), before[..., :-1]], -1)
         added = self.vehicles.new_stop(state, on_ground, action_valid)
         return longer if added is None else torch.where(added.unsqueeze(-1), longer, before)
+
+    def _readings(self, state: State) -> Tensor:
+        """Readings of all sensors beside each other, [B, N, K]."""
+        if not self.sensors:
+            return state.sent.readings
+        return torch.cat([sensor.read(state, self) for sensor in self.sensors.values()], -1)
+
+    def _read_anew(self, worlds: PackedState) -> PackedState:
+        """Worlds at the start of an episode, whose first messages get the readings of this episode."""
+        state = self.layout.unpack(worlds)
+        return self.layout.pack(state._replace(sent=state.sent._replace(readings=self._readings(state))))
 
     def _source(self, state: State, now: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Position of the source [B, 2], whether it emits [B], and whether its walk is over [B]."""
@@ -202,6 +225,8 @@ class Simulation:
             source=drawn.walk.stop[:, 0],
             source_over=torch.zeros_like(number, dtype=torch.bool),
             message_sent=torch.ones_like(goal, dtype=torch.bool),
-            sent=Messages.blank(goal.unsqueeze(-1).repeat(1, 1, trail)),
+            sent=Messages.blank(
+                goal.unsqueeze(-1).repeat(1, 1, trail), sum(sensor.width for sensor in self.sensors.values())
+            ),
         )
         return self._sense(state)

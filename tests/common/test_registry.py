@@ -3,7 +3,7 @@
 import pytest
 
 from damian.common.errors import InputError
-from damian.common.registry import Registry
+from damian.common.registry import Registry, check_parameters
 
 
 def greetings() -> Registry:
@@ -55,6 +55,41 @@ def test_a_module_that_fails_says_so(tmp_path, monkeypatch):
     (tmp_path / "broken_words.py").write_text("1 / 0\n")
     with pytest.raises(InputError, match="importing it raised ZeroDivisionError: division by zero"):
         greetings().get("broken_words:formal", "greeting")
+
+
+def polite(*, to: str, loud: bool = False) -> str:
+    return f"good day, {to}"
+
+
+def test_a_component_and_its_parameters_are_read_from_a_mapping():
+    path, function, parameters = greetings().read({"greeting": "plain", "to": "all"}, "key", "greeting")
+    assert (path, function(), parameters) == ("plain", "hello", {"to": "all"})
+    check_parameters(polite, {"to": "all"}, path, "key")
+
+
+@pytest.mark.parametrize("written", ["plain", ["plain"], {"to": "all"}])
+def test_what_is_no_mapping_with_the_component_is_refused(written):
+    with pytest.raises(InputError) as error:
+        greetings().read(written, "key", "greeting")
+    assert str(error.value) == f"key: {written} is not {{greeting: package.module:name, parameter: value}}"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"too": "all"}, "key.too: all is no parameter of plain, which has to, loud"),
+        ({"loud": True}, "key: plain needs a value for to"),
+    ],
+)
+def test_unknown_and_missing_parameters_are_refused(given, message):
+    with pytest.raises(InputError) as error:
+        check_parameters(polite, given, "plain", "key")
+    assert str(error.value) == message
+
+
+def test_a_name_is_refused_where_nothing_is_registered():
+    with pytest.raises(InputError, match=r"^key: rude is not a path such as package\.module:Name$"):
+        Registry("greeting").get("rude", "key")
 
 
 @pytest.mark.parametrize("name", ["plain", "a:path"])

@@ -181,13 +181,13 @@ CLOCKS = {"fixed": ClockConfig(), "triggered": ClockConfig(trigger="3s", shortes
 @pytest.mark.parametrize("kind", CLOCKS)
 def test_a_batch_has_one_period_of_steps_and_no_step_is_lost_or_doubled(kind):
     setting = config(CLOCKS[kind], level_db=138.0)
-    collected = batches(setting, 80, 5)
+    collected, server = batches(setting, 80, 5), learning_env(setting).server
     assert [batch.shape for _, batch in collected] == [(WORLDS, period) for period, _ in collected]
     changes = {b - a for (a, _), (b, _) in itertools.pairwise(collected)}
     assert (changes == {0}) if kind == "fixed" else (min(changes) < 0 < max(changes))
     for (period, batch), (next_period, _) in itertools.pairwise(collected):
         spots = Messages.unpack(batch["next", "agents", "received"][:, -1]).spotted.any(-1)
-        assert spots.equal(spotting(batch).any(-1))
+        assert spots.equal(spotting(batch, server).any(-1))
         expected = SystemClock(setting.clock, 5)
         expected.period = period
         expected.tick(spots.unsqueeze(-1))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import everything, random_actions, square
+from sensor_cases import GLOBAL, LOCAL, SENSORS
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import SamplerWithoutReplacement, SliceSampler, TensorDictReplayBuffer
@@ -18,6 +19,8 @@ from damian.envs.uav_env import EXTRAS
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
 from damian.replay.recompute import server_recompute
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.messages import Messages
 
@@ -162,6 +165,22 @@ def test_back_updated_steps_equal_undelayed_ones_once_every_message_has_arrived(
     corrected, expected = (td[: 39 - LONGEST] for td in (in_order(replay, 39), undelayed.transpose(0, 1)))
     assert not corrected["next", "agents", "received"].equal(expected["next", "agents", "message"])
     check_corrected(corrected, expected)
+
+
+@pytest.mark.parametrize("motion", ["instant", "polynomial"])
+def test_back_updated_steps_know_late_readings(motion):
+    observation = ObservationConfig(["spotted", *LOCAL], ["source_time", *GLOBAL])
+    reward = RewardConfig(custom=[{"term": "sensor_cases:calm"}])
+    sections = {"observation": observation, "reward": reward, "sensors": SENSORS}
+    scenario = everything(motion, episode=PERSISTENT, **sections)
+    undelayed = rollout(scenario, 39).transpose(0, 1)[: 39 - LONGEST]
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 39)
+    replay = buffer(scenario, 64)
+    for part in delayed.split(13, 1):
+        replay.extend(part)
+    key = ("next", "agents", "global_observation")
+    assert not delayed.transpose(0, 1)[: 39 - LONGEST][key].equal(undelayed[key])
+    check_corrected(in_order(replay, 39)[: 39 - LONGEST], undelayed)
 
 
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig, observe, stack
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig, feature, observe, stack
 from damian.world.messages import Messages
 
 NAMES = [name for name in (*LOCAL, *GLOBAL) if name != "coverage"]
@@ -150,6 +150,24 @@ def test_the_actor_observes_the_age_of_the_uavs_message_and_the_critic_does_not(
     assert config.actor == ["spotted", "age"]
     assert config.critic == ["source_time", "spotted"]
     assert ObservationConfig(["spotted"], ["source_time"], age=True).actor == [*config.critic, "age"]
+
+
+@pytest.mark.parametrize(
+    ("declared", "message"),
+    [
+        ({"scope": "locale"}, "scope of a feature: locale is not one of local, global, actor"),
+        ({"width": 0}, "width of a feature: 0 is not at least 1"),
+        ({"width": 1.5}, "width of a feature: 1.5 is not a whole number"),
+        ({"low": 1.0}, "range of a feature: low=1.0, high=1.0 are not finite with low < high"),
+        ({"low": 2, "high": -2}, "range of a feature: low=2, high=-2 are not finite with low < high"),
+        ({"high": math.inf}, "range of a feature: low=0.0, high=inf are not finite with low < high"),
+        ({"low": math.nan}, "range of a feature: low=nan, high=1.0 are not finite with low < high"),
+    ],
+)
+def test_a_feature_cannot_declare_an_impossible_width_or_range(declared, message):
+    with pytest.raises(InputError) as error:
+        feature(**({"scope": "local"} | declared))
+    assert str(error.value) == message
 
 
 @pytest.mark.parametrize(

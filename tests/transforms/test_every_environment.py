@@ -157,6 +157,13 @@ def test_the_outputs_with_clocks_sums_and_histories_match_the_specs(kind):
         check_env_specs(TransformedEnv(case.make(), transform), seed=0, break_when_any_done="both")
 
 
+def test_appending_actions_keeps_the_bounds_of_an_observation_and_adds_those_of_the_actions():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), ActionHistory(2, append_to="observation"))
+    spec = env.observation_spec["observation"]
+    assert spec.low.tolist() == [-1, -1, -8, 0, 0]
+    assert spec.high.tolist() == [1, 1, 8, 1, 1]
+
+
 @kinds
 def test_the_outputs_with_all_transforms_together_match_the_specs(kind):
     case = KINDS[kind]

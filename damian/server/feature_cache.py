@@ -1,0 +1,68 @@
+"""What a feature reads: messages, and what the server knows besides them."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+from torch import Tensor
+
+from damian.common.errors import InputError
+from damian.world.battery import BatteryConfig
+from damian.world.coverage import FootprintTables
+from damian.world.messages import Messages
+
+
+class ServerContext(NamedTuple):
+    """What the server knows besides the messages."""
+
+    now: Tensor
+    """Current time [s], [*]."""
+    scale: Tensor
+    """Largest vertex distance of the region [m], [*]."""
+    time_scale: float
+    """Times are divided by this [s]."""
+    battery: BatteryConfig
+    """Gives the resolution with which battery levels are observed."""
+    footprints: FootprintTables | None
+    """For the feature ``coverage``; None if it is not needed."""
+    points: Tensor
+    """Landing points by flat id, [R*L, 2] metres."""
+    age_scale: float
+    """Ages are divided by this [s]."""
+    newest: bool = False
+    """Estimate the source's position from only the newest detections (``ObservationConfig.estimate``)."""
+    readings: Mapping[str, tuple[int, int]] = MappingProxyType({})
+    """First column, and number of columns, of each reading in ``Messages.readings``, by name."""
+
+
+class FeatureCache:
+    """Messages, and intermediate results that several features share, each computed once and on demand."""
+
+    def __init__(self, messages: Messages, context: ServerContext) -> None:
+        self.messages, self.context = messages, context
+        self._shared: dict[Callable, Tensor] = {}
+
+    def __call__(self, compute: Callable[["FeatureCache"], Tensor]) -> Tensor:
+        """The result of ``compute(self)``, from the cache after the first call."""
+        if compute not in self._shared:
+            self._shared[compute] = compute(self)
+        return self._shared[compute]
+
+    def reading(self, name: str) -> Tensor:
+        """Values of a sensor of one's own (``damian.sensor``), [*, N], or [*, N, width] if it has several.
+
+        Raises:
+            InputError: the settings have no such sensor.
+        """
+        known = self.context.readings
+        if name not in known:
+            problem = f"is not one of {', '.join(known)}" if known else "is missing: no sensor is given"
+            raise InputError(f"sensors: {name}, which a feature reads, {problem}")
+        first, width = known[name]
+        values = self.messages.readings.narrow(-1, first, width)
+        return values.squeeze(-1) if width == 1 else values
+
+    @property
+    def scale(self) -> Tensor:
+        """Largest vertex distance of the region [m], [*, 1]."""
+        return self.context.scale.unsqueeze(-1)

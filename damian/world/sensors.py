@@ -1,0 +1,97 @@
+"""Sensors of one's own: functions of the true state of the worlds, whose readings the messages carry."""
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.common.registry import Registry, check_parameters
+from damian.world.messages import Messages
+from damian.world.state import State
+
+
+class Sensor(NamedTuple):
+    """A function that reads the true state of the worlds, and how many values it returns for a UAV."""
+
+    compute: Callable[..., Tensor]
+    """From the ``State`` of B worlds and the ``Simulation`` to values, [B, N] or [B, N, width]."""
+    width: int
+    """Number of values for each UAV."""
+    name: str
+    """Name of the reading: the function's name."""
+
+    def read(self, state: State, world: Any) -> Tensor:
+        """The values as columns, [B, N, width] float32.
+
+        Raises:
+            InputError: the values have another shape than the sensor declares.
+        """
+        values = self.compute(state, world)
+        expected = state.track.shape if self.width == 1 else (*state.track.shape, self.width)
+        if values.shape != expected:
+            raise InputError(
+                f"sensors: {self.name} returns values of shape {list(values.shape)}, "
+                f"not {list(expected)}, as width={self.width} asks for"
+            )
+        return values.float().view(*state.track.shape, self.width)
+
+
+def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
+    """Decorator that makes a sensor of a function.
+
+    The function gets the ``State`` of B worlds when the UAVs and the source have moved, and the
+    ``Simulation``; ``state.steps * world.dt`` is the time [s]. It returns a value for each UAV, [B, N], or
+    ``width`` of them, [B, N, width]. Its keyword-only arguments are parameters that a configuration may set.
+    It must be pure, batched over B and, for ``env.compile()``, free of branches on data. Random numbers come
+    from ``damian.common.counter_rng`` with ``state.seed``, ``state.episode`` and ``state.steps``.
+
+    Every message carries the reading of the time at which it was generated, as float32. Features read it as
+    ``cache.reading("name")``, by the name of the function.
+
+    Args:
+        width: number of values for each UAV.
+
+    Raises:
+        InputError: the width is not a positive integer.
+
+    Examples:
+        >>> # in lab.py, used as sensors=[{sensor: lab:loudness, reach: 50}]
+        >>> @sensor()
+        ... def loudness(state, world, *, reach=100.0):
+        ...     to_source = state.position[..., :2] - state.source.unsqueeze(-2)
+        ...     return (-torch.linalg.vector_norm(to_source, dim=-1) / reach).exp()
+    """
+    checks.whole("width of a sensor", width, 1)
+    return lambda compute: Sensor(compute, width, compute.__name__)
+
+
+def _not_a_sensor(found: Any) -> str | None:
+    return None if isinstance(found, Sensor) else "is no sensor: decorate the function with damian.sensor"
+
+
+SENSORS = Registry[Sensor]("sensor", _not_a_sensor)
+"""Sensors of one's own, as ``package.module:name``."""
+
+
+def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
+    """Read a list of ``package.module:name`` and ``{sensor: package.module:name, strength: 3}``.
+
+    Returns:
+        The sensors with their parameters, by the names of their readings.
+
+    Raises:
+        InputError: a sensor does not exist, has no such parameter, or has the name of another one or of a
+            field of the messages.
+    """
+    key, found = "sensors", {}
+    for each in written:
+        entry = each if isinstance(each, Mapping) else {"sensor": each}
+        path, declared, parameters = SENSORS.read(entry, key, "sensor")
+        check_parameters(declared.compute, parameters, path, key)
+        taken = declared.name in found or declared.name in Messages._fields
+        checks.require(not taken, key, path, "has the name of another sensor, or of a field of the messages")
+        found[declared.name] = declared._replace(compute=functools.partial(declared.compute, **parameters))
+    return found

@@ -1,0 +1,178 @@
+"""Features of one's own, of any width and range, read sensors wherever features are computed."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import FLYING, all_same, both_motions, everything, play, random_actions, square
+from sensor_cases import GLOBAL, LOCAL, SENSORS
+from tensordict import TensorDictBase
+from torchrl.envs.utils import check_env_specs
+
+from damian.baselines.greedy import greedy_policy
+from damian.common.errors import InputError
+from damian.delays.config import DelayConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.evaluation.metrics import evaluate
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
+from damian.server.termination import EpisodeConfig
+
+LATE = 3
+"""Constant delay of the messages [steps]."""
+
+
+def sensing(motion: str = "instant", own: bool = False, **changed) -> ScenarioConfig:
+    """Episodes without end, and readings in the actor's and the critic's observation and in the reward."""
+    observation = ObservationConfig(["spotted", *LOCAL], [*GLOBAL, "source_time"], ctde=True, own=own)
+    reward = RewardConfig(spotted=0.0, custom=[{"term": "sensor_cases:calm"}])
+    sections = {"observation": observation, "reward": reward, "sensors": SENSORS}
+    return everything(motion, episode=EpisodeConfig(max_steps=None), **(sections | changed))
+
+
+def fly(scenario: ScenarioConfig, n_steps: int = 20) -> list[TensorDictBase]:
+    """The first output, and those after each of the same random actions."""
+    env, generator = make_env(scenario, 4, seed=1, extras=["message"]), torch.Generator().manual_seed(0)
+    outputs = play(env, [random_actions(env.uav_env, generator) for _ in range(n_steps)])
+    return [outputs[0], *outputs[1::2]]
+
+
+@both_motions
+def test_a_feature_is_late_by_as_many_steps_as_the_messages(motion):
+    scenario = sensing(motion)
+    timely, late = fly(scenario), fly(replace(scenario, delay=DelayConfig(obs=LATE)))
+    for step, output in enumerate(late):
+        then = timely[max(step - LATE, 0)]["agents", "message"]
+        assert output["agents", "received"].equal(then)
+        for key, columns in (("observation", slice(1, 3)), ("global_observation", slice(0, 4))):
+            expected = timely[max(step - LATE, 0)]["agents", key][..., columns]
+            assert output["agents", key][..., columns].equal(expected), (step, key)
+    assert not timely[-1]["agents", "observation"].equal(late[-1]["agents", "observation"])
+
+
+def test_a_uav_that_knows_its_own_messages_knows_its_own_reading_at_once():
+    timely, late = (fly(sensing(own=True, delay=DelayConfig(obs=obs))) for obs in (0, LATE))
+    for one, other in zip(timely, late, strict=True):
+        assert one["agents", "observation"].equal(other["agents", "observation"])
+    last = [output[-1]["agents", "global_observation"] for output in (timely, late)]
+    assert not last[0].equal(last[1])
+
+
+@pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs={"law": "uniform", "low": 1, "high": 4})])
+def test_a_scripted_policy_and_an_evaluation_do_the_same_with_sensors(delay):
+    """Both read trails or rewards of messages, which have readings behind them."""
+    plain = everything(delay=delay)
+    results = []
+    for scenario in (plain, replace(plain, sensors=SENSORS)):
+        env = make_env(scenario, 8, seed=3, extras=["message"])
+        torch.manual_seed(0)
+        results.append(evaluate(env, greedy_policy(env), 12))
+    assert results[0] == results[1]
+
+
+def test_an_evaluation_recomputes_rewards_that_depend_on_readings():
+    env = make_env(sensing(), 4, seed=3, extras=["message"])
+    result = evaluate(env, greedy_policy(env), 12)
+    assert result.true_return == pytest.approx(result.episode_return)
+    assert result.true_return > 0
+
+
+@both_motions
+def test_a_reward_term_reads_features_of_any_width_and_range(motion):
+    for output in fly(sensing(motion))[1:]:
+        felt, widest = (
+            output["agents", "observation"][..., 1:3],
+            output["agents", "global_observation"][..., 0],
+        )
+        assert output["agents", "reward"].squeeze(-1).equal(felt.sum(-1) + widest)
+
+
+def test_a_compiled_environment_with_sensors_does_the_same():
+    observation = ObservationConfig(["spotted", *LOCAL], GLOBAL)
+    scenario = square(motion=FLYING, sensors=SENSORS, observation=observation, delay=DelayConfig(obs=2))
+    plain, graph = (make_env(scenario, 3, seed=1, extras=["message"]) for _ in range(2))
+    generator = torch.Generator().manual_seed(0)
+    actions = [random_actions(plain.uav_env, generator) for _ in range(14)]
+    shown = play(plain, actions)
+    assert any(output["done"].any() for output in shown)
+    assert all_same(shown, play(graph.compile(backend="eager"), actions))
+
+
+# Specs.
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {},
+        {"delay": DelayConfig(obs=2, act=1, history=2)},
+        {"delay": DelayConfig(obs=2, history=3), "clock": ClockConfig(agents="2s", server="2s")},
+        {"delay": DelayConfig(obs=2, history=1), "own": True},
+    ],
+)
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_the_specs_have_the_range_of_every_feature(kind, changed):
+    scenario = sensing(**changed)
+    scenario.actions.kind = kind
+    env = make_env(scenario, 2, extras=["message", "privileged"])
+    check_env_specs(env, seed=0)
+    history = 2 * scenario.delay.history
+    critic = [0] * 6 + [-1, -1], [1e4] * 4 + [1] * 4
+    expected = {
+        "observation": ([0, -1, -1] + [0] * history, [1] * (3 + history)),
+        "global_observation": critic,
+        "privileged_observation": (critic[0] + [-1, -1], critic[1] + [1, 1]),
+    }
+    for name, (low, high) in expected.items():
+        spec = env.observation_spec["agents", name]
+        assert spec.low.equal(torch.tensor(low).expand(spec.shape).float()), name
+        assert spec.high.equal(torch.tensor(high).expand(spec.shape).float()), name
+
+
+# Mistakes, found when the environment is built.
+
+
+def observing(feature: str) -> dict:
+    return {"observation": ObservationConfig(["spotted", feature], ["source_time"])}
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            observing("sensor_cases:single"),
+            "feature sensor_cases:single: shape [12, 3] is not [12, 3, 2], as its width=2 asks for",
+        ),
+        (
+            observing("sensor_cases:unbatched"),
+            "feature sensor_cases:unbatched: shape [3] is not [12, 3], as its width=1 asks for",
+        ),
+        (
+            {"observation": ObservationConfig(["spotted"], ["sensor_cases:flat"])},
+            "feature sensor_cases:flat: shape [12, 3] is not [12, 3, K], as its width=None asks for",
+        ),
+        (
+            observing("sensor_cases:smelt"),
+            "sensors: odour, which a feature reads, is not one of gust, gap",
+        ),
+        (
+            observing("sensor_cases:smelt") | {"sensors": []},
+            "sensors: odour, which a feature reads, is missing: no sensor is given",
+        ),
+        (
+            {"sensors": ["sensor_cases:three"]},
+            "sensors: three returns values of shape [12, 3], not [12, 3, 3], as width=3 asks for",
+        ),
+        (
+            {"reward": RewardConfig(custom=[{"term": "sensor_cases:unsummed"}])},
+            "reward term unsummed: shape [12, 3, 2] is not [12, 3], one value for each UAV",
+        ),
+    ],
+)
+def test_a_mistake_is_one_line(changed, message):
+    scenario = everything(**({"sensors": SENSORS} | changed))
+    with pytest.raises(InputError) as error:
+        make_env(scenario)
+    assert str(error.value) == message
