@@ -34,6 +34,7 @@ from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
 from damian.evaluation.run_folder import read_metrics
 
 from .evaluate import fly
+from .shared.command_line import whole_laws
 from .shared.composition_errors import COMPOSITION_ERRORS, one_line
 from .shared.known_settings import CONF
 from .shared.launch import checked, launch, reported
@@ -144,7 +145,7 @@ def _seeds(config: CompareConfig, folder: Path, overrides: list[str]) -> Iterato
     """The runs of one task, delay and arm, which the folder names."""
     task, delay, name = folder.parts[-3:]
     arm = config.experiment.arms[name]
-    overrides = ["logger=csv", *overrides, *arm.overrides, *config.overrides]
+    overrides = whole_laws(["logger=csv", *overrides, *arm.overrides, *config.overrides])
     try:
         unseeded = checked(compose("train", overrides))
         if arm.policy_of is None:

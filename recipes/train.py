@@ -35,6 +35,7 @@ from damian.baselines.random import random_policy
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED
+from damian.evaluation.loggers import make_loggers
 from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate
 from damian.evaluation.run_folder import (
     CHECKPOINT,
@@ -157,7 +158,8 @@ def train(config: TrainConfig, folder: Path) -> None:
     elif config.checkpoint:
         load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", *["critic"] * same_learner(config)])
     save_config(config, folder)
-    log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames)
+    loggers = make_loggers(config.logger.custom, folder)
+    log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames, loggers)
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     bar = progress_bar(config, progress, episodes)
     with closing(log), closing(bar), Interrupt() as interrupt:

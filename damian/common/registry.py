@@ -5,6 +5,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from damian.common import checks
@@ -142,12 +143,16 @@ def _import_path(path: str, key: str) -> Any:
 
 
 def _module(name: str) -> Any:
-    """A module, also from the current folder."""
+    """A module, also from the current folder, which stays on the path for worker processes if it has it."""
     folder = os.getcwd()
     if folder in sys.path:
         return importlib.import_module(name)
     sys.path.append(folder)
     try:
-        return importlib.import_module(name)
-    finally:
+        module = importlib.import_module(name)
+    except BaseException:
         sys.path.remove(folder)
+        raise
+    if Path(folder) not in Path(getattr(module, "__file__", None) or "/").parents:
+        sys.path.remove(folder)
+    return module

@@ -3,6 +3,7 @@
 import csv
 import math
 import signal
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from damian.common.errors import InputError
 from damian.common.markdown import markdown_table
+from damian.evaluation.loggers import Logger
 from damian.evaluation.metrics import Evaluation
 
 matplotlib.use("Agg")
@@ -24,7 +26,7 @@ TABLE = "result.md"
 
 
 class MetricsLog:
-    """Writes rows of named numbers to ``metrics.csv`` and TensorBoard; a resumed run appends to its old rows.
+    """Writes named numbers to ``metrics.csv``, TensorBoard and other loggers; a resumed run appends to them.
 
     Args:
         folder: the run folder.
@@ -32,9 +34,18 @@ class MetricsLog:
         to_csv: whether to write ``metrics.csv``.
         frames: environment steps, over all worlds, at the checkpoint from which the run resumes; rows of
             later steps are dropped.
+        loggers: further loggers, which get every number.
     """
 
-    def __init__(self, folder: Path, tensorboard: bool, to_csv: bool, frames: int = 0) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        tensorboard: bool,
+        to_csv: bool,
+        frames: int = 0,
+        loggers: Sequence[Logger] = (),
+    ) -> None:
+        self._loggers = loggers
         self._path = folder / METRICS if to_csv else None
         purge = frames + 1 if frames else None
         self._writer = SummaryWriter(str(folder), purge_step=purge) if tensorboard else None
@@ -49,14 +60,16 @@ class MetricsLog:
         row = {"frames": float(frames), **numbers}
         self.rows.append(row)
         self._append(row)
-        if self._writer:
-            for name, number in numbers.items():
+        for name, number in numbers.items():
+            if self._writer:
                 self._writer.add_scalar(name, number, frames)
+            for logger in self._loggers:
+                logger.log_scalar(name, number, frames)
 
     def close(self) -> None:
-        """Write the pending TensorBoard events."""
-        if self._writer:
-            self._writer.close()
+        """Write the pending TensorBoard events, and close all loggers that can be closed."""
+        for logger in filter(None, [self._writer, *self._loggers]):
+            getattr(logger, "close", lambda: None)()
 
     def _append(self, row: dict[str, float]) -> None:
         if not self._path:

@@ -66,7 +66,7 @@ class CustomTerm(NamedTuple):
     """A reward term as a configuration uses it."""
 
     name: str
-    """Key of the term in logs: the function's name."""
+    """Key of the term in logs: ``name`` in the settings, or else the function's name."""
     weight: float
     """Weight of the term within its scope."""
     compute: Callable[..., Tensor]
@@ -77,7 +77,7 @@ class CustomTerm(NamedTuple):
 
 
 def custom_term(written: Any) -> CustomTerm:
-    """Read ``{term: package.module:name, weight: 0.1, ...}``.
+    """Read ``{term: package.module:name, weight: 0.1, ...}``; a ``name`` tells terms of one function apart.
 
     Raises:
         InputError: the term does not exist, has no such parameter, or its weight is no finite number.
@@ -87,6 +87,7 @@ def custom_term(written: Any) -> CustomTerm:
     weight = parameters.pop("weight", 1.0)
     finite = isinstance(weight, int | float) and math.isfinite(weight)
     checks.require(finite, f"{key}.weight", weight, f"is not a finite weight of {path}")
+    name = parameters.pop("name", path.rpartition(":")[2])
+    checks.require(str(name).isidentifier(), f"{key}.name", name, "is not a name of letters, digits and _")
     check_parameters(term.compute, parameters, path, key)
-    name = path.rpartition(":")[2]
     return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)

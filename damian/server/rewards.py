@@ -81,20 +81,32 @@ class RewardConfig:
     """Subtracted from the reward of every UAV when an episode ends without success."""
     custom: list[Any] = field(default_factory=list)
     """Terms of one's own (``damian.reward_term``), each as ``{term: package.module:name, weight: 0.1}`` with
-    any parameters of the term beside its weight."""
+    any parameters of the term beside its weight, and a ``name`` if a term appears twice."""
 
     def __post_init__(self) -> None:
-        self._custom = {term.name: term for term in map(custom_term, self.custom)}
+        terms = [custom_term(written) for written in self.custom]
+        self._custom = {term.name: term for term in terms}
         taken = {*INDIVIDUAL, *SYSTEM} & {*self._custom}
         once = len(self._custom) == len(self.custom) and not taken
         checks.require(
-            once, "reward.custom", [*self._custom], "must differ from each other and the built-in terms"
+            once,
+            "reward.custom",
+            [term.name for term in terms],
+            "must differ from each other and the built-in terms; a name does, as in {term: ..., name: low}",
         )
         for name in (*INDIVIDUAL, *SYSTEM, "individual", "system", "bonus", "penalty"):
             value = getattr(self, name)
             checks.require(math.isfinite(value), f"reward.{name}", value, "is not a finite weight")
         checks.one_of("reward.drift", self.drift, ["smooth", "printed"])
         checks.in_range("reward.desired_spotting", self.desired_spotting, 0.0, 1.0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The settings alone, because a worker process finds the functions by their paths."""
+        return {name: value for name, value in vars(self).items() if name != "_custom"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.__post_init__()
 
     @property
     def terms(self) -> list[str]:

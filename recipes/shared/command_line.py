@@ -27,10 +27,16 @@ def prepared(words: Sequence[str]) -> list[str]:
     that was trained with configuration files of one's own is evaluated with the same files.
     """
     folders = [match[1] for word in words if (match := re.fullmatch(r"checkpoint=(.*)", word))]
-    words = [_quoted(word) for word in words]
+    words = whole_laws([_quoted(word) for word in words])
     if config_dir(words) is None:
         words += [f"--config-dir={folder}" for folder in _config_dirs(folders)]
     return words
+
+
+def whole_laws(words: Sequence[str]) -> list[str]:
+    """The words with a number before each delay law, because Hydra would merge it with the law before it."""
+    pairs = [(re.fullmatch(r"(delay\.(?:obs|act|rew))=\{.*", word), word) for word in words]
+    return [new for law, word in pairs for new in ([f"{law[1]}=0", word] if law else [word])]
 
 
 def _quoted(word: str) -> str:

@@ -94,4 +94,6 @@ def no_such_key(key: str) -> str:
     known = [own] if own else [[*known_settings(name)] for name in _programs]
     matches = (difflib.get_close_matches(key, keys, n=1, cutoff=0.75) for keys in known)
     nearest = next(filter(None, matches), [])
+    if key in nearest:  # another learner has it
+        return f"{key}: no such key of the chosen learner"
     return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in nearest)

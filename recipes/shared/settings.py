@@ -4,6 +4,7 @@ import os
 import re
 import zlib
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
@@ -14,6 +15,7 @@ from damian import keys
 from damian.common import checks
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
+from damian.evaluation.loggers import check_loggers
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
@@ -31,6 +33,12 @@ class LoggerConfig:
     """Write TensorBoard events."""
     csv: bool = True
     """Write ``metrics.csv``."""
+    custom: list[Any] = field(default_factory=list)
+    """Loggers of one's own, each ``package.module:Name``, or ``{logger: package.module:Name, ...}`` with its
+    parameters."""
+
+    def __post_init__(self) -> None:
+        check_loggers(self.custom)
 
 
 @dataclass

@@ -1,0 +1,52 @@
+"""Loggers of one's own, which get every number that a training logs."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from damian.common.registry import Registry, check_parameters
+
+
+class Logger(Protocol):
+    """Receives numbers, as TorchRL's loggers do; if it has a method ``close()``, it is called at the end."""
+
+    def log_scalar(self, name: str, value: float, step: int) -> None:
+        """Log a number.
+
+        Args:
+            name: such as ``episode_return``, ``reward/spotted``, or one of the learner's.
+            value: the number; nan if it is not known yet.
+            step: environment steps so far, over all worlds.
+        """
+        ...
+
+
+def _not_a_logger(found: Any) -> str | None:
+    good = callable(found) and (not isinstance(found, type) or hasattr(found, "log_scalar"))
+    return None if good else "is no function (folder) -> logger, nor a class with a method log_scalar"
+
+
+LOGGERS = Registry[Callable[..., Logger]]("logger", _not_a_logger)
+"""Loggers of one's own as ``package.module:Name``: functions or classes that get the run folder."""
+
+
+def make_loggers(written: Sequence[Any], folder: Path) -> list[Logger]:
+    """Make loggers for a run folder; the arguments are as for ``check_loggers``."""
+    return [make(folder, **parameters) for make, parameters in map(_read, written)]
+
+
+def check_loggers(written: Sequence[Any]) -> None:
+    """Check settings of loggers, each ``package.module:Name`` or ``{logger: package.module:Name, ...}``.
+
+    Raises:
+        InputError: a logger does not exist, or has no such parameter.
+    """
+    for each in written:
+        _read(each)
+
+
+def _read(written: Any) -> tuple[Callable[..., Logger], dict[str, Any]]:
+    key, entry = "logger.custom", written if isinstance(written, Mapping) else {"logger": written}
+    path, make, parameters = LOGGERS.read(entry, key, "logger")
+    check_parameters(make, parameters, path, key)
+    return make, parameters
