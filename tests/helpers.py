@@ -340,6 +340,6 @@ def check_refused(recipe: Callable[[], Any], message: str, capsys: pytest.Captur
         recipe()
     error = capsys.readouterr().err
     assert stopped.value.code == 2
-    assert message in error
+    assert message in error, error
     assert error.startswith("error: ")
     assert error.count("\n") == 1

@@ -9,6 +9,8 @@ from damian.evaluation.run_record import read_record
 
 CONFIG_DIR = ("--config-dir", "-cd")
 """Hydra's option for a folder with configuration files of one's own."""
+_TAKES_VALUE = (*CONFIG_DIR, "--config-path", "-cp", "--config-name", "-cn", "--package", "-p", "--cfg", "-c")
+"""Options of Hydra that the next word belongs to."""
 
 
 def config_dir(words: Sequence[str]) -> str | None:
@@ -23,14 +25,25 @@ def config_dir(words: Sequence[str]) -> str | None:
 def prepared(words: Sequence[str]) -> list[str]:
     """The words with what Hydra needs and a person should not have to write.
 
-    Folders of runs get quotes if they have ``=`` or ``,`` in their names, as those of a sweep do. A policy
-    that was trained with configuration files of one's own is evaluated with the same files.
+    Options may stand anywhere. Folders of runs get quotes if their names contain ``=`` or ``,``, as those
+    of a sweep do. A policy that was trained with configuration files of one's own is evaluated with the same
+    files.
     """
     folders = [match[1] for word in words if (match := re.fullmatch(r"checkpoint=(.*)", word))]
-    words = whole_laws([_quoted(word) for word in words])
+    words = whole_laws([_quoted(word) for word in _options_first(words)])
     if config_dir(words) is None:
-        words += [f"--config-dir={folder}" for folder in _config_dirs(folders)]
+        words = [*(f"--config-dir={folder}" for folder in _config_dirs(folders)), *words]
     return words
+
+
+def _options_first(words: Sequence[str]) -> list[str]:
+    """The words with the options before the overrides, because Hydra wants no option between overrides."""
+    options, overrides, takes_next = [], [], False
+    for word in words:
+        is_option = takes_next or word.startswith("-")
+        (options if is_option else overrides).append(word)
+        takes_next = not takes_next and word in _TAKES_VALUE
+    return options + overrides
 
 
 def whole_laws(words: Sequence[str]) -> list[str]:

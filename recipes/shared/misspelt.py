@@ -28,6 +28,7 @@ _programs: list[str] = ["train"]
 def set_program(program: str) -> None:
     """Set the running program (a key of ``SCHEMAS``), whose keys are suggested for a misspelt key."""
     _programs[:] = dict.fromkeys([program, "train"])
+    _learner_keys.clear()
 
 
 _learner_keys: list[str] = []

@@ -11,6 +11,7 @@ import damian
 from damian.learners.base import LEARNERS
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.compare import CompareConfig
+from damian.recipes.shared.command_line import prepared
 from damian.recipes.shared.known_settings import groups, known_settings
 from damian.recipes.shared.settings import TrainConfig
 
@@ -103,3 +104,14 @@ def test_a_misspelt_word_is_answered_without_loading_torch():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "False"
     assert done.returncode == 2
+
+
+def test_words_are_prepared_for_hydra(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "seed=1,agents=2").mkdir()
+    words = ["agents=2", "-m", "checkpoint=seed=1,agents=2", "-cd", "conf", "seed=0,1", "--cfg", "job"]
+    options = ["-m", "-cd", "conf", "--cfg", "job"]
+    assert prepared(words) == [*options, "agents=2", "checkpoint='seed=1,agents=2'", "seed=0,1"]
+    assert prepared(["checkpoint=a,b"]) == ["checkpoint=a,b"]  # a sweep over two policies
+    law = "delay.obs={law: uniform}"
+    assert prepared(["delay=paper", law]) == ["delay=paper", "delay.obs=0", law]

@@ -1,28 +1,21 @@
 """The files of examples/extending run from outside the package, and a mistake in them is one clear line."""
 
 import csv
-import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from extensions import TINY
 from helpers import act, check_refused, everything, one_uav
 
 from damian import UavEnv, make_env
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
-from damian.recipes import evaluate, train
-from damian.recipes.shared.launch import launch
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
-
-EXAMPLES = Path(__file__).parents[1] / "examples" / "extending"
-TINY = ["frames=128", "worlds=4", "learner.steps=16", "eval_episodes=3", "model.hidden=[8]", "logger=csv"]
-TINY += ["region.lattice_step=60", "episode.max_steps=12"]
 
 LAW = ["delay.obs={law: law:Satellite, hop: 2s, extra: 0.3}"]
 LAW += ["delay.act={law: law:Distance, antenna: [0, 20], speed: 40, reach: 90}"]
@@ -77,31 +70,10 @@ def feature_in(module: str, name: str) -> str:
     return f"observation.local_features=[{module}:{name}]"
 
 
-@pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
-    """An empty folder with a copy of the examples, from which programs are started."""
-    for file in EXAMPLES.glob("*.py"):
-        shutil.copy(file, tmp_path)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def run(folder, monkeypatch) -> Callable[..., Path]:
-    """Run a recipe with overrides; returns its run folder."""
-
-    def run_recipe(*overrides: str, program=train, name: str = "run") -> Path:
-        monkeypatch.setattr(sys, "argv", ["program", *overrides, f"hydra.run.dir={name}"])
-        launch(program.main)
-        return folder / name
-
-    return run_recipe
-
-
 def check_trained_and_evaluated(run: Callable[..., Path], *overrides: str) -> dict[str, str]:
     """Train and evaluate with extensions; returns the last row of the metrics."""
     first = run(*TINY, *overrides)
-    second = run(f"checkpoint={first}", "seed=1", program=evaluate, name="evaluated")
+    second = run(f"checkpoint={first}", "seed=1", program="evaluate", name="evaluated")
     assert (second / "result.csv").is_file()
     with (first / "metrics.csv").open(newline="") as file:
         return list(csv.DictReader(file))[-1]

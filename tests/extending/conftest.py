@@ -1,0 +1,30 @@
+"""A folder with the files of examples/extending/, and programs that are started from it."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from damian.recipes.command import main
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "extending"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """An empty folder with a copy of the examples, from which programs are started."""
+    shutil.copytree(EXAMPLES, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def run(folder) -> Callable[..., Path]:
+    """Run a program of the command with overrides; returns its run folder."""
+
+    def run_program(*overrides: str, program: str = "train", name: str = "run") -> Path:
+        main([program, *overrides, f"hydra.run.dir={name}"])
+        return folder / name
+
+    return run_program

@@ -1,0 +1,128 @@
+"""Learners, loggers and configuration files of one's own: trained with, resumed, evaluated, compared."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from extensions import TINY
+from helpers import check_refused
+from omegaconf import OmegaConf
+
+OWN = ["--config-dir=conf", "scenario=windy"]
+READER = """
+from dataclasses import dataclass
+from typing import ClassVar
+
+from damian import keys
+from learner import Reinforce, ReinforceConfig
+
+@dataclass
+class ReaderConfig(ReinforceConfig):
+    reads: ClassVar = ("state", "hindsight")
+
+    def buffer_size(self, setup):
+        return (setup.longest_period + 2 * setup.longest_delay) * setup.worlds
+
+    def make(self, env, setup, buffer):
+        return Reader(env, self, setup, buffer)
+
+class Reader(Reinforce):
+    def __init__(self, env, config, setup, buffer):
+        super().__init__(env, config, setup)
+        self.buffer = buffer
+
+    def learn(self, batch):
+        self.buffer.extend(batch)
+        storage = self.buffer.storage
+        steps = storage.steps[storage.latest(batch.shape[1])]
+        held, now = (steps["next"][key] for key in (keys.RECEIVED, keys.HINDSIGHT))
+        changed = (held != now).any(-1).float().mean().item()
+        marked = steps[keys.BACKUPDATED].float().mean().item()
+        state = float(keys.STATE in batch.keys())
+        return super().learn(batch) | {"changed": changed, "marked": marked, "state": state}
+
+@dataclass
+class WishfulConfig(ReinforceConfig):
+    reads: ClassVar = ("future",)
+"""
+
+
+def last_metrics(folder: Path) -> dict[str, str]:
+    with (folder / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))[-1]
+
+
+def test_a_scenario_of_ones_own_is_trained_with_a_learner_and_a_logger_of_ones_own(run, folder):
+    first = run(*OWN, *TINY, "logger.custom=[{logger: logger:Progress, every: 1, goal: 2}]")
+    metrics = last_metrics(first)
+    assert {"loss", "baseline", "reward/together"} <= metrics.keys()
+    config = OmegaConf.load(first / "config.yaml")
+    assert config.learner.name == "learner:ReinforceConfig"
+    assert (config.agents, config.delay.obs.law) == (2, "law:Distance")
+    *_, progress = (first / "progress.txt").read_text().splitlines()
+    assert progress == f"128 steps: {float(metrics['episode_return']) / 2:.0%}"
+    assert json.loads((first / "run.json").read_text())["config_dir"] == str(folder / "conf")
+    # The learner and the folder of configuration files are found again.
+    evaluated = run("checkpoint=run", "agents=3", program="evaluate", name="evaluated")
+    assert OmegaConf.load(evaluated / "config.yaml").learner.name == "learner:ReinforceConfig"
+    run_resumed(run, "run")
+    assert last_metrics(first)["frames"] == "256.0"
+
+
+def run_resumed(run, name: str) -> None:
+    """Resume a run; it stays in its folder."""
+    run(f"resume={name}", "frames=256", name="unused")
+
+
+def test_a_learner_gets_what_it_reads_and_what_was_held_before_and_after_back_updating(run, folder):
+    (folder / "reader.py").write_text(READER)
+    metrics = last_metrics(run(*TINY, "learner=reader:ReaderConfig", "delay.obs=3", "aware=backupdate"))
+    assert float(metrics["state"]) == 1
+    assert 0.5 < float(metrics["changed"]) == float(metrics["marked"]) < 1
+
+
+def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
+    (folder / "conf" / "experiment").mkdir()
+    (folder / "conf" / "experiment" / "mine.yaml").write_text(
+        "tasks: {windy: [scenario=windy]}\n"
+        "delays: {late: ['delay.obs={law: law:Satellite, hop: 2}']}\n"
+        "arms:\n"
+        "  undelayed: {delayed: false, regime: R3, overrides: [delay.obs=0]}\n"
+        "  naive: {naive: true}\n"
+    )
+    tiny = ",".join(f"'{word}'" for word in TINY if word != "logger=csv")
+    words = ["--config-dir=conf", "experiment=mine", "seeds=1", "processes=2", f"overrides=[{tiny}]"]
+    compared = run(*words, program="compare", name="compared")
+    assert "| naive | R0 |" in (compared / "table.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["learner=learnr:X"], "learner: learnr:X: No module named 'learnr'; learnr must be installed"),
+        (["learner=learner:Reinforce"], "learner: learner:Reinforce is no dataclass derived from"),
+        (
+            ["learner=learner:ReinforceConfig", "learner.entropi=1"],
+            "learner.entropi: no such key; did you mean",
+        ),
+        (
+            ["learner=learner:ReinforceConfig", "learner.entropy=2"],
+            "learner.entropy: 2.0 is not between 0 and 1",
+        ),
+        (["learner=reader:WishfulConfig"], "WishfulConfig.reads: future is not one of message, state"),
+        (["learner=sac", "learner.lmbda=1"], "learner.lmbda: no such key of the chosen learner"),
+        (["logger.custom=[loger:Progress]"], "logger.custom.logger: loger:Progress: No module named 'loger'"),
+        (
+            ["logger.custom=[{logger: logger:Progress, often: 1}]"],
+            "logger.custom.often: 1 is no parameter of",
+        ),
+        (["logger.custom=[law:Satellite]"], "law:Satellite is no function (folder) -> logger, nor a class"),
+        (["--config-dir=conf", "scenario=windi"], "scenario: windi is not one of windy, coverage"),
+        (["--config-dir=nowhere", "scenario=windy"], "nowhere"),
+    ],
+)
+def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
+    (folder / "reader.py").write_text(READER)
+    check_refused(lambda: run(*TINY, *overrides), message, capsys)
+    assert not (folder / "run").exists()
