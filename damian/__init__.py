@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     )
     from damian.world.sensors import sensor
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _MODULES = {
     "damian.delays.config": ["DelayConfig"],

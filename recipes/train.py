@@ -7,9 +7,10 @@
     damian train hydra.run.dir=runs/first
     damian train resume=runs/first frames=600000
 
-``--help`` lists the groups of settings, ``--cfg job`` all keys. The run folder, runs/DATE_TIME unless
-hydra.run.dir names another one, gets config.yaml, metrics.csv (a row for each update), TensorBoard events,
-checkpoint, learning_curve.png, and the evaluation as result.csv and result.md.
+``--help`` lists the groups of settings, ``--help KEY`` explains a setting or a section. The run folder,
+runs/DATE_TIME unless hydra.run.dir names another one, gets config.yaml, run.json (versions, machine, wall
+time), metrics.csv (a row for each update), TensorBoard events, checkpoint, learning_curve.png, and the
+evaluation as result.csv and result.md.
 """
 
 import sys
