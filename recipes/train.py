@@ -60,8 +60,9 @@ from .shared.known_settings import CONF
 from .shared.launch import launch, load, perform, prepare, reported, save_config, stored_config
 from .shared.settings import TrainConfig
 
-MEANING = "sampled: actions are drawn from the policy's distribution; mode: the most likely action is taken."
-"""Line under the table of an evaluation."""
+MEANING = """sampled: actions are drawn from the policy's distribution; mode: the most likely action is taken.
+Fly the one with the higher return: a policy without memory often needs chance to search."""
+"""Lines under the table of an evaluation."""
 
 
 @dataclass

@@ -129,7 +129,8 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
     figure, axes = plt.subplots(1, len(panels), figsize=(5 * len(panels), 3.4), squeeze=False)
     for axis, (name, label, level) in zip(axes[0], panels, strict=True):
         points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
-        axis.plot(*zip(*points, strict=True), color="tab:blue", label="while training")
+        mark = "o" if len(points) == 1 else ""  # a line of one point would be invisible
+        axis.plot(*zip(*points, strict=True), color="tab:blue", marker=mark, label="while training")
         axis.axhline(level, color="tab:gray", linestyle="--", label="random policy")
         axis.set_xlabel("environment steps, all worlds")
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
