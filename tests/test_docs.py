@@ -77,7 +77,7 @@ def hold_messages(delays: list[int]) -> tuple[list[int], list[int]]:
     """Numbers and ages of the messages that a receiver holds, if message 0 is there from the start."""
 
     class Listed(Sampler):
-        def forward(self, streams, clock, memory):
+        def forward(self, streams, clock, memory, context=None):
             return torch.tensor([delays[int(clock) - 1]]), memory
 
     line = DelayLine(Listed([[1 / NEVER] * NEVER]), "generation")
