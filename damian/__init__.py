@@ -3,6 +3,7 @@
 The names below are loaded when they are first used, because TorchRL takes seconds to import.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
         ServerNode,
     )
     from damian.world.sensors import sensor
+
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported
 
 __version__ = "0.3.0"
 

@@ -13,14 +13,11 @@ import argparse
 import csv
 import json
 import multiprocessing
-import os
 import statistics
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, NoReturn
-
-os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import torch
 from torch import nn

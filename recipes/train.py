@@ -15,7 +15,7 @@ evaluation as result.csv and result.md.
 
 import sys
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -33,6 +33,8 @@ from tqdm import tqdm
 from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
+from damian.common import checks
+from damian.common.errors import naming_errors
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED
@@ -48,7 +50,7 @@ from damian.evaluation.run_folder import (
     save_results,
 )
 from damian.keys import next_key
-from damian.learners.base import Learner
+from damian.learners.base import Learner, check_learner, check_numbers
 from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage
@@ -97,16 +99,29 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
 
 def make_learner(config: TrainConfig, env: DelayedEnv) -> Learner:
     """The learner, with a replay buffer (back-updating or not) if it needs one."""
-    setup = config.learning_setup
-    size = config.learner.buffer_size(setup)
+    setup, name = config.learning_setup, config.learner.name
+    with own_code(name):
+        size = config.learner.buffer_size(setup)
     buffer = None if size is None else make_buffer(config, env.server, size)
-    return config.learner.make(env, setup, buffer)
+    with own_code(name):
+        learner = config.learner.make(env, setup, buffer)
+        check_learner(learner, name)
+    return learner
+
+
+def own_code(learner: str) -> AbstractContextManager[None]:
+    """A context that names a learner of the user's own in errors; a built-in one keeps its traceback."""
+    return naming_errors(learner) if ":" in learner else nullcontext()
 
 
 def make_buffer(config: TrainConfig, server: Server, size: int) -> ReplayBuffer:
     """A replay buffer of ``size`` environment steps; with ``backupdate``, late messages correct them."""
     if not config.backupdates:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
+    setup = config.learning_setup
+    least = (setup.longest_period + 2 * setup.longest_delay) * setup.worlds
+    should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
+    checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
     recompute = server_recompute(server, actor=config.recompute_actor)
     hindsight = keys.HINDSIGHT if "hindsight" in config.learner.reads else None
     options = {"hindsight_key": hindsight, "device": config.device}
@@ -167,7 +182,8 @@ def train(config: TrainConfig, folder: Path) -> None:
     with closing(log), closing(bar), Interrupt() as interrupt:
         for batch in ticks(collector, clock) if not enough(config, progress, episodes) else ():
             episodes.add(batch)
-            losses = learner.learn(batch)
+            with own_code(config.learner.name):
+                losses = check_numbers(learner.learn(batch), config.learner.name)
             progress.frames += batch.numel()
             progress.updates += 1
             means = {"episodes": float(episodes.finished), **episodes.means()}

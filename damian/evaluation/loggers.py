@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from damian.common import checks
+from damian.common.errors import naming_errors
 from damian.common.registry import Registry, check_parameters
 
 
@@ -32,7 +34,15 @@ LOGGERS = Registry[Callable[..., Logger]]("logger", _not_a_logger)
 
 def make_loggers(written: Sequence[Any], folder: Path) -> list[Logger]:
     """Make loggers for a run folder; the arguments are as for ``check_loggers``."""
-    return [make(folder, **parameters) for make, parameters in map(_read, written)]
+    loggers = []
+    for each in written:
+        path, make, parameters = _read(each)
+        with naming_errors(f"logger.custom: {path}"):
+            logger = make(folder, **parameters)
+            should = "is no logger: it has no method log_scalar(name, value, step)"
+            checks.require(hasattr(logger, "log_scalar"), path, type(logger).__name__, should)
+        loggers.append(logger)
+    return loggers
 
 
 def check_loggers(written: Sequence[Any]) -> None:
@@ -45,8 +55,8 @@ def check_loggers(written: Sequence[Any]) -> None:
         _read(each)
 
 
-def _read(written: Any) -> tuple[Callable[..., Logger], dict[str, Any]]:
+def _read(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
     key, entry = "logger.custom", written if isinstance(written, Mapping) else {"logger": written}
     path, make, parameters = LOGGERS.read(entry, key, "logger")
     check_parameters(make, parameters, path, key)
-    return make, parameters
+    return path, make, parameters

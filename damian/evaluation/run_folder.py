@@ -10,7 +10,7 @@ from pathlib import Path
 import matplotlib
 from torch.utils.tensorboard import SummaryWriter
 
-from damian.common.errors import InputError
+from damian.common.errors import InputError, naming_errors
 from damian.common.markdown import markdown_table
 from damian.evaluation.loggers import Logger
 from damian.evaluation.metrics import Evaluation
@@ -64,12 +64,14 @@ class MetricsLog:
             if self._writer:
                 self._writer.add_scalar(name, number, frames)
             for logger in self._loggers:
-                logger.log_scalar(name, number, frames)
+                with naming_errors(f"logger {type(logger).__name__}"):
+                    logger.log_scalar(name, number, frames)
 
     def close(self) -> None:
         """Write the pending TensorBoard events, and close all loggers that can be closed."""
         for logger in filter(None, [self._writer, *self._loggers]):
-            getattr(logger, "close", lambda: None)()
+            with naming_errors(f"logger {type(logger).__name__}"):
+                getattr(logger, "close", lambda: None)()
 
     def _append(self, row: dict[str, float]) -> None:
         if not self._path:

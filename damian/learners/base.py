@@ -1,6 +1,6 @@
 """The interface of a learner: its settings, its actor, and its updates from collected batches."""
 
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 from tensordict import NestedKey, TensorDictBase
@@ -10,7 +10,9 @@ from torchrl.modules import ProbabilisticActor
 
 from damian import keys
 from damian.common import checks
+from damian.common.errors import InputError
 from damian.common.registry import Registry
+from damian.common.text_files import show
 from damian.learners.networks import ModelConfig, make_actor
 
 
@@ -96,8 +98,10 @@ class LearnerConfig:
         checks.above("learner.lr", self.lr, 0.0)
         checks.in_range("learner.gamma", self.gamma, 0.0, 1.0)
         checks.in_range("learner.steps", self.steps, 1)
-        for name in self.reads:
-            checks.one_of(f"{type(self).__name__}.reads", name, READABLE)
+        key, reads = f"{type(self).__name__}.reads", self.reads
+        checks.require(isinstance(reads, tuple | list), key, reads, "is not a tuple such as ('message',)")
+        for name in reads:
+            checks.one_of(key, name, READABLE)
 
     def check(self, setup: LearningSetup) -> None:
         """Check that this learner can learn in such a run.
@@ -127,10 +131,42 @@ class LearnerConfig:
 
 
 def _not_a_learner(found: Any) -> str | None:
-    good = isinstance(found, type) and issubclass(found, LearnerConfig) and is_dataclass(found)
+    good = isinstance(found, type) and issubclass(found, LearnerConfig)
+    if good and "__dataclass_fields__" not in vars(found):
+        return "is no dataclass: write @dataclass above the class"
     if good and found.make is not LearnerConfig.make:
         return None
     return "is no dataclass derived from damian.LearnerConfig with a method make"
+
+
+def check_learner(learner: Any, name: str) -> None:
+    """Check that an object is a ``Learner``.
+
+    Raises:
+        InputError: it lacks a part, or its components lack the actor.
+    """
+    missing = [part for part in ("actor", "learn", "components") if not hasattr(learner, part)]
+    should = f"is no learner: it has no {', '.join(missing)} (damian.learners.base.Learner)"
+    checks.require(not missing, f"{name}: make returned", type(learner).__name__, should)
+    components = learner.components()
+    good = isinstance(components, dict) and components.get("actor") is learner.actor
+    should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
+    checks.require(good, f"{name}: components", show(components), should)
+
+
+def check_numbers(numbers: Any, name: str) -> dict[str, float]:
+    """The numbers that ``learn`` returns, as floats.
+
+    Raises:
+        InputError: they are not numbers by name.
+    """
+    good = isinstance(numbers, dict) and all(isinstance(key, str) for key in numbers)
+    should = "is not a dict of numbers by name, such as {'loss': 0.1}"
+    checks.require(good, f"{name}: learn returned", show(numbers), should)
+    try:
+        return {key: float(number) for key, number in numbers.items()}
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{name}: learn returned {show(numbers)}, which {should}") from error
 
 
 LEARNERS = Registry[type[LearnerConfig]]("learner", _not_a_learner)

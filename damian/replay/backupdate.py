@@ -88,7 +88,7 @@ class BackupdateStorage(TimeStorage):
             unravel_key(step_count_key),
             None if hindsight_key is None else unravel_key(hindsight_key),
         )
-        self._checked = False
+        self._checked, self._n_worlds = False, 0
         if env is not None:
             self._check_once(example_steps(env))
 
@@ -101,6 +101,8 @@ class BackupdateStorage(TimeStorage):
             InputError: an entry is missing or misshapen, the storage is too small for the batch, or a message
                 is later than ``longest``.
         """
+        if data.dim() != 2:
+            raise InputError(f"steps: a batch of shape {list(data.shape)} is not [T, B]")
         self._check_once(data[:2])
         self._check_times(data)
         super().set(cursor, self._with_added_entries(data), set_cursor=set_cursor)
@@ -113,10 +115,15 @@ class BackupdateStorage(TimeStorage):
         steps = steps if self.device == "auto" else steps.to(self.device)
         check_steps(steps, self.step_keys)
         check_recompute(self.recompute, self._with_added_entries(steps), self.step_keys)
-        self._checked = True
+        self._checked, self._n_worlds = True, steps.shape[1]
 
     def _check_times(self, data: TensorDictBase) -> None:
         needs, n_worlds = len(data) + 2 * self.longest, data.shape[1]
+        if n_worlds != self._n_worlds:
+            raise InputError(
+                f"steps: a batch of shape {list(data.shape)} is not one of {self._n_worlds} worlds: give "
+                f"ReplayBuffer.extend [B, T], as collectors and rollouts return it"
+            )
         if self.max_size < needs * n_worlds:
             raise InputError(
                 f"max_size: {self.max_size} is too little for batches of {len(data)} steps and delays of "

@@ -96,6 +96,8 @@ def check_recompute(recompute: Recompute, steps: TensorDictBase, step_keys: Step
     entries = recompute(steps, steps[next_key(step_keys.received)])
     should = "is not a dict of entries by key, such as {('next', 'reward'): reward}"
     checks.require(isinstance(entries, dict), "recompute", f"a {type(entries).__name__}", should)
+    useful = bool(entries) or step_keys.hindsight is not None
+    checks.require(useful, "recompute", entries, "corrects nothing: return at least one entry")
     recorded = {next_key(key) for key in step_keys[:4]}
     returned = {unravel_key(key): value for key, value in entries.items()}
     for key, value in returned.items():

@@ -1,12 +1,9 @@
 """All settings of the recipes: those of a scenario (``damian.envs.scenario``), and those of the training."""
 
-import os
 import re
 import zlib
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
-
-os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 from hydra.core.config_store import ConfigNode, ConfigStore
 from omegaconf import MISSING, OmegaConf
@@ -124,6 +121,9 @@ class TrainConfig(ScenarioConfig):
         for key, (value, given) in incompatible.items():
             should = "does not go with backupdate=true, which would undo it; leave out one of them"
             checks.require(not (self.backupdate and given), key, value, should)
+        hindsight = "hindsight" in self.learner.reads and not self.backupdates
+        should = "reads hindsight, which needs aware=backupdate and a message delay (delay.obs)"
+        checks.require(not hindsight, "learner", self.learner.name, should)
         for key in ("settle", "recompute_actor"):
             alone = getattr(self, key) and not self.backupdate
             checks.require(not alone, key, True, "means nothing without backupdate=true")

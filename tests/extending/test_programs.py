@@ -48,6 +48,62 @@ class WishfulConfig(ReinforceConfig):
 """
 
 
+BROKEN = """
+from dataclasses import dataclass
+from learner import Reinforce, ReinforceConfig
+
+@dataclass
+class NoneConfig(ReinforceConfig):
+    def make(self, env, setup, buffer):
+        pass
+
+@dataclass
+class NoActorConfig(ReinforceConfig):
+    def make(self, env, setup, buffer):
+        learner = super().make(env, setup, buffer)
+        learner.components = lambda: {"optimizer": learner.optimizer}
+        return learner
+
+@dataclass
+class NoNumbersConfig(ReinforceConfig):
+    def make(self, env, setup, buffer):
+        learner = super().make(env, setup, buffer)
+        learner.learn = lambda batch: None
+        return learner
+
+@dataclass
+class RaisingConfig(ReinforceConfig):
+    def make(self, env, setup, buffer):
+        learner = super().make(env, setup, buffer)
+        learner.learn = lambda batch: {"loss": batch["nothing"]}
+        return learner
+
+@dataclass
+class SmallConfig(ReinforceConfig):
+    def buffer_size(self, setup):
+        return 3
+
+class Bare(ReinforceConfig):
+    extra: float = 1.0
+
+    def make(self, env, setup, buffer):
+        pass
+
+def no_logger(folder):
+    return 5
+
+def no_folder():
+    return 5
+
+class Raising:
+    def __init__(self, folder):
+        pass
+
+    def log_scalar(self, name, value, step):
+        raise OSError("disk full")
+"""
+
+
 def last_metrics(folder: Path) -> dict[str, str]:
     with (folder / "metrics.csv").open(newline="") as file:
         return list(csv.DictReader(file))[-1]
@@ -118,11 +174,28 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
             "logger.custom.often: 1 is no parameter of",
         ),
         (["logger.custom=[law:Satellite]"], "law:Satellite is no function (folder) -> logger, nor a class"),
+        (
+            ["learner=broken:NoneConfig"],
+            "broken:NoneConfig: make returned: NoneType is no learner: it has no actor",
+        ),
+        (["learner=broken:NoActorConfig"], "broken:NoActorConfig: components: {'optimizer': "),
+        (["learner=broken:NoNumbersConfig"], "broken:NoNumbersConfig: learn returned: None is not a dict of"),
+        (["learner=broken:RaisingConfig"], "broken:RaisingConfig: KeyError: "),
+        (["learner=broken:Bare"], "learner: broken:Bare is no dataclass: write @dataclass above the class"),
+        (
+            ["learner=broken:SmallConfig", "delay.obs=2", "aware=backupdate"],
+            "broken:SmallConfig: buffer_size: 3 is too little for back-updating, which needs 80",
+        ),
+        (["learner=reader:ReaderConfig"], "learner: reader:ReaderConfig reads hindsight, which needs aware="),
+        (["logger.custom=[broken:no_logger]"], "broken:no_logger: int is no logger: it has no method"),
+        (["logger.custom=[broken:no_folder]"], "broken:no_folder: TypeError: no_folder() takes 0 positional"),
+        (["logger.custom=[broken:Raising]"], "logger Raising: OSError: disk full"),
         (["--config-dir=conf", "scenario=windi"], "scenario: windi is not one of windy, coverage"),
         (["--config-dir=nowhere", "scenario=windy"], "nowhere"),
     ],
 )
 def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
     (folder / "reader.py").write_text(READER)
+    (folder / "broken.py").write_text(BROKEN)
     check_refused(lambda: run(*TINY, *overrides), message, capsys)
     assert not (folder / "run").exists()

@@ -167,3 +167,20 @@ def test_recompute_is_checked_only_once_on_two_steps(with_env):
     assert n_steps == [2] * with_env
     stored(storage, rollout(env, 20), 2)
     assert n_steps == [2, 10, 20]
+
+
+@pytest.mark.parametrize("knows_env", [True, False])
+def test_batches_of_another_shape_than_steps_of_the_same_worlds_are_refused(knows_env):
+    env = make_env(())
+    steps = rollout(env, 8)
+    storage = make_storage((), None, **({"env": env} if knows_env else {}))
+    stored(storage, steps)
+    for batch in (steps.transpose(0, 1), steps[:2]):
+        with pytest.raises(InputError, match=r"steps: a batch of shape \[.*\] is not one of 3 worlds: give"):
+            stored(storage, batch)
+    with pytest.raises(InputError, match=r"steps: a batch of shape \[24\] is not \[T, B\]"):
+        storage.set(range(24), steps.reshape(-1))
+
+
+def test_recompute_must_correct_something_unless_hindsight_is_stored():
+    refuse("recompute: {} corrects nothing: return at least one entry", lambda steps, messages: {})
