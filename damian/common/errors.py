@@ -1,4 +1,11 @@
-"""The error raised for wrong input: a setting, a file or an argument."""
+"""The error raised for wrong input: a setting, a file, an argument, or a component of one's own."""
+
+import sysconfig
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
 
 
 class InputError(ValueError):
@@ -6,3 +13,60 @@ class InputError(ValueError):
 
     A recipe prints that line and exits with code 2; any other error keeps its traceback.
     """
+
+
+@contextmanager
+def naming_errors(name: str) -> Iterator[None]:
+    """Turn an error raised inside by a component of one's own into an ``InputError`` of one line.
+
+    The line has the name, the error, and the file and line of the component. It is meant for the first call
+    of a component, not for a step.
+
+    Args:
+        name: the setting and the component, such as ``delay.obs: law rush:BusyHour``.
+
+    Raises:
+        InputError: anything was raised inside; an ``InputError`` stays as it is.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # a component of one's own can raise anything
+        raise InputError(f"{name}: {described(error)}") from error
+
+
+def described(error: BaseException) -> str:
+    """An error on one line: its type, its message, and the deepest line of code that is one's own."""
+    text = " ".join(str(error).split())
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_own(frame.filename)]
+    known = not own or isinstance(error, SyntaxError)  # its message has the place
+    place = "" if known else f" ({Path(own[-1].filename).name}, line {own[-1].lineno})"
+    return f"{type(error).__name__}{': ' if text else ''}{text}{place}"
+
+
+class Declared(dict[str, Any]):
+    """Values that a component may read by name; any other name is one line of error.
+
+    Args:
+        values: by name.
+        problem: what to say of another name, which takes the place of ``NAME``.
+    """
+
+    def __init__(self, values: Mapping[str, Any], problem: str) -> None:
+        super().__init__(values)
+        self._problem = problem
+
+    def __missing__(self, name: object) -> NoReturn:
+        raise InputError(self._problem.replace("NAME", str(name)))
+
+
+_OTHERS = [Path(__file__).parents[1], Path(sysconfig.get_path("stdlib"))]
+"""Folders of the package and of Python."""
+
+
+def _is_own(file: str) -> bool:
+    """Does a file belong neither to the package, nor to an installed one, nor to Python?"""
+    path = Path(file)
+    installed = {"site-packages", "dist-packages"} & {*path.parts}
+    return not installed and not file.startswith("<frozen") and not {*_OTHERS} & {*path.parents}

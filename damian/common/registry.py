@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from damian.common import checks
-from damian.common.errors import InputError
+from damian.common.errors import InputError, described
 
 T = TypeVar("T")
 Component = TypeVar("Component")
@@ -113,10 +113,13 @@ def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], pat
     Raises:
         InputError: the function has no such parameter, or one without a default is not given.
     """
-    accepted = inspect.signature(function).parameters.values()
+    accepted = [*inspect.signature(function).parameters.values()]
     known = {each.name: each for each in accepted if each.kind is inspect.Parameter.KEYWORD_ONLY}
+    unmarked = [each for each in accepted if each.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD]
+    unmarked = [str(each) for each in unmarked if each.default is not each.empty]
+    hint = f"; parameters stand after a *, as in (..., *, {', '.join(unmarked)})" if unmarked else ""
     for name, value in given.items():
-        problem = f"is no parameter of {path}, which has {', '.join(known) or 'none'}"
+        problem = f"is no parameter of {path}, which has {', '.join(known) or 'none'}{hint}"
         checks.require(name in known, f"{key}.{name}", value, problem)
     missing = [name for name, each in known.items() if each.default is each.empty and name not in given]
     checks.require(not missing, key, path, f"needs a value for {', '.join(missing)}")
@@ -131,12 +134,15 @@ def _import_path(path: str, key: str) -> Any:
     module_name, _, name = path.partition(":")
     try:
         module = _module(module_name)
-    except ImportError as error:
-        raise InputError(
-            f"{key}: {path}: {error}; {module_name} must be installed, on PYTHONPATH, or in {os.getcwd()}"
-        ) from error
+    except InputError as error:
+        raise InputError(f"{key}: {path}: {error}") from error
     except Exception as error:  # the module of a user can raise anything
-        raise InputError(f"{key}: {path}: importing it raised {type(error).__name__}: {error}") from error
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing and f"{module_name}.".startswith(f"{missing}."):
+            problem = f"{error}; {module_name} must be installed, on PYTHONPATH, or in {os.getcwd()}"
+        else:
+            problem = f"importing it raised {described(error)}"
+        raise InputError(f"{key}: {path}: {problem}") from error
     if not hasattr(module, name):
         raise InputError(f"{key}: {path}: the module {module_name} has no {name}")
     return getattr(module, name)

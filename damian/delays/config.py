@@ -7,7 +7,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.text_files import show
 from damian.delays.delay_line import ORDERS
-from damian.delays.laws import LONGEST, LOSES, Held, Law, law_of
+from damian.delays.laws import LONGEST, LOSES, Held, Law, law_of, sampler_of
 from damian.delays.samplers import Sampler
 
 CONTEXT_KEYS = {"position": keys.POSITION}
@@ -58,6 +58,10 @@ class DelayConfig:
         """Names of the entries that the laws read in the contexts of messages."""
         return {name for sampler in self._samplers(dt).values() for name in sampler.reads}
 
+    def sees_context(self, dt: float) -> bool:
+        """Whether a law computes delays from the contexts of messages."""
+        return any(sampler.sees_context for sampler in self._samplers(dt).values())
+
     def check(self, dt: float) -> None:
         """Check that every law is valid for steps of ``dt`` seconds.
 
@@ -75,4 +79,4 @@ class DelayConfig:
         """The samplers of the laws, by the name of the setting."""
         names = ("obs", "act", "rew")
         laws = {name: law_of(getattr(self, name), f"delay.{name}") for name in names}
-        return {name: law.sampler(dt, key=f"delay.{name}") for name, law in laws.items()}
+        return {name: sampler_of(law, dt, key=f"delay.{name}") for name, law in laws.items()}

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from damian.common import checks
-from damian.common.errors import InputError
+from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry
 from damian.common.text_files import named, near, read_text, show
 from damian.delays.samplers import HeldSampler, Recorded, Sampler
@@ -51,6 +51,25 @@ class Law(ABC):
         Raises:
             InputError: a parameter of the law is invalid.
         """
+
+
+def law_name(law: Law) -> str:
+    """The path of a law's class, such as ``lab:Satellite``, for errors."""
+    return f"{type(law).__module__}:{type(law).__qualname__}"
+
+
+def sampler_of(law: Law, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+    """Build the sampler of a law, which may be one's own; the arguments are those of ``Law.sampler``.
+
+    Raises:
+        InputError: a parameter is invalid, or a law of one's own raises an error or returns no ``Sampler``.
+    """
+    name = f"law {law_name(law)}"
+    with naming_errors(f"{key}: {name}"):
+        sampler = law.sampler(dt, loss, key)
+    problem = f"returns a {type(sampler).__name__} from sampler(dt, loss, key), not a Sampler"
+    checks.require(isinstance(sampler, Sampler), key, name, problem)
+    return sampler
 
 
 def _is_no_law(found: Any) -> str | None:
@@ -150,9 +169,8 @@ class Burst(Law):
         states = []
         for name in ("good", "bad"):
             inner_key = f"{key}.{name}"
-            inner = law_of(getattr(self, name), inner_key).sampler(
-                dt, getattr(self, f"{name}_loss"), inner_key
-            )
+            law, inner_loss = law_of(getattr(self, name), inner_key), getattr(self, f"{name}_loss")
+            inner = sampler_of(law, dt, inner_loss, inner_key)
             problem = "depends on the context of the message, which a burst does not know"
             checks.require(not inner.sees_context, inner_key, show(getattr(self, name)), problem)
             memoryless = len(inner.chances) == 1 and not isinstance(inner, Recorded)
@@ -198,7 +216,7 @@ class Held(Law):
     law: Law
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return HeldSampler(self.law.sampler(dt, loss, key))
+        return HeldSampler(sampler_of(self.law, dt, loss, key))
 
 
 def law_of(written: Any, key: str = "delay") -> Law:
@@ -213,6 +231,9 @@ def law_of(written: Any, key: str = "delay") -> Law:
     """
     if isinstance(written, Law):
         return written
+    if isinstance(written, str) and (written in LAWS or ":" in written):
+        own = "a law of one's own" if ":" in written else "that law"
+        raise InputError(f"{key}: {written} is no delay; {own} is written {{law: {written}}}")
     if not isinstance(written, Mapping):
         return Constant(_number(written))
     kind = written.get("law")
@@ -220,9 +241,10 @@ def law_of(written: Any, key: str = "delay") -> Law:
     values = {k: str(v) if k == "path" else _plain(v) for k, v in written.items() if k != "law"}
     names = [field.name for field in fields(law)]
     for name, value in values.items():
-        problem = f"is no setting of the law {kind}, which has {', '.join(names)}"
+        problem = f"is no setting of the law {kind}, which has {', '.join(names) or 'none'}"
         checks.require(name in names, f"{key}.{name}", value, problem)
-    return law(**values)
+    with naming_errors(f"{key}: law {kind}"):
+        return law(**values)
 
 
 def in_steps(key: str, delay: Delay, dt: float) -> int:

@@ -8,10 +8,15 @@ from torch import Tensor, nn
 
 from damian.common import checks, counter_rng
 from damian.common.errors import InputError
+from damian.common.text_files import show
 
 
 class MessageContext(NamedTuple):
-    """Circumstances of M messages at the instant at which they are sent; nothing in it lies in the future."""
+    """Circumstances of M messages at the instant at which they are sent; nothing in it lies in the future.
+
+    Fields: ``sender``, ``receiver`` and ``n_sending`` [M] long, ``time`` [M] [s], ``uniform`` [M] in [0, 1),
+    ``dt`` [s], and ``entries``, a dict of what the law reads, such as ``position`` [M, 2] [m].
+    """
 
     sender: Tensor
     """Index of the sender among the agents of its world, [M] long; 0 if a world has one agent."""
@@ -52,6 +57,11 @@ class Sampler(nn.Module):
         super().__init__()
         checks.in_range("loss", loss, 0.0, 1.0)
         self.longest = max(map(len, states)) - 1
+        for chances in states:
+            proper = sum(chances) <= 1 + 1e-6 and all(chance >= 0 for chance in chances)
+            checks.require(
+                proper, "chances of the delays", show(chances), "are not at least 0 and at most 1 in all"
+            )
         arrive = torch.zeros(len(states), self.longest + 1, dtype=torch.float64)
         for row, chances in zip(arrive, states, strict=True):
             row[: len(chances)] = torch.tensor(chances, dtype=torch.float64) * (1 - loss)
@@ -79,6 +89,13 @@ class Sampler(nn.Module):
     def initial_state(self, streams: Tensor) -> Tensor:
         """Draw the initial state of each sender's channel [M] from its random stream [M]."""
         return (counter_rng.uniform(streams) < self._bad_share).long()
+
+    def try_context(self, context: MessageContext) -> None:
+        """Try what computes delays from contexts once, before the first step.
+
+        Raises:
+            InputError: it does not return a finite number of steps for each message.
+        """
 
     def forward(
         self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
@@ -148,6 +165,9 @@ class HeldSampler(Sampler):
     def initial_state(self, streams: Tensor) -> Tensor:
         return self.drawn.initial_state(streams)
 
+    def try_context(self, context: MessageContext) -> None:
+        self.drawn.try_context(context)
+
     def forward(
         self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
@@ -160,8 +180,10 @@ class ContextSampler(Sampler):
 
     Args:
         delay_fn: pure function of a ``MessageContext`` that returns the delays [steps], [M]; they are rounded
-            up and cut to ``longest``, and a message of negative delay is lost. A method of the law can be
-            pickled, as worker processes need; it must have no branches on data.
+            up and cut to ``longest``, and a message of negative delay is lost. So that rounding errors cost
+            no step, 1e-5 steps (or of a longer delay, its share 1e-5) are taken from a delay that is a float
+            before it is rounded up. A method of the law can be pickled, as worker processes need; it must
+            have no branches on data.
         longest: longest delay [steps].
         loss: probability that a message is lost, whatever its delay.
         loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, so that the
@@ -201,13 +223,28 @@ class ContextSampler(Sampler):
         delay = self._delay_fn(context)
         self._check(delay, streams.shape)
         arrives = delay >= 0  # false for nan too
-        steps = torch.where(arrives, delay, 0).ceil().clamp(max=self.longest).long()
+        steps = torch.where(arrives, delay, 0)
+        if steps.dtype.is_floating_point:  # 21.000002 steps are 21
+            steps = steps - 1e-5 * steps.clamp(1, self.longest)
+        steps = steps.ceil().clamp(max=self.longest).long()
         if self._loses:
             steps = torch.where(arrives, steps, self.lost)
         if self._loss:  # by a draw that is independent of ``context.uniform``
             draw = counter_rng.uniform(streams, clock, torch.zeros_like(clock))
             steps = torch.where(draw < self._loss, self.lost, steps)
         return steps, memory
+
+    def try_context(self, context: MessageContext) -> None:
+        delay = self._delay_fn(context)
+        self._check(delay, context.sender.shape)
+        bad = delay[~delay.isfinite()].tolist()
+        problem = "is not a finite number of steps; a negative one means that the message is lost"
+        checks.require(not bad, self._name, bad[:1], problem)
+
+    @property
+    def _name(self) -> str:
+        """Name of the function."""
+        return getattr(self._delay_fn, "__qualname__", type(self._delay_fn).__name__)
 
     def _check(self, delay: Any, shape: torch.Size) -> None:
         """Require a number of steps for each message."""
@@ -216,5 +253,6 @@ class ContextSampler(Sampler):
             if delay.shape == shape and delay.dtype != torch.bool:
                 return
             found = f"a tensor of {delay.dtype} and shape {tuple(delay.shape)}"
-        name = getattr(self._delay_fn, "__qualname__", type(self._delay_fn).__name__)
-        raise InputError(f"{name}: {found} is not one number of steps per message, shape {tuple(shape)}")
+        raise InputError(
+            f"{self._name}: {found} is not one number of steps per message, shape {tuple(shape)}"
+        )

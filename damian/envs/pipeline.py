@@ -67,6 +67,9 @@ def make_env(
     )
     pipeline = DelayedEnv(env, make_transforms(scenario, server, extras))
     pipeline.set_seed(seed)
+    if scenario.delay.sees_context(scenario.clock.dt):
+        pipeline.reset()  # tries the laws, so that a mistake in them is found here
+        pipeline.set_seed(seed)
     return pipeline
 
 

@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian.delays.delay_line import DelayLine
-from damian.delays.laws import law_of
+from damian.delays.laws import law_of, sampler_of
 from damian.transforms.action_specs import ActionTransform
 from damian.transforms.context import ContextReader
 from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows, sibling_key
@@ -63,7 +63,7 @@ class ActionDelay(ActionTransform):
     ) -> None:
         super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed)
         law = law_of(delay)
-        self.sampler = law.sampler(dt, loss)
+        self.sampler = sampler_of(law, dt, loss)
         self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)

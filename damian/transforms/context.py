@@ -8,8 +8,8 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.common.errors import InputError
-from damian.delays.laws import Law
+from damian.common.errors import Declared, naming_errors
+from damian.delays.laws import Law, law_name
 from damian.delays.samplers import MessageContext, Sampler
 from damian.transforms.entries import Entries, Memory, as_rows, select_entries, sibling_key
 
@@ -48,7 +48,7 @@ class ContextReader:
             should = f"has no key for {name}, which the law {type(law).__name__} reads"
             checks.require(name in known, "context_keys", known, should)
             self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(known[name])))
-        self._law_name, self._sampler, self._dt = type(law).__name__, sampler, dt
+        self._name, self._sampler, self._dt = f"law {law_name(law)}", sampler, dt
         self._since_clock = 0 if before_step else 1
 
     def init_memory(self, memory: Memory, tensordict: TensorDictBase, rows: torch.Size) -> Memory:
@@ -68,13 +68,11 @@ class ContextReader:
         n_agents = rows.numel() // tensordict.batch_size.numel()
         memory = memory | {"agents": torch.arange(n_agents, device=streams.device)}
         context = self.read(memory, select_entries(tensordict, list(self.keys.values())), None, rows)
-        try:
-            self._sampler(streams, memory["clock"], memory["channel"], context)
-        except KeyError as error:
-            raise InputError(
-                f"{self._law_name}: it raised KeyError: {error}; the entries of a context are those that the "
-                f"sampler declares with reads={list(self.keys)}"
-            ) from error
+        if context is not None:
+            problem = f"{self._name}: the context has no entry NAME: the sampler declares those that it has, "
+            entries = Declared(context.entries, f"{problem}reads={list(self.keys)}")
+            with naming_errors(self._name):
+                self._sampler.try_context(context._replace(entries=entries))
         return memory
 
     def read(

@@ -10,7 +10,7 @@ from torchrl.data import Binary, Composite, Unbounded
 
 from damian.common import checks
 from damian.delays.delay_line import ORDERS, DelayLine, Delivery
-from damian.delays.laws import law_of
+from damian.delays.laws import law_of, sampler_of
 from damian.transforms.base import StatefulTransform
 from damian.transforms.context import ContextReader
 from damian.transforms.entries import (
@@ -83,7 +83,7 @@ class ObservationDelay(StatefulTransform):
         checks.one_of("order", order, ORDERS)
         super().__init__(in_keys, out_keys or in_keys, seed=seed)
         law = law_of(delay)
-        self.sampler = law.sampler(dt, loss)
+        self.sampler = sampler_of(law, dt, loss)
         self.line = DelayLine(self.sampler, order)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)

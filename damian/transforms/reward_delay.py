@@ -10,7 +10,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.delays.delay_line import advance_slot
-from damian.delays.laws import LOSES, law_of
+from damian.delays.laws import LOSES, law_of, sampler_of
 from damian.transforms.base import StatefulTransform
 from damian.transforms.context import ContextReader
 from damian.transforms.entries import (
@@ -100,7 +100,7 @@ class RewardDelay(RewardTransform):
     ) -> None:
         super().__init__(reward_key, seed)
         law = law_of(delay)
-        self.sampler = law.sampler(dt)
+        self.sampler = sampler_of(law, dt)
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)

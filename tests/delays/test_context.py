@@ -200,6 +200,16 @@ def test_delays_are_rounded_up_and_cut_and_negative_ones_are_lost(loses, expecte
     assert (sampler.longest, sampler.lost, sampler.certain, sampler.loses) == (5, 6, None, loses)
 
 
+def test_the_rounding_errors_of_a_float_cost_no_step():
+    senders = torch.tensor([7, 14, 17, 19])
+    delays = senders * 0.3 / 0.1  # in float32: 21.000002, 42.000004, ...
+    assert (delays.ceil() > 3 * senders).any()
+    for values, expected in ((delays, 3 * senders), (delays.round() + 0.001, 3 * senders + 1)):
+        sampler = ContextSampler(lambda _, values=values: values, 100)
+        delay, _ = sampler(senders, torch.tensor(1), senders, context_of(torch.rand(4)))
+        assert delay.equal(expected)
+
+
 def test_losses_whatever_the_delay_do_not_depend_on_the_random_number_of_the_context():
     sampler = ContextSampler(lambda context: (context.uniform < 0.5).long(), 1, loss=0.3, loses=False)
     streams, clock = counter_rng.world_seeds(5, 40_000), torch.tensor(3)
@@ -279,7 +289,8 @@ def test_an_entry_that_is_missing_or_has_other_rows_is_refused():
 def test_a_name_that_is_not_declared_cannot_be_read():
     law = Of(lambda context: context.entries["speed"])
     message = refused(delayed(ObservationDelay(law, [OBSERVATION])).reset)
-    assert message.startswith("Of: it raised KeyError: 'speed'; the entries of a context are those that")
+    expected = "the context has no entry speed: the sampler declares those that it has, reads=[]"
+    assert message == f"law test_context:Of: {expected}"
 
 
 def test_a_step_without_what_the_law_reads_is_refused():
