@@ -57,15 +57,15 @@ class MetricsLog:
 
     def add(self, frames: int, numbers: dict[str, float]) -> None:
         """Log numbers by name, after so many environment steps over all worlds."""
-        row = {"frames": float(frames), **numbers}
-        self.rows.append(row)
-        self._append(row)
         for name, number in numbers.items():
-            if self._writer:
-                self._writer.add_scalar(name, number, frames)
             for logger in self._loggers:
                 with naming_errors(f"logger {type(logger).__name__}"):
                     logger.log_scalar(name, number, frames)
+            if self._writer:
+                self._writer.add_scalar(name, number, frames)
+        row = {"frames": float(frames), **numbers}
+        self.rows.append(row)
+        self._append(row)
 
     def close(self) -> None:
         """Write the pending TensorBoard events, and close all loggers that can be closed."""

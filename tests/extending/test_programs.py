@@ -179,8 +179,6 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
             "broken:NoneConfig: make returned: NoneType is no learner: it has no actor",
         ),
         (["learner=broken:NoActorConfig"], "broken:NoActorConfig: components: {'optimizer': "),
-        (["learner=broken:NoNumbersConfig"], "broken:NoNumbersConfig: learn returned: None is not a dict of"),
-        (["learner=broken:RaisingConfig"], "broken:RaisingConfig: KeyError: "),
         (["learner=broken:Bare"], "learner: broken:Bare is no dataclass: write @dataclass above the class"),
         (
             ["learner=broken:SmallConfig", "delay.obs=2", "aware=backupdate"],
@@ -189,7 +187,6 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
         (["learner=reader:ReaderConfig"], "learner: reader:ReaderConfig reads hindsight, which needs aware="),
         (["logger.custom=[broken:no_logger]"], "broken:no_logger: int is no logger: it has no method"),
         (["logger.custom=[broken:no_folder]"], "broken:no_folder: TypeError: no_folder() takes 0 positional"),
-        (["logger.custom=[broken:Raising]"], "logger Raising: OSError: disk full"),
         (["--config-dir=conf", "scenario=windi"], "scenario: windi is not one of windy, coverage"),
         (["--config-dir=nowhere", "scenario=windy"], "nowhere"),
     ],
@@ -198,4 +195,24 @@ def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
     (folder / "reader.py").write_text(READER)
     (folder / "broken.py").write_text(BROKEN)
     check_refused(lambda: run(*TINY, *overrides), message, capsys)
+    assert not (folder / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("learner=broken:NoNumbersConfig", "broken:NoNumbersConfig: learn returned: None is not a dict of"),
+        ("learner=broken:RaisingConfig", "broken:RaisingConfig: KeyError: "),
+        ("logger.custom=[broken:Raising]", "logger Raising: OSError: disk full (broken.py, line 53)"),
+    ],
+)
+def test_an_error_in_the_first_update_is_one_line_after_the_progress_bar(
+    run, folder, capsys, override, message
+):
+    (folder / "broken.py").write_text(BROKEN)
+    with pytest.raises(SystemExit) as stopped:
+        run(*TINY, override)
+    assert stopped.value.code == 2
+    *_, last = capsys.readouterr().err.strip().splitlines()
+    assert last.startswith(f"error: {message}")
     assert not (folder / "run").exists()
