@@ -101,6 +101,27 @@ class Registry(Generic[T]):
         yield from self._components.items()
 
 
+def name_of(parameters: dict[str, Any], default: str, key: str) -> str:
+    """Take the entry ``name``, which tells components of one function apart, out of the parameters.
+
+    Raises:
+        InputError: it is no name of letters, digits and underscores.
+    """
+    name = parameters.pop("name", default)
+    checks.require(str(name).isidentifier(), f"{key}.name", name, "is not a name of letters, digits and _")
+    return name
+
+
+def require_parentheses(first: Any, written: str) -> None:
+    """Refuse a decorator without parentheses, which gets the function as its first argument.
+
+    Raises:
+        InputError: it did.
+    """
+    if inspect.isfunction(first):
+        raise InputError(f"{first.__name__}: write {written} above it, with parentheses")
+
+
 def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str) -> None:
     """Require that the given parameters are keyword-only arguments of a function, and that none is missing.
 

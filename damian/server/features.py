@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.registry import Registry
+from damian.common.registry import Registry, require_parentheses
 from damian.common.tensors import gather_rows
 from damian.server.feature_cache import FeatureCache, ServerContext
 from damian.world.battery import observed
@@ -114,27 +114,6 @@ def feature_bounds(features: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict
     return low, high
 
 
-def check_shapes(features: dict[str, Tensor], shape: torch.Size) -> None:
-    """Require that features of messages [*, N] have the shapes that they declare.
-
-    Args:
-        features: values by name.
-        shape: the shape [*, N].
-
-    Raises:
-        InputError: a feature has another shape.
-    """
-    for name, values in features.items():
-        width = FEATURES.get(name, "feature").width
-        last = [] if width == 1 else ["K" if width is None else width]
-        actual = list(values.shape)
-        good = actual[: len(shape)] == [*shape] and len(actual) == len(shape) + len(last)
-        good = good and (width in (1, None) or actual[-1] == width)
-        expected = ", ".join(map(str, [*shape, *last]))
-        problem = f"is not [{expected}], as its width={width} asks for"
-        checks.require(good, f"feature {name}", f"shape {actual}", problem)
-
-
 class Feature(NamedTuple):
     """How a feature is computed, its shape and range, and who may observe it."""
 
@@ -168,13 +147,15 @@ def feature(
         high: highest possible value. Networks learn best from values about 1 in size.
 
     Raises:
-        InputError: there is no such scope, the width is not positive, or the range is empty or not finite.
+        InputError: there is no such scope, the width is not positive, the range is empty or not finite, or
+            the decorator has no parentheses.
 
     Examples:
         >>> @feature("local")
         ... def track(cache):  # in lab.py, used as observation.local_features=[spotted,lab:track]
         ...     return cache.messages.track / (2 * math.pi)
     """
+    require_parentheses(scope, '@damian.feature("local")')
     checks.one_of("scope of a feature", scope, ("local", "global", "actor"))
     if width is not None:
         checks.whole("width of a feature", width, 1)

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.registry import Registry, check_parameters
+from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
+from damian.server.features import FEATURES
 
 
 class Counters(NamedTuple):
@@ -45,12 +46,19 @@ def reward_term(
         reads: names of the features that it reads, built-in or of one's own (``package.module:name``).
         scope: ``individual`` or ``system``.
 
+    Raises:
+        InputError: ``reads`` is no list, there is no such scope, or the decorator has no parentheses.
+
     Examples:
         >>> # in lab.py, used as reward.custom=[{term: lab:low_battery, weight: -1, below: 0.5}]
         >>> @reward_term(reads=["battery"])
         ... def low_battery(features, counters, *, below=0.3):
         ...     return (features["battery"] < below).float()
     """
+    require_parentheses(reads, "@damian.reward_term(reads=[...])")
+    problem = f"is not a list of names: write reads=[{reads!r}]"
+    checks.require(not isinstance(reads, str), "reads of a reward term", reads, problem)
+    checks.one_of("scope of a reward term", scope, ("individual", "system"))
     return lambda compute: RewardTerm(compute, tuple(reads), scope)
 
 
@@ -76,18 +84,23 @@ class CustomTerm(NamedTuple):
     """Keyword arguments of ``compute``."""
 
 
-def custom_term(written: Any) -> CustomTerm:
+def custom_term(written: Any, key: str) -> CustomTerm:
     """Read ``{term: package.module:name, weight: 0.1, ...}``; a ``name`` tells terms of one function apart.
 
+    Args:
+        written: what the configuration says.
+        key: of the setting, for errors.
+
     Raises:
-        InputError: the term does not exist, has no such parameter, or its weight is no finite number.
+        InputError: the term or a feature that it reads does not exist, it has no such parameter, or its
+            weight is no finite number.
     """
-    key = "reward.custom"
     path, term, parameters = REWARD_TERMS.read(written, key, "term")
+    for read in term.reads:
+        FEATURES.get(read, f"{key}.term: reads of {path}")
     weight = parameters.pop("weight", 1.0)
     finite = isinstance(weight, int | float) and math.isfinite(weight)
     checks.require(finite, f"{key}.weight", weight, f"is not a finite weight of {path}")
-    name = parameters.pop("name", path.rpartition(":")[2])
-    checks.require(str(name).isidentifier(), f"{key}.name", name, "is not a name of letters, digits and _")
+    name = name_of(parameters, path.rpartition(":")[2], key)
     check_parameters(term.compute, parameters, path, key)
     return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.server.reward_terms import Counters, custom_term
+from damian.server.reward_terms import Counters, CustomTerm, custom_term
 from damian.server.termination import Status
 
 INDIVIDUAL = ("coverage", "spotted", "battery")
@@ -84,7 +84,7 @@ class RewardConfig:
     any parameters of the term beside its weight, and a ``name`` if a term appears twice."""
 
     def __post_init__(self) -> None:
-        terms = [custom_term(written) for written in self.custom]
+        terms = [custom_term(written, f"reward.custom[{i}]") for i, written in enumerate(self.custom)]
         self._custom = {term.name: term for term in terms}
         taken = {*INDIVIDUAL, *SYSTEM} & {*self._custom}
         once = len(self._custom) == len(self.custom) and not taken
@@ -116,6 +116,11 @@ class RewardConfig:
         return [*individual, *system, *(name for name in self._custom if self.weight(name) != 0)]
 
     @property
+    def custom_terms(self) -> list[CustomTerm]:
+        """The terms of one's own whose weight is not 0."""
+        return [self._custom[name] for name in self.terms if name in self._custom]
+
+    @property
     def features(self) -> list[str]:
         """Names of the features that these terms read; a built-in term reads the feature of its name."""
         read = ([name] if name not in self._custom else self._custom[name].reads for name in self.terms)
@@ -133,7 +138,7 @@ class RewardConfig:
         """A term before it is weighted, [*, N]."""
         if name in self._custom:
             term = self._custom[name]
-            return term.compute(features, counters, **term.parameters)
+            return term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
         return _TERMS[name](features[name], counters, self)
 
 

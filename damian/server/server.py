@@ -12,14 +12,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.tensors import gather_rows
 from damian.server.feature_cache import ServerContext
-from damian.server.features import ObservationConfig, check_shapes, observe, stack
+from damian.server.features import ObservationConfig, observe, stack
 from damian.server.reward_terms import Counters
 from damian.server.rewards import RewardConfig, final_reward, reward
 from damian.server.termination import EpisodeConfig, Status, status
+from damian.server.trial import try_feature, try_term
 from damian.world.airspace import Airspace
 from damian.world.battery import BatteryConfig
 from damian.world.coverage import FootprintTables, build_tables
@@ -137,31 +137,21 @@ class Server:
             steps: elapsed steps of the episode, [*].
             names: features to compute; if not given, all that an observation or a reward term needs.
         """
-        context = ServerContext(
-            now=steps * self.dt,
-            scale=self._scales(messages),
-            time_scale=self.time_scale,
-            battery=self.battery,
-            footprints=self._footprints,
-            points=self._points,
-            age_scale=self.observation.age_scale,
-            newest=self.observation.estimate == "newest",
-            readings=self._readings,
-        )
-        return observe(messages, context, names or self._names)
+        return observe(messages, self._context(messages, steps), names or self._names)
 
     def checked_features(self, messages: Messages, steps: Tensor) -> Features:
-        """The features of ``features``, whose shapes and those of the reward terms are checked.
+        """The features of ``features``; those of one's own, and one's own reward terms, are tried first.
 
         Raises:
-            InputError: a feature or a reward term has another shape than it declares, or reads a sensor that
-                does not exist.
+            InputError: a feature or a reward term raises an error, or returns something else than it
+                declares.
         """
-        features, shape = self.features(messages, steps), messages.track.shape
-        check_shapes(features, shape)
-        for name, term in reward(features, Counters(steps, messages.motions), self.reward).items():
-            problem = f"is not {list(shape)}, one value for each UAV"
-            checks.require(term.shape == shape, f"reward term {name}", f"shape {list(term.shape)}", problem)
+        context = self._context(messages, steps)
+        for name in self._names:
+            try_feature(name, messages, context)
+        features = observe(messages, context, self._names)
+        for term in self.reward.custom_terms:
+            try_term(term, features, Counters(steps, messages.motions))
         return features
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
@@ -212,6 +202,20 @@ class Server:
         terms = reward(features, counters, self.reward)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
         return RewardAndStatus(sum(terms.values(), start=final), terms, ended)
+
+    def _context(self, messages: Messages, steps: Tensor) -> ServerContext:
+        """What the server knows besides the messages after the elapsed steps [*]."""
+        return ServerContext(
+            now=steps * self.dt,
+            scale=self._scales(messages),
+            time_scale=self.time_scale,
+            battery=self.battery,
+            footprints=self._footprints,
+            points=self._points,
+            age_scale=self.observation.age_scale,
+            newest=self.observation.estimate == "newest",
+            readings=self._readings,
+        )
 
     def _scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""

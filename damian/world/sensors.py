@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.errors import InputError
-from damian.common.registry import Registry, check_parameters
+from damian.common.errors import InputError, naming_errors
+from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
 from damian.world.messages import Messages
 from damian.world.state import State
 
@@ -21,7 +21,18 @@ class Sensor(NamedTuple):
     width: int
     """Number of values for each UAV."""
     name: str
-    """Name of the reading: the function's name."""
+    """Name of the reading: ``name`` in the settings, or else the function's name."""
+
+    def check(self, state: State, world: Any) -> None:
+        """Try the sensor once.
+
+        Raises:
+            InputError: it raises an error, or does not return finite values of the shape that it declares.
+        """
+        with naming_errors(f"sensors: {self.name}"):
+            values = self.compute(state, world)
+        why = f", as width={self.width} asks for"
+        checks.values_of_uavs(f"sensors: {self.name}", values, state.track.shape, self.width, why)
 
     def read(self, state: State, world: Any) -> Tensor:
         """The values as columns, [B, N, width] float32.
@@ -55,7 +66,7 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
         width: number of values for each UAV.
 
     Raises:
-        InputError: the width is not a positive integer.
+        InputError: the width is not a positive integer, or the decorator has no parentheses.
 
     Examples:
         >>> # in lab.py, used as sensors=[{sensor: lab:loudness, reach: 50}]
@@ -64,6 +75,7 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
         ...     to_source = state.position[..., :2] - state.source.unsqueeze(-2)
         ...     return (-torch.linalg.vector_norm(to_source, dim=-1) / reach).exp()
     """
+    require_parentheses(width, "@damian.sensor()")
     checks.whole("width of a sensor", width, 1)
     return lambda compute: Sensor(compute, width, compute.__name__)
 
@@ -79,6 +91,8 @@ SENSORS = Registry[Sensor]("sensor", _not_a_sensor)
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
     """Read a list of ``package.module:name`` and ``{sensor: package.module:name, strength: 3}``.
 
+    A ``name`` among the parameters tells the readings of one function apart.
+
     Returns:
         The sensors with their parameters, by the names of their readings.
 
@@ -86,12 +100,16 @@ def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
         InputError: a sensor does not exist, has no such parameter, or has the name of another one or of a
             field of the messages.
     """
-    key, found = "sensors", {}
-    for each in written:
+    found: dict[str, Sensor] = {}
+    for number, each in enumerate(written):
+        key = f"sensors[{number}]"
         entry = each if isinstance(each, Mapping) else {"sensor": each}
         path, declared, parameters = SENSORS.read(entry, key, "sensor")
+        name = name_of(parameters, declared.name, key)
         check_parameters(declared.compute, parameters, path, key)
-        taken = declared.name in found or declared.name in Messages._fields
-        checks.require(not taken, key, path, "has the name of another sensor, or of a field of the messages")
-        found[declared.name] = declared._replace(compute=functools.partial(declared.compute, **parameters))
+        taken = name in found or name in Messages._fields
+        problem = "is the name of another sensor, or of a field of the messages: give it another one, as in "
+        checks.require(not taken, f"{key}.name", name, f"{problem}{{sensor: {path}, name: other}}")
+        compute = functools.partial(declared.compute, **parameters)
+        found[name] = declared._replace(compute=compute, name=name)
     return found

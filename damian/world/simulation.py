@@ -19,7 +19,7 @@ from damian.world.messages import Messages
 from damian.world.sensors import sensors_of
 from damian.world.signal_source import footprint_radius, locate
 from damian.world.state import EPISODE, SEED, PackedState, State, StateLayout
-from damian.world.vehicles import MOTION_MODELS
+from damian.world.vehicles import check_model, make_model
 
 
 class Simulation:
@@ -44,7 +44,7 @@ class Simulation:
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         drawn = draw_initial_conditions(config, self.airspace, rng)
         self.walk = drawn.walk
-        self.vehicles = MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, self.airspace, dt)
+        self.vehicles = make_model(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
         self.initial = self._initial_state(drawn, trail, seed)
         self.layout = StateLayout(self.initial)
@@ -229,4 +229,7 @@ class Simulation:
                 goal.unsqueeze(-1).repeat(1, 1, trail), sum(sensor.width for sensor in self.sensors.values())
             ),
         )
+        check_model(self.vehicles, self.config.motion.kind, state)
+        for sensor in self.sensors.values():
+            sensor.check(state, self)
         return self._sense(state)

@@ -143,15 +143,18 @@ def observing(feature: str) -> dict:
     [
         (
             observing("sensor_cases:single"),
-            "feature sensor_cases:single: shape [12, 3] is not [12, 3, 2], as its width=2 asks for",
+            "feature sensor_cases:single: shape [12, 3] is not [12, 3, 2]"
+            " = [initial conditions, UAVs, values], as width=2 asks for",
         ),
         (
             observing("sensor_cases:unbatched"),
-            "feature sensor_cases:unbatched: shape [3] is not [12, 3], as its width=1 asks for",
+            "feature sensor_cases:unbatched: shape [3] is not [12, 3]"
+            " = [initial conditions, UAVs], as width=1 asks for",
         ),
         (
             {"observation": ObservationConfig(["spotted"], ["sensor_cases:flat"])},
-            "feature sensor_cases:flat: shape [12, 3] is not [12, 3, K], as its width=None asks for",
+            "feature sensor_cases:flat: shape [12, 3] is not [12, 3, K]"
+            " = [initial conditions, UAVs, values], as width=None asks for",
         ),
         (
             observing("sensor_cases:smelt"),
@@ -163,11 +166,12 @@ def observing(feature: str) -> dict:
         ),
         (
             {"sensors": ["sensor_cases:three"]},
-            "sensors: three returns values of shape [12, 3], not [12, 3, 3], as width=3 asks for",
+            "sensors: three: shape [12, 3] is not [12, 3, 3]"
+            " = [initial conditions, UAVs, values], as width=3 asks for",
         ),
         (
             {"reward": RewardConfig(custom=[{"term": "sensor_cases:unsummed"}])},
-            "reward term unsummed: shape [12, 3, 2] is not [12, 3], one value for each UAV",
+            "reward term unsummed: shape [12, 3, 2] is not [12, 3] = [initial conditions, UAVs]",
         ),
     ],
 )

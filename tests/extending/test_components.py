@@ -98,27 +98,27 @@ def test_a_sensor_and_a_feature_that_reads_it_are_trained_with(run):
     [
         (
             ["sensors=[sensors:wind]"],
-            "sensors.sensor: sensors:wind: No module named 'sensors'; sensors must be",
+            "sensors[0].sensor: sensors:wind: No module named 'sensors'; sensors must be",
         ),
         (
             ["sensors=[features:heading]"],
-            "sensors.sensor: features:heading is no sensor: decorate the function",
+            "sensors[0].sensor: features:heading is no sensor: decorate the function",
         ),
         (
             ["sensors=[{sensor: sensor:wind, strenght: 3}]"],
-            "sensors.strenght: 3 is no parameter of sensor:wind, which has strength, noise",
+            "sensors[0].strenght: 3 is no parameter of sensor:wind, which has strength, noise",
         ),
-        (["sensors=[sensor:wind, sensor:wind]"], "sensors: sensor:wind has the name of another sensor"),
+        (["sensors=[sensor:wind, sensor:wind]"], "sensors[1].name: wind is the name of another sensor"),
         (SENSOR[1:], "sensors: wind, which a feature reads, is missing: no sensor is given"),
         (
             [*SENSOR[:1], feature_in("mistakes", "smelt")],
             "sensors: odour, which a feature reads, is not one of wind",
         ),
         ([feature_in("mistakes", "single")], "feature mistakes:single: shape ["),
-        (["sensors=[mistakes:three]"], "sensors: three returns values of shape ["),
+        (["sensors=[mistakes:three]"], "sensors: three: shape ["),
         (
             [feature_in("no_range", "narrow")],
-            "no_range:narrow: importing it raised InputError: range of a feature: low=1.0, high=1.0 are not",
+            "no_range:narrow: range of a feature: low=1.0, high=1.0 are not",
         ),
     ],
 )
@@ -230,17 +230,17 @@ def test_a_mistake_in_a_law_that_sees_the_context_is_one_clear_line(run, folder,
         ),
         (
             ["reward.custom=[rewards:together]"],
-            "reward.custom: rewards:together is not {term: package.module:name",
+            "reward.custom[0]: rewards:together is not {term: package.module:name",
         ),
         (
             ["reward.custom=[{term: rewards:low_battery, bellow: 1}]"],
-            "reward.custom.bellow: 1 is no parameter of",
+            "reward.custom[0].bellow: 1 is no parameter of",
         ),
         (
             ["reward.custom=[{term: rewards:together, weight: x}]"],
-            "reward.custom.weight: x is not a finite weight",
+            "reward.custom[0].weight: x is not a finite weight",
         ),
-        (["reward.custom=[{term: law:Satellite}]"], "reward.custom.term: law:Satellite is no reward term"),
+        (["reward.custom=[{term: law:Satellite}]"], "reward.custom[0].term: law:Satellite is no reward term"),
         (["region.kind=region:park"], "region.kind: region:park: the module region has no park"),
         (
             ["region.kind=law:Satellite"],

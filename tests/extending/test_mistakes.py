@@ -10,6 +10,10 @@ from helpers import same, square
 from damian import make_env
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
+from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
 
 LINES = Path(wrong.__file__).read_text().splitlines()
 
@@ -91,3 +95,156 @@ def test_a_law_without_its_braces_is_told_how_to_write_it():
     for written, own in (("wrong:Rush", "a law of one's own"), ("uniform", "that law")):
         message = f"delay.obs: {written} is no delay; {own} is written {{law: {written}}}"
         check({"delay": lambda written=written: DelayConfig(obs=written)}, message)
+
+
+WORLD = "[8, 3] = [initial conditions, UAVs]"
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ("wrong:silent", "sensors: silent: a NoneType is not a tensor"),
+        ({"sensor": "wrong:silent", "name": "geiger"}, "sensors: geiger: a NoneType is not a tensor"),
+        ("wrong:number", "sensors: number: a float is not a tensor"),
+        (
+            "wrong:misnamed",
+            "sensors: misnamed: AttributeError: 'State' object has no attribute 'batery'"
+            + line("state.batery"),
+        ),
+        ("wrong:unending", "sensors: unending: [inf] is not finite"),
+        (
+            {"sensor": "wrong:unmarked", "half": 20},
+            "sensors[0].half: 20 is no parameter of wrong:unmarked, which has none; parameters stand after "
+            "a *, as in (..., *, half: float = 3.0)",
+        ),
+    ],
+)
+def test_a_mistake_in_a_sensor_is_one_line(written, message):
+    check({"sensors": lambda: [written]}, message)
+
+
+OTHERS = "is local, but depends on the messages of other UAVs: make it global, or read only the UAV's own"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "absent",
+            "AttributeError: 'FeatureCache' object has no attribute 'message'" + line("cache.message.track"),
+        ),
+        ("percent", "[100.0] lies outside of low=0 and high=50, which it declares"),
+        ("divided", "[nan] is not finite"),
+        ("mean_battery", OTHERS),
+        ("newest", OTHERS),
+    ],
+)
+def test_a_mistake_in_a_feature_is_one_line(name, message):
+    message = f"feature wrong:{name}: {message}"
+    check({"observation": lambda: ObservationConfig([f"wrong:{name}"])}, message)
+
+
+def test_local_features_without_mistakes_are_not_refused(folder):
+    names = ["wrong:flag", "features:heading", "sensor:wind_felt"]
+    make_env(square(observation=ObservationConfig(names), sensors=["sensor:wind"]))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "undeclared",
+            "reward term undeclared: it reads the feature battery, which is missing from its "
+            "reads=['spotted']",
+        ),
+        ("scalar", "reward term scalar: a float is not a tensor"),
+        ("hopeless", "reward term hopeless: [nan] is not finite"),
+    ],
+)
+def test_a_mistake_in_a_reward_term_is_one_line(name, message):
+    check({"reward": lambda: RewardConfig(custom=[{"term": f"wrong:{name}"}])}, message)
+    observation = ObservationConfig(["spotted", "battery"])
+    with pytest.raises(InputError) as error:  # also if another part of the scenario needs the feature
+        make_env(square(observation=observation, reward=RewardConfig(custom=[{"term": f"wrong:{name}"}])))
+    assert str(error.value) == message
+
+
+def test_a_misspelt_feature_of_a_reward_term_names_the_term():
+    terms = [{"term": "wrong:hopeless"}, {"term": "wrong:misspelt"}]
+    with pytest.raises(
+        InputError, match=r"^reward\.custom\[1\]\.term: reads of wrong:misspelt: batery is not"
+    ):
+        RewardConfig(custom=terms)
+
+
+NO_LIST = "is not a list of damian.world.regions.region.Region"
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        ("raise", "region.kind: wrong:park: KeyError: 'raise'" + line("return returned[config.options]")),
+        ("region", f"region.kind: wrong:park: a Region {NO_LIST}"),
+        ("polygon", f"region.kind: wrong:park: a Polygon {NO_LIST}"),
+        ("none", f"region.kind: wrong:park: a NoneType {NO_LIST}"),
+        ("nothing", f"region.kind: wrong:park: an empty list {NO_LIST}"),
+        ("polygons", f"region.kind: wrong:park: a list with a Polygon {NO_LIST}"),
+        ("points", "region.kind: wrong:park: polygon of park: a Point is not one of shapely's polygons"),
+        (
+            "crossing",
+            "region.kind: wrong:park: polygon of park: Self-intersection[100 100] [m] makes it invalid: its "
+            "edges must not cross",
+        ),
+        (
+            "many",
+            "region.initial_conditions: 8 for 9 regions, but each needs an initial condition of its own",
+        ),
+    ],
+)
+def test_a_mistake_in_a_region_source_is_one_line(mistake, message):
+    check({"region": lambda: RegionConfig("wrong:park", options=mistake, initial_conditions=8)}, message)
+
+
+def test_a_region_source_with_other_arguments_is_one_line():
+    message = "region.kind: wrong:no_arguments: TypeError: no_arguments() takes 0 positional arguments but 2 "
+    check({"region": lambda: RegionConfig("wrong:no_arguments")}, f"{message}were given")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "KeyError: 'mistake'" + line("self.mistake = config")),
+        ({"mistake": "float flag"}, "ready: torch.float32 [8, 3] is not a tensor of torch.bool [8, 3]"),
+        ({"mistake": "no UAVs"}, "on_ground: torch.bool [8] is not a tensor of torch.bool [8, 3]"),
+        ({"mistake": "none"}, "take_off: a NoneType is not a State"),
+        (
+            {"mistake": "double"},
+            "move: elapsed: torch.float64 [8, 3] is not a tensor of torch.float32 [8, 3]",
+        ),
+        ({"mistake": "raise"}, "ValueError: Got unexpected field names: ['height']" + line("height=0")),
+    ],
+)
+def test_a_mistake_in_a_motion_model_is_one_line(options, message):
+    message = f"motion.kind: wrong:Flight: {message}"
+    check({"motion": lambda: MotionConfig("wrong:Flight", options=options)}, message)
+
+
+@pytest.mark.parametrize(
+    ("decorator", "message"),
+    [
+        ("@sensor", "bare: write @damian.sensor() above it, with parentheses"),
+        ("@feature", 'bare: write @damian.feature("local") above it, with parentheses'),
+        (
+            "@reward_term",
+            "bare: write @damian.reward_term(reads=[...]) above it, with parentheses",
+        ),
+        (
+            "@reward_term('battery')",
+            "reads of a reward term: battery is not a list of names: write reads=['battery']",
+        ),
+    ],
+)
+def test_a_decorator_without_parentheses_or_with_one_name_is_one_line(decorator, message):
+    with pytest.raises(InputError) as error:
+        exec(f"from damian import *\n{decorator}\ndef bare(*given): ...")
+    assert str(error.value) == message

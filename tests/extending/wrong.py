@@ -3,10 +3,21 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import shapely
 import torch
 from torch import Tensor
 
-from damian import ContextSampler, Law, MessageContext
+from damian import ContextSampler, Law, MessageContext, feature, reward_term, sensor
+from damian.server.features import FeatureCache
+from damian.server.reward_terms import Counters
+from damian.world.airspace import Airspace
+from damian.world.config import WorldConfig
+from damian.world.regions.config import RegionConfig
+from damian.world.regions.region import Region
+from damian.world.simulation import Simulation
+from damian.world.state import State
+from damian.world.vehicles import PolynomialFlight
 
 
 @dataclass(frozen=True)
@@ -37,3 +48,127 @@ class Rush(Law):
 
     def undeclared(self, context: MessageContext) -> Tensor:
         return context.entries["position"][:, 0]
+
+
+@sensor()
+def silent(state: State, world: Simulation) -> Any:
+    return None
+
+
+@sensor()
+def number(state: State, world: Simulation) -> Any:
+    return 0.5
+
+
+@sensor()
+def misnamed(state: State, world: Simulation) -> Tensor:
+    return state.batery  # type: ignore[attr-defined]
+
+
+@sensor()
+def unending(state: State, world: Simulation) -> Tensor:
+    return state.battery / 0
+
+
+@sensor()
+def unmarked(state: State, world: Simulation, half: float = 3.0) -> Tensor:
+    """Its parameter stands before a ``*``."""
+    return state.battery / half
+
+
+@feature("local")
+def absent(cache: FeatureCache) -> Tensor:
+    return cache.message.track  # type: ignore[attr-defined]
+
+
+@feature("local", high=50.0)
+def percent(cache: FeatureCache) -> Tensor:
+    return cache.messages.battery
+
+
+@feature("local", high=1e9)
+def divided(cache: FeatureCache) -> Tensor:
+    return 0 / cache.messages.track
+
+
+@feature("local")
+def flag(cache: FeatureCache) -> Tensor:
+    """No mistake: a flag is a number too."""
+    return cache.messages.spotted
+
+
+@feature("local", high=100.0)
+def mean_battery(cache: FeatureCache) -> Tensor:
+    battery = cache.messages.battery
+    return battery.mean(-1, keepdim=True).expand_as(battery)
+
+
+@feature("local", width=2)
+def newest(cache: FeatureCache) -> Tensor:
+    """The first value follows from the UAV's own message, the second one from all messages."""
+    time, latest = cache.messages.time, cache.messages.time.amax(-1, keepdim=True)
+    return torch.stack([time, latest.expand_as(time)], -1) / cache.context.time_scale
+
+
+@reward_term(reads=["spotted"])
+def undeclared(features: dict[str, Tensor], counters: Counters) -> Tensor:
+    return features["battery"] + features["spotted"]
+
+
+@reward_term(reads=["spotted"])
+def scalar(features: dict[str, Tensor], counters: Counters) -> Any:
+    return 1.0
+
+
+@reward_term(reads=["spotted"])
+def hopeless(features: dict[str, Tensor], counters: Counters) -> Tensor:
+    return (features["spotted"] - 2).log()
+
+
+@reward_term(reads=["spotted", "batery"])
+def misspelt(features: dict[str, Tensor], counters: Counters) -> Tensor:
+    return features["batery"]
+
+
+def park(config: RegionConfig, rng: np.random.Generator) -> Any:
+    """A region source that makes the mistake that its options name."""
+    corners = {"crossing": [(0, 0), (200, 200), (200, 0), (0, 200)]}
+    area = shapely.Polygon(corners.get(config.options, [(0, 0), (200, 0), (200, 200), (0, 200)]))
+    returned = {
+        "region": Region(area, "park"),
+        "polygon": area,
+        "none": None,
+        "nothing": [],
+        "polygons": [area],
+        "points": [Region(area.centroid, "park")],  # type: ignore[arg-type]
+        "crossing": [Region(area, "park")],
+        "many": [Region(area, "park")] * 9,
+    }
+    return returned[config.options]
+
+
+def no_arguments() -> list[Region]:
+    return []
+
+
+class Flight(PolynomialFlight):
+    """A motion model that makes the mistake that its options name."""
+
+    def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
+        super().__init__(config, airspace, dt)
+        self.mistake = config.motion.options["mistake"]
+
+    def ready(self, state: State) -> Any:
+        return super().ready(state).float() if self.mistake == "float flag" else super().ready(state)
+
+    def on_ground(self, state: State) -> Any:
+        return super().on_ground(state)[:, 0] if self.mistake == "no UAVs" else super().on_ground(state)
+
+    def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> Any:
+        return None if self.mistake == "none" else super().take_off(state, goal, ready, departs)
+
+    def move(self, state: State) -> State:
+        moved = super().move(state)
+        if self.mistake == "raise":
+            return moved._replace(height=0)  # type: ignore[call-arg]
+        return moved._replace(elapsed=moved.elapsed.double()) if self.mistake == "double" else moved

@@ -69,6 +69,15 @@ def test_sensors_change_nothing_else(motion):
         assert longer.shape[-1] == message.shape[-1] + 3
 
 
+def test_one_function_is_used_twice_under_two_names():
+    twice = [*SENSORS, {"sensor": "sensor_cases:gust", "name": "breeze", "strength": 1.0}]
+    env = UavEnv(everything(sensors=twice), num_worlds=2, seed=2)
+    read = env.server.messages(env.reset()["agents", "message"]).readings
+    torch.testing.assert_close(read[..., 3:], readings_of(env, strength=1.0)[..., :2])
+    torch.testing.assert_close(read[..., :3], readings_of(env))
+    assert list(env.simulation.sensors) == ["gust", "gap", "breeze"]
+
+
 @given(
     seed=st.integers(0, 2**32 - 1),
     window=st.integers(1, 5),
@@ -130,23 +139,37 @@ def test_a_pickled_environment_with_sensors_continues_in_the_same_way():
 @pytest.mark.parametrize(
     ("sensors", "message"),
     [
-        (["gust"], "sensors.sensor: gust is not a path such as package.module:Name"),
+        (["gust"], "sensors[0].sensor: gust is not a path such as package.module:Name"),
         (
             [{"strength": 1}],
-            "sensors: {'strength': 1} is not {sensor: package.module:name, parameter: value}",
+            "sensors[0]: {'strength': 1} is not {sensor: package.module:name, parameter: value}",
         ),
-        (["sensor_cases:gusts"], "sensors.sensor: sensor_cases:gusts: the module sensor_cases has no gusts"),
+        (
+            ["sensor_cases:gusts"],
+            "sensors[0].sensor: sensor_cases:gusts: the module sensor_cases has no gusts",
+        ),
         (
             ["sensor_cases:gust_felt"],
-            "sensors.sensor: sensor_cases:gust_felt is no sensor: decorate the function with damian.sensor",
+            "sensors[0].sensor: sensor_cases:gust_felt is no sensor: decorate the function with "
+            "damian.sensor",
         ),
         (
             [{"sensor": "sensor_cases:gust", "strenght": 1}],
-            "sensors.strenght: 1 is no parameter of sensor_cases:gust, which has strength",
+            "sensors[0].strenght: 1 is no parameter of sensor_cases:gust, which has strength",
         ),
         (
             [*SENSORS, "sensor_cases:gap"],
-            "sensors: sensor_cases:gap has the name of another sensor, or of a field of the messages",
+            "sensors[2].name: gap is the name of another sensor, or of a field of the messages: give it "
+            "another one, as in {sensor: sensor_cases:gap, name: other}",
+        ),
+        (
+            [{"sensor": "sensor_cases:gap", "name": "battery"}],
+            "sensors[0].name: battery is the name of another sensor, or of a field of the messages: give it "
+            "another one, as in {sensor: sensor_cases:gap, name: other}",
+        ),
+        (
+            [{"sensor": "sensor_cases:gap", "name": "no name"}],
+            "sensors[0].name: no name is not a name of letters, digits and _",
         ),
     ],
 )

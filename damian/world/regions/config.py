@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from damian.common import checks
+from damian.common.errors import naming_errors
 from damian.common.registry import Registry
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geojson import read_geojson
 from damian.world.regions.polygon import polygon_from_vertices, random_polygon
-from damian.world.regions.region import Region
+from damian.world.regions.region import Region, check_regions
 
 
 @dataclass
@@ -83,9 +84,18 @@ class RegionConfig:
         """Read the region from its file or vertices, or draw ``pool`` random regions.
 
         Raises:
-            InputError: the file cannot be read, or the vertices form no valid polygon.
+            InputError: the file cannot be read, the vertices form no valid polygon, or a source of one's own
+                raises an error or returns no list of regions with valid polygons.
         """
-        return REGION_SOURCES.get(self.kind, "region.kind")(self, rng)
+        source, name = REGION_SOURCES.get(self.kind, "region.kind"), f"region.kind: {self.kind}"
+        if ":" not in self.kind:
+            return source(self, rng)
+        with naming_errors(name):
+            found = source(self, rng)
+        check_regions(found, name)
+        most, problem = self.initial_conditions, "regions, but each needs an initial condition of its own"
+        checks.require(len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem)
+        return found
 
 
 RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
+from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
 from damian.world.regions.geodesy import Floats, to_local, wrap_longitude
@@ -30,6 +31,35 @@ class Region:
     name: str
     origin: tuple[float, float] | None = None
     levels: tuple[float, float] | None = None
+
+
+def check_regions(found: Any, name: str) -> None:
+    """Require a list of regions with valid polygons.
+
+    Args:
+        found: what a region source returned.
+        name: of the source, for errors.
+
+    Raises:
+        InputError: it is something else.
+    """
+    shown = f"a {type(found).__name__}"
+    if isinstance(found, list):
+        others = [type(each).__name__ for each in found if not isinstance(each, Region)]
+        shown = f"a list with a {others[0]}" if others else "" if found else "an empty list"
+    problem = "is not a list of damian.world.regions.region.Region"
+    checks.require(isinstance(found, list) and not shown, name, shown, problem)
+    for region in found:
+        polygon, name_of_region = region.polygon, f"{name}: polygon of {region.name}"
+        good = isinstance(polygon, Polygon | MultiPolygon)
+        checks.require(
+            good, name_of_region, f"a {type(polygon).__name__}", "is not one of shapely's polygons"
+        )
+        checks.require(not polygon.is_empty, name_of_region, "it", "is empty")
+        reason = shapely.is_valid_reason(polygon)
+        checks.require(
+            polygon.is_valid, name_of_region, reason, "[m] makes it invalid: its edges must not cross"
+        )
 
 
 def local_region(
