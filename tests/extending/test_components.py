@@ -201,6 +201,7 @@ class Broken(Law):
 def test_a_mistake_in_a_law_that_sees_the_context_is_one_clear_line(run, folder, capsys, setting, message):
     (folder / "broken.py").write_text(BROKEN)
     check_refused(lambda: run(*TINY, f"delay.obs={{law: broken:Broken, {setting}}}"), message, capsys)
+    assert not (folder / "run").exists()
 
 
 @pytest.mark.parametrize(
