@@ -1,7 +1,7 @@
 """Checks of settings; a failed check raises one line that names the key, the value and its unit."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -19,6 +19,7 @@ def require(condition: bool, key: str, value: Any, should: str) -> None:
 
 def in_range(key: str, value: float, low: float, high: float = math.inf, unit: str = "") -> None:
     """Require a finite number ``low <= value <= high``."""
+    _require_bounds(key, value, low, high)
     unit = f" {unit}" if unit else ""
     bounds = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
     good = isinstance(value, int | float) and low <= value <= high and value < math.inf
@@ -56,9 +57,31 @@ def values_of_uavs(name: str, found: Any, shape: Sequence[int], width: int | Non
 
 def above(key: str, value: float, low: float, unit: str = "") -> None:
     """Require a finite number above ``low``."""
+    _require_bounds(key, value, low)
     unit = f" {unit}" if unit else ""
     good = isinstance(value, int | float) and low < value < math.inf
     require(good, key, f"{value}{unit}", f"is not above {low:g}{unit}")
+
+
+def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:
+    """Require a mapping without unknown keys, such as the options of a component of one's own.
+
+    Args:
+        key: of the setting, for errors.
+        given: the mapping, or None for an empty one.
+        known: the keys that it may have.
+
+    Returns:
+        The mapping.
+    """
+    known = list(known)
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise InputError(f"{key}: {given} is not a mapping such as {{{known[0]}: 1}}")
+    for name, value in given.items():
+        require(name in known, f"{key}.{name}", value, f"is not one of its options: {', '.join(known)}")
+    return dict(given)
 
 
 def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:
@@ -95,3 +118,10 @@ def device(key: str, value: str) -> None:
     available = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
     available += ["cuda"] * (len(available) > 1)
     require(value in available, key, value, f"is not one of the devices here: {', '.join(available)}")
+
+
+def _require_bounds(key: str, value: Any, *bounds: Any) -> None:
+    """Require that the bounds with which a value is compared are numbers."""
+    for bound in bounds:
+        good = isinstance(bound, int | float)
+        require(good, key, value, f"cannot be compared with {bound!r}, which is not a number")

@@ -13,7 +13,11 @@ from damian.world.messages import Messages
 
 
 class ServerContext(NamedTuple):
-    """What the server knows besides the messages."""
+    """What the server knows besides the messages.
+
+    Fields for features: ``now`` [*] [s], ``scale`` [*] [m], ``time_scale`` and ``age_scale`` [s], and
+    ``points`` [R*L, 2] [m].
+    """
 
     now: Tensor
     """Current time [s], [*]."""

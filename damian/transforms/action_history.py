@@ -1,5 +1,6 @@
 """A transform that lets an agent observe its own latest actions (paper, section 3.3)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from damian.common import checks
 from damian.common.tensors import expand_mask, gather_rows
 from damian.transforms.action_specs import ActionTransform
-from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows, sibling_key
+from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows, require_keys, sibling_key
 from damian.transforms.order import KeyUsage
 
 
@@ -72,6 +73,10 @@ class ActionHistory(ActionTransform):
     def key_usage(self) -> KeyUsage:
         return KeyUsage(reads=self._reads, appends=self.in_keys, records=[self.action_key])
 
+    @property
+    def required_keys(self) -> Sequence[NestedKey]:
+        return self.step_keys
+
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         actions = self.actions
         scale = {"low": actions.low, "width": actions.width}
@@ -119,6 +124,7 @@ class ActionHistory(ActionTransform):
         if not self.in_keys:
             observation_spec[key] = Unbounded(torch.Size((*self.actions.rows, width)), device=device)
             return observation_spec
+        require_keys(type(self).__name__, [key], observation_spec)
         old = observation_spec[key]
         flat = old.dtype.is_floating_point and len(old.shape) == len(self.actions.rows) + 1
         should = "is not a vector of floats, so no actions can be appended to it; use out_key instead"

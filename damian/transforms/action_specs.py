@@ -9,7 +9,7 @@ from torchrl.data import Bounded, Categorical, MultiCategorical, MultiOneHot, On
 from torchrl.envs import EnvBase
 
 from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import as_rows, spec_rows
+from damian.transforms.entries import as_rows, require_keys, spec_rows
 
 
 class ActionSpecs(NamedTuple):
@@ -92,6 +92,7 @@ class ActionTransform(StatefulTransform):
     def actions(self) -> ActionSpecs:
         """Shape, range and default of the actions, read from the environment's specs once."""
         if "_actions" not in self.__dict__:
+            require_keys(type(self).__name__, [self.action_key], self.env.full_action_spec)
             self.__dict__["_actions"] = read_action_specs(self.env, self.action_key, self.default)
         return self.__dict__["_actions"]
 

@@ -15,6 +15,7 @@ from damian.transforms.entries import (
     Entries,
     Memory,
     flag_rows,
+    require_keys,
     row_shape,
     select_entries,
 )
@@ -152,6 +153,11 @@ class StatefulTransform(Transform):
         return row_shape(tensordict, self.row_key)
 
     @property
+    def required_keys(self) -> Sequence[NestedKey]:
+        """Keys of the entries that the outputs of the first reset must have."""
+        return self.in_keys
+
+    @property
     def row_key(self) -> NestedKey:
         """Key of an entry whose innermost TensorDict has one element for each row."""
         return self.in_keys[0]
@@ -169,6 +175,7 @@ class StatefulTransform(Transform):
             self._check_rows(tensordict_reset)
             mask = flag_rows(tensordict, "_reset", self.row_key, self.rows)
         else:
+            require_keys(type(self).__name__, self.required_keys, tensordict_reset)
             self._rows = self.find_rows(tensordict_reset)
             self.set_memory(self.init_memory(tensordict_reset))
         if mask is None:

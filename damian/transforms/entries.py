@@ -7,6 +7,9 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
+from damian.common import checks
+from damian.common.text_files import listed
+
 Memory = dict[str, Tensor]
 """The memory of a transform: its buffers by name."""
 
@@ -42,6 +45,23 @@ def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Ent
     """The entries with these keys, as far as they exist, detached from the autograd graph."""
     found = {key: tensordict.get(key, None) for key in keys}
     return {key: value.detach() for key, value in found.items() if value is not None}
+
+
+def require_keys(transform: str, keys: Sequence[NestedKey], present: TensorDictBase | Composite) -> None:
+    """Require that the entries that a transform reads exist.
+
+    Args:
+        transform: name of the transform, for errors.
+        keys: of the entries.
+        present: the outputs of a reset, or specs.
+
+    Raises:
+        InputError: one is missing.
+    """
+    known = list(present.keys(True, True))
+    for key in keys:
+        should = f"is not among the keys of the environment: {listed(map(str, known))}"
+        checks.require(key in known, transform, key, should)
 
 
 def flag_rows(

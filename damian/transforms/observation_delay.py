@@ -19,6 +19,7 @@ from damian.transforms.entries import (
     Memory,
     as_rows,
     from_rows,
+    require_keys,
     select_entries,
     sibling_key,
     spec_rows,
@@ -97,6 +98,10 @@ class ObservationDelay(StatefulTransform):
         created = [key for key in self.out_keys if key not in self.in_keys]
         return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=created)
 
+    @property
+    def required_keys(self) -> Sequence[NestedKey]:
+        return [*self.in_keys, *([self.sent_key] if self.sent_key else [])]
+
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))
         memory = self.line.init_memory(values, self.streams(tensordict.batch_size, values[0].device))
@@ -126,6 +131,7 @@ class ObservationDelay(StatefulTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if out_key != key:
+                require_keys(type(self).__name__, [key], observation_spec)
                 observation_spec[out_key] = observation_spec[key].clone()
         shape = torch.Size((*spec_rows(observation_spec, self.row_key), 1))
         device = observation_spec.device

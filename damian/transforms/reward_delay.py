@@ -1,6 +1,6 @@
 """Transforms that delay rewards, and that sum the latest rewards (paper, section 3.5)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -21,6 +21,7 @@ from damian.transforms.entries import (
     flag_keys,
     flag_rows,
     from_rows,
+    require_keys,
     spec_rows,
 )
 from damian.transforms.order import KeyUsage
@@ -46,7 +47,12 @@ class RewardTransform(StatefulTransform):
     def key_usage(self) -> KeyUsage:
         return KeyUsage(delays=[self.reward_key])
 
+    @property
+    def required_keys(self) -> Sequence[NestedKey]:
+        return []  # a reset outputs no reward
+
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
+        require_keys(type(self).__name__, [self.reward_key], self.env.full_reward_spec)
         return spec_rows(self.env.full_reward_spec, self.reward_key)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:

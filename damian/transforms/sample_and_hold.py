@@ -10,7 +10,15 @@ from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.delays.laws import Delay, in_steps
 from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows, select_entries
+from damian.transforms.entries import (
+    Change,
+    Entries,
+    Memory,
+    as_rows,
+    from_rows,
+    require_keys,
+    select_entries,
+)
 from damian.transforms.order import KeyUsage
 
 
@@ -57,12 +65,17 @@ class SampleAndHold(StatefulTransform):
     def key_usage(self) -> KeyUsage:
         return KeyUsage(reads=self.step_keys, delays=self.in_keys, replaces=self.in_keys_inv)
 
+    @property
+    def required_keys(self) -> Sequence[NestedKey]:
+        return self.step_keys
+
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         first = select_entries(tensordict, self.in_keys)
         device = first[self.in_keys[0]].device
         elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
         held = {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(first.values())}
         specs = self.env.full_action_spec
+        require_keys(type(self).__name__, self.in_keys_inv, specs)
         acted = {
             f"acted_{i}": as_rows(specs[key].zero(), self.rows) for i, key in enumerate(self.in_keys_inv)
         }

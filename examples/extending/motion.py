@@ -25,8 +25,8 @@ class WindyFlight(PolynomialFlight):
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         super().__init__(config, airspace, dt)
-        options = config.motion.options or {}
-        speed, bearing = float(options.get("wind", 3.0)), math.radians(options.get("bearing", 270.0))
+        options = checks.known_keys("motion.options", config.motion.options, ["wind", "bearing"])
+        speed, bearing = options.get("wind", 3.0), math.radians(options.get("bearing", 270.0))
         checks.in_range("motion.options.wind", speed, 0.0, 0.9 * config.motion.max_speed, "m/s")
         # The wind blows from its bearing, clockwise from north.
         self.wind = -speed * torch.tensor([math.sin(bearing), math.cos(bearing)])

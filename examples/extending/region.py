@@ -17,7 +17,8 @@ from damian.world.regions.region import Region
 
 def yard(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
     """An L whose outer sides are ``side`` metres long, at the origin."""
-    side = float((config.options or {}).get("side", 300.0))
+    options = checks.known_keys("region.options", config.options, ["side"])
+    side = options.get("side", 300.0)
     checks.above("region.options.side", side, 0.0, "m")
     square = shapely.box(-side / 2, -side / 2, side / 2, side / 2)
     return [Region(square.difference(shapely.box(0, 0, side, side)), "L-shaped yard")]

@@ -96,3 +96,32 @@ def test_a_name_is_refused_where_nothing_is_registered():
 def test_a_name_is_given_once_and_is_no_path(name):
     with pytest.raises(ValueError, match="the name is taken, or looks like a path"):
         greetings().register(name)(print)
+
+
+@pytest.mark.parametrize(
+    ("code", "problem"),
+    [
+        (
+            "\n\nimport no_such_package\n",
+            "importing it raised ModuleNotFoundError: No module named 'no_such_package' (blame_0.py, line 3)",
+        ),
+        (
+            "x = 1\nx.y\n",
+            "importing it raised AttributeError: 'int' object has no attribute 'y' (blame_1.py, line 2)",
+        ),
+        ("def formal(:\n", "importing it raised SyntaxError: invalid syntax (blame_2.py, line 1)"),
+        (
+            "from damian import sensor\n\n@sensor\ndef formal(state, world): ...\n",
+            "formal: write @damian.sensor() above it, with parentheses",
+        ),
+    ],
+)
+def test_an_import_that_fails_inside_the_module_blames_its_line(
+    tmp_path, monkeypatch, request, code, problem
+):
+    number = request.node.callspec.indices["code"]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / f"blame_{number}.py").write_text(code)
+    with pytest.raises(InputError) as error:
+        greetings().get(f"blame_{number}:formal", "greeting")
+    assert str(error.value) == f"greeting: blame_{number}:formal: {problem}"

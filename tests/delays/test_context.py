@@ -309,6 +309,9 @@ def test_where_a_law_with_context_makes_no_sense_it_is_refused():
     assert message.endswith("reads altitude, but a law can read only position")
     assert message.startswith("delay.act: ")
     assert refused(lambda: ContextSampler(len, 3, reads="position")).startswith("reads: position is not a")
+    for chances in ([0.7, 0.7], [-0.1, 1.0], [math.nan]):
+        expected = f"chances of the delays: {chances} are not at least 0 and at most 1 in all"
+        assert refused(lambda chances=chances: Sampler([chances])) == expected
     assert refused(lambda: ContextSampler(len, 2.5)) == "longest: 2.5 steps is not a whole number"
     with pytest.raises(ValueError, match="context: it is missing"):
         ContextSampler(len, 3)(torch.arange(2), torch.tensor(1), torch.zeros(2))

@@ -201,6 +201,7 @@ class Broken(Law):
 def test_a_mistake_in_a_law_that_sees_the_context_is_one_clear_line(run, folder, capsys, setting, message):
     (folder / "broken.py").write_text(BROKEN)
     check_refused(lambda: run(*TINY, f"delay.obs={{law: broken:Broken, {setting}}}"), message, capsys)
+    assert not (folder / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -248,13 +249,21 @@ def test_a_mistake_in_a_law_that_sees_the_context_is_one_clear_line(run, folder,
         ),
         (
             ["region.kind=region:yard", "region.options={side: -1}"],
-            "region.options.side: -1.0 m is not above 0 m",
+            "region.options.side: -1 m is not above 0 m",
+        ),
+        (
+            ["region.kind=region:yard", "region.options={sid: 50}"],
+            "region.options.sid: 50 is not one of its options: side",
+        ),
+        (
+            [*MOTION[:2], "motion.options={wnd: 4}"],
+            "motion.options.wnd: 4 is not one of its options: wind, bearing",
         ),
         (["motion.kind=motion:Windy"], "motion.kind: motion:Windy: the module motion has no Windy"),
         (["motion.kind=law:Satellite"], "motion.kind: law:Satellite is no class derived from"),
         (
             [*MOTION[:2], "motion.options={wind: 40}"],
-            "motion.options.wind: 40.0 m/s is not between 0 and 18 m/s",
+            "motion.options.wind: 40 m/s is not between 0 and 18 m/s",
         ),
     ],
 )
