@@ -10,7 +10,10 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from .shared.known_settings import help_text
+from damian.common.errors import InputError
+
+from .shared.command_line import parsed, prepared
+from .shared.help_text import help_text
 from .shared.misspelt import check_words
 
 PROGRAMS = {
@@ -42,14 +45,26 @@ def main(words: Sequence[str] | None = None) -> None:
         return
     if name not in PROGRAMS:
         sys.exit(_refuse(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}"))
-    if name in SETTINGS:
-        if {"-h", "--help"} & {*words}:
-            print(help_text(name, SETTINGS[name], [word for word in words if not word.startswith("-")]))
-            return
-        if problem := check_words(SETTINGS[name], words):
-            sys.exit(_refuse(problem))
+    if name in SETTINGS and _answered(name, words):
+        return
     sys.argv = [f"damian {name}", *words]
     import_module(f".{name}", __package__).run()
+
+
+def _answered(name: str, words: Sequence[str]) -> bool:
+    """Answer a question for help and a misspelt word, without loading the program."""
+    try:
+        given = parsed(words)
+        if given.help:
+            keys = [word for word in given.overrides if "=" not in word]
+            print(help_text(name, SETTINGS[name], keys, given.config_dir))
+            return True
+        problem = check_words(SETTINGS[name], prepared(words))
+    except InputError as error:
+        problem = str(error)
+    if problem:
+        sys.exit(_refuse(problem))
+    return False
 
 
 def usage() -> str:

@@ -29,7 +29,7 @@ from omegaconf import MISSING, DictConfig
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.evaluation.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison
+from damian.evaluation.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison, regime
 from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
 from damian.evaluation.run_folder import read_metrics
 
@@ -37,7 +37,7 @@ from .evaluate import fly
 from .shared.command_line import whole_laws
 from .shared.composition_errors import COMPOSITION_ERRORS, one_line
 from .shared.known_settings import CONF
-from .shared.launch import checked, launch, reported
+from .shared.launch import checked, command, launch, reported, shown, typed_words
 from .shared.parallel import LOG, Run, check_stored, perform_all
 from .train import train
 
@@ -68,11 +68,17 @@ class Experiment:
                 good = re.fullmatch(r"[\w.-]+", name) and name not in (NOT_LATE, *SCRIPTED)
                 should = "cannot name a folder: use letters, digits, _ . - but not none, random or greedy"
                 checks.require(bool(good), f"experiment.{kind}", name, should)
+        for kind in ("tasks", "arms"):
+            if not getattr(self, kind):
+                raise InputError(
+                    f"experiment.{kind}: it is missing or empty; an experiment needs at least one"
+                )
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
         should = "are not delayed: exactly one arm must have delayed=false"
         checks.require(len(undelayed) == 1, "experiment.arms", undelayed, should)
         for name, arm in self.arms.items():
-            checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))
+            if arm.regime:
+                checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))
         for name in self.best:
             checks.one_of("experiment.best", name, LABELS)
 
@@ -179,7 +185,7 @@ def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
             "task": run.task,
             "delay": run.delay,
             "arm": run.arm,
-            "regime": arms[run.arm].regime,
+            "regime": regime(arms, run.arm),
             "seed": run.config.seed,
             **row,
         }
@@ -217,11 +223,10 @@ def _training_length(run: Run) -> str:
 def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
     """Lines above the tables: the command, the number of seeds and episodes, what the columns mean."""
     seeds, episodes = sorted({row["seed"] for row in rows}), int(min(row["episodes"] for row in rows))
-    overrides = [word for word in HydraConfig.get().overrides.task if not word.startswith("report_only")]
-    quoted = [f'"{word}"' if re.search(r"[^\w=.,+/-]", word) else word for word in overrides]
+    words = [word for word in typed_words() if not word.startswith("report_only")]
     missing = [run.name for run in runs if not run.finished]
     notes = [
-        f"`{' '.join(['damian compare', *quoted])}`",
+        f"`{command(words)}`",
         f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {episodes} episodes per evaluation",
         f"Mean over seeds [95 % interval: stratified bootstrap over seeds]; J: {config.score} of the "
         f"{config.policy} policy; seen: as the server perceived it, else as it truly was; age in steps",
@@ -238,7 +243,7 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
 def main(composed: DictConfig) -> None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise InputError("-m: a comparison runs all of its arms and seeds anyway; leave it out")
-    config: CompareConfig = checked(composed)
+    config: CompareConfig = checked(composed, "compare")
     folder = Path(HydraConfig.get().runtime.output_dir)
     runs = plan(config, folder)
     for run in runs:
@@ -255,7 +260,7 @@ def main(composed: DictConfig) -> None:
         sys.exit(1)
     report(config, runs, folder)
     print((folder / MARKDOWN).read_text())
-    print(f"results: {folder}")
+    print(f"results: {shown(folder)}")
     if failed:
         sys.exit(1)
 

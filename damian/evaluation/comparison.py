@@ -47,9 +47,21 @@ class Arm:
     """Whether the arm ignores the delay; recovery 0 is the score of the best such arm."""
     policy_of: str | None = None
     """Arm whose policies this one flies, without any training of its own; None: this arm trains."""
-    regime: str = "R0"
+    regime: str = ""
     """Information that the arm uses: R0: messages that have arrived; R1: the truth, for the critic; R2: no
-    delay in training; R3: no delay at all."""
+    delay in training; R3: no delay at all. If it is not given, ``delayed`` and ``policy_of`` decide."""
+
+
+def regime(arms: Mapping[str, Arm], name: str) -> str:
+    """The regime of an arm: its own, or R3 without delay, R2 with a policy trained without, or else R0."""
+    arm = arms[name]
+    if arm.regime:
+        return arm.regime
+    if not arm.delayed:
+        return "R3"
+    if arm.policy_of is None:
+        return "R0"
+    return "R2" if not arms[arm.policy_of].delayed else regime(arms, arm.policy_of)
 
 
 class Estimate(NamedTuple):
@@ -247,5 +259,5 @@ def _line(comparison: Comparison, task: str, delay: str, arm: str, policy: str) 
         name: _estimates(lambda scores: scores.mean(-1), np.array([list(runs.values())]))[0]
         for name, runs in found.items()
     }
-    regime = comparison.arms[arm].regime
-    return Line(task, delay, arm, regime, policy, sorted(found["age"]), means)
+    information = regime(comparison.arms, arm)
+    return Line(task, delay, arm, information, policy, sorted(found["age"]), means)

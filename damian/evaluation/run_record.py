@@ -4,7 +4,6 @@ import json
 import os
 import platform
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,20 +15,23 @@ from typing import Any
 import damian
 
 RECORD = "run.json"
+OF_FIRST_PART = ("command", "started")
+"""What a resumed run records for each of its parts."""
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy", "shapely")
 """Packages whose versions a record names."""
 
 
-def new_record(device: str, threads: int, config_dir: str | None) -> dict[str, Any]:
+def new_record(command: str, device: str, threads: int, config_dir: str | None) -> dict[str, Any]:
     """What is known when a run begins.
 
     Args:
+        command: the command line, to be run again in a shell.
         device: name of the device of all tensors.
         threads: number of torch's threads.
         config_dir: folder with configuration files of the user's own, if there is one.
     """
     return {
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": command,
         "config_dir": config_dir and str(Path(config_dir).resolve()),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "damian": damian.__version__,
@@ -69,8 +71,18 @@ def processor() -> str:
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> None:
-    """Write the record into a run folder; a resumed run keeps the wall time of its earlier part."""
-    record["wall_time_s"] = read_record(folder).get("wall_time_s", 0.0)
+    """Write the record into a run folder.
+
+    A resumed run keeps the command, the configuration files and the wall time of its first part; the list
+    ``resumed`` gets the command and the time of each further part.
+    """
+    first = read_record(folder)
+    if first:
+        part = {name: record[name] for name in OF_FIRST_PART}
+        record |= {name: first[name] for name in (*OF_FIRST_PART, "config_dir") if first.get(name)}
+        parts = first.get("resumed")
+        record["resumed"] = [*(parts if isinstance(parts, list) else []), part]
+    record["wall_time_s"] = _wall_time(first)
     _write(folder, record)
 
 
@@ -82,16 +94,23 @@ def timed(folder: Path) -> Iterator[None]:
         yield
     finally:
         if record := read_record(folder):
-            record["wall_time_s"] = round(record["wall_time_s"] + time.monotonic() - begin, 1)
+            record["wall_time_s"] = round(_wall_time(record) + time.monotonic() - begin, 1)
             _write(folder, record)
 
 
 def read_record(folder: Path) -> dict[str, Any]:
     """The record of a run; empty if there is none that can be read."""
     try:
-        return json.loads((folder / RECORD).read_text())
-    except (OSError, ValueError):
+        record = json.loads((folder / RECORD).read_text())
+    except (OSError, ValueError, RecursionError):
         return {}
+    return record if isinstance(record, dict) else {}
+
+
+def _wall_time(record: dict[str, Any]) -> float:
+    """The wall time in a record [s]; 0 if it has none, as that of a damaged file."""
+    seconds = record.get("wall_time_s")
+    return seconds if isinstance(seconds, float | int) else 0.0
 
 
 def _write(folder: Path, record: dict[str, Any]) -> None:

@@ -1,49 +1,52 @@
 """The words of a command line, before Hydra reads them."""
 
+import os
 import re
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
+from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.errors import HydraException
+
+from damian.common.errors import InputError
 from damian.evaluation.run_record import read_record
 
-CONFIG_DIR = ("--config-dir", "-cd")
-"""Hydra's option for a folder with configuration files of one's own."""
-_TAKES_VALUE = (*CONFIG_DIR, "--config-path", "-cp", "--config-name", "-cn", "--package", "-p", "--cfg", "-c")
-"""Options of Hydra that the next word belongs to."""
+
+def parsed(words: Sequence[str]) -> Namespace:
+    """The options and the ``overrides`` of a command line, as Hydra's own parser reads them.
+
+    Hydra accepts no option between overrides; here options may stand anywhere.
+
+    Raises:
+        InputError: an option does not exist, or lacks its value.
+    """
+    parser = get_args_parser()
+    parser.error = _refuse
+    return parser.parse_intermixed_args(list(words))
 
 
-def config_dir(words: Sequence[str]) -> str | None:
-    """The folder with configuration files of one's own, if one is given."""
-    for word, following in pairwise([*words, ""]):
-        name, equals, value = word.partition("=")
-        if name in CONFIG_DIR:
-            return value if equals else following
-    return None
+def _refuse(message: str) -> NoReturn:
+    raise InputError(message)
 
 
 def prepared(words: Sequence[str]) -> list[str]:
     """The words with what Hydra needs and a person should not have to write.
 
-    Options may stand anywhere. Folders of runs get quotes if their names contain ``=`` or ``,``, as those
-    of a sweep do. A policy that was trained with configuration files of one's own is evaluated with the same
-    files.
+    Options come first. Names of folders get quotes if Hydra would not read them as a name. A policy that was
+    trained with configuration files of one's own is evaluated with the same files.
+
+    Raises:
+        InputError: an option is wrong, or policies were trained with different folders of files.
     """
-    folders = [match[1] for word in words if (match := re.fullmatch(r"checkpoint=(.*)", word))]
-    words = whole_laws([_quoted(word) for word in _options_first(words)])
-    if config_dir(words) is None:
-        words = [*(f"--config-dir={folder}" for folder in _config_dirs(folders)), *words]
-    return words
-
-
-def _options_first(words: Sequence[str]) -> list[str]:
-    """The words with the options before the overrides, because Hydra wants no option between overrides."""
-    options, overrides, takes_next = [], [], False
-    for word in words:
-        is_option = takes_next or word.startswith("-")
-        (options if is_option else overrides).append(word)
-        takes_next = not takes_next and word in _TAKES_VALUE
-    return options + overrides
+    options = vars(parsed(words))
+    overrides = whole_laws([_quoted(word) for word in options.pop("overrides")])
+    options["config_dir"] = options["config_dir"] or _config_dir(overrides)
+    given = ((f"--{name.replace('_', '-')}", value) for name, value in options.items() if value)
+    return [*(name if value is True else f"{name}={value}" for name, value in given), *overrides]
 
 
 def whole_laws(words: Sequence[str]) -> list[str]:
@@ -53,14 +56,49 @@ def whole_laws(words: Sequence[str]) -> list[str]:
 
 
 def _quoted(word: str) -> str:
+    """The word with quotes around the folders that it names, where Hydra needs them."""
     key, _, value = word.partition("=")
-    is_folder = key in ("checkpoint", "resume") and re.search(r"[=,]", value) and Path(value).is_dir()
-    return f"{key}='{value}'" if is_folder else word
+    if re.fullmatch(r"\+*(checkpoint|resume)", key):
+        names = [value] if os.path.isdir(value) else value.split(",")  # several in a sweep
+        if all(map(os.path.isdir, names)):
+            return f"{key}={','.join(map(_quoted_name, names))}"
+    if key in ("hydra.run.dir", "hydra.sweep.dir") and _values(word) is None:
+        return f"{key}={_quoted_name(value)}"
+    return word
 
 
-def _config_dirs(folders: Sequence[str]) -> Iterator[str]:
-    """The folders with configuration files that runs were trained with."""
-    for folder in map(Path, folders):
-        used = read_record(folder).get("config_dir")
-        if used and Path(used).is_dir():
-            yield used
+def _quoted_name(name: str) -> str:
+    is_plain = re.fullmatch(r"[A-Za-z_][\w./-]*|[./][\w./-]+", name, re.ASCII) and name.lower() not in _WORDS
+    return name if is_plain else QuotedString(name, Quote.single).with_quotes()
+
+
+_WORDS = ("null", "true", "false", "nan", "inf")
+"""Names that Hydra would read as values."""
+
+
+def _values(word: str) -> list[str] | None:
+    """The values of an override, several in a sweep; None if Hydra cannot read it."""
+    try:
+        override = OverridesParser.create().parse_override(word)
+        found = override.sweep_iterator() if override.is_choice_sweep() else [override.value()]
+        return [each.text if isinstance(each, QuotedString) else str(each) for each in found]
+    except HydraException:
+        return None
+
+
+def _config_dir(overrides: Sequence[str]) -> str | None:
+    """The folder with configuration files that the policies on the command line were trained with.
+
+    Raises:
+        InputError: there are several such folders.
+    """
+    policies = [word for word in overrides if re.match(r"\+*checkpoint=", word)]
+    records = [read_record(Path(folder)) for word in policies for folder in _values(word) or ()]
+    used = [record.get("config_dir") for record in records]
+    folders = sorted({folder for folder in used if isinstance(folder, str) and os.path.isdir(folder)})
+    if len(folders) > 1:
+        raise InputError(
+            f"checkpoint: the policies were trained with the configuration files of {' and '.join(folders)}: "
+            "evaluate them one after the other, or choose one folder with --config-dir"
+        )
+    return folders[0] if folders else None

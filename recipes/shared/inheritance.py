@@ -16,12 +16,13 @@ KEPT = ("delay.history",)
 
 def inherited(stored: TrainConfig, overrides: Sequence[str]) -> list[str]:
     """The given overrides, preceded by those of a stored run that they do not replace."""
-    given = [_key(override) for override in overrides]
-    kept = [old for old in stored.overrides if not any(_replaces(key, _key(old)) for key in given)]
+    given = [key_of(override) for override in overrides]
+    kept = [old for old in stored.overrides if not any(_replaces(key, key_of(old)) for key in given)]
     return kept + list(overrides)
 
 
-def _key(override: str) -> str:
+def key_of(override: str) -> str:
+    """The key or group that an override sets."""
     return override.lstrip("+~").partition("=")[0]
 
 

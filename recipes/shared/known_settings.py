@@ -6,11 +6,10 @@ Torch takes seconds to import; a misspelt setting and a question for help should
 import ast
 import functools
 import inspect
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-
-from omegaconf import OmegaConf
 
 import damian
 
@@ -40,8 +39,8 @@ class Setting:
 
     @property
     def is_open(self) -> bool:
-        """Whether the keys below this setting are not declared, such as those of a delay law."""
-        return "Any" in self.kind or "dict" in self.kind
+        """Whether the keys below this setting are not declared: those of a delay law, elements of a list."""
+        return any(word in self.kind for word in ("Any", "dict", "list", "tuple"))
 
 
 @functools.cache
@@ -51,12 +50,18 @@ def known_settings(program: str) -> dict[str, Setting]:
     Args:
         program: one of ``SCHEMAS``.
     """
-    known: dict[str, Setting] = {}
-    for key, setting in _settings(*SCHEMAS[program].split(":")):
-        before = known.get(key, setting)  # another learner or a base class may declare it too
-        defaults = dict.fromkeys([before.default, setting.default])
-        known[key] = replace(setting, default=" or ".join(defaults), text=setting.text or before.text)
-    return known
+    return _settings(*SCHEMAS[program].split(":"))
+
+
+@functools.cache
+def default_options(program: str) -> dict[str, str]:
+    """The groups of a program, each with the option that applies if none is chosen; ``???`` if one must be.
+
+    Args:
+        program: one of ``SCHEMAS``.
+    """
+    text = Path(CONF, f"{program}.yaml").read_text()
+    return dict(re.findall(r"^  - (\w+): (\S+)", text, re.MULTILINE))
 
 
 def groups(own_folder: str | None = None) -> dict[str, list[str]]:
@@ -74,51 +79,49 @@ def groups(own_folder: str | None = None) -> dict[str, list[str]]:
     return options
 
 
-def help_text(recipe: str, program: str, keys: Sequence[str] = ()) -> str:
-    """What ``--help`` prints: a page on the program, or the meaning of settings.
-
-    Args:
-        recipe: name of a file of recipes/.
-        program: one of ``SCHEMAS``.
-        keys: dotted keys of settings or sections to explain.
-    """
-    if keys:
-        return "\n".join(_explain(program, key) or f"{key}: no such key" for key in keys)
-    if recipe == "train":
-        return str(OmegaConf.load(Path(CONF, "hydra", "help", "train.yaml")).template)
-    text = ast.get_docstring(ast.parse((RECIPES / f"{recipe}.py").read_text())) or ""
-    return f"{text}\n\nSettings: damian train --help, damian {recipe} --help KEY."
-
-
-def _explain(program: str, key: str) -> str:
-    """Key, type, default and meaning of a setting, or of all settings of a section."""
-    chosen = {k: s for k, s in known_settings(program).items() if k == key or k.startswith(f"{key}.")}
-    lines = []
-    for name, setting in chosen.items():
-        default = f" = {setting.default}" if setting.default else ""
-        lines += [f"{name}: {setting.kind}{default}", *(f"    {line}" for line in setting.text.splitlines())]
-    return "\n".join(lines)
-
-
-def _settings(module: str, name: str, path: str = "") -> Iterator[tuple[str, Setting]]:
+def _settings(module: str, name: str, path: str = "") -> dict[str, Setting]:
     """The fields of a dataclass and of its bases, and below each field those of its own dataclass."""
-    tree = _tree(module)
+    tree, settings = _tree(module), {}
     node = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name)
     for base in node.bases:
         if isinstance(base, ast.Name) and (found := _find(module, base.id)):
-            yield from _settings(*found, path)
+            settings |= _settings(*found, path)
     for i, part in enumerate(node.body):
         if not isinstance(part, ast.AnnAssign) or not isinstance(part.target, ast.Name):
             continue
         key, kind = path + part.target.id, ast.unparse(part.annotation)
         if kind.startswith("ClassVar"):
             continue
-        chosen = [class_path.partition(":") for class_path in CHOICES.get(kind, [])]
-        sections = [(module, name) for module, _, name in chosen] or [_find(module, kind)]
-        default = "" if sections[0] or part.value is None else _default(part.value)
-        yield key, Setting(kind, default, _text_after(node.body, i))
-        for section in filter(None, sections):
-            yield from _settings(*section, f"{key}.")
+        below = _below(module, key, kind)
+        default = "" if below or part.value is None else _default(part.value)
+        text = _text_after(node.body, i) or (settings[key].text if key in settings else "")
+        settings |= {key: Setting(kind, default, text), **below}
+    return settings
+
+
+def _below(module: str, key: str, kind: str) -> dict[str, Setting]:
+    """The settings below a field: those of its dataclass, or of the dataclass that its dictionary holds."""
+    if kind in CHOICES:
+        return _any_of([path.split(":") for path in CHOICES[kind]], f"{key}.")
+    if each := re.fullmatch(r"dict\[str, (\w+)\]", kind):
+        key, kind = f"{key}.NAME", each[1]
+    found = _find(module, kind)
+    return _settings(*found, f"{key}.") if found else {}
+
+
+def _any_of(classes: Sequence[Sequence[str]], path: str) -> dict[str, Setting]:
+    """The settings of dataclasses of which one is chosen; a default says in brackets whose it is."""
+    found = {module.rpartition(".")[2]: _settings(module, name, path) for module, name in classes}
+    merged = {}
+    for key in dict.fromkeys(key for settings in found.values() for key in settings):
+        having = {name: settings[key] for name, settings in found.items() if key in settings}
+        first = next(iter(having.values()))
+        defaults = {name: setting.default for name, setting in having.items() if setting.default}
+        agree = len(having) == len(found) and len({*defaults.values()}) <= 1
+        owned = " or ".join(f"{default} ({name})" for name, default in defaults.items())
+        text = next((setting.text for setting in having.values() if setting.text), "")
+        merged[key] = Setting(first.kind, first.default if agree else owned, text)
+    return merged
 
 
 def _default(value: ast.expr) -> str:

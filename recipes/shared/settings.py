@@ -2,7 +2,7 @@
 
 import re
 import zlib
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hydra.core.config_store import ConfigNode, ConfigStore
@@ -18,8 +18,6 @@ from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import SacConfig  # noqa: F401 (registers the learner)
 from damian.learners.schedule import SystemClock
-
-from .misspelt import set_learner_keys
 
 
 @dataclass
@@ -207,7 +205,6 @@ class _OwnLearners(dict[str, ConfigNode]):
     def __getitem__(self, option: str) -> ConfigNode:
         path = option.removesuffix(".yaml")
         settings = LEARNERS.get(path, "learner")
-        set_learner_keys([f"learner.{field.name}" for field in fields(settings)])
         return ConfigNode(option, OmegaConf.structured(settings(name=path)), "learner", None, "damian")
 
 

@@ -1,6 +1,8 @@
 """The comparison recipe, run by its command line: its runs, its refusals of wrong input, its statistics."""
 
 import csv
+import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import check_refused
 
-from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison
+from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison, regime
 from damian.evaluation.report import markdown, plot_curves, plot_norms
 from damian.evaluation.statistics import interquartile_mean
 from damian.recipes.compare import main
@@ -62,8 +64,9 @@ def stamps(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_mtime_ns for path in sorted(folder.rglob("seed_*/*")) if path.is_file()}
 
 
-def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare, capsys):
-    folder = compare(*TWO)
+def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare, capsys, tmp_path):
+    (tmp_path / "my files").mkdir()
+    folder = compare("--config-dir", "my files", *TWO)
     printed = capsys.readouterr().out
     runs = [f"none/undelayed/seed_{n}" for n in (8, 9)] + [f"paper/unaware/seed_{n}" for n in (8, 9)]
     found = sorted(path.parent.relative_to(folder / "usecase2") for path in folder.rglob("result.csv"))
@@ -72,8 +75,10 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
     text = (folder / "table.md").read_text()
     assert text.strip() in printed
-    for part in ("**developing**", "2 seeds (8 to 9), 3 episodes", "Trained for 16 frames or 500", '"arms='):
+    for part in ("**developing**", "2 seeds (8 to 9), 3 episodes", "Trained for 16 frames or 500"):
         assert part in text
+    typed = re.search(r"^- `damian compare (.*)`$", text, re.MULTILINE)[1]
+    assert shlex.split(typed) == ["--config-dir", "my files", *TWO]
     rows = table(folder / "results.csv")
     assert len(rows) == 4 * 4
     unaware = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("unaware", SAMPLED, "paper")]
@@ -148,6 +153,9 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
         (["experiment.arms.both.delayed=false"], "experiment.arms: ['undelayed', 'both'] are not delayed"),
         (["+experiment.delays.none=[]"], "experiment.delays: none cannot name a folder"),
         (["report_only=true"], "experiment: no run of it is finished in"),
+        (["+agents=3"], "agents: it is a setting of the runs; all of them get it by \"overrides=['agents="),
+        (["overrides=agents"], "overrides: it is a list: [agents]"),
+        (["arms=unaware"], "arms: it is a list: [unaware]"),
     ],
 )
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
@@ -155,6 +163,43 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
 ):
     check_refused(lambda: compare("experiment=usecase2", "seeds=2", *overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("tasks: {spotting: []}", "experiment.arms: it is missing or empty"),
+        ("arms: {undelayed: {delayed: false}}", "experiment.tasks: it is missing or empty"),
+        (
+            "tasks: {spotting: []}\narms: {undelayed: {delayed: false, overrides: agents=2}}",
+            "experiment.arms.undelayed.overrides: it is a list: [...]",
+        ),
+        (
+            "tasks: {spotting: agents=2}\narms: {undelayed: {delayed: false}}",
+            "experiment.tasks.spotting: it is a list",
+        ),
+        (
+            "tasks: {spotting: []}\narms: {undelayed: {delayed: false, polcy_of: x}}",
+            "experiment.arms.undelayed.polcy_of: no such key",
+        ),
+    ],
+)
+def test_a_mistake_in_an_experiment_of_ones_own_is_one_line(compare, capsys, tmp_path, text, message):
+    (tmp_path / "own" / "experiment").mkdir(parents=True)
+    (tmp_path / "own" / "experiment" / "mine.yaml").write_text(text)
+    check_refused(lambda: compare("--config-dir=own", "experiment=mine"), message, capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["own"]
+
+
+def test_the_regime_of_an_arm_follows_from_its_delays_unless_it_is_given():
+    arms = ARMS | {
+        "truth": Arm(regime="R1"),
+        "of truth": Arm(policy_of="truth"),
+        "given": Arm(policy_of="best", regime="R0"),
+    }
+    expected = {"best": "R3", "blind": "R0", "flown": "R2", "aware": "R0"}
+    expected |= {"truth": "R1", "of truth": "R1", "given": "R0"}
+    assert {name: regime(arms, name) for name in arms} == expected
 
 
 def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = SAMPLED) -> dict:

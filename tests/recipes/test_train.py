@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from omegaconf import OmegaConf
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint
 
+from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.learners.networks import make_actor, make_critic
-from damian.recipes.shared.launch import launch, stored_config
+from damian.recipes.shared.launch import launch, perform, save_config, stored_config
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import main
 
@@ -128,7 +130,7 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, ca
         (["backupdate=true", "delay.rew=3"], "delay.rew: 3 does not go with"),
         (["backupdate=true", "clock.server=4s"], "clock.server: 4s does not go with"),
         (
-            ["delay=paper", "delay.obs={law: burst, enter: 0.1}"],
+            ["delay=paper", "delay.obs.enter=0.1"],
             "to write another law, choose delay=none first",
         ),
         (["delay=papers"], "delay: papers is not one of burst, none, paper"),
@@ -180,6 +182,18 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, ca
         (["-m", "seed=-1,0", "hydra.sweep.dir=sweep"], "seed: -1 is not between"),
         (["-m", "resume=nowhere", "frames=1,2", "hydra.sweep.dir=sweep"], "leave out -m"),
         (["resume=nowhere"], "nowhere holds no config.yaml"),
+        (["-m", "seed=0,x"], "seed: Value 'x'"),
+        (["seed=0,1"], "seed: several values need -m"),
+        (
+            ["delay.obs={law:", "uniform,", "low:", "3s}"],
+            'a mapping needs quotes, such as "delay.obs={law: uni',
+        ),
+        (["delay.obs={law: uniform"], "a mapping needs quotes, such as"),
+        (["agents"], "agents: this word is not of the form KEY=VALUE"),
+        (["sensors=geiger:counts"], "sensors: it is a list: [geiger:counts]"),
+        (["reward.custom={component: a:b}"], "reward.custom: it is a list: [{component: a:b}]"),
+        (["model.hidden=8"], "model.hidden: it is a list: [8]"),
+        (["experiment=usecase2"], "experiment: no such key"),
         (["resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
     ],
 )
@@ -259,11 +273,19 @@ def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):
 
 
 @both_learners
-def test_resuming_a_finished_run_trains_no_further(run, learner):
+def test_resuming_a_finished_run_trains_no_further(run, capsys, learner):
     folder = run(*TINY, *learner, folder="first")
-    before = (folder / "metrics.csv").read_text()
-    run(f"resume={folder}", folder="second")
+    before, record = (folder / "metrics.csv").read_text(), json.loads((folder / "run.json").read_text())
+    assert "nothing is left" not in capsys.readouterr().out
+    run(f"resume={folder}", "frames=100", folder="second")
+    printed = capsys.readouterr().out
+    assert "frames: 100 are asked for, and the run has 256 already: nothing is left to train\n" in printed
+    assert printed.endswith("learning curve: first/learning_curve.png\nresults: first\n")
     assert (folder / "metrics.csv").read_text() == before
+    resumed = json.loads((folder / "run.json").read_text())
+    assert record["command"] == resumed["command"]
+    assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
+    assert resumed["resumed"][0]["command"] == f"damian train resume={folder} frames=100 hydra.run.dir=second"
 
 
 @pytest.mark.parametrize(
@@ -285,6 +307,91 @@ def test_a_damaged_run_folder_is_refused_in_one_line(run, capsys, damage, messag
     assert stopped.value.code == 2
     assert error.startswith("error: ")
     assert message in error
+
+
+@pytest.mark.parametrize("kept", [None, "checkpoint", "metrics.csv", "notes.txt"])
+def test_a_run_that_is_refused_before_its_first_step_leaves_no_folder(tmp_path, kept):
+    folder = tmp_path / "runs" / "sweep" / "seed=0"
+    folder.mkdir(parents=True)
+    (folder.parent / "multirun.yaml").touch()
+
+    def program(config: TrainConfig, folder: Path) -> None:
+        save_config(config, folder)
+        (folder / "events.out.tfevents.1").touch()
+        if kept:
+            (folder / kept).touch()
+        raise InputError("wrong")
+
+    with pytest.raises(InputError):
+        perform(TrainConfig(), folder, program)
+    assert {path.name for path in tmp_path.iterdir()} == ({"runs"} if kept else set())
+    assert folder.exists() == bool(kept)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("agents: 2\n", "scenario: begin scenario/mine.yaml with the line # @package _global_"),
+        ("# @package _global_\nagents: 2\n\tseed: 3\n", "mine.yaml, line 3, column 1: found character"),
+        ("# @package _global_\nagents: [2\n", "mine.yaml, line 3, column 1: expected ',' or ']'"),
+        ("# @package _global_\nmodel: {hidden: 8}\n", "model.hidden: it is a list: [...]"),
+    ],
+)
+def test_a_mistake_in_a_file_of_ones_own_is_one_line(run, capsys, tmp_path, text, message):
+    (tmp_path / "own" / "scenario").mkdir(parents=True)
+    (tmp_path / "own" / "scenario" / "mine.yaml").write_text(text)
+    check_refused(lambda: run("--config-dir=own", "scenario=mine"), message, capsys)
+
+
+def test_a_sweep_is_no_run(run, capsys, tmp_path):
+    (tmp_path / "swept" / "seed=0").mkdir(parents=True)
+    (tmp_path / "swept" / "multirun.yaml").touch()
+    for key in ("checkpoint", "resume"):
+        message = f"{key}: swept is a sweep: give one of the folders in it"
+        check_refused(lambda key=key: run(f"{key}=swept"), message, capsys)
+
+
+BROKEN = """
+from dataclasses import dataclass
+from damian.learners.mappo import MappoConfig
+
+@dataclass
+class BrokenConfig(MappoConfig):
+    sign: int = 3
+
+    def __post_init__(self):
+        if self.sign != 3:
+            "three" + self.sign
+
+@dataclass
+class NeverConfig(BrokenConfig):
+    sign: int = 4
+"""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["learner=broken:NeverConfig"], ["learner=broken:BrokenConfig", "learner.sign=4"]],
+    ids=["when it is made", "when it gets its values"],
+)
+def test_the_traceback_of_an_exception_of_ones_own_code_can_be_shown(run, capsys, monkeypatch, words):
+    Path("broken.py").write_text(BROKEN)
+    hint = "(DAMIAN_TRACEBACK=1 shows the traceback)\n"
+    check_refused(lambda: run(*words), 'can only concatenate str (not "int") to str ' + hint, capsys)
+    monkeypatch.setenv("DAMIAN_TRACEBACK", "1")
+    with pytest.raises(SystemExit):
+        run(*words)
+    printed = capsys.readouterr().err
+    assert '"three" + self.sign' in printed
+    assert printed.splitlines()[-1].startswith("error: ")
+    assert hint not in printed
+
+
+@pytest.mark.parametrize("word", ["agents=two", "region=3", "agnts=3", "agents=0", "checkpoint=nowhere"])
+def test_wrong_input_needs_no_traceback(run, capsys, word):
+    with pytest.raises(SystemExit):
+        run(word)
+    assert "traceback" not in capsys.readouterr().err
 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(run, capsys):
