@@ -18,7 +18,7 @@ OUTPUTS = "observation, done, terminated, truncated"
 
 def rollout(*transforms: Transform) -> None:
     """Fly the pendulum with transforms."""
-    TransformedEnv(GymEnv("Pendulum-v1"), Compose(*transforms)).rollout(3)
+    TransformedEnv(GymEnv("Pendulum-v1"), Compose(*transforms)).rollout(3)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
