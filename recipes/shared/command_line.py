@@ -2,6 +2,7 @@
 
 import os
 import re
+import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,14 @@ def parsed(words: Sequence[str]) -> Namespace:
     parser = get_args_parser()
     parser.error = _refuse
     return parser.parse_intermixed_args(list(words))
+
+
+def own_folder() -> str | None:
+    """The folder with configuration files of the user's own, if this process was given one."""
+    try:
+        return parsed(sys.argv[1:]).config_dir
+    except InputError:  # a script with options of its own
+        return None
 
 
 def _refuse(message: str) -> NoReturn:

@@ -9,7 +9,7 @@ from yaml import MarkedYAMLError
 
 from damian.common.errors import InputError
 
-from .command_line import parsed
+from .command_line import own_folder
 from .known_settings import default_options, groups
 from .misspelt import RENAMED, no_such_key, no_such_option
 
@@ -19,7 +19,7 @@ REMEDIES = {
     r"mismatched input '='|no viable alternative at input '\[\w+='": (
         "a value with = in it needs quotes, such as \"overrides=['frames=1000','worlds=8']\""
     ),
-    r"input '\{|LexerNoViableAltException: \{|input '[^']*\{": (
+    r"input '[^']*\{|LexerNoViableAltException: .*\{": (
         'a mapping needs quotes, such as "delay.obs={law: uniform, low: 3s, high: 7s}"'
     ),
     r"Error parsing override '(.*)'\nmissing EQUAL": (
@@ -58,7 +58,7 @@ def _about_words(text: str, program: str) -> str | None:
         if match := re.search(pattern, text):
             return match.expand(remedy)
     if option := re.search(r"Could not find '([\w-]+)/(\S+)'", text):
-        return no_such_option(option[1], option[2], _own_folder())
+        return no_such_option(option[1], option[2], own_folder())
     if group := re.search(r"Could not override '([\w/]+)'\. No match in the defaults list", text):
         return no_such_key(group[1], program)
     if "Config group override must be a string" in text:
@@ -94,7 +94,7 @@ def foreign_cause(error: BaseException) -> BaseException | None:
     elif isinstance(error, InputError):
         cause = error.__cause__
     else:
-        cause = None if _about_words(str(error), "train") else error
+        cause = None if isinstance(error, OSError) or _about_words(str(error), "train") else error
     return None if isinstance(cause, known) else cause
 
 
@@ -106,14 +106,6 @@ def _unknown(key: str, text: str, error: BaseException, program: str) -> str:
     section, _, _ = key.rpartition(".")
     node = getattr(error, "parent_node", None)
     return no_such_key(key, program, beside=[f"{section}.{name}" for name in node or ()])
-
-
-def _own_folder() -> str | None:
-    """The folder with configuration files of the user's own, if one is given."""
-    try:
-        return parsed(sys.argv[1:]).config_dir
-    except InputError:
-        return None
 
 
 def _gives_group_no_name(override: str) -> bool:

@@ -26,7 +26,7 @@ from damian.evaluation.run_folder import CHECKPOINT, CONFIG
 from damian.evaluation.run_record import RECORD, new_record, timed, write_record
 from damian.learners.base import LEARNERS
 
-from .command_line import parsed, prepared
+from .command_line import own_folder, prepared
 from .composition_errors import COMPOSITION_ERRORS, foreign_cause, one_line
 from .inheritance import changes, check_policy_fits, inherited, key_of
 from .known_settings import RECIPES, SCHEMAS
@@ -108,11 +108,13 @@ def perform(config: TrainConfig, folder: Path, program: Program) -> None:
     """
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
+    was_empty = not folder.is_dir() or not any(folder.iterdir())
     try:
         with timed(folder):
             program(config, folder)
     except (InputError, OmegaConfBaseException):
-        _drop_unused(folder)
+        if was_empty:
+            _drop_unused(folder)
         raise
     print(f"results: {folder}")
 
@@ -157,8 +159,7 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     OmegaConf.save(OmegaConf.structured(config), folder / CONFIG)
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    own_files = parsed(sys.argv[1:]).config_dir
-    write_record(folder, new_record(command(typed_words()), device, config.threads, own_files))
+    write_record(folder, new_record(command(typed_words()), device, config.threads, own_folder()))
 
 
 def stored_config(folder: Path, key: str) -> DictConfig:

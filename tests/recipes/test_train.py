@@ -322,10 +322,21 @@ def test_a_run_that_is_refused_before_its_first_step_leaves_no_folder(tmp_path, 
             (folder / kept).touch()
         raise InputError("wrong")
 
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="wrong"):
         perform(TrainConfig(), folder, program)
     assert {path.name for path in tmp_path.iterdir()} == ({"runs"} if kept else set())
     assert folder.exists() == bool(kept)
+
+
+def test_files_that_lay_in_the_folder_before_are_kept(tmp_path):
+    (tmp_path / "events.out.tfevents.1").touch()
+
+    def program(config: TrainConfig, folder: Path) -> None:
+        raise InputError("wrong")
+
+    with pytest.raises(InputError, match="wrong"):
+        perform(TrainConfig(), tmp_path, program)
+    assert (tmp_path / "events.out.tfevents.1").exists()
 
 
 @pytest.mark.parametrize(
