@@ -4,7 +4,7 @@
     damian belief delay=paper scenario=tracking agents=2 seed=1
     damian belief delay.obs=3 delay.loss=0.2 motion=polynomial
 
-Every override of recipes/train.py may be given, except resume. The run folder gets config.yaml, belief.png (a
+Every override of damian train may be given, except resume. The run folder gets config.yaml, belief.png (a
 map, the positions over time, the age of information) and belief.csv (a row for each time and UAV).
 """
 

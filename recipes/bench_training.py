@@ -39,7 +39,7 @@ RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
 UNDELAYED = "scenario=paper/usecase2"
 PAPER = f"{UNDELAYED} delay=paper"
 ARMS = (UNDELAYED, PAPER, f"{PAPER} aware=backupdate", f"{PAPER} aware=both")
-"""Overrides of ``recipes/train.py``, separated by spaces."""
+"""Overrides of ``damian train``, separated by spaces."""
 HEADER = (
     "training",
     "frames/s",
@@ -81,7 +81,7 @@ def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
     """The configuration of an arm.
 
     Args:
-        words: overrides of ``recipes/train.py``, separated by spaces.
+        words: overrides of ``damian train``, separated by spaces.
         worlds: B of a batch.
         steps: T of a batch.
     """
@@ -91,7 +91,7 @@ def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
 
 
 def damian(config: TrainConfig) -> Iterator[Seconds]:
-    """Train as ``recipes/train.py`` does; yields the times of each iteration."""
+    """Train as ``damian train`` does; yields the times of each iteration."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     learner = cast(Mappo, make_learner(config, env))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)

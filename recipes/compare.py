@@ -52,9 +52,9 @@ class Experiment:
     """Tasks, delays and arms to compare, as written in a file of conf/experiment."""
 
     tasks: dict[str, list[str]] = field(default_factory=dict)
-    """Overrides of ``recipes/train.py`` for each task."""
+    """Overrides of ``damian train`` for each task."""
     delays: dict[str, list[str]] = field(default_factory=dict)
-    """Overrides of ``recipes/train.py`` for each delay."""
+    """Overrides of ``damian train`` for each delay."""
     arms: dict[str, Arm] = field(default_factory=dict)
     """One of them, the reference, has ``delayed: false``."""
     first_seed: int = 0
@@ -85,7 +85,7 @@ class Experiment:
 
 @dataclass
 class CompareConfig:
-    """All settings of ``recipes/compare.py``."""
+    """All settings of ``damian compare``."""
 
     experiment: Experiment = MISSING
     seeds: int = SEEDS
@@ -99,7 +99,7 @@ class CompareConfig:
     arms: list[str] | None = None
     """Names of the arms to run; all of the experiment's if not given."""
     overrides: list[str] = field(default_factory=list)
-    """Further overrides of ``recipes/train.py`` for every run."""
+    """Further overrides of ``damian train`` for every run."""
     score: str = "true_return"
     """The measure J that J_norm and recovery are computed from."""
     policy: str = "sampled"

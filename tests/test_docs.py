@@ -39,7 +39,7 @@ def test_every_command_that_a_file_names_exists(file):
         command = re.split(r"  +[#(]", line)[0]  # an explanation stands behind some spaces
         name, *words = shlex.split(command, comments=True)
         assert name in PROGRAMS, line
-        own = [word for word in words if "=" in word and "FOLDER" not in word and "NAME" not in word]
+        own = [word for word in words if "FOLDER" not in word and "NAME" not in word]
         if name in SETTINGS and "--help" not in words:
             assert check_words(SETTINGS[name], own) is None, line
 

@@ -40,7 +40,7 @@ class Arm:
     """One way to train policies for a task, or to fly those of another arm."""
 
     overrides: list[str] = field(default_factory=list)
-    """Overrides of the settings of ``recipes/train.py``."""
+    """Overrides of the settings of ``damian train``."""
     delayed: bool = True
     """Whether the arm has delays. Exactly one arm has none: the reference, run once for each task."""
     naive: bool = False

@@ -38,7 +38,7 @@ class LoggerConfig:
 
 @dataclass
 class TrainConfig(ScenarioConfig):
-    """All settings of ``recipes/train.py``, beside those of the scenario."""
+    """All settings of ``damian train``, beside those of the scenario."""
 
     learner: LearnerConfig = field(default_factory=MappoConfig)
     """Settings of the learner: ``MappoConfig``, ``SacConfig``, or a class of one's own."""
