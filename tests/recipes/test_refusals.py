@@ -198,11 +198,11 @@ class NeverConfig(BrokenConfig):
 
 @pytest.mark.parametrize(
     "words",
-    [["learner=broken:NeverConfig"], ["learner=broken:BrokenConfig", "learner.sign=4"]],
+    [["learner=unmade:NeverConfig"], ["learner=unmade:BrokenConfig", "learner.sign=4"]],
     ids=["when it is made", "when it gets its values"],
 )
 def test_the_traceback_of_an_exception_of_ones_own_code_can_be_shown(run, capsys, monkeypatch, words):
-    Path("broken.py").write_text(BROKEN)
+    Path("unmade.py").write_text(BROKEN)
     hint = "(DAMIAN_TRACEBACK=1 shows the traceback)\n"
     check_refused(lambda: run(*words), 'can only concatenate str (not "int") to str ' + hint, capsys)
     monkeypatch.setenv("DAMIAN_TRACEBACK", "1")
