@@ -10,15 +10,18 @@ from damian.envs.scenario import ScenarioConfig
 
 from .settings import TrainConfig
 
-KEPT = ("delay.history",)
-"""Settings of the observation, which a new option of their group (``delay=paper``) does not replace."""
-
 
 def inherited(stored: TrainConfig, overrides: Sequence[str]) -> list[str]:
-    """The given overrides, preceded by those of a stored run that they do not replace."""
+    """The given overrides, preceded by those of a stored run that they do not replace.
+
+    The policy keeps its action history, because it is part of its observation, even if a file of the stored
+    run's scenario or an option of ``delay`` says otherwise.
+    """
     given = [key_of(override) for override in overrides]
-    kept = [old for old in stored.overrides if not any(_replaces(key, key_of(old)) for key in given)]
-    return kept + list(overrides)
+    history = [] if {"delay.history", "aware"} & {*given} else [f"delay.history={stored.delay.history}"]
+    replaced = [*given, *map(key_of, history)]
+    kept = [old for old in stored.overrides if not any(_replaces(key, key_of(old)) for key in replaced)]
+    return [*kept, *history, *overrides]
 
 
 def key_of(override: str) -> str:
@@ -28,7 +31,7 @@ def key_of(override: str) -> str:
 
 def _replaces(given: str, key: str) -> bool:
     """Does an override of ``given``, a key or a group, replace an earlier override of ``key``?"""
-    return key == given or (key.startswith(f"{given}.") and key not in KEPT)
+    return key == given or key.startswith(f"{given}.")
 
 
 def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:

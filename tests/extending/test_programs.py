@@ -120,8 +120,11 @@ def test_a_scenario_of_ones_own_is_trained_with_a_learner_and_a_logger_of_ones_o
     assert progress == f"128 steps: {float(metrics['episode_return']) / 2:.0%}"
     assert json.loads((first / "run.json").read_text())["config_dir"] == str(folder / "conf")
     # The learner and the folder of configuration files are found again.
-    evaluated = run("checkpoint=run", "agents=3", program="evaluate", name="evaluated")
-    assert OmegaConf.load(evaluated / "config.yaml").learner.name == "learner:ReinforceConfig"
+    # The policy keeps its action history, which a file of the scenario has chosen.
+    evaluated = run("checkpoint=run", "agents=3", "delay=paper", program="evaluate", name="evaluated")
+    config = OmegaConf.load(evaluated / "config.yaml")
+    assert config.learner.name == "learner:ReinforceConfig"
+    assert (config.delay.obs.law, config.delay.history) == ("uniform", 2)
     run_resumed(run, "run")
     assert last_metrics(first)["frames"] == "256.0"
 
