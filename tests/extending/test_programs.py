@@ -178,25 +178,25 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
         ),
         (["logger.custom=[law:Satellite]"], "law:Satellite is no function (folder) -> logger, nor a class"),
         (
-            ["learner=broken:NoneConfig"],
-            "broken:NoneConfig: make returned: NoneType is no learner: it has no actor",
+            ["learner=faulty:NoneConfig"],
+            "faulty:NoneConfig: make returned: NoneType is no learner: it has no actor",
         ),
-        (["learner=broken:NoActorConfig"], "broken:NoActorConfig: components: {'optimizer': "),
-        (["learner=broken:Bare"], "learner: broken:Bare is no dataclass: write @dataclass above the class"),
+        (["learner=faulty:NoActorConfig"], "faulty:NoActorConfig: components: {'optimizer': "),
+        (["learner=faulty:Bare"], "learner: faulty:Bare is no dataclass: write @dataclass above the class"),
         (
-            ["learner=broken:SmallConfig", "delay.obs=2", "aware=backupdate"],
-            "broken:SmallConfig: buffer_size: 3 is too little for back-updating, which needs 80",
+            ["learner=faulty:SmallConfig", "delay.obs=2", "aware=backupdate"],
+            "faulty:SmallConfig: buffer_size: 3 is too little for back-updating, which needs 80",
         ),
         (["learner=reader:ReaderConfig"], "learner: reader:ReaderConfig reads hindsight, which needs aware="),
-        (["logger.custom=[broken:no_logger]"], "broken:no_logger: int is no logger: it has no method"),
-        (["logger.custom=[broken:no_folder]"], "broken:no_folder: TypeError: no_folder() takes 0 positional"),
+        (["logger.custom=[faulty:no_logger]"], "faulty:no_logger: int is no logger: it has no method"),
+        (["logger.custom=[faulty:no_folder]"], "faulty:no_folder: TypeError: no_folder() takes 0 positional"),
         (["--config-dir=conf", "scenario=windi"], "scenario: windi is not one of windy, coverage"),
         (["--config-dir=nowhere", "scenario=windy"], "nowhere"),
     ],
 )
 def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
     (folder / "reader.py").write_text(READER)
-    (folder / "broken.py").write_text(BROKEN)
+    (folder / "faulty.py").write_text(BROKEN)
     check_refused(lambda: run(*TINY, *overrides), message, capsys)
     assert not (folder / "run").exists()
 
@@ -204,15 +204,15 @@ def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("learner=broken:NoNumbersConfig", "broken:NoNumbersConfig: learn returned: None is not a dict of"),
-        ("learner=broken:RaisingConfig", "broken:RaisingConfig: KeyError: "),
-        ("logger.custom=[broken:Raising]", "logger Raising: OSError: disk full (broken.py, line 53)"),
+        ("learner=faulty:NoNumbersConfig", "faulty:NoNumbersConfig: learn returned: None is not a dict of"),
+        ("learner=faulty:RaisingConfig", "faulty:RaisingConfig: KeyError: "),
+        ("logger.custom=[faulty:Raising]", "logger Raising: OSError: disk full (faulty.py, line 53)"),
     ],
 )
 def test_an_error_in_the_first_update_is_one_line_after_the_progress_bar(
     run, folder, capsys, override, message
 ):
-    (folder / "broken.py").write_text(BROKEN)
+    (folder / "faulty.py").write_text(BROKEN)
     with pytest.raises(SystemExit) as stopped:
         run(*TINY, override)
     assert stopped.value.code == 2
