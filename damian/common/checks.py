@@ -33,28 +33,6 @@ def whole(key: str, value: Any, low: int, high: float = math.inf, unit: str = ""
     in_range(key, value, low, high, unit)
 
 
-def values_of_uavs(name: str, found: Any, shape: Sequence[int], width: int | None = 1, why: str = "") -> None:
-    """Require what a component of one's own must return: finite values for each UAV.
-
-    Args:
-        name: of the component, for errors.
-        found: what it returned.
-        shape: number of initial conditions and of UAVs, [Q, N].
-        width: number of values for each UAV: [Q, N] for 1, else [Q, N, width]; None if it may be any number.
-        why: what declares the width, for errors.
-    """
-    if not isinstance(found, torch.Tensor):
-        raise InputError(f"{name}: a {type(found).__name__} is not a tensor")
-    last = [] if width == 1 else [width or "K"]
-    actual, good = list(found.shape), found.dim() == len(shape) + len(last)
-    good = good and actual == [*shape, *(actual[-1:] if width is None else last)]
-    expected = ", ".join(map(str, [*shape, *last]))
-    meaning = f"[initial conditions, UAVs{', values' if last else ''}]"
-    require(good, name, f"shape {actual}", f"is not [{expected}] = {meaning}{why}")
-    bad = found[~found.isfinite()][:1].tolist()
-    require(not bad, name, bad, "is not finite")
-
-
 def above(key: str, value: float, low: float, unit: str = "") -> None:
     """Require a finite number above ``low``."""
     _require_bounds(key, value, low)

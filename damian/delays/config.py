@@ -11,7 +11,7 @@ from damian.delays.laws import LONGEST, LOSES, Held, Law, law_of, sampler_of
 from damian.delays.samplers import Sampler
 
 CONTEXT_KEYS = {"position": keys.POSITION}
-"""What a law of a scenario may read in the context of a message: keys of the entries by name."""
+"""TensorDict keys of the entries that a delay law of a scenario may read, by the name in ``reads``."""
 
 
 @dataclass

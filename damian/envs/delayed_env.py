@@ -222,6 +222,6 @@ class DelayedEnv(TransformedEnv):
 
 
 def _mask_sent(stepped: Tensor, transforms: Sequence[StatefulTransform], entries: Entries) -> Entries:
-    """The entries with the flags of what is sent cleared in all worlds outside the mask ``stepped`` [B]."""
+    """The entries with all flags of sent messages and actions false in worlds outside ``stepped`` [B]."""
     flags = [transform.sent_key for transform in transforms if transform.sent_key in entries]
     return entries | {key: entries[key] & expand_mask(stepped, entries[key]) for key in flags}

@@ -1,10 +1,7 @@
 """``UavEnv``: the simulation and the server node as a TorchRL environment without delays."""
 
-import os
 from collections.abc import Collection
 from typing import Any, cast
-
-os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase

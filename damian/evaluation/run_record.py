@@ -16,7 +16,7 @@ import damian
 
 RECORD = "run.json"
 OF_FIRST_PART = ("command", "started")
-"""What a resumed run records for each of its parts."""
+"""Entries of ``new_record`` that the list ``resumed`` repeats each time that a run is resumed."""
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy", "shapely")
 """Packages whose versions a record names."""
 

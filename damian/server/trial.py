@@ -10,6 +10,7 @@ from damian.server.feature_cache import FeatureCache, ServerContext
 from damian.server.features import FEATURES, Feature
 from damian.server.reward_terms import Counters, CustomTerm
 from damian.world.messages import Messages
+from damian.world.uav_values import check_uav_values
 
 _TRIED = 32
 """Number of initial conditions with which a local feature is tried."""
@@ -32,9 +33,7 @@ def try_feature(name: str, messages: Messages, context: ServerContext) -> None:
     found, key = FEATURES.get(name, "feature"), f"feature {name}"
     with naming_errors(key):
         values = found.compute(FeatureCache(messages, context))
-    checks.values_of_uavs(
-        key, values, messages.track.shape, found.width, f", as width={found.width} asks for"
-    )
+    check_uav_values(key, values, messages.track.shape, found.width, f", as width={found.width} asks for")
     slack = 1e-5 * (found.high - found.low)
     beyond = values[(values < found.low - slack) | (values > found.high + slack)][:1].tolist()
     problem = f"lies outside of low={found.low:g} and high={found.high:g}, which it declares"
@@ -101,4 +100,4 @@ def try_term(term: CustomTerm, features: dict[str, Tensor], counters: Counters) 
     declared = Declared({name: features[name] for name in term.reads}, problem)
     with naming_errors(key):
         values = term.compute(declared, counters, **term.parameters)
-    checks.values_of_uavs(key, values, counters.motions.shape)
+    check_uav_values(key, values, counters.motions.shape)

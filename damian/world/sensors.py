@@ -11,6 +11,7 @@ from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
 from damian.world.messages import Messages
 from damian.world.state import State
+from damian.world.uav_values import check_uav_values
 
 
 class Sensor(NamedTuple):
@@ -32,7 +33,7 @@ class Sensor(NamedTuple):
         with naming_errors(f"sensors: {self.name}"):
             values = self.compute(state, world)
         why = f", as width={self.width} asks for"
-        checks.values_of_uavs(f"sensors: {self.name}", values, state.track.shape, self.width, why)
+        check_uav_values(f"sensors: {self.name}", values, state.track.shape, self.width, why)
 
     def read(self, state: State, world: Any) -> Tensor:
         """The values as columns, [B, N, width] float32.

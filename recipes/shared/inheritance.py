@@ -80,12 +80,3 @@ def _settings(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield from _settings(value, f"{path}{field.name}.")
         else:
             yield f"{path}{field.name}", value
-
-
-def leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every dotted key of nested dictionaries with its value."""
-    if isinstance(node, dict) and node:
-        for key, value in node.items():
-            yield from leaves(value, f"{path}.{key}" if path else key)
-    else:
-        yield path, node

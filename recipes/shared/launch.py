@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NoReturn, cast
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``launch`` prints them
-os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 import torch
 from hydra import compose

@@ -23,7 +23,6 @@ from damian.common.errors import InputError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
 
 from .composition_errors import one_line
-from .inheritance import leaves
 from .launch import Program, perform, stored_config
 from .settings import TrainConfig
 
@@ -90,7 +89,7 @@ def check_stored(run: Run) -> None:
     except InputError as error:
         raise InputError(f"{error}; delete the folder") from error
     asked = OmegaConf.create(OmegaConf.to_yaml(OmegaConf.structured(run.config)))
-    old, new = (dict(leaves(OmegaConf.to_container(config))) for config in (stored, asked))
+    old, new = (dict(_leaves(OmegaConf.to_container(config))) for config in (stored, asked))
     for key in new | old:
         may_differ = key in ("resume", "overrides") or (key == "checkpoint" and not run.trains)
         if not may_differ and old.get(key) != new.get(key):
@@ -98,6 +97,15 @@ def check_stored(run: Run) -> None:
                 f"{run.folder}: {key} is {old.get(key)} in this stored run, and {new.get(key)} is asked "
                 "for: delete the folder, or choose another one with hydra.run.dir"
             )
+
+
+def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every dotted key of nested dictionaries with its value."""
+    if isinstance(node, dict) and node:
+        for key, value in node.items():
+            yield from _leaves(value, f"{path}.{key}" if path else key)
+    else:
+        yield path, node
 
 
 def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> list[Run]:
