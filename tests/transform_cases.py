@@ -46,11 +46,6 @@ def delayed(*transforms: StatefulTransform, worlds: Sequence[int] = WORLDS, **op
     return TransformedEnv(Counting(worlds, N_AGENTS, **options), Compose(*transforms))
 
 
-def streams_of(worlds: Sequence[int]) -> Tensor:
-    """The random streams from which the transforms of ``delayed`` draw, [M]."""
-    return counter_rng.bits(torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)).flatten()
-
-
 def choices(worlds: Sequence[int] = WORLDS, n_steps: int = STEPS) -> list[Tensor]:
     """Actions for each step, [B, N]; those of a world do not depend on the other worlds."""
     names, agents = torch.tensor(worlds).unsqueeze(-1), torch.arange(N_AGENTS)

@@ -1,37 +1,56 @@
-"""Random numbers as a pure function of (world seed, counter): no generator, no hidden state.
+"""Random numbers as a pure function of a key and counters: no generator, no hidden state.
 
-Each world has its own stream, so a world draws the same numbers in a batch as alone, on any device and
-under ``torch.compile``. The hash is the 32-bit finaliser "lowbias32" (C. Wellons, "Prospecting for hash
-functions", 2018) in int64 arithmetic: good enough for simulation, not for cryptography.
+A key is a 64-bit integer (int64, so that it may be negative), one for each random stream. A stream draws
+the same numbers in a batch as alone, on any device and under ``torch.compile``. The hash is the mixing
+function of SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014;
+multipliers: D. Stafford's variant 13) of the counter, with the key added within it a second time: each
+key gives a sequence of its own, not another section of the sequence that all keys share. It is a third of
+the operations of Philox, and good enough for simulation, not for cryptography.
 """
+
+import hashlib
 
 import torch
 from torch import Tensor
 
 _MASK = 0xFFFFFFFF
+_WEYL = -0x61C8864680B583EB  # 2^64 / golden ratio, as a signed number
+_FIRST, _SECOND = -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15
 
 
-def mix(x: Tensor) -> Tensor:
-    """Hash non-negative integers below 2^32 to integers below 2^32; int64 in and out, any shape."""
-    x = ((x ^ (x >> 16)) * 0x7FEB352D) & _MASK
-    x = ((x ^ (x >> 15)) * 0x846CA68B) & _MASK  # int64 wraps; the low 32 bits stay exact
-    return x ^ (x >> 16)
+def bits64(key: Tensor, *counters: Tensor) -> Tensor:
+    """Draw 64 random bits as int64, one for each element of the broadcast shape of key and counters.
 
-
-def bits(seed: Tensor, *counters: Tensor) -> Tensor:
-    """Draw uniform integers in [0, 2^32), one per element of the broadcast shape of seed and counters."""
-    value = seed
+    Args:
+        key: random stream, int64.
+        counters: whole numbers, int64, that tell the draws of a stream apart; their order matters.
+    """
     for counter in counters:
-        value = mix((value + 0x9E3779B9 * (counter + 1)) & _MASK)
-    return value
+        x = (counter * _WEYL) ^ key
+        x = (x ^ ((x >> 30) & 0x3FFFFFFFF)) * _FIRST  # int64 wraps; a shift fills up with the sign
+        x = x + key
+        x = (x ^ ((x >> 27) & 0x1FFFFFFFFF)) * _SECOND
+        key = x ^ ((x >> 31) & 0x1FFFFFFFF)
+    return key
 
 
-def uniform(seed: Tensor, *counters: Tensor) -> Tensor:
-    """Draw uniform floats in [0, 1), one per element of the broadcast shape of seed and counters."""
-    return (bits(seed, *counters) >> 8).to(torch.float32) * 2.0**-24
+def bits(key: Tensor, *counters: Tensor) -> Tensor:
+    """Draw uniform integers in [0, 2^32); the arguments are those of ``bits64``."""
+    return (bits64(key, *counters) >> 32) & _MASK
+
+
+def uniform(key: Tensor, *counters: Tensor) -> Tensor:
+    """Draw uniform floats in [0, 1), multiples of 2^-24; the arguments are those of ``bits64``."""
+    return ((bits64(key, *counters) >> 40) & 0xFFFFFF).to(torch.float32) * 2.0**-24
 
 
 def world_seeds(seed: int, n_worlds: int, device: torch.device | None = None) -> Tensor:
-    """Derive one well-separated seed per world, [B]; neighbouring values of ``seed`` share no streams."""
-    base = mix(torch.tensor(seed & _MASK, device=device))
-    return bits(base, torch.arange(n_worlds, device=device))
+    """Derive one key for each world from a seed, [B] int64; neighbouring seeds share no streams."""
+    wrapped = (seed + 2**63) % 2**64 - 2**63
+    base = torch.full((n_worlds,), wrapped, dtype=torch.long, device=device)
+    return bits64(base, torch.zeros_like(base), torch.arange(n_worlds, device=device))
+
+
+def number_of(text: str) -> int:
+    """A 63-bit number that stands for a text: a counter that tells streams of different uses apart."""
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big") >> 1

@@ -16,7 +16,7 @@ def gather_rows(table: Tensor, index: Tensor) -> Tensor:
 
 def expand_mask(mask: Tensor, like: Tensor) -> Tensor:
     """Append dimensions of size 1 to a mask [*], so that it broadcasts against ``like`` [*, ...]."""
-    return mask.view(*mask.shape, *[1] * (like.dim() - mask.dim()))
+    return mask.view((*mask.shape, *[1] * (like.dim() - mask.dim())))
 
 
 def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:

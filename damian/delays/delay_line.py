@@ -48,10 +48,11 @@ class DelayLine:
     Args:
         sampler: draws the delays.
         order: one of ``ORDERS``.
+        gradients: whether messages keep their autograd graph; the slots are then not written in place.
     """
 
-    def __init__(self, sampler: Sampler, order: str) -> None:
-        self.sampler = sampler
+    def __init__(self, sampler: Sampler, order: str, gradients: bool = False) -> None:
+        self.sampler, self._gradients = sampler, gradients
         self._hold_last_generated = order == "generation"
 
     def init_memory(self, values: list[Tensor], streams: Tensor) -> Memory:
@@ -71,6 +72,10 @@ class DelayLine:
             memory[f"slots_{i}"] = value.new_zeros(n_rows, *value.shape)
             memory[f"held_{i}"] = value.clone()
         return memory
+
+    def row_dims(self, n_values: int) -> dict[str, int]:
+        """The dimension of the senders in the buffers in which it is not the first."""
+        return {"stamps": 1} | {f"slots_{i}": 1 for i in range(n_values)}
 
     def reset(self, memory: Memory, values: list[Tensor], mask: Tensor) -> tuple[Memory, Delivery]:
         """Where the mask [M] is true, hold ``values`` [M, ...] and discard all messages in transit."""
@@ -119,8 +124,13 @@ class DelayLine:
         held = []
         for i, value in enumerate(values):
             slots, old = memory[f"slots_{i}"], memory[f"held_{i}"]
-            new = slots.flatten(0, 1).index_copy_(0, row_sent, value).index_select(0, row_now)
-            held.append(torch.where(expand_mask(fresh, old), new, old))
+            flat = slots.flatten(0, 1)
+            if self._gradients:
+                flat = flat.index_copy(0, row_sent, value)
+                memory[f"slots_{i}"] = flat.view_as(slots)
+            else:
+                flat.index_copy_(0, row_sent, value)
+            held.append(torch.where(expand_mask(fresh, old), flat.index_select(0, row_now), old))
             memory[f"held_{i}"] = held[i]
         return memory, Delivery(held, clock - generated_at, fresh, delay)
 

@@ -73,7 +73,7 @@ class Sampler(nn.Module):
         self.register_buffer("_boundaries", boundaries, persistent=False)
         self._bad_share = (turn[0, 1] / (turn[0, 1] + turn[1, 0])).item() if turns else 0.0
         likeliest = int(chances[0].argmax())
-        self.certain = likeliest if len(states) == 1 and chances[0, likeliest] == 1 else None
+        self.certain = likeliest if bool((chances[:, likeliest] == 1).all()) else None
         """The delay [steps] if it is always the same, else None."""
 
     @property

@@ -1,6 +1,6 @@
-"""A transformed environment that seeds its transforms too, and steps with them as one compiled graph."""
+"""A transformed environment that steps with its transforms as one compiled graph."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, cast
 
 import torch
@@ -9,21 +9,17 @@ from torch import Tensor
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian import keys
-from damian.common import counter_rng
 from damian.common.compiling import compiled
-from damian.common.tensors import expand_mask, tree_where
+from damian.common.tensors import tree_where
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
 from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import Entries, Memory, drop_keys, select_entries
+from damian.transforms.entries import STEPPED, Entries, Memory, drop_keys, select_entries
 from damian.world.state import PackedState
-
-_SEED_STRIDE = 7919
-"""Difference between the seeds of two successive transforms."""
 
 
 class DelayedEnv(TransformedEnv):
-    """A ``TransformedEnv`` that also seeds its transforms, and steps a ``UavEnv`` and them in one function.
+    """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function.
 
     The result is that of TorchRL's ``TransformedEnv``, which calls one transform after the other; but no
     TensorDict is built between two transforms, so that a step compiles into one graph.
@@ -50,12 +46,6 @@ class DelayedEnv(TransformedEnv):
         """The server node that environment, transforms, replay storage and evaluation share."""
         return self.uav_env.server
 
-    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Seed the worlds and every transform; the environment must be reset before its next step."""
-        for number, transform in enumerate(self._all_stateful()):
-            transform.set_seed(None if seed is None else seed + _SEED_STRIDE * (number + 1))
-        return super().set_seed(seed, static_seed)
-
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own random streams, so that it evolves the same alone as among others.
 
@@ -63,8 +53,8 @@ class DelayedEnv(TransformedEnv):
             seeds: integers, one for each world, [B].
         """
         self.uav_env.seed_worlds(seeds)
-        for number, transform in enumerate(self._all_stateful()):
-            transform.seed_worlds(counter_rng.bits(seeds, torch.full_like(seeds, number)))
+        for transform in self._all_stateful():
+            transform.seed_worlds(seeds)
 
     def compile(self, **options: Any) -> "DelayedEnv":
         """Compile a step of ``UavEnv`` with its transforms as one graph.
@@ -144,16 +134,13 @@ class DelayedEnv(TransformedEnv):
         this step later, and what is in transit is written in place.
         """
         (stateful, _), memories = self._split_transforms(), list(memories)
-        if stepped is not None:
-            entries = _mask_sent(stepped, stateful, entries)
+        mask: Entries = {} if stepped is None else {STEPPED: stepped}
         for i, transform in reversed(list(enumerate(stateful))):
-            memories[i], changed = transform.on_action(memories[i], entries)
+            memories[i], changed = transform.on_action(memories[i], entries | mask)
             entries = entries | changed
         worlds, outputs = self.uav_env.step_fn(worlds, entries[keys.ACTION], entries.get(keys.ACTION_VALID))
-        if stepped is not None:
-            outputs = _mask_sent(stepped, stateful, outputs)
         for i, transform in enumerate(stateful):
-            memories[i], changed = transform.on_step(memories[i], outputs)
+            memories[i], changed = transform.on_step(memories[i], outputs | mask)
             outputs = drop_keys(outputs | changed, transform.dropped_keys)
         return worlds, memories, outputs
 
@@ -219,9 +206,3 @@ class DelayedEnv(TransformedEnv):
         for module in self.transform.modules():
             if isinstance(module, StatefulTransform):
                 yield module
-
-
-def _mask_sent(stepped: Tensor, transforms: Sequence[StatefulTransform], entries: Entries) -> Entries:
-    """The entries with all flags of sent messages and actions false in worlds outside ``stepped`` [B]."""
-    flags = [transform.sent_key for transform in transforms if transform.sent_key in entries]
-    return entries | {key: entries[key] & expand_mask(stepped, entries[key]) for key in flags}

@@ -36,9 +36,11 @@ class ActionDelay(ActionTransform):
             ``SerialEnv`` passes it on, a ``ParallelEnv`` only if its specs name it.
         context_keys: key of each entry that the law may read, by the name that the law gives it
             (``ContextSampler``). The policy's input and the outputs of a reset must have the entry.
-        seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
+        seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
+            global generator at the first reset.
+        gradients: let gradients flow through the executed actions (``StatefulTransform``).
 
-    A bare name for one of the last three keys means an entry in the same TensorDict as the action.
+    A bare name for one of the three keys above means an entry in the same TensorDict as the action.
 
     Raises:
         InputError: the delay is not valid, or its law reads what has no key.
@@ -60,11 +62,13 @@ class ActionDelay(ActionTransform):
         valid_key: NestedKey | None = None,
         context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
+        gradients: bool = False,
     ) -> None:
-        super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed)
+        super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed, gradients=gradients)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
-        self.line = DelayLine(self.sampler, "generation")
+        self.draws = self.sampler.certain is None
+        self.line = DelayLine(self.sampler, "generation", gradients)
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
         sent_keys = [self.sent_key] if self.sent_key else []
@@ -73,6 +77,14 @@ class ActionDelay(ActionTransform):
     @property
     def key_usage(self) -> KeyUsage:
         return KeyUsage(replaces=[self.action_key])
+
+    @property
+    def row_dims(self) -> dict[str, int]:
+        return self.line.row_dims(1)
+
+    @property
+    def memory_sizes(self) -> dict[str, int]:
+        return {"longest": self.sampler.longest}
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         initial = self.actions.initial
@@ -86,10 +98,10 @@ class ActionDelay(ActionTransform):
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         chosen = as_rows(entries[self.action_key], self.rows)
-        sent = entries[self.sent_key].reshape(-1) if self.sent_key in entries else None
+        sent = self.sending_rows(entries)
         context = self.contexts.read(memory, entries, sent, self.rows)
         memory, delivery = self.line.step(memory, [chosen], sent, context)
-        executed: Entries = {self.action_key: from_rows(delivery.held[0], self.rows)}
+        executed: Entries = {self.action_key: from_rows(delivery.held[0], self.rows).clone()}
         if self.valid_key:
             default = memory["generated_at"] == memory["reset_at"]
             executed[self.valid_key] = (delivery.fresh | default).view(self.rows)

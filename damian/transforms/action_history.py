@@ -74,6 +74,10 @@ class ActionHistory(ActionTransform):
         return KeyUsage(reads=self._reads, appends=self.in_keys, records=[self.action_key])
 
     @property
+    def memory_sizes(self) -> dict[str, int]:
+        return {"steps": self.steps}
+
+    @property
     def required_keys(self) -> Sequence[NestedKey]:
         return self.step_keys
 

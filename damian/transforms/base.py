@@ -1,28 +1,33 @@
-"""The base class of transforms with memory: buffers, seeds, and the methods that subclasses implement."""
+"""The base class of transforms with memory: the methods that subclasses implement, and TorchRL's hooks."""
 
 from collections.abc import Sequence
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, Transform
+from torchrl.envs import Compose, EnvBase
 
-from damian.common import counter_rng
 from damian.common.tensors import expand_mask
 from damian.transforms.entries import (
+    STEPPED,
     Change,
     Entries,
     Memory,
-    flag_rows,
+    as_rows,
+    from_rows,
+    read_keys,
     require_keys,
+    reset_rows,
     row_shape,
     select_entries,
 )
+from damian.transforms.memory import MemoryTransform
 from damian.transforms.order import KeyUsage, check_order, leaf_transforms
+from damian.transforms.seeding import all_transforms
 
 
-class StatefulTransform(Transform):
+class StatefulTransform(MemoryTransform):
     """Base class of transforms that remember earlier steps of each world, or of each agent of each world.
 
     The memory has M rows. For an entry under a nested key, such as ``("agents", "observation")``, there is a
@@ -35,13 +40,20 @@ class StatefulTransform(Transform):
     environment steps) and ``on_step`` (after it). Thus all transforms of an environment compile into one
     graph.
 
+    ``set_seed`` of the environment seeds everything that the transform draws. Without it, and without
+    ``seed``, the seed is drawn from torch's global generator at the first reset. What the transform writes
+    shares no memory with its buffers, so that others may change it in place.
+
     Args:
-        in_keys: keys of the entries that the transform reads, as in TorchRL's ``Transform``.
+        in_keys: keys of the entries that the transform reads, as in TorchRL's ``Transform``: one key (a name,
+            or a tuple of names), or a list of keys.
         out_keys: keys of the entries that it writes.
         in_keys_inv: keys of the actions that it reads.
         out_keys_inv: keys of the actions that it writes.
-        seed: seed of everything that the transform draws. If not given, the seed is drawn from torch's global
-            generator at the first reset.
+        seed: seed of everything that the transform draws, until the environment is seeded.
+        gradients: keep the autograd graph of the entries that the transform remembers. If false, what it
+            writes has no gradient with respect to its inputs. The graph of a rollout grows from step to step;
+            a reset of all worlds cuts it.
     """
 
     action_keys: Sequence[NestedKey] = ()
@@ -55,18 +67,16 @@ class StatefulTransform(Transform):
 
     def __init__(
         self,
-        in_keys: Sequence[NestedKey] = (),
-        out_keys: Sequence[NestedKey] = (),
-        in_keys_inv: Sequence[NestedKey] = (),
-        out_keys_inv: Sequence[NestedKey] = (),
+        in_keys: NestedKey | Sequence[NestedKey] = (),
+        out_keys: NestedKey | Sequence[NestedKey] = (),
+        in_keys_inv: NestedKey | Sequence[NestedKey] = (),
+        out_keys_inv: NestedKey | Sequence[NestedKey] = (),
         seed: int | None = None,
+        gradients: bool = False,
     ) -> None:
-        super().__init__(
-            *([unravel_key(key) for key in keys] for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv))
-        )
-        self._rows: torch.Size | None = None
-        self._seed: int | None = seed
-        self._world_seeds: Tensor | None = None
+        super().__init__(*(read_keys(keys) for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)))
+        self._seed = seed
+        self.gradients = gradients
 
     # Pure functions, for subclasses.
 
@@ -115,11 +125,17 @@ class StatefulTransform(Transform):
             after: memory after a step of all worlds.
             stepped: worlds that have stepped, [B] bool.
         """
-        rows = self.expand_worlds(stepped)
-        return {
-            name: new if new is before[name] else torch.where(expand_mask(rows, new), new, before[name])
-            for name, new in after.items()
-        }
+        rows, merged = self.expand_worlds(stepped), {}
+        for name, new in after.items():
+            mask = rows.view(*[1] * self.row_dims.get(name, 0), *rows.shape)
+            old = before[name]
+            merged[name] = new if new is old else torch.where(expand_mask(mask, new), new, old)
+        return merged
+
+    @property
+    def row_dims(self) -> dict[str, int]:
+        """The dimension of a buffer, by name, in which its M rows lie, where that is not the first."""
+        return {}
 
     def skipped_worlds(self, entries: Entries) -> Tensor | None:
         """Worlds that must step once more before the outputs are returned, [B] bool.
@@ -167,24 +183,42 @@ class StatefulTransform(Transform):
         """What this transform does with which keys, for ``check_order``."""
         return KeyUsage()
 
+    def sending_rows(self, entries: Entries) -> Tensor | None:
+        """The rows that send a message in this step, [M] bool; None if all do.
+
+        Args:
+            entries: inputs or outputs of the step.
+        """
+        sending = entries[self.sent_key].reshape(-1) if self.sent_key in entries else None
+        if STEPPED not in entries:
+            return sending
+        stepped = self.expand_worlds(entries[STEPPED].reshape(-1))
+        return stepped if sending is None else sending & stepped
+
     # TorchRL's hooks.
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = None
         if self.has_memory:
+            mask = reset_rows(tensordict, self.row_key, self.rows)
+            if mask is None and not self.env.batch_locked and self.find_rows(tensordict_reset) != self.rows:
+                self.clear_memory()  # such an environment may begin with another number of worlds
+        if self.has_memory:
             self._check_rows(tensordict_reset)
-            mask = flag_rows(tensordict, "_reset", self.row_key, self.rows)
         else:
             require_keys(type(self).__name__, self.required_keys, tensordict_reset)
             self._rows = self.find_rows(tensordict_reset)
-            self.set_memory(self.init_memory(tensordict_reset))
+            with torch.inference_mode(False):  # else the buffers could be written only in inference mode
+                self.set_memory(self.init_memory(tensordict_reset))
+        memory = self.memory
         if mask is None:
-            device = next((value.device for value in self.memory.values()), None)
+            device = next((value.device for value in memory.values()), None)
             mask = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
-        change = self.on_reset(self.memory, select_entries(tensordict_reset, self.step_keys), mask)
-        return self._write(
-            tensordict_reset, change
-        )  # TorchRL restores the entries of the worlds without a reset
+            memory = {name: value.detach() for name, value in memory.items()}
+        entries = select_entries(tensordict_reset, self.step_keys, self.gradients)
+        change = self.on_reset(memory, entries, mask)
+        # TorchRL restores the entries of the worlds without a reset.
+        return self._write(tensordict_reset, change)
 
     def _check_rows(self, tensordict: TensorDictBase) -> None:
         rows = self.find_rows(tensordict)
@@ -197,14 +231,44 @@ class StatefulTransform(Transform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self.action_keys:
             return tensordict
-        self.check()
-        entries = select_entries(tensordict, self.action_keys)
-        return self._write(tensordict, self.on_action(self.memory, entries))
+        self.check(tensordict.batch_size)
+        entries = select_entries(tensordict, [*self.action_keys, STEPPED], self.gradients)
+        change = self.on_action(self.memory, entries)
+        if STEPPED in entries:
+            change = self._only_stepped(change, entries[STEPPED], tensordict, tensordict)
+        return self._write(tensordict, change)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.check()
-        entries = select_entries(next_tensordict, self.step_keys)
-        return self._write(next_tensordict, self.on_step(self.memory, entries))
+        self.check(next_tensordict.batch_size)
+        entries = select_entries(next_tensordict, self.step_keys, self.gradients)
+        stepped = tensordict.get(STEPPED, None)
+        if stepped is None:
+            return self._write(next_tensordict, self.on_step(self.memory, entries))
+        change = self.on_step(self.memory, entries | {STEPPED: stepped})
+        return self._write(next_tensordict, self._only_stepped(change, stepped, tensordict, next_tensordict))
+
+    def _only_stepped(
+        self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase
+    ) -> Change:
+        """Undo a change in the worlds that do not step: these keep their memory and their entries.
+
+        Args:
+            change: as if all worlds had stepped.
+            stepped: worlds that step, [B] bool.
+            before: contains the entries from before the step.
+            after: contains the entries that ``before`` lacks.
+        """
+        memory, entries = change
+        stepped = stepped.reshape(-1)
+        memory = self.merge_worlds(self.memory, memory, stepped)
+        rows = self.expand_worlds(stepped)
+        merged: Entries = {}
+        for key, new in entries.items():
+            old = before.get(key, after.get(key, None))
+            old = torch.zeros_like(new) if old is None else old
+            mask, shape = expand_mask(rows, as_rows(new, self.rows)), self.rows
+            merged[key] = from_rows(torch.where(mask, as_rows(new, shape), as_rows(old, shape)), shape)
+        return memory, merged
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -220,93 +284,6 @@ class StatefulTransform(Transform):
             tensordict.pop(key, None)
         return tensordict
 
-    # The memory.
-
-    @property
-    def has_memory(self) -> bool:
-        """Has the memory been allocated, by a reset or by ``load_state_dict``."""
-        return self._rows is not None
-
-    @property
-    def rows(self) -> torch.Size:
-        """The shape of the rows, M in all."""
-        assert self._rows is not None
-        return self._rows
-
-    def expand_worlds(self, worlds: Tensor) -> Tensor:
-        """Expand a mask of worlds [B] to a mask of rows [M]."""
-        return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
-
-    @property
-    def memory(self) -> Memory:
-        """The memory of the transform: its buffers by name."""
-        return cast(Memory, dict(self._buffers))
-
-    def set_memory(self, memory: Memory) -> None:
-        """Replace the buffers that have these names."""
-        self._buffers.update(memory)
-
-    def clear_memory(self) -> None:
-        """Delete the memory; the next reset counts as the first."""
-        self._rows = None
-        self._buffers.clear()
-
-    def get_extra_state(self) -> Tensor | None:
-        """The shape of the rows, for ``state_dict``."""
-        return None if self._rows is None else torch.tensor(self._rows, dtype=torch.long)
-
-    def set_extra_state(self, state: Tensor | None) -> None:
-        """Set the shape of the rows from a ``state_dict``."""
-        self._rows = None if state is None else torch.Size(state.tolist())
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        inner = {
-            name.removeprefix(prefix): value for name, value in state_dict.items() if name.startswith(prefix)
-        }
-        saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
-        devices = {name: buffer.device for name, buffer in self.memory.items()}
-        # TorchRL also loads states without entries of this transform: the next reset is then the first.
-        self.clear_memory()
-        self.set_memory({k: v.detach().clone().to(devices.get(k, v.device)) for k, v in saved.items()})
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-    def clone(self) -> "StatefulTransform":
-        """A copy of the transform without memory."""
-        copied = super().clone()
-        copied.clear_memory()
-        return copied
-
-    # Seeds.
-
-    def set_seed(self, seed: int | None) -> None:
-        """Set the seed and delete the memory; the next reset counts as the first."""
-        self._seed, self._world_seeds = seed, None
-        self.clear_memory()
-
-    def seed_worlds(self, seeds: Tensor) -> None:
-        """Set a seed for each world, [B] integers: a world's draws then do not depend on the other worlds."""
-        self._seed, self._world_seeds = None, seeds
-        self.clear_memory()
-
-    def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
-        """A random stream (a seed of the counter-based generator) for each row, [M] long.
-
-        Args:
-            batch: batch size of the worlds.
-            device: device of the streams.
-        """
-        n_worlds = batch.numel()
-        if self._world_seeds is not None:
-            worlds = self._world_seeds.to(device)
-        elif self._seed is not None:
-            worlds = counter_rng.world_seeds(self._seed, n_worlds, device)
-        else:
-            worlds = torch.randint(2**32, (n_worlds,)).to(device)
-        agents = torch.arange(self.rows.numel() // n_worlds, device=device)
-        return counter_rng.bits(worlds.view(-1, 1), agents).flatten()
-
     # The place of the transform in an environment.
 
     def set_container(self, container: Any) -> None:
@@ -315,6 +292,7 @@ class StatefulTransform(Transform):
             check_order(leaf_transforms(container))
             outer = container.__dict__.get("_container")  # a weak reference
             container = outer() if outer is not None else None
+        check_order(all_transforms(container))
 
     @property
     def env(self) -> EnvBase:
@@ -328,14 +306,24 @@ class StatefulTransform(Transform):
             self._refuse()
         return parent
 
-    def check(self) -> None:
+    def check(self, batch_size: torch.Size | None = None) -> None:
         """Make sure that the transform belongs to an environment that has been reset.
 
+        Args:
+            batch_size: of the TensorDict of a step, if there is one.
+
         Raises:
-            RuntimeError: it does not.
+            RuntimeError: it does not, or the TensorDict has other worlds than the memory.
         """
         if not self.has_memory or self.container is None:
             self._refuse()
+        if batch_size is not None and batch_size != self.rows[: len(batch_size)]:
+            name, n_rows = type(self).__name__, tuple(self.rows)
+            raise RuntimeError(
+                f"{name} has memory for rows of shape {n_rows}, but this step has the batch size "
+                f"{tuple(batch_size)}: every step needs all worlds that were reset; those that skip it "
+                "have a false '_step', which an environment whose batch is chosen at reset does not support"
+            )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._refuse()

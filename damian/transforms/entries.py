@@ -1,13 +1,15 @@
 """Entries of TensorDicts, viewed as M rows: one for each world, or for each agent of each world."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from typing import cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Composite
 
 from damian.common import checks
+from damian.common.tensors import expand_mask
 from damian.common.text_files import listed
 
 Memory = dict[str, Tensor]
@@ -19,16 +21,32 @@ Entries = dict[NestedKey, Tensor]
 Change = tuple[Memory, Entries]
 """The new memory of a transform, and the entries that it writes."""
 
+STEPPED = "_step"
+"""TorchRL's key of the worlds that take this step, [B] bool; all of them if there is no such entry."""
+
+
+def read_keys(written: NestedKey | Sequence[NestedKey]) -> list[NestedKey]:
+    """Keys as TorchRL's transforms take them: a name or a tuple of names is one key, a list holds several."""
+    nested = isinstance(written, tuple) and all(isinstance(part, str) for part in written)
+    keys = [written] if written and (isinstance(written, str) or nested) else written
+    return [unravel_key(key) for key in keys]  # type: ignore[arg-type]
+
+
+def path_of(key: NestedKey) -> tuple[str, ...]:
+    """The path of the TensorDict that directly contains an entry."""
+    return cast(tuple[str, ...], key[:-1]) if isinstance(key, tuple) else ()
+
 
 def row_shape(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
     """The batch size of the TensorDict that directly contains an entry."""
-    inner = tensordict.get(key[:-1]) if isinstance(key, tuple) and len(key) > 1 else tensordict
-    return inner.batch_size
+    path = path_of(key)
+    return (tensordict.get(path) if path else tensordict).batch_size
 
 
 def spec_rows(specs: Composite, key: NestedKey) -> torch.Size:
     """As ``row_shape``, but read from specs."""
-    return (specs[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else specs).shape
+    path = path_of(key)
+    return (specs[path] if path else specs).shape
 
 
 def as_rows(value: Tensor, rows: torch.Size) -> Tensor:
@@ -41,10 +59,10 @@ def from_rows(value: Tensor, rows: torch.Size) -> Tensor:
     return value.view((*rows, *value.shape[1:]))
 
 
-def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
-    """The entries with these keys, as far as they exist, detached from the autograd graph."""
+def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey], gradients: bool = False) -> Entries:
+    """The entries with these keys, as far as they exist, without their autograd graph unless it is wanted."""
     found = {key: tensordict.get(key, None) for key in keys}
-    return {key: value.detach() for key, value in found.items() if value is not None}
+    return {key: value if gradients else value.detach() for key, value in found.items() if value is not None}
 
 
 def require_keys(transform: str, keys: Sequence[NestedKey], present: TensorDictBase | Composite) -> None:
@@ -61,37 +79,54 @@ def require_keys(transform: str, keys: Sequence[NestedKey], present: TensorDictB
     known = list(present.keys(True, True))
     for key in keys:
         should = f"is not among the keys of the environment: {listed(map(str, known))}"
+        if isinstance(key, tuple) and all(part in known for part in key):
+            should = f"is one nested key, which the environment lacks; two keys are written {list(key)}"
         checks.require(key in known, transform, key, should)
 
 
-def flag_rows(
-    tensordict: TensorDictBase | Mapping[NestedKey, Tensor], name: str, key: NestedKey, rows: torch.Size
-) -> Tensor | None:
-    """The flag ``name``, such as ``_reset`` or ``done``, that applies to the rows of an entry, [M] bool.
+def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[NestedKey]:
+    """The keys of the flags that apply to an entry, such as ``done``, the outermost first.
 
-    TensorDicts may contain the flag at several levels: the one nearest to the entry applies.
+    These are the flags in the TensorDict of the entry and in those that contain it. If there are none, they
+    are all flags within the innermost TensorDict around the entry that contains any: a world is done, or is
+    reset, if any of its agents is, as TorchRL aggregates flags.
 
     Args:
-        tensordict: contains the flag.
         name: name of the flag.
         key: key of the entry.
-        rows: shape of the entry's rows.
-
-    Returns:
-        The flag of each row, or None if there is no such flag.
+        present: all keys that exist.
     """
-    for flag_key in flag_keys(name, key):
-        flag = tensordict.get(flag_key, None)
-        if flag is not None:
-            flag = flag.any(-1)
-            return flag.view((*flag.shape, *[1] * (len(rows) - flag.dim()))).expand(rows).reshape(-1)
-    return None
+    path = path_of(key)
+    flags = [flag for flag in present if (flag if isinstance(flag, str) else flag[-1]) == name]
+    around = [flag for flag in flags if path[: len(path_of(flag))] == path_of(flag)]
+    if around:
+        return sorted(around, key=lambda flag: len(path_of(flag)))
+    within = ([f for f in flags if path_of(f)[:depth] == path[:depth]] for depth in range(len(path), -1, -1))
+    return next((found for found in within if found), [])
 
 
-def flag_keys(name: str, key: NestedKey) -> list[NestedKey]:
-    """The keys under which a flag that applies to an entry may be found, the nearest to the entry first."""
-    path = key[:-1] if isinstance(key, tuple) else ()
-    return [(*path[:depth], name) for depth in range(len(path), 0, -1)] + [name]
+def reset_rows(tensordict: TensorDictBase, key: NestedKey, rows: torch.Size) -> Tensor | None:
+    """The rows of an entry that are reset, [M] bool, or None if the TensorDict does not say which.
+
+    If there are flags ``_reset`` at several levels, the outermost one decides, as in TorchRL.
+    """
+    keys = flag_keys("_reset", key, list(tensordict.keys(True, True)))
+    if not keys:
+        return None
+    around = path_of(key)[: len(path_of(keys[0]))] == path_of(keys[0])
+    return any_flag([tensordict.get(flag) for flag in (keys[:1] if around else keys)], rows)
+
+
+def any_flag(flags: Sequence[Tensor], rows: torch.Size) -> Tensor:
+    """Whether any of some flags of worlds [*B, 1], or of their agents [*B, N, 1], is true for a row, [M]."""
+    found = torch.zeros(rows, dtype=torch.bool, device=flags[0].device)
+    for flag in flags:
+        shape = flag.shape[:-1]
+        if len(shape) > len(rows):
+            found = found | flag.flatten(len(rows)).any(-1)
+        else:
+            found = found | expand_mask(flag.squeeze(-1), found)
+    return found.reshape(-1)
 
 
 def sibling_key(key: NestedKey, name: NestedKey | None) -> NestedKey | None:

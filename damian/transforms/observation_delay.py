@@ -37,7 +37,8 @@ class ObservationDelay(StatefulTransform):
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
             A delay is drawn for each world, each agent (under a nested key) and each step.
-        in_keys: keys of the entries that are sent together; their TensorDicts have the same batch size.
+        in_keys: keys of the entries that are sent together, or one key; their TensorDicts have the same batch
+            size.
         out_keys: keys under which the received entries are written; if not given, ``in_keys``, so that the
             current entries are overwritten.
         loss: probability that a message is lost.
@@ -52,9 +53,11 @@ class ObservationDelay(StatefulTransform):
         sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
         context_keys: key of each entry that the law may read, by the name that the law gives it
             (``ContextSampler``).
-        seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
+        seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
+            global generator at the first reset.
+        gradients: let gradients flow through the received entries (``StatefulTransform``).
 
-    A bare name for one of the last five keys means an entry in the same TensorDict as ``in_keys[0]``.
+    A bare name for one of the five keys above means an entry in the same TensorDict as ``in_keys[0]``.
 
     Raises:
         InputError: the delay or the order is not valid, or the law reads what has no key.
@@ -68,8 +71,8 @@ class ObservationDelay(StatefulTransform):
     def __init__(
         self,
         delay: Any,
-        in_keys: Sequence[NestedKey] = ("observation",),
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: NestedKey | Sequence[NestedKey] = "observation",
+        out_keys: NestedKey | Sequence[NestedKey] | None = None,
         *,
         loss: float = 0.0,
         order: str = "generation",
@@ -80,12 +83,14 @@ class ObservationDelay(StatefulTransform):
         sent_key: NestedKey | None = None,
         context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
+        gradients: bool = False,
     ) -> None:
         checks.one_of("order", order, ORDERS)
-        super().__init__(in_keys, out_keys or in_keys, seed=seed)
+        super().__init__(in_keys, out_keys or in_keys, seed=seed, gradients=gradients)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
-        self.line = DelayLine(self.sampler, order)
+        self.draws = self.sampler.certain is None
+        self.line = DelayLine(self.sampler, order, gradients)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
@@ -97,6 +102,14 @@ class ObservationDelay(StatefulTransform):
     def key_usage(self) -> KeyUsage:
         created = [key for key in self.out_keys if key not in self.in_keys]
         return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=created)
+
+    @property
+    def row_dims(self) -> dict[str, int]:
+        return self.line.row_dims(len(self.in_keys))
+
+    @property
+    def memory_sizes(self) -> dict[str, int]:
+        return {"longest": self.sampler.longest, "in_keys": len(self.in_keys)}
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -112,7 +125,7 @@ class ObservationDelay(StatefulTransform):
         return memory, self._outputs(delivery)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        sent = entries[self.sent_key].reshape(-1) if self.sent_key else None
+        sent = self.sending_rows(entries)
         context = self.contexts.read(memory, entries, sent, self.rows)
         memory, delivery = self.line.step(memory, self._values(entries), sent, context)
         return memory, self._outputs(delivery)
@@ -122,8 +135,9 @@ class ObservationDelay(StatefulTransform):
 
     def _outputs(self, delivery: Delivery) -> Entries:
         pairs = zip(self.out_keys, delivery.held, strict=True)
-        held = {key: from_rows(value, self.rows) for key, value in pairs}
-        flags = {self.age_key: delivery.age.float(), self.fresh_key: delivery.fresh}
+        # A copy, because the line keeps what it holds.
+        held = {key: from_rows(value, self.rows).clone() for key, value in pairs}
+        flags = {self.age_key: delivery.age.to(torch.float32), self.fresh_key: delivery.fresh}
         if self.delay_key:
             flags[self.delay_key] = torch.where(delivery.delay < self.sampler.lost, delivery.delay, -1)
         return held | {key: flag.view(*self.rows, 1) for key, flag in flags.items() if key is not None}
@@ -136,7 +150,7 @@ class ObservationDelay(StatefulTransform):
         shape = torch.Size((*spec_rows(observation_spec, self.row_key), 1))
         device = observation_spec.device
         if self.age_key:
-            observation_spec[self.age_key] = Unbounded(shape, device=device)
+            observation_spec[self.age_key] = Unbounded(shape, dtype=torch.float32, device=device)
         if self.fresh_key:
             observation_spec[self.fresh_key] = Binary(1, shape=shape, dtype=torch.bool, device=device)
         if self.delay_key:

@@ -1,13 +1,24 @@
 """A check of the order of transforms, from what each one does with which keys."""
 
 import itertools
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 from tensordict import NestedKey
-from torchrl.envs import Compose, Transform
+from torchrl.envs import (
+    Compose,
+    ConditionalSkip,
+    RandomTruncationTransform,
+    RewardSum,
+    StepCounter,
+    TerminateTransform,
+    Transform,
+)
 
 from damian.common.errors import InputError
+
+_ENDS = ("done", "terminated", "truncated")
 
 
 class KeyUsage(NamedTuple):
@@ -25,12 +36,21 @@ class KeyUsage(NamedTuple):
     """Actions that it replaces before they reach the environment."""
     records: Sequence[NestedKey] = ()
     """Actions that it records as the policy chose them."""
+    pays_at_end: bool = False
+    """Whether it pays what is still in transit in the last step of an episode."""
+    may_end: bool = False
+    """Whether it may end episodes."""
+    derives: Sequence[tuple[NestedKey, NestedKey]] = ()
+    """Entries that it computes from others: pairs of the entry read and another one written."""
+    skips: bool = False
+    """Whether it may keep worlds from stepping."""
 
 
 def check_order(transforms: Sequence[Transform]) -> None:
     """Refuse an order in which one transform undoes or misses the effect of another.
 
-    Only transforms with a ``key_usage`` are compared.
+    Pairs of which neither is damian's are not looked at. What TorchRL's own transforms do is read from their
+    keys. Where a wrong order may be meant, a warning is given.
 
     Args:
         transforms: transforms in the order in which they process the environment's outputs.
@@ -38,33 +58,62 @@ def check_order(transforms: Sequence[Transform]) -> None:
     Raises:
         InputError: two transforms are in the wrong order; the message names them and the key.
     """
-    declared: list[tuple[Transform, KeyUsage]] = [
-        (transform, cast(Any, transform).key_usage)
-        for transform in transforms
-        if _declares_key_usage(transform)
-    ]
-    for (first, a), (second, b) in itertools.combinations(declared, 2):
-        name = type(second).__name__
-        for key in _common_keys([*a.reads, *a.delays, *a.appends], b.creates):
-            raise _wrong_order(first, second, f"it uses {key}, which {name} creates")
-        for key in _common_keys(a.records, b.replaces):
-            why = f"it must record {key} as chosen, and actions pass the transforms in reverse order"
-            raise _wrong_order(first, second, why)
-        for key in _common_keys(a.appends, b.delays):
-            raise _wrong_order(first, second, f"{name} must not delay what it appends to {key}")
+    usages = [(transform, _usage_of(transform)) for transform in transforms]
+    for (first, a), (second, b) in itertools.combinations(usages, 2):
+        if _declares_key_usage(first) or _declares_key_usage(second):
+            _check_pair(first, a, second, b)
 
 
-def leaf_transforms(compose: Compose) -> list[Any]:
-    """All transforms of a Compose and of the Composes within it, in order."""
-    return [leaf for t in compose for leaf in (leaf_transforms(t) if isinstance(t, Compose) else [t])]
+def _check_pair(first: Transform, a: KeyUsage, second: Transform, b: KeyUsage) -> None:
+    names = type(first).__name__, type(second).__name__
+    for key in _common_keys([*a.reads, *a.delays, *a.appends], b.creates):
+        raise _wrong_order(names, f"it uses {key}, which {names[1]} creates")
+    for key in _common_keys(a.records, b.replaces):
+        why = f"it must record {key} as chosen, and actions pass the transforms in reverse order"
+        raise _wrong_order(names, why)
+    for key in _common_keys(a.appends, b.delays):
+        raise _wrong_order(names, f"{names[1]} must not delay what it appends to {key}")
+    if a.pays_at_end and b.may_end:
+        raise _wrong_order(names, f"what is in transit when {names[1]} ends an episode would be lost")
+    if a.skips and _declares_key_usage(second):
+        raise _wrong_order(names, f"{names[1]} must know which worlds skip a step")
+    for key, derived in a.derives:
+        if key in b.delays and key in second.out_keys and derived not in b.delays:
+            problem = f"{names[0]} computes {derived} from {key} before {names[1]} changes {key}"
+            warnings.warn(f"order of transforms: {problem}", stacklevel=2)
+
+
+def leaf_transforms(transform: Transform | None) -> list[Any]:
+    """All transforms of a Compose and of the Composes within it, in order; or the one transform."""
+    if transform is None:
+        return []
+    if not isinstance(transform, Compose):
+        return [transform]
+    return [leaf for inner in transform for leaf in leaf_transforms(inner)]
+
+
+def _usage_of(transform: Transform) -> KeyUsage:
+    if _declares_key_usage(transform):
+        return cast(Any, transform).key_usage
+    ends = isinstance(transform, StepCounter) and transform.max_steps is not None
+    ends = ends or isinstance(transform, (RandomTruncationTransform, TerminateTransform))
+    # Not the properties: some of TorchRL's transforms choose their keys when these are first read.
+    read, written = (transform.__dict__.get(name) or [] for name in ("_in_keys", "_out_keys"))
+    if isinstance(transform, RewardSum) and not read:
+        read, written = ["reward"], ["episode_reward"]
+    others = [key for key in written if key not in read]
+    return KeyUsage(
+        may_end=ends or any((key if isinstance(key, str) else key[-1]) in _ENDS for key in others),
+        derives=[(key, other) for key in read for other in others],
+        skips=isinstance(transform, ConditionalSkip),
+    )
 
 
 def _declares_key_usage(transform: Transform) -> bool:
     return isinstance(getattr(type(transform), "key_usage", None), property)
 
 
-def _wrong_order(first: Transform, second: Transform, why: str) -> InputError:
-    names = type(first).__name__, type(second).__name__
+def _wrong_order(names: tuple[str, str], why: str) -> InputError:
     return InputError(f"order of transforms: {names[0]} must come after {names[1]}, because {why}")
 
 

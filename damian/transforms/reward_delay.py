@@ -17,9 +17,9 @@ from damian.transforms.entries import (
     Change,
     Entries,
     Memory,
+    any_flag,
     as_rows,
     flag_keys,
-    flag_rows,
     from_rows,
     require_keys,
     spec_rows,
@@ -33,19 +33,27 @@ class RewardTransform(StatefulTransform):
     Args:
         reward_key: key of the reward.
         seed: as in ``StatefulTransform``.
+        gradients: as in ``StatefulTransform``.
     """
 
     n_past: int
     """Number of rewards that are remembered for each of the M rows, K."""
 
-    def __init__(self, reward_key: NestedKey, seed: int | None = None) -> None:
-        super().__init__([reward_key], [reward_key], seed=seed)
+    def __init__(self, reward_key: NestedKey, seed: int | None = None, gradients: bool = False) -> None:
+        super().__init__(reward_key, reward_key, seed=seed, gradients=gradients)
         self.reward_key: NestedKey = self.in_keys[0]
-        self.step_keys = [self.reward_key, *flag_keys("done", self.reward_key)]
+
+    @property
+    def step_keys(self) -> Sequence[NestedKey]:  # type: ignore[override]
+        return [self.reward_key]
 
     @property
     def key_usage(self) -> KeyUsage:
         return KeyUsage(delays=[self.reward_key])
+
+    @property
+    def memory_sizes(self) -> dict[str, int]:
+        return {"n_past": self.n_past}
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -63,10 +71,9 @@ class RewardTransform(StatefulTransform):
         past = memory["past"]
         return memory | {"past": past.masked_fill(expand_mask(mask, past[0]), 0)}, {}
 
-    def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
-        old, new = before["past"], after["past"]
-        past = torch.where(expand_mask(self.expand_worlds(stepped), old[0]), new, old)
-        return super().merge_worlds(before, after | {"past": old}, stepped) | {"past": past}
+    @property
+    def row_dims(self) -> dict[str, int]:
+        return {"past": 1}
 
 
 class RewardDelay(RewardTransform):
@@ -85,7 +92,9 @@ class RewardDelay(RewardTransform):
         dt: length of a step [s], for delays given as times.
         context_keys: key of each entry that the law may read, by the name that the law gives it
             (``ContextSampler``). A bare name means an entry in the same TensorDict as the reward.
-        seed: seed of the delays; if not given, it is drawn from torch's global generator at the first reset.
+        seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
+            global generator at the first reset.
+        gradients: let gradients flow through the received rewards (``StatefulTransform``).
 
     Raises:
         InputError: the delay is not valid, or its law loses rewards or reads what has no key.
@@ -103,18 +112,34 @@ class RewardDelay(RewardTransform):
         dt: float = 1.0,
         context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
+        gradients: bool = False,
     ) -> None:
-        super().__init__(reward_key, seed)
+        super().__init__(reward_key, seed, gradients)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt)
+        self.draws = self.sampler.certain is None
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)
-        self.step_keys = [*self.step_keys, *self.contexts.keys.values()]
+
+    @property
+    def step_keys(self) -> Sequence[NestedKey]:
+        return [self.reward_key, *self.done_keys, *self.contexts.keys.values()]
+
+    @property
+    def done_keys(self) -> list[NestedKey]:
+        """Keys of the flags that end an episode of the reward, read from the environment's specs once."""
+        if "_done_keys" not in self.__dict__:
+            self.__dict__["_done_keys"] = flag_keys("done", self.reward_key, self.env.done_keys)
+        return self.__dict__["_done_keys"]
+
+    def reset_parent(self) -> None:
+        super().reset_parent()
+        self.__dict__.pop("_done_keys", None)
 
     @property
     def key_usage(self) -> KeyUsage:
-        return super().key_usage._replace(reads=list(self.contexts.keys.values()))
+        return super().key_usage._replace(reads=list(self.contexts.keys.values()), pays_at_end=True)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         memory = super().init_memory(tensordict)
@@ -143,9 +168,9 @@ class RewardDelay(RewardTransform):
         flat = in_transit.flatten(0, 1).index_add(0, row, reward)
         received = flat.index_select(0, here)
         in_transit = flat.index_fill(0, here, 0).view_as(in_transit)
-        done = flag_rows(entries, "done", self.reward_key, self.rows)
-        if done is not None:
-            ended = expand_mask(done, received)
+        done = [entries[key] for key in self.done_keys if key in entries]
+        if done:
+            ended = expand_mask(any_flag(done, self.rows), received)
             received = torch.where(ended, received + in_transit.sum(0), received)
             in_transit = in_transit.masked_fill(ended, 0)
         memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "past": in_transit}
@@ -162,6 +187,7 @@ class CumulativeReward(RewardTransform):
         steps: number of rewards in the sum, T.
         gamma: discount per step, in (0, 1].
         reward_key: key of the reward.
+        gradients: let gradients flow through the sum (``StatefulTransform``).
 
     Raises:
         InputError: the number of steps or the discount is not valid.
@@ -171,11 +197,13 @@ class CumulativeReward(RewardTransform):
         >>> rollout = env.rollout(200)  # each reward is a discounted sum of the last five
     """
 
-    def __init__(self, steps: int, gamma: float = 0.9, reward_key: NestedKey = "reward") -> None:
+    def __init__(
+        self, steps: int, gamma: float = 0.9, reward_key: NestedKey = "reward", *, gradients: bool = False
+    ) -> None:
         checks.whole("steps", steps, 1)
         checks.above("gamma", gamma, 0.0)
         checks.in_range("gamma", gamma, 0.0, 1.0)
-        super().__init__(reward_key)
+        super().__init__(reward_key, gradients=gradients)
         self.n_past = steps
         self.weights = [gamma**age for age in range(steps)]
 

@@ -36,6 +36,7 @@ class SampleAndHold(StatefulTransform):
         ready_key: key of a flag, [...] bool, that is set to false between two ticks, as an agent cannot
             choose then; None to leave it out.
         dt: length of a step [s], for a period given as a time.
+        gradients: let gradients flow through the held entries (``StatefulTransform``).
 
     Raises:
         InputError: the period is not valid.
@@ -48,13 +49,14 @@ class SampleAndHold(StatefulTransform):
     def __init__(
         self,
         period: Delay,
-        in_keys: Sequence[NestedKey] = ("observation",),
-        in_keys_inv: Sequence[NestedKey] = (),
+        in_keys: NestedKey | Sequence[NestedKey] = "observation",
+        in_keys_inv: NestedKey | Sequence[NestedKey] = (),
         *,
         ready_key: NestedKey | None = None,
         dt: float = 1.0,
+        gradients: bool = False,
     ) -> None:
-        super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv)
+        super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv, gradients=gradients)
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
         self.ready_key = ready_key
@@ -64,6 +66,10 @@ class SampleAndHold(StatefulTransform):
     @property
     def key_usage(self) -> KeyUsage:
         return KeyUsage(reads=self.step_keys, delays=self.in_keys, replaces=self.in_keys_inv)
+
+    @property
+    def memory_sizes(self) -> dict[str, int]:
+        return {"period": self.period, "in_keys": len(self.in_keys), "in_keys_inv": len(self.in_keys_inv)}
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -110,5 +116,5 @@ class SampleAndHold(StatefulTransform):
             new, old = as_rows(entries[key], self.rows), memory[f"{name}_{i}"]
             held = torch.where(expand_mask(sampled, new), new, old)
             memory = memory | {f"{name}_{i}": held}
-            outputs[key] = from_rows(held, self.rows)
+            outputs[key] = from_rows(held, self.rows).clone()  # the memory keeps the held values
         return memory, outputs

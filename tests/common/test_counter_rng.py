@@ -1,40 +1,118 @@
-"""Random numbers as a function of seed and counter: the hash, uniformity, and separate streams."""
+"""Random numbers as a function of key and counters: the hash, uniformity, and streams of their own."""
 
+import itertools
+
+import pytest
 import torch
+from torch.func import vmap
 
 from damian.common import counter_rng
 
+N = 20_000
+
 
 def test_the_hash_agrees_with_a_plain_python_implementation():
-    def lowbias32(x: int) -> int:
-        x ^= x >> 16
-        x = x * 0x7FEB352D & 0xFFFFFFFF
-        x ^= x >> 15
-        x = x * 0x846CA68B & 0xFFFFFFFF
-        return x ^ (x >> 16)
+    def mixed(key: int, counter: int) -> int:
+        mask = 2**64 - 1
+        x = (counter * 0x9E3779B97F4A7C15 & mask) ^ key
+        x = (x ^ x >> 30) * 0xBF58476D1CE4E5B9 & mask
+        x = x + key & mask
+        x = (x ^ x >> 27) * 0x94D049BB133111EB & mask
+        return x ^ x >> 31
 
-    numbers = torch.randint(2**32, (1000,), generator=torch.Generator().manual_seed(0))
-    assert counter_rng.mix(numbers).tolist() == [lowbias32(x) for x in numbers.tolist()]
-
-
-def test_uniform_draws_fill_the_unit_interval_evenly_over_seeds_and_over_counters():
-    seeds = counter_rng.world_seeds(0, 10_000)
-    counter = torch.zeros_like(seeds)
-    for draws in (
-        counter_rng.uniform(seeds, counter),
-        counter_rng.uniform(seeds[:1], torch.arange(10_000)),
-        counter_rng.uniform(seeds[:1], torch.arange(10_000), torch.tensor(3)),
-    ):
-        counts = torch.histc(draws, bins=20, min=0, max=1)
-        chi_square = ((counts - 500).square() / 500).sum()
-        assert chi_square < 50  # 19 degrees of freedom: exceeded with probability 1/7000
+    generator = torch.Generator().manual_seed(0)
+    keys, first, second = (torch.randint(-(2**63), 2**63 - 1, (500,), generator=generator) for _ in range(3))
+    found = counter_rng.bits64(keys, first, second)
+    numbers = zip(*((x % 2**64 for x in column.tolist()) for column in (keys, first, second)), strict=True)
+    expected = [mixed(mixed(key, one), other) for key, one, other in numbers]
+    assert [x % 2**64 for x in found.tolist()] == expected
+    assert counter_rng.bits(keys, first, second).tolist() == [x >> 32 for x in expected]
+    assert counter_rng.uniform(keys, first, second).tolist() == [(x >> 40) / 2**24 for x in expected]
 
 
-def test_different_worlds_and_seeds_have_different_streams():
-    seeds = torch.cat([counter_rng.world_seeds(seed, 4096) for seed in range(4)])
-    assert len(seeds.unique()) == len(seeds)
-    counters = torch.arange(100)
-    first = counter_rng.uniform(seeds[:1], counters)
-    second = counter_rng.uniform(seeds[1:2], counters)
-    assert torch.corrcoef(torch.stack([first, second]))[0, 1].abs() < 0.3
-    assert not torch.equal(first, second)
+def chi_square(draws, n_bins=64):
+    """Pearson's statistic of uniform draws, standardised: about normal(0, 1) if they are uniform."""
+    counts = torch.histc(draws.double(), bins=n_bins, min=0, max=1)
+    expected = draws.numel() / n_bins
+    statistic = ((counts - expected).square() / expected).sum().item()
+    return (statistic - (n_bins - 1)) / (2 * (n_bins - 1)) ** 0.5
+
+
+def correlation(one, other):
+    """Correlation of two sequences, standardised: about normal(0, 1) if they are independent."""
+    return torch.corrcoef(torch.stack([one, other]).double())[0, 1].item() * one.numel() ** 0.5
+
+
+COUNTERS = {
+    "small": torch.arange(N),
+    "large": torch.arange(N) + 2**40,
+    "powers of two": 1 << torch.arange(63),
+}
+KEYS = {"hashed": counter_rng.world_seeds(0, 8), "small": torch.arange(8), "close": 7919 * torch.arange(1, 9)}
+
+
+@pytest.mark.parametrize("keys", KEYS.values(), ids=KEYS)
+def test_each_stream_is_uniform_and_its_draws_do_not_follow_from_earlier_ones(keys):
+    for key in keys:
+        draws = counter_rng.uniform(key, torch.arange(N))
+        assert abs(chi_square(draws)) < 5
+        for lag in (1, 2, 3, 7, 64):
+            assert abs(correlation(draws[lag:], draws[:-lag])) < 5
+        pairs = (draws[:-1] * 8).floor() * 8 + (draws[1:] * 8).floor()  # all 64 pairs of eighths
+        assert abs(chi_square((pairs + 0.5) / 64)) < 5
+
+
+@pytest.mark.parametrize("keys", KEYS.values(), ids=KEYS)
+def test_streams_are_uniform_beside_each_other_and_independent_at_every_shift(keys):
+    draws = counter_rng.uniform(keys.unsqueeze(-1), torch.arange(N))
+    for one, other in itertools.combinations(draws, 2):
+        for lag in (0, 1, 5, 100):
+            assert abs(correlation(one[lag:], other[: N - lag])) < 5
+    across = counter_rng.uniform(torch.arange(N) if keys is KEYS["small"] else counter_rng.world_seeds(3, N))
+    assert abs(chi_square(counter_rng.uniform(torch.arange(N), torch.tensor(17)))) < 5
+    assert keys is KEYS["small"] or abs(chi_square(across)) < 5
+
+
+@pytest.mark.parametrize("counters", COUNTERS.values(), ids=COUNTERS)
+def test_every_bit_of_a_draw_is_set_in_half_of_the_draws(counters):
+    draws = counter_rng.bits64(counter_rng.world_seeds(1, 50).unsqueeze(-1), counters).flatten()
+    share = torch.stack([(draws >> bit) & 1 for bit in range(64)]).double().mean(-1)
+    assert ((share - 0.5).abs() < 5 * 0.5 / draws.numel() ** 0.5).all()
+
+
+def test_a_changed_bit_of_key_or_counter_changes_half_of_the_bits():
+    keys, counter = counter_rng.world_seeds(0, 2000), torch.arange(2000)
+    before = counter_rng.bits64(keys, counter)
+    for bit in range(64):
+        flip = torch.tensor(1 << bit if bit < 63 else -(2**63))
+        for after in (counter_rng.bits64(keys ^ flip, counter), counter_rng.bits64(keys, counter ^ flip)):
+            changed = torch.stack([((before ^ after) >> b) & 1 for b in range(64)]).double().mean()
+            assert 0.48 < changed < 0.52
+
+
+def overlaps(draws):
+    """Number of draws of a stream that are also draws of another one."""
+    _, counts = draws.flatten().unique(return_counts=True)
+    return int((counts > 1).sum())
+
+
+def test_no_stream_is_a_section_of_another():
+    """Streams that are sections of one sequence share runs of numbers; streams of their own share none."""
+    keys = counter_rng.world_seeds(0, 4096)
+    assert overlaps(counter_rng.bits64(keys.unsqueeze(-1), torch.arange(500))) == 0
+    shifted = torch.arange(4096) * 100  # what the check would find otherwise
+    assert overlaps(counter_rng.bits64(torch.tensor(0), shifted.unsqueeze(-1) + torch.arange(500))) > 1000
+
+
+def test_neighbouring_seeds_give_different_keys_to_all_worlds():
+    keys = torch.cat([counter_rng.world_seeds(seed, 4096) for seed in (*range(4), -1, 2**63, 2**64 - 2)])
+    assert len(keys.unique()) == len(keys)
+
+
+def test_compiled_and_batched_draws_are_the_same():
+    keys, counters = counter_rng.world_seeds(5, 100), torch.arange(100)
+    eager = counter_rng.bits64(keys, counters)
+    assert torch.compile(counter_rng.bits64, fullgraph=True)(keys, counters).equal(eager)
+    assert vmap(counter_rng.bits64)(keys, counters).equal(eager)
+    alone = [counter_rng.bits64(key, counter) for key, counter in zip(keys, counters, strict=True)]
+    assert torch.stack(alone).equal(eager)

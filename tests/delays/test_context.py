@@ -26,7 +26,6 @@ from transform_cases import (
     choices,
     column,
     delayed,
-    streams_of,
 )
 
 from damian.common import counter_rng
@@ -70,7 +69,7 @@ def test_messages_are_as_late_as_the_twin_says():
     outputs = play(delayed(transform), choices())
     observed, sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
     held, found = column(outputs, "agents", "held"), column(outputs, "agents", "delay")
-    done, uniform, seen = column(outputs, "done"), uniforms(streams_of(WORLDS)), set()
+    done, uniform, seen = column(outputs, "done"), uniforms(transform.memory["streams"]), set()
     for row, (w, n) in enumerate(ROWS):
         receiver, elapsed = Receiver("generation"), 0
         receiver.begin(0, observed[0][w][n])
@@ -97,7 +96,7 @@ def test_actions_are_as_late_as_the_twin_says():
     observed, done, uniform = (
         after(outputs, *OBSERVATION),
         after(outputs, "done"),
-        uniforms(streams_of(WORLDS)),
+        uniforms(transform.memory["streams"]),
     )
     for row, (w, n) in enumerate(ROWS):
         receiver, elapsed = Receiver("generation"), 0
@@ -117,7 +116,7 @@ def test_rewards_are_as_late_as_the_twin_says_and_none_is_lost():
     transform = RewardDelay(Crowd("seen", column=4, loses=False), REWARD, **SEEN)
     outputs = play(delayed(transform), choices())
     seen, received, done = after(outputs, *OBSERVATION), after(outputs, *REWARD), after(outputs, "done")
-    uniform = uniforms(streams_of(WORLDS))
+    uniform = uniforms(transform.memory["streams"])
     for row, (w, n) in enumerate(ROWS):
         purse, elapsed = Purse(), 0
         for t in range(STEPS):

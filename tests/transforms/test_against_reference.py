@@ -21,7 +21,6 @@ from transform_cases import (
     choices,
     column,
     delayed,
-    streams_of,
 )
 
 from damian.transforms import (
@@ -50,7 +49,7 @@ def test_every_agent_holds_the_message_that_the_reference_receiver_holds(law, or
     outputs = play(delayed(transform), choices())
     observed, message_sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
     found = {key: column(outputs, "agents", key) for key in ("seen", "age", "fresh", "delay")}
-    table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
+    table = drawn(transform.sampler, transform.memory["streams"], STEPS).tolist()
     done, lost = column(outputs, "done"), transform.sampler.lost
     for row, (w, n) in enumerate(ROWS):
         receiver = Receiver(order)
@@ -81,7 +80,7 @@ def test_every_agent_executes_the_action_that_the_reference_receiver_holds(law, 
     outputs = play(delayed(transform), chosen)
     ready = before(outputs, "agents", "ready")
     observed, done = after(outputs, *OBSERVATION), after(outputs, "done")
-    table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
+    table = drawn(transform.sampler, transform.memory["streams"], STEPS).tolist()
     for row, (w, n) in enumerate(ROWS):
         receiver = Receiver("generation")
         receiver.begin(0, default)
@@ -111,7 +110,7 @@ def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law)
     transform = RewardDelay(law, REWARD)
     earned, done = rewards_of(play(Counting(WORLDS, N_AGENTS), choices()))
     received, _ = rewards_of(play(delayed(transform), choices()))
-    table = drawn(transform.sampler, streams_of(WORLDS), STEPS).tolist()
+    table = drawn(transform.sampler, transform.memory["streams"], STEPS).tolist()
     for row, (w, n) in enumerate(ROWS):
         purse, in_transit = Purse(), 0.0
         for t in range(STEPS):

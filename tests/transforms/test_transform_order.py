@@ -8,7 +8,7 @@ from contract import (
     Drift,
     unserved,
 )
-from torchrl.envs import Compose, RewardSum, TransformedEnv
+from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.transforms import (
@@ -66,7 +66,7 @@ RIGHT = {
 
 
 def appended_inside(env, one, other):
-    inner = Compose(RewardSum())
+    inner = Compose(InitTracker())
     env = TransformedEnv(env, Compose(one, inner))
     inner.append(other)
     return env
@@ -74,11 +74,11 @@ def appended_inside(env, one, other):
 
 WAYS = {
     "Compose": lambda env, one, other: TransformedEnv(env, Compose(one, other)),
-    "nested first": lambda env, one, other: TransformedEnv(env, Compose(RewardSum(), Compose(one), other)),
+    "nested first": lambda env, one, other: TransformedEnv(env, Compose(InitTracker(), Compose(one), other)),
     "nested second": lambda env, one, other: TransformedEnv(env, Compose(one, Compose(other))),
     "append": lambda env, one, other: TransformedEnv(env, one).append_transform(other),
     "append nested": lambda env, one, other: TransformedEnv(env, Compose(one)).append_transform(
-        Compose(RewardSum(), other)
+        Compose(InitTracker(), other)
     ),
     "append inside": appended_inside,
     "insert": lambda env, one, other: TransformedEnv(env, other).insert_transform(0, one),

@@ -60,7 +60,7 @@ def test_a_message_has_no_effect_before_it_arrives(name, order, tmp_path):
         return play(delayed(delay, ends=0.0, tampered=tampered), choices(n_steps=n_steps))
 
     honest = rollout(None)
-    for w, n, sent in ((0, 0, 3), (1, 1, 7), (3, 0, 12)):
+    for w, n, sent in ((0, 0, 3), (1, 1, 7), (2, 0, 8), (3, 0, 12), (3, 1, 15)):
         changed = differs(honest, rollout((w, n, sent)), *OBSERVATION)
         arrival = sent + int(honest[2 * sent - 1]["agents", "delay"][w, n])
         assert not changed[: arrival - 1].any()
