@@ -206,6 +206,7 @@ class StatefulTransform(MemoryTransform):
         if self.has_memory:
             self._check_rows(tensordict_reset)
         else:
+            check_order(all_transforms(self.container))  # others may have come since this one
             require_keys(type(self).__name__, self.required_keys, tensordict_reset)
             self._rows = self.find_rows(tensordict_reset)
             with torch.inference_mode(False):  # else the buffers could be written only in inference mode

@@ -143,9 +143,9 @@ class ObservationDelay(StatefulTransform):
         return held | {key: flag.view(*self.rows, 1) for key, flag in flags.items() if key is not None}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        require_keys(type(self).__name__, self.in_keys, observation_spec)
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if out_key != key:
-                require_keys(type(self).__name__, [key], observation_spec)
                 observation_spec[out_key] = observation_spec[key].clone()
         shape = torch.Size((*spec_rows(observation_spec, self.row_key), 1))
         device = observation_spec.device

@@ -64,6 +64,10 @@ class SampleAndHold(StatefulTransform):
         self.step_keys = [*self.in_keys, *([ready_key] if ready_key else [])]
 
     @property
+    def row_key(self) -> NestedKey:
+        return [*self.in_keys, *self.in_keys_inv][0]
+
+    @property
     def key_usage(self) -> KeyUsage:
         return KeyUsage(reads=self.step_keys, delays=self.in_keys, replaces=self.in_keys_inv)
 

@@ -8,7 +8,18 @@ from contract import (
     Drift,
     unserved,
 )
-from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs import (
+    CatFrames,
+    CatTensors,
+    Compose,
+    ConditionalSkip,
+    InitTracker,
+    RandomTruncationTransform,
+    RewardSum,
+    StepCounter,
+    TerminateTransform,
+    TransformedEnv,
+)
 
 from damian.common.errors import InputError
 from damian.transforms import (
@@ -126,3 +137,62 @@ def test_a_server_node_must_come_after_the_uplink_and_before_transforms_of_its_o
     wrong = [server, uplink] if other is uplink else [uplink, other, server]
     with pytest.raises(InputError, match="order of transforms"):
         Compose(*(make() for make in wrong))
+
+
+# TorchRL's own transforms.
+
+
+FOREIGN_WRONG = {
+    "a time limit": lambda: StepCounter(max_steps=5),
+    "random time limits": lambda: RandomTruncationTransform(1, 5),
+    "a condition for the end": lambda: TerminateTransform(lambda td: td["done"]),
+}
+
+
+@every_way
+@pytest.mark.parametrize("ends", FOREIGN_WRONG.values(), ids=FOREIGN_WRONG)
+def test_a_reward_delay_must_come_after_what_ends_episodes(ends, way):
+    transform = ends()
+    counter = [StepCounter()] if isinstance(transform, RandomTruncationTransform) else []
+    with pytest.raises(InputError, match=rf"RewardDelay must come after {type(transform).__name__}.*be lost"):
+        way(TransformedEnv(Drift(), Compose(*counter)), RewardDelay(2), transform).reset()
+
+
+@every_way
+def test_a_counter_of_steps_that_ends_nothing_may_come_later(way):
+    assert way(Drift(), RewardDelay(2), StepCounter()).rollout(3).shape == (3, 3)
+
+
+def test_the_order_is_checked_across_nested_environments():
+    inner = TransformedEnv(Drift(), ActionHistory(2))
+    with pytest.raises(InputError, match="ActionHistory must come after ActionDelay"):
+        TransformedEnv(inner, ActionDelay(2), auto_unwrap=False).reset()
+
+
+def test_what_skips_steps_must_come_last():
+    def skip() -> ConditionalSkip:
+        return ConditionalSkip(lambda td: td["done"])
+
+    assert TransformedEnv(Drift(), Compose(delay(), skip())).reset().shape == (3,)
+    with pytest.raises(InputError, match="ConditionalSkip must come after ObservationDelay"):
+        Compose(skip(), delay())
+
+
+@pytest.mark.parametrize(
+    ("early", "late"),
+    [
+        (RewardSum, lambda: RewardDelay(2)),
+        (lambda: RewardSum(["reward"], ["total"]), lambda: RewardDelay(2)),
+        (lambda: CatTensors(["observation"], "both", del_keys=False), delay),
+        (lambda: CatFrames(2, -1, ["observation"], ["frames"]), lambda: SampleAndHold(2)),
+    ],
+)
+def test_a_warning_says_what_follows_from_an_entry_before_it_is_delayed(early, late):
+    with pytest.warns(UserWarning, match="computes .* from .* before .* changes"):
+        Compose(early(), late())
+    Compose(late(), early())
+
+
+def test_a_transform_that_changes_an_entry_in_place_may_come_before_its_delay():
+    env = TransformedEnv(Drift(), Compose(CatFrames(2, -1, ["observation"]), delay(), StepCounter(4)))
+    assert env.rollout(3)["observation"].shape == (3, 3, 4)

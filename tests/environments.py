@@ -1,0 +1,111 @@
+"""Environments of every kind on which the transforms must work, with the keys of their entries."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from helpers import square
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase, GymEnv, PendulumEnv
+
+from damian.envs.uav_env import UavEnv
+
+
+class Kind(NamedTuple):
+    """An environment, and the keys of its entries."""
+
+    make: Callable[[], EnvBase]
+    observation: Any = ("agents", "observation")
+    action: Any = ("agents", "action")
+    reward: Any = ("agents", "reward")
+    begin: Callable[[EnvBase], TensorDictBase | None] = lambda env: None
+    """The argument of ``reset``."""
+    stateless: bool = False
+    """Whether the environment reads its state from the TensorDict, so that no entry may be overwritten."""
+
+
+class Teams(EnvBase):
+    """Two worlds of two agents with flags only in the group, and a state and a team reward at the root.
+
+    The state counts the steps of an episode, which lasts 3 or 5 steps; each reward is 1. PettingZoo
+    environments with a root state look so.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(batch_size=torch.Size([2]))
+        agents = torch.Size([2, 2])
+        group = {"observation": Unbounded((*agents, 3))}
+        self.observation_spec = Composite(
+            agents=Composite(**group, shape=agents), state=Unbounded((2, 1)), shape=(2,)
+        )
+        self.action_spec = Composite(
+            agents=Composite(action=Bounded(-1.0, 1.0, (*agents, 2)), shape=agents), shape=(2,)
+        )
+        flag = Categorical(2, shape=(*agents, 1), dtype=torch.bool)
+        self.done_spec = Composite(
+            agents=Composite(done=flag, terminated=flag.clone(), shape=agents), shape=(2,)
+        )
+        self.reward_spec = Composite(
+            agents=Composite(reward=Unbounded((*agents, 1)), shape=agents),
+            team_reward=Unbounded((2, 1)),
+            shape=(2,),
+        )
+        self.time = torch.zeros(2)
+
+    def _outputs(self, done: torch.Tensor) -> TensorDict:
+        agents = {"observation": self.time.view(2, 1, 1).expand(2, 2, 3).clone()}
+        flag = done.view(2, 1, 1).expand(2, 2, 1)
+        agents |= {"done": flag.clone(), "terminated": flag.clone()}
+        return TensorDict({"agents": TensorDict(agents, [2, 2]), "state": self.time.view(2, 1).clone()}, [2])
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get(("agents", "_reset"), None)
+        mask = torch.ones(2, dtype=torch.bool) if mask is None else mask.flatten(1).any(-1)
+        self.time = self.time.masked_fill(mask, 0)
+        return self._outputs(torch.zeros(2, dtype=torch.bool))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.time = self.time + 1
+        outputs = self._outputs(self.time >= torch.tensor([3, 5]))
+        outputs["agents", "reward"] = torch.ones(2, 2, 1)
+        return outputs.set("team_reward", torch.ones(2, 1))
+
+    def _set_seed(self, seed: int | None) -> None:
+        """The environment has no randomness."""
+
+
+def vmas() -> EnvBase:
+    """A multi-agent environment of VMAS."""
+    pytest.importorskip("vmas")
+    from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
+
+    return VmasEnv("navigation", num_envs=2, seed=0, max_steps=4, n_agents=2, collisions=False)
+
+
+def petting_zoo() -> EnvBase:
+    """A PettingZoo environment without batch dimensions, with a state at the root and flags in the group."""
+    spread = pytest.importorskip("mpe2.simple_spread_v3")
+    from torchrl.envs.libs.pettingzoo import PettingZooWrapper  # noqa: PLC0415
+
+    options = {"N": 2, "max_cycles": 4, "continuous_actions": True}
+    return PettingZooWrapper(spread.parallel_env(**options), return_state=True, seed=0)
+
+
+ROOT = ("observation", "action", "reward")
+KINDS = {
+    "CartPole": Kind(
+        lambda: GymEnv("CartPole-v1", categorical_action_encoding=True, max_episode_steps=4), *ROOT
+    ),
+    "Pendulum": Kind(lambda: GymEnv("Pendulum-v1", max_episode_steps=4), *ROOT),
+    "VMAS": Kind(vmas),
+    "PettingZoo": Kind(petting_zoo, *(("agent", name) for name in ROOT)),
+    "PettingZoo, state": Kind(petting_zoo, "state", ("agent", "action"), ("agent", "reward")),
+    "flags in the group": Kind(Teams),
+    "flags in the group, root entries": Kind(Teams, "state", ("agents", "action"), "team_reward"),
+    "batch chosen at reset": Kind(
+        PendulumEnv, "th", "action", "reward", lambda env: env.gen_params(batch_size=[3]), stateless=True
+    ),
+    "UAVs": Kind(lambda: UavEnv(square(), num_worlds=2, extras=["message"])),
+}
