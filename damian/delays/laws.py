@@ -19,12 +19,7 @@ from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry
 from damian.common.text_files import named, near, read_text, show
 from damian.delays.samplers import HeldSampler, Recorded, Sampler
-
-Delay = int | str
-"""Whole steps (``3``), or a time with its unit (``"3s"``)."""
-
-LONGEST = 10_000
-"""Longest delay allowed [steps], because every message in transit takes memory."""
+from damian.delays.times import LONGEST, Delay, in_steps, seconds  # noqa: F401 (others import all of them here)
 
 LOSES = "loses messages, but no reward may be lost"
 
@@ -245,41 +240,6 @@ def law_of(written: Any, key: str = "delay") -> Law:
         checks.require(name in names, f"{key}.{name}", value, problem)
     with naming_errors(f"{key}: law {kind}"):
         return law(**values)
-
-
-def in_steps(key: str, delay: Delay, dt: float) -> int:
-    """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up.
-
-    Raises:
-        InputError: the delay is neither steps nor a time, or longer than ``LONGEST``.
-    """
-    if isinstance(delay, str):
-        steps = math.ceil(min(seconds(key, delay) / dt, LONGEST + 1) - 1e-9)
-    else:
-        is_steps = isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
-        checks.require(is_steps, key, delay, "is neither whole steps such as 3 nor a time such as 3s or 0.5m")
-        steps = delay
-    checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
-    return steps
-
-
-def seconds(key: str, delay: Delay) -> float:
-    """Convert a time with its unit to seconds; unlike ``checks.seconds``, zero (``0s``) is allowed.
-
-    Raises:
-        InputError: the delay is no time.
-    """
-    number, unit = str(delay)[:-1], str(delay)[-1:]
-    problem = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
-    checks.require(unit in ("s", "m", "h"), key, delay, problem)
-    return 0.0 if _is_zero(number) else checks.seconds(key, str(delay))
-
-
-def _is_zero(text: str) -> bool:
-    try:
-        return float(text) == 0
-    except ValueError:
-        return False
 
 
 def _number(written: Any) -> Any:
