@@ -18,6 +18,7 @@ from damian.common import checks
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry
 from damian.common.text_files import named, near, read_text, show
+from damian.delays.lag_sampler import LagSampler
 from damian.delays.samplers import HeldSampler, Recorded, Sampler
 from damian.delays.times import LONGEST, Delay, in_steps, seconds  # noqa: F401 (others import all of them here)
 
@@ -142,7 +143,10 @@ class Geometric(Law):
 @LAWS.register("burst")
 @dataclass(frozen=True)
 class Burst(Law):
-    """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state (1960, 1963)."""
+    """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state (1960, 1963).
+
+    ``Burst(enter, leave, good=0, bad=0, bad_loss=1)`` loses runs of messages, ``1 / leave`` in the mean.
+    """
 
     enter: float = 0.05
     """Probability that a good channel turns bad, per step."""
@@ -163,14 +167,8 @@ class Burst(Law):
         checks.above(f"{key}.enter + leave", self.enter + self.leave, 0.0)
         states = []
         for name in ("good", "bad"):
-            inner_key = f"{key}.{name}"
-            law, inner_loss = law_of(getattr(self, name), inner_key), getattr(self, f"{name}_loss")
-            inner = sampler_of(law, dt, inner_loss, inner_key)
-            problem = "depends on the context of the message, which a burst does not know"
-            checks.require(not inner.sees_context, inner_key, show(getattr(self, name)), problem)
-            memoryless = len(inner.chances) == 1 and not isinstance(inner, Recorded)
-            checks.require(memoryless, inner_key, show(getattr(self, name)), "is not a memoryless law")
-            states.append(inner.chances[0].tolist()[:-1])
+            inner_loss = getattr(self, f"{name}_loss")
+            states.append(_memoryless("burst", getattr(self, name), dt, inner_loss, f"{key}.{name}"))
         transitions = [[1 - self.enter, self.enter], [self.leave, 1 - self.leave]]
         return Sampler(states, transitions, loss)
 
@@ -199,6 +197,59 @@ class Trace(Law):
     def _read(self, written: str | None, key: str, dt: float) -> int:
         written = (written or "").strip()
         return -1 if written == LOST else in_steps(key, _number(written), dt)
+
+
+@LAWS.register("lag")
+@dataclass(frozen=True)
+class Lag(Law):
+    """A sender draws a delay, the lag, from another law, and all its messages have it until the next draw.
+
+    The first message of an episode always draws a lag. Losses (also those of the other law) are not held, but
+    drawn for each message. When the lag shrinks, messages overtake each other.
+    """
+
+    lag: Any = 0
+    """Law from which the lags are drawn; it must be memoryless."""
+    update_period: Delay = 1
+    """Time between two draws: steps, a time, or ``episode``: a lag is held until the end of the episode."""
+    hold_probability: float = 0.0
+    """Probability that an update keeps the lag instead of drawing another one."""
+    shared: bool = False
+    """All agents of a world have the same lags and losses."""
+    stagger: bool = False
+    """Each sender has its own time until its second draw, random and at most a period, so that senders do not
+    all update in the same step."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        checks.in_range(f"{key}.hold_probability", self.hold_probability, 0.0, 1.0)
+        for name in ("shared", "stagger"):
+            checks.one_of(f"{key}.{name}", getattr(self, name), (True, False))
+        period = self._period(dt, f"{key}.update_period")
+        for name in ("hold_probability", "stagger"):
+            problem = "has no effect with update_period=episode, which draws one lag per episode"
+            value = getattr(self, name)
+            checks.require(period is not None or not value, f"{key}.{name}", value, problem)
+        chances = _memoryless("lag", self.lag, dt, 0.0, f"{key}.lag")
+        return LagSampler(
+            chances,
+            loss,
+            period=period,
+            hold_probability=self.hold_probability,
+            shared=self.shared,
+            stagger=self.stagger,
+        )
+
+    def _period(self, dt: float, key: str) -> int | None:
+        """Steps between two draws, None for a whole episode."""
+        written = self.update_period
+        if written == "episode":
+            return None
+        is_word = isinstance(written, str) and written[:1].isalpha()
+        problem = "is neither whole steps such as 3, nor a time such as 3s, nor episode"
+        checks.require(not is_word, key, written, problem)
+        period = in_steps(key, written, dt)
+        checks.require(period > 0, key, written, "is not above 0")
+        return period
 
 
 @dataclass(frozen=True)
@@ -240,6 +291,19 @@ def law_of(written: Any, key: str = "delay") -> Law:
         checks.require(name in names, f"{key}.{name}", value, problem)
     with naming_errors(f"{key}: law {kind}"):
         return law(**values)
+
+
+def _memoryless(user: str, written: Any, dt: float, loss: float, key: str) -> list[float]:
+    """Probabilities of the delays 0, 1, ... of a law that another law, the user, draws from.
+
+    Raises:
+        InputError: it is no law, or one with memory or context.
+    """
+    inner = sampler_of(law_of(written, key), dt, loss, key)
+    problem = f"depends on the context of the message, which a {user} does not know"
+    checks.require(not inner.sees_context, key, show(written), problem)
+    checks.require(inner.memoryless, key, show(written), "is not a memoryless law")
+    return inner.chances[0].tolist()[:-1]
 
 
 def _number(written: Any) -> Any:

@@ -293,6 +293,8 @@ class StatefulTransform(Transform):
     def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
         """A random stream (a seed of the counter-based generator) for each row, [M] long.
 
+        The agents of a world have one stream if the transform's ``sampler`` is ``shared``.
+
         Args:
             batch: batch size of the worlds.
             device: device of the streams.
@@ -305,6 +307,8 @@ class StatefulTransform(Transform):
         else:
             worlds = torch.randint(2**32, (n_worlds,)).to(device)
         agents = torch.arange(self.rows.numel() // n_worlds, device=device)
+        if getattr(getattr(self, "sampler", None), "shared", False):
+            agents = torch.zeros_like(agents)
         return counter_rng.bits(worlds.view(-1, 1), agents).flatten()
 
     # The place of the transform in an environment.

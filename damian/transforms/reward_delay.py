@@ -127,6 +127,7 @@ class RewardDelay(RewardTransform):
         return self.contexts.init_memory(memory | {"reset_at": zero.clone()}, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory = memory | {"channel": self.sampler.begin_episode(memory["channel"], mask)}
         if self.sampler.sees_context:
             memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
         return super().on_reset(memory, entries, mask)
