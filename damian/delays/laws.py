@@ -11,15 +11,19 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
+from torch import Tensor
 
 from damian.common import checks
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry
 from damian.common.text_files import named, near, read_text, show
 from damian.delays.lag_sampler import LagSampler
-from damian.delays.samplers import HeldSampler, Recorded, Sampler
+from damian.delays.samplers import ContextSampler, HeldSampler, MessageContext, Recorded, Sampler
 from damian.delays.times import LONGEST, Delay, in_steps, seconds  # noqa: F401 (others import all of them here)
 
 LOSES = "loses messages, but no reward may be lost"
@@ -250,6 +254,66 @@ class Lag(Law):
         period = in_steps(key, written, dt)
         checks.require(period > 0, key, written, "is not above 0")
         return period
+
+
+@LAWS.register("distance")
+@dataclass(frozen=True)
+class Distance(Law):
+    """Delays and losses that grow with the distance d between sender and receiver.
+
+    The delay is ``base + d / speed``. The path loss grows with log d, with log-normal shadowing, so that a
+    message is received with probability Q(10 n log10(d / range) / sigma), where Q is the tail of the standard
+    normal distribution (Rappaport, Wireless Communications, 2nd ed., 2002, section 4.9).
+
+    The law reads the sender's ``position``, and ``receiver_position`` where it is given, [M, 2] [m].
+    """
+
+    base: Delay = 0
+    """Delay at distance 0, of processing and transmission: steps, or a time."""
+    speed: float = math.inf
+    """Propagation speed [m/s]."""
+    range: float = math.inf
+    """Distance at which half of the messages are lost [m]."""
+    path_loss_exponent: float = 2.0
+    """Exponent n of the path loss; 2 in free space, 3 to 5 in cities."""
+    shadowing: float = 6.0
+    """Standard deviation sigma of the path loss around its mean [dB]; a small one makes the range sharp."""
+    receiver: Any = (0.0, 0.0)
+    """Place of the receiver, east and north [m], if messages have no ``receiver_position``."""
+    longest: Delay = 20
+    """Longest delay, to which longer ones are cut: steps, or a time."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        for name, unit in (("speed", "m/s"), ("range", "m")):
+            value = getattr(self, name)
+            above = isinstance(value, int | float) and value > 0  # infinity is allowed
+            checks.require(above, f"{key}.{name}", f"{value} {unit}", f"is not above 0 {unit}")
+        checks.above(f"{key}.path_loss_exponent", self.path_loss_exponent, 0.0)
+        checks.above(f"{key}.shadowing", self.shadowing, 0.0, "dB")
+        checks.place(f"{key}.receiver", self.receiver)
+        longest = in_steps(f"{key}.longest", self.longest, dt)
+        problem = f"is longer than longest={self.longest}"
+        checks.require(in_steps(f"{key}.base", self.base, dt) <= longest, f"{key}.base", self.base, problem)
+        base = seconds(f"{key}.base", self.base) / dt if isinstance(self.base, str) else self.base
+        return ContextSampler(
+            partial(self.delays, base),
+            longest,
+            loss,
+            loses=math.isfinite(self.range),
+            reads=["position"],
+            optional_reads=["receiver_position"],
+        )
+
+    def delays(self, base: float, context: MessageContext) -> Tensor:
+        """Delay of each of M messages [steps], [M], -1 if it is lost; ``base`` is in steps, too."""
+        entries, position = context.entries, context.entries["position"]
+        given = "receiver_position" in entries
+        receiver = entries["receiver_position"] if given else position.new_tensor(self.receiver)
+        distance = torch.linalg.vector_norm(position - receiver, dim=-1)
+        steps = base + distance / (self.speed * context.dt)
+        margin = 10 * self.path_loss_exponent * (self.range / distance).log10()  # [dB]
+        loss = torch.special.erfc(margin / (self.shadowing * math.sqrt(2))) / 2
+        return torch.where(context.uniform < loss, -1.0, steps)
 
 
 @dataclass(frozen=True)

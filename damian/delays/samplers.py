@@ -48,6 +48,8 @@ class Sampler(nn.Module):
     """Whether a delay depends on the message's context."""
     reads: tuple[str, ...] = ()
     """Names of the entries that the context must contain."""
+    optional_reads: tuple[str, ...] = ()
+    """Names of the entries that the context contains where the transform has a key for them."""
     shared: bool = False
     """Whether all agents of a world draw the same numbers."""
     chances: Tensor
@@ -176,7 +178,7 @@ class HeldSampler(Sampler):
         super().__init__([[0.0] * drawn.longest + [chance] for chance in arrival_chances])
         self.drawn = drawn
         self.sees_context, self.shared = drawn.sees_context, drawn.shared
-        self.reads = drawn.reads
+        self.reads, self.optional_reads = drawn.reads, drawn.optional_reads
         self.certain = None if self.loses else self.longest
 
     @property
@@ -213,6 +215,7 @@ class ContextSampler(Sampler):
         loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, so that the
             sampler can delay rewards, none of which may be lost.
         reads: names of the entries that ``delay_fn`` reads, such as ``position``.
+        optional_reads: names of the entries that it reads if the transform has a key for them.
 
     Raises:
         InputError: an argument is invalid.
@@ -229,14 +232,16 @@ class ContextSampler(Sampler):
         *,
         loses: bool = True,
         reads: Sequence[str] = (),
+        optional_reads: Sequence[str] = (),
     ) -> None:
         checks.whole("longest", longest, 0, unit="steps")
-        checks.require(not isinstance(reads, str), "reads", reads, "is not a list of names")
+        for name, names in (("reads", reads), ("optional_reads", optional_reads)):
+            checks.require(not isinstance(names, str), name, names, "is not a list of names")
         # The table holds the worst case, because the true chances depend on the contexts: it serves only to
         # tell the longest delay, and whether messages can be lost.
         super().__init__([[0.0] * longest + [float(not loses)]], loss=loss)
         self.certain = None
-        self.sees_context, self.reads = True, tuple(reads)
+        self.sees_context, self.reads, self.optional_reads = True, tuple(reads), tuple(optional_reads)
         self._delay_fn, self._loss, self._loses = delay_fn, loss, loses
 
     def forward(

@@ -346,7 +346,7 @@ def test_a_lag_can_be_written_as_a_mapping():
     pickle.loads(pickle.dumps(law.sampler()))
 
 
-@pytest.mark.parametrize("name", ["lag"])
+@pytest.mark.parametrize("name", ["lag", "distance"])
 def test_the_package_has_a_configuration_with_the_law(name):
     written = yaml.safe_load((Path(damian.__file__).parents[1] / f"conf/delay/{name}.yaml").read_text())
     delay = DelayConfig(**written)
