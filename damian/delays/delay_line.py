@@ -36,7 +36,7 @@ class DelayLine:
     the memory, except that a step writes the slots in place. The memory:
 
     - ``clock``: number of steps so far, and ``slot``: the slot of the current step, [M] each;
-    - ``streams``: random stream of each sender, [M], and ``channel``: state of its channel, [M];
+    - ``streams``: random stream of each sender, [M], and ``channel``: state of its channel, [M, ...];
     - ``reset_at``: clock at the sender's latest reset, [M], and ``generated_at``: clock at which the held
       message was generated, [M];
     - ``senders``: 0, 1, ..., M - 1;
@@ -81,6 +81,7 @@ class DelayLine:
         """Where the mask [M] is true, hold ``values`` [M, ...] and discard all messages in transit."""
         clock = memory["clock"]
         memory = memory | {n: torch.where(mask, clock, memory[n]) for n in ("reset_at", "generated_at")}
+        memory["channel"] = self.sampler.begin_episode(memory["channel"], mask)
         for i, new in enumerate(values):
             memory[f"held_{i}"] = torch.where(expand_mask(mask, new), new, memory[f"held_{i}"])
         zero = torch.zeros_like(memory["generated_at"])

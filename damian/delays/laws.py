@@ -11,20 +11,20 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
+from torch import Tensor
 
 from damian.common import checks
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry
 from damian.common.text_files import named, near, read_text, show
-from damian.delays.samplers import HeldSampler, Recorded, Sampler
-
-Delay = int | str
-"""Whole steps (``3``), or a time with its unit (``"3s"``)."""
-
-LONGEST = 10_000
-"""Longest delay allowed [steps], because every message in transit takes memory."""
+from damian.delays.lag_sampler import LagSampler
+from damian.delays.samplers import ContextSampler, HeldSampler, MessageContext, Recorded, Sampler
+from damian.delays.times import LONGEST, Delay, in_steps, seconds  # noqa: F401 (others import all of them here)
 
 LOSES = "loses messages, but no reward may be lost"
 
@@ -147,7 +147,10 @@ class Geometric(Law):
 @LAWS.register("burst")
 @dataclass(frozen=True)
 class Burst(Law):
-    """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state (1960, 1963)."""
+    """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state (1960, 1963).
+
+    ``Burst(enter, leave, good=0, bad=0, bad_loss=1)`` loses runs of messages, ``1 / leave`` in the mean.
+    """
 
     enter: float = 0.05
     """Probability that a good channel turns bad, per step."""
@@ -168,14 +171,8 @@ class Burst(Law):
         checks.above(f"{key}.enter + leave", self.enter + self.leave, 0.0)
         states = []
         for name in ("good", "bad"):
-            inner_key = f"{key}.{name}"
-            law, inner_loss = law_of(getattr(self, name), inner_key), getattr(self, f"{name}_loss")
-            inner = sampler_of(law, dt, inner_loss, inner_key)
-            problem = "depends on the context of the message, which a burst does not know"
-            checks.require(not inner.sees_context, inner_key, show(getattr(self, name)), problem)
-            memoryless = len(inner.chances) == 1 and not isinstance(inner, Recorded)
-            checks.require(memoryless, inner_key, show(getattr(self, name)), "is not a memoryless law")
-            states.append(inner.chances[0].tolist()[:-1])
+            inner_loss = getattr(self, f"{name}_loss")
+            states.append(_memoryless("burst", getattr(self, name), dt, inner_loss, f"{key}.{name}"))
         transitions = [[1 - self.enter, self.enter], [self.leave, 1 - self.leave]]
         return Sampler(states, transitions, loss)
 
@@ -204,6 +201,119 @@ class Trace(Law):
     def _read(self, written: str | None, key: str, dt: float) -> int:
         written = (written or "").strip()
         return -1 if written == LOST else in_steps(key, _number(written), dt)
+
+
+@LAWS.register("lag")
+@dataclass(frozen=True)
+class Lag(Law):
+    """A sender draws a delay, the lag, from another law, and all its messages have it until the next draw.
+
+    The first message of an episode always draws a lag. Losses (also those of the other law) are not held, but
+    drawn for each message. When the lag shrinks, messages overtake each other.
+    """
+
+    lag: Any = 0
+    """Law from which the lags are drawn; it must be memoryless."""
+    update_period: Delay = 1
+    """Time between two draws: steps, a time, or ``episode``: a lag is held until the end of the episode."""
+    hold_probability: float = 0.0
+    """Probability that an update keeps the lag instead of drawing another one."""
+    shared: bool = False
+    """All agents of a world have the same lags and losses."""
+    stagger: bool = False
+    """Each sender has its own time until its second draw, random and at most a period, so that senders do not
+    all update in the same step."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        checks.in_range(f"{key}.hold_probability", self.hold_probability, 0.0, 1.0)
+        for name in ("shared", "stagger"):
+            checks.one_of(f"{key}.{name}", getattr(self, name), (True, False))
+        period = self._period(dt, f"{key}.update_period")
+        for name in ("hold_probability", "stagger"):
+            problem = "has no effect with update_period=episode, which draws one lag per episode"
+            value = getattr(self, name)
+            checks.require(period is not None or not value, f"{key}.{name}", value, problem)
+        chances = _memoryless("lag", self.lag, dt, 0.0, f"{key}.lag")
+        return LagSampler(
+            chances,
+            loss,
+            period=period,
+            hold_probability=self.hold_probability,
+            shared=self.shared,
+            stagger=self.stagger,
+        )
+
+    def _period(self, dt: float, key: str) -> int | None:
+        """Steps between two draws, None for a whole episode."""
+        written = self.update_period
+        if written == "episode":
+            return None
+        is_word = isinstance(written, str) and written[:1].isalpha()
+        problem = "is neither whole steps such as 3, nor a time such as 3s, nor episode"
+        checks.require(not is_word, key, written, problem)
+        period = in_steps(key, written, dt)
+        checks.require(period > 0, key, written, "is not above 0")
+        return period
+
+
+@LAWS.register("distance")
+@dataclass(frozen=True)
+class Distance(Law):
+    """Delays and losses that grow with the distance d between sender and receiver.
+
+    The delay is ``base + d / speed``. The path loss grows with log d, with log-normal shadowing, so that a
+    message is received with probability Q(10 n log10(d / range) / sigma), where Q is the tail of the standard
+    normal distribution (Rappaport, Wireless Communications, 2nd ed., 2002, section 4.9).
+
+    The law reads the sender's ``position``, and ``receiver_position`` where it is given, [M, 2] [m].
+    """
+
+    base: Delay = 0
+    """Delay at distance 0, of processing and transmission: steps, or a time."""
+    speed: float = math.inf
+    """Propagation speed [m/s]."""
+    range: float = math.inf
+    """Distance at which half of the messages are lost [m]."""
+    path_loss_exponent: float = 2.0
+    """Exponent n of the path loss; 2 in free space, 3 to 5 in cities."""
+    shadowing: float = 6.0
+    """Standard deviation sigma of the path loss around its mean [dB]; a small one makes the range sharp."""
+    receiver: Any = (0.0, 0.0)
+    """Place of the receiver, east and north [m], if messages have no ``receiver_position``."""
+    longest: Delay = 20
+    """Longest delay, to which longer ones are cut: steps, or a time."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        for name, unit in (("speed", "m/s"), ("range", "m")):
+            value = getattr(self, name)
+            above = isinstance(value, int | float) and value > 0  # infinity is allowed
+            checks.require(above, f"{key}.{name}", f"{value} {unit}", f"is not above 0 {unit}")
+        checks.above(f"{key}.path_loss_exponent", self.path_loss_exponent, 0.0)
+        checks.above(f"{key}.shadowing", self.shadowing, 0.0, "dB")
+        checks.place(f"{key}.receiver", self.receiver)
+        longest = in_steps(f"{key}.longest", self.longest, dt)
+        problem = f"is longer than longest={self.longest}"
+        checks.require(in_steps(f"{key}.base", self.base, dt) <= longest, f"{key}.base", self.base, problem)
+        base = seconds(f"{key}.base", self.base) / dt if isinstance(self.base, str) else self.base
+        return ContextSampler(
+            partial(self.delays, base),
+            longest,
+            loss,
+            loses=math.isfinite(self.range),
+            reads=["position"],
+            optional_reads=["receiver_position"],
+        )
+
+    def delays(self, base: float, context: MessageContext) -> Tensor:
+        """Delay of each of M messages [steps], [M], -1 if it is lost; ``base`` is in steps, too."""
+        entries, position = context.entries, context.entries["position"]
+        given = "receiver_position" in entries
+        receiver = entries["receiver_position"] if given else position.new_tensor(self.receiver)
+        distance = torch.linalg.vector_norm(position - receiver, dim=-1)
+        steps = base + distance / (self.speed * context.dt)
+        margin = 10 * self.path_loss_exponent * (self.range / distance).log10()  # [dB]
+        loss = torch.special.erfc(margin / (self.shadowing * math.sqrt(2))) / 2
+        return torch.where(context.uniform < loss, -1.0, steps)
 
 
 @dataclass(frozen=True)
@@ -247,39 +357,17 @@ def law_of(written: Any, key: str = "delay") -> Law:
         return law(**values)
 
 
-def in_steps(key: str, delay: Delay, dt: float) -> int:
-    """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up.
+def _memoryless(user: str, written: Any, dt: float, loss: float, key: str) -> list[float]:
+    """Probabilities of the delays 0, 1, ... of a law that another law, the user, draws from.
 
     Raises:
-        InputError: the delay is neither steps nor a time, or longer than ``LONGEST``.
+        InputError: it is no law, or one with memory or context.
     """
-    if isinstance(delay, str):
-        steps = math.ceil(min(seconds(key, delay) / dt, LONGEST + 1) - 1e-9)
-    else:
-        is_steps = isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
-        checks.require(is_steps, key, delay, "is neither whole steps such as 3 nor a time such as 3s or 0.5m")
-        steps = delay
-    checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
-    return steps
-
-
-def seconds(key: str, delay: Delay) -> float:
-    """Convert a time with its unit to seconds; unlike ``checks.seconds``, zero (``0s``) is allowed.
-
-    Raises:
-        InputError: the delay is no time.
-    """
-    number, unit = str(delay)[:-1], str(delay)[-1:]
-    problem = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
-    checks.require(unit in ("s", "m", "h"), key, delay, problem)
-    return 0.0 if _is_zero(number) else checks.seconds(key, str(delay))
-
-
-def _is_zero(text: str) -> bool:
-    try:
-        return float(text) == 0
-    except ValueError:
-        return False
+    inner = sampler_of(law_of(written, key), dt, loss, key)
+    problem = f"depends on the context of the message, which a {user} does not know"
+    checks.require(not inner.sees_context, key, show(written), problem)
+    checks.require(inner.memoryless, key, show(written), "is not a memoryless law")
+    return inner.chances[0].tolist()[:-1]
 
 
 def _number(written: Any) -> Any:

@@ -48,6 +48,10 @@ class Sampler(nn.Module):
     """Whether a delay depends on the message's context."""
     reads: tuple[str, ...] = ()
     """Names of the entries that the context must contain."""
+    optional_reads: tuple[str, ...] = ()
+    """Names of the entries that the context contains where the transform has a key for them."""
+    shared: bool = False
+    """Whether all agents of a world draw the same numbers."""
     chances: Tensor
     _boundaries: Tensor
 
@@ -86,9 +90,23 @@ class Sampler(nn.Module):
         """Whether messages can be lost."""
         return bool((self.chances[:, -1] > 1e-9).any())
 
+    @property
+    def memoryless(self) -> bool:
+        """Whether all delays are drawn independently from the same table, by this class's ``forward``."""
+        return len(self.chances) == 1 and type(self).forward is Sampler.forward
+
     def initial_state(self, streams: Tensor) -> Tensor:
-        """Draw the initial state of each sender's channel [M] from its random stream [M]."""
+        """Draw the initial state of each sender's channel [M, ...] from its random stream [M]."""
         return (counter_rng.uniform(streams) < self._bad_share).long()
+
+    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
+        """The states [M, ...] of the channels before the first message of an episode.
+
+        Args:
+            memory: the states before, [M, ...].
+            mask: senders of which an episode begins, [M] bool.
+        """
+        return memory
 
     def try_context(self, context: MessageContext) -> None:
         """Try what computes delays from contexts once, before the first step.
@@ -100,12 +118,12 @@ class Sampler(nn.Module):
     def forward(
         self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw the delays [M] of the messages sent at ``clock``, and the channels' next states [M].
+        """Draw the delays [M] of the messages sent at ``clock``, and the channels' next states [M, ...].
 
         Args:
             streams: random stream of each sender, [M].
             clock: step, [M] or a scalar.
-            memory: state of each channel, [M].
+            memory: state of each channel, [M, ...].
             context: circumstances of the messages; needed only if ``sees_context``.
         """
         if self.certain is not None:
@@ -159,11 +177,19 @@ class HeldSampler(Sampler):
         arrival_chances = (1 - drawn.chances[:, -1]).tolist()
         super().__init__([[0.0] * drawn.longest + [chance] for chance in arrival_chances])
         self.drawn = drawn
-        self.sees_context, self.reads = drawn.sees_context, drawn.reads
+        self.sees_context, self.shared = drawn.sees_context, drawn.shared
+        self.reads, self.optional_reads = drawn.reads, drawn.optional_reads
         self.certain = None if self.loses else self.longest
+
+    @property
+    def memoryless(self) -> bool:
+        return self.drawn.memoryless
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return self.drawn.initial_state(streams)
+
+    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
+        return self.drawn.begin_episode(memory, mask)
 
     def try_context(self, context: MessageContext) -> None:
         self.drawn.try_context(context)
@@ -189,6 +215,7 @@ class ContextSampler(Sampler):
         loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, so that the
             sampler can delay rewards, none of which may be lost.
         reads: names of the entries that ``delay_fn`` reads, such as ``position``.
+        optional_reads: names of the entries that it reads if the transform has a key for them.
 
     Raises:
         InputError: an argument is invalid.
@@ -205,14 +232,16 @@ class ContextSampler(Sampler):
         *,
         loses: bool = True,
         reads: Sequence[str] = (),
+        optional_reads: Sequence[str] = (),
     ) -> None:
         checks.whole("longest", longest, 0, unit="steps")
-        checks.require(not isinstance(reads, str), "reads", reads, "is not a list of names")
+        for name, names in (("reads", reads), ("optional_reads", optional_reads)):
+            checks.require(not isinstance(names, str), name, names, "is not a list of names")
         # The table holds the worst case, because the true chances depend on the contexts: it serves only to
         # tell the longest delay, and whether messages can be lost.
         super().__init__([[0.0] * longest + [float(not loses)]], loss=loss)
         self.certain = None
-        self.sees_context, self.reads = True, tuple(reads)
+        self.sees_context, self.reads, self.optional_reads = True, tuple(reads), tuple(optional_reads)
         self._delay_fn, self._loss, self._loses = delay_fn, loss, loses
 
     def forward(

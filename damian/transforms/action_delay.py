@@ -67,7 +67,7 @@ class ActionDelay(ActionTransform):
         super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed, gradients=gradients)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
-        self.draws = self.sampler.certain is None
+        self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         self.line = DelayLine(self.sampler, "generation", gradients)
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)

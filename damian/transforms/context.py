@@ -44,7 +44,7 @@ class ContextReader:
         known = dict(context_keys or {})
         self.keys: dict[str, NestedKey] = {}
         """Keys of the entries that the law reads, by name."""
-        for name in sampler.reads:
+        for name in (*sampler.reads, *(name for name in sampler.optional_reads if name in known)):
             should = f"has no key for {name}, which the law {type(law).__name__} reads"
             checks.require(name in known, "context_keys", known, should)
             self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(known[name])))

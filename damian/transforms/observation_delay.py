@@ -89,7 +89,7 @@ class ObservationDelay(StatefulTransform):
         super().__init__(in_keys, out_keys or in_keys, seed=seed, gradients=gradients)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
-        self.draws = self.sampler.certain is None
+        self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         self.line = DelayLine(self.sampler, order, gradients)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)

@@ -117,7 +117,7 @@ class RewardDelay(RewardTransform):
         super().__init__(reward_key, seed, gradients)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt)
-        self.draws = self.sampler.certain is None
+        self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)
@@ -152,6 +152,7 @@ class RewardDelay(RewardTransform):
         return self.contexts.init_memory(memory | {"reset_at": zero.clone()}, tensordict, self.rows)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory = memory | {"channel": self.sampler.begin_episode(memory["channel"], mask)}
         if self.sampler.sees_context:
             memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
         return super().on_reset(memory, entries, mask)

@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from damian.common import checks
+from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
 from damian.delays.laws import Delay, in_steps
 from damian.transforms.base import StatefulTransform
@@ -36,6 +36,10 @@ class SampleAndHold(StatefulTransform):
         ready_key: key of a flag, [...] bool, that is set to false between two ticks, as an agent cannot
             choose then; None to leave it out.
         dt: length of a step [s], for a period given as a time.
+        stagger: every row (world, or agent under a nested key) draws the time from each reset to its second
+            tick, from one step to a period, so that the clocks do not all tick in the same step.
+        seed: seed of these draws until the environment is seeded; if there is none, it is drawn from torch's
+            global generator at the first reset.
         gradients: let gradients flow through the held entries (``StatefulTransform``).
 
     Raises:
@@ -54,12 +58,15 @@ class SampleAndHold(StatefulTransform):
         *,
         ready_key: NestedKey | None = None,
         dt: float = 1.0,
+        stagger: bool = False,
+        seed: int | None = None,
         gradients: bool = False,
     ) -> None:
-        super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv, gradients=gradients)
+        super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv, seed, gradients)
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
-        self.ready_key = ready_key
+        self.ready_key, self.stagger = ready_key, stagger
+        self.draws = stagger
         self.action_keys = self.in_keys_inv
         self.step_keys = [*self.in_keys, *([ready_key] if ready_key else [])]
 
@@ -89,10 +96,18 @@ class SampleAndHold(StatefulTransform):
         acted = {
             f"acted_{i}": as_rows(specs[key].zero(), self.rows) for i, key in enumerate(self.in_keys_inv)
         }
-        return {"elapsed": elapsed, **held, **acted}
+        memory = {"elapsed": elapsed, **held, **acted}
+        if not self.stagger:
+            return memory
+        streams = self.streams(tensordict.batch_size, device)
+        return memory | {"streams": streams, "episode": elapsed.clone(), "phase": elapsed.clone()}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
+        if self.stagger:
+            episode = memory["episode"] + mask
+            phase = counter_rng.bits(memory["streams"], episode) % self.period
+            memory = memory | {"episode": episode, "phase": torch.where(mask, phase, memory["phase"])}
         return self._hold(memory, entries, self.in_keys, "held", mask)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
@@ -109,7 +124,10 @@ class SampleAndHold(StatefulTransform):
 
     def _ticks(self, memory: Memory) -> Tensor:
         """Is this step a tick, [M]."""
-        return memory["elapsed"] % self.period == 0
+        elapsed = memory["elapsed"]
+        if self.stagger:
+            return (elapsed == 0) | ((elapsed + memory["phase"]) % self.period == 0)
+        return elapsed % self.period == 0
 
     def _hold(
         self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, sampled: Tensor

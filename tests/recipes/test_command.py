@@ -86,8 +86,11 @@ def test_help_explains_a_program_a_section_and_a_setting(capsys):
         (["trian"], "trian: no such program; the programs are train, evaluate"),
         (["train", "agnts=3"], "agnts: no such key; did you mean agents?"),
         (["train", "agents=2", "learner.lrr=1"], "learner.lrr: no such key; did you mean learner.lr?"),
-        (["train", "delay=papers"], "delay: papers is not one of burst, none, paper"),
-        (["train", "-m", "delay=none,papers"], "delay: papers is not one of burst, none, paper"),
+        (["train", "delay=papers"], "delay: papers is not one of burst, distance, lag, none, paper"),
+        (
+            ["train", "-m", "delay=none,papers"],
+            "delay: papers is not one of burst, distance, lag, none, paper",
+        ),
         (["evaluate", "delay.obs.hgih=3s"], None),
         (["compare", "experimnt=usecase1"], "experimnt: no such key; did you mean experiment?"),
         (

@@ -1,0 +1,46 @@
+"""Delays as they are written: in steps (``3``) or as a time with its unit (``"3s"``, ``"0.5m"``)."""
+
+import math
+
+from damian.common import checks
+
+Delay = int | str
+"""Whole steps (``3``), or a time with its unit (``"3s"``)."""
+
+LONGEST = 10_000
+"""Longest delay allowed [steps], because every message in transit takes memory."""
+
+
+def in_steps(key: str, delay: Delay, dt: float) -> int:
+    """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up.
+
+    Raises:
+        InputError: the delay is neither steps nor a time, or longer than ``LONGEST``.
+    """
+    if isinstance(delay, str):
+        steps = math.ceil(min(seconds(key, delay) / dt, LONGEST + 1) - 1e-9)
+    else:
+        is_steps = isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
+        checks.require(is_steps, key, delay, "is neither whole steps such as 3 nor a time such as 3s or 0.5m")
+        steps = delay
+    checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
+    return steps
+
+
+def seconds(key: str, delay: Delay) -> float:
+    """Convert a time with its unit to seconds; unlike ``checks.seconds``, zero (``0s``) is allowed.
+
+    Raises:
+        InputError: the delay is no time.
+    """
+    number, unit = str(delay)[:-1], str(delay)[-1:]
+    problem = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
+    checks.require(unit in ("s", "m", "h"), key, delay, problem)
+    return 0.0 if _is_zero(number) else checks.seconds(key, str(delay))
+
+
+def _is_zero(text: str) -> bool:
+    try:
+        return float(text) == 0
+    except ValueError:
+        return False
