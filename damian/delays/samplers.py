@@ -148,11 +148,12 @@ class Recorded(Sampler):
 
     def __init__(self, delays: list[int], loss: float) -> None:
         longest = max(*delays, 0)
-        frequencies = [delays.count(k) / len(delays) for k in range(longest + 1)]
-        super().__init__([frequencies], loss=loss)
+        codes = torch.tensor([longest + 1 if delay < 0 else delay for delay in delays])
+        counts = torch.bincount(codes, minlength=longest + 2)
+        frequencies = counts[:-1].double() / len(delays)
+        super().__init__([frequencies.tolist()], loss=loss)
         self._loss = loss
-        codes = [longest + 1 if delay < 0 else delay for delay in delays]
-        self.register_buffer("_delays", torch.tensor(codes), persistent=False)
+        self.register_buffer("_delays", codes, persistent=False)
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return counter_rng.bits(streams) % len(self._delays)

@@ -7,7 +7,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
-from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
@@ -322,7 +322,7 @@ class UavEnv(EnvBase):
     def _spec_of(self, table: Tensor, bounds: tuple[Tensor, Tensor] | None) -> TensorSpec:
         shape = torch.Size((*self.batch_size, *table.shape[1:]))
         if table.dtype == torch.bool:
-            return Binary(shape[-1], shape=shape, dtype=torch.bool, device=self.device)
+            return Categorical(2, shape=shape, dtype=torch.bool, device=self.device)
         if bounds is not None:
             low, high = (limit.expand(shape) for limit in bounds)
             return Bounded(low, high, shape=shape, dtype=table.dtype, device=self.device)

@@ -1,6 +1,6 @@
 """A transform that delays actions (paper, section 3.3)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict import NestedKey, TensorDictBase
@@ -26,7 +26,7 @@ class ActionDelay(ActionTransform):
             A delay is drawn for each world, each agent (under a nested key) and each step.
         action_key: key of the action.
         default: action that is executed until the first one arrives: a number, or values in the shape of an
-            action; an index for discrete actions. If not given, the legal value nearest to 0.
+            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
         loss: probability that an action never arrives.
         dt: length of a step [s], for delays given as times.
         sent_key: key of a flag in the policy's input, [...] bool: an action is sent only where it is true.
@@ -43,7 +43,8 @@ class ActionDelay(ActionTransform):
     A bare name for one of the three keys above means an entry in the same TensorDict as the action.
 
     Raises:
-        InputError: the delay is not valid, or its law reads what has no key.
+        InputError: the delay is not valid, or its law reads what has no key; at the first use of the
+            environment also: the default is no legal action, or the environment has no entry ``sent_key``.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))
@@ -86,8 +87,12 @@ class ActionDelay(ActionTransform):
     def memory_sizes(self) -> dict[str, int]:
         return {"longest": self.sampler.longest}
 
+    @property
+    def required_keys(self) -> Sequence[NestedKey]:
+        return self.flag_to_require(self.sent_key)
+
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        initial = self.actions.initial
+        initial = self.action_rows(self.actions.initial)
         streams = self.streams(tensordict.batch_size, initial.device)
         memory = self.line.init_memory([initial], streams) | {"initial": initial}
         return self.contexts.init_memory(memory, tensordict, self.rows)

@@ -25,12 +25,13 @@ class ActionHistory(ActionTransform):
     Args:
         steps: number of actions.
         action_key: key of the action.
-        out_key: key of the history, [..., steps * A]; a bare name means an entry beside the action.
-        append_to: key of an entry to which the history is appended; ``out_key`` is then not used.
+        out_key: key of the history, [..., steps * A] float32; a bare name means an entry beside the action.
+        append_to: key of an entry to which the history is appended in its own type; ``out_key`` is then
+            not used.
         codes: vectors that represent discrete actions, [n_actions, A]. If not given, actions are scaled to
             [0, 1]; one-hot actions are already.
         default: action that fills the history before the first one: a number, or values in the shape of an
-            action. If not given, the legal value nearest to 0.
+            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
         recorded_key: key of a flag in the policy's input, [...] bool: an action is recorded only where it is
             true; a bare name means an entry beside the action. If not given, every action is recorded.
         age_key: key of the age of the observation [steps], [..., 1], as ``ObservationDelay`` writes it. The
@@ -38,7 +39,9 @@ class ActionHistory(ActionTransform):
             which the observation already reflects, are replaced by the default.
 
     Raises:
-        InputError: the number of steps is not a positive integer, or ``append_to`` cannot be appended to.
+        InputError: the number of steps is not a positive integer; at the first use of the environment also:
+            ``append_to`` cannot be appended to, the default is no legal action, or the environment has no
+            entry ``recorded_key``.
 
     Examples:
         >>> history = ActionHistory(2, append_to="observation")
@@ -79,13 +82,15 @@ class ActionHistory(ActionTransform):
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
-        return self.step_keys
+        return [*self.step_keys, *self.flag_to_require(self.recorded_key)]
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        actions = self.actions
-        scale = {"low": actions.low, "width": actions.width}
-        scale |= {} if self.codes is None else {"codes": self.codes.to(actions.initial.device)}
-        first = self._encode(scale, actions.initial).repeat(1, self.steps)
+        _, initial, low, width, _ = self.actions
+        initial, low, width = (self.action_rows(value) for value in (initial, low, width))
+        scale = {"low": low, "width": width}
+        if self.codes is not None:
+            scale = {"codes": self.codes.to(initial.device, torch.float32)}
+        first = self._encode(scale, initial).repeat(1, self.steps)
         # "since": steps since each recorded action was chosen
         since = torch.zeros(len(first), self.steps, dtype=torch.long, device=first.device)
         return scale | {"first": first, "recent": first, "since": since}
@@ -113,24 +118,28 @@ class ActionHistory(ActionTransform):
             width = recent.shape[-1] // self.steps
             recent = torch.where(not_reflected.repeat_interleave(width, -1), recent, memory["first"])
         history = from_rows(recent, self.rows)
-        return memory, {key: torch.cat([entries[key], history], -1) if key in entries else history}
+        if key not in entries:
+            return memory, {key: history.clone()}  # others may change it in place, but not the memory
+        return memory, {key: torch.cat([entries[key], history.to(entries[key].dtype)], -1)}
 
     def _encode(self, scale: Memory, action: Tensor) -> Tensor:
-        """Represent actions [M, ...] by vectors [M, A]."""
+        """Represent actions [M, ...] by vectors [M, A] float32."""
         if self.codes is not None:
             return gather_rows(scale["codes"], action)
-        return ((action.float() - scale["low"]) / scale["width"]).view(len(action), -1).float()
+        return ((action.float() - scale["low"]) / scale["width"]).reshape(len(action), -1)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        example = self.actions.initial[:1]
-        width = self.steps * (example.numel() if self.codes is None else self.codes.shape[-1])
+        rows, initial = self.actions.rows, self.actions.initial
+        n_numbers = initial.shape[len(rows) :].numel() if self.codes is None else self.codes.shape[-1]
+        width = self.steps * n_numbers
         key, device = self.out_keys[0], observation_spec.device
         if not self.in_keys:
-            observation_spec[key] = Unbounded(torch.Size((*self.actions.rows, width)), device=device)
+            shape = torch.Size((*rows, width))
+            observation_spec[key] = Unbounded(shape, dtype=torch.float32, device=device)
             return observation_spec
         require_keys(type(self).__name__, [key], observation_spec)
         old = observation_spec[key]
-        flat = old.dtype.is_floating_point and len(old.shape) == len(self.actions.rows) + 1
+        flat = old.dtype.is_floating_point and len(old.shape) == len(rows) + 1
         should = "is not a vector of floats, so no actions can be appended to it; use out_key instead"
         checks.require(flat, "append_to", key, should)
         observation_spec[key] = self._appended(old, width)

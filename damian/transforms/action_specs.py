@@ -1,30 +1,47 @@
 """Shape, range and default of an environment's actions, read from its action spec."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec
+from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
+from torchrl.data.tensor_specs import Stacked
 from torchrl.envs import EnvBase
 
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.common.text_files import show
 from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import as_rows, require_keys, spec_rows
+from damian.transforms.batches import expand_to_rows, rows_of_batch
+from damian.transforms.entries import require_keys, spec_rows
 
 
 class ActionSpecs(NamedTuple):
-    """Actions of M rows; a row is a world, or an agent of a world."""
+    """Actions in the shape of their spec, [*rows, ...]; a row is a world, or an agent of a world."""
 
     rows: torch.Size
-    """Batch size of the actions' TensorDict; its elements are the M rows."""
+    """Batch size of the actions' TensorDict, as the specs tell it."""
     initial: Tensor
-    """Default actions, [M, ...]."""
+    """Default actions, [*rows, ...]."""
     low: Tensor
-    """Lower bound of each number of an action."""
+    """Lower bound of each number of an action, [*rows, ...] float32."""
     width: Tensor
-    """Upper minus lower bound of each number of an action; 1 where actions have no bounds, or are one-hot."""
+    """Upper minus lower bound of each number of an action, [*rows, ...] float32; 1 where actions have no
+    bounds, can take one value only, or are one-hot."""
     bounded: bool
     """Whether (action - low) / width lies in [0, 1] for every number of an action."""
+
+
+class _Range(NamedTuple):
+    """Range of each number of an action, in the shape of the spec."""
+
+    low: Tensor
+    """Lowest value, in the type of the actions."""
+    high: Tensor
+    """Highest value, in the type of the actions."""
+    bounded: Tensor
+    """Whether the spec sets these bounds, bool; if not, they are those of the type of the actions."""
 
 
 def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs:
@@ -33,38 +50,75 @@ def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs
     Args:
         env: environment that has the action.
         key: key of the action.
-        default: default action: a number, or values in the shape of an action (an index for discrete
-            actions); if None, the legal value nearest to 0.
+        default: default action: a number, or values in the shape of an action (indices for one-hot actions);
+            if None, the legal value nearest to 0.
+
+    Raises:
+        InputError: the default is no legal action.
     """
-    spec, rows = env.full_action_spec[key], spec_rows(env.full_action_spec, key)
-    value = torch.as_tensor(0 if default is None else default, device=spec.device)
-    if isinstance(spec, MultiOneHot):
-        blocks = [one.n for one in spec.space]
-        first = torch.cat([torch.nn.functional.one_hot(torch.tensor(0), n) for n in blocks])
-        initial = (first if default is None else value).to(spec.device, spec.dtype).expand(spec.shape).clone()
-    elif isinstance(spec, OneHot):
-        index = value.long().expand(spec.shape[:-1])
-        initial = torch.nn.functional.one_hot(index, spec.shape[-1]).to(spec.dtype)
-    else:
-        initial = value.to(spec.dtype).expand(spec.shape).clone()
-        initial = spec.project(initial) if default is None else initial  # type: ignore[arg-type]
-    return ActionSpecs(rows, as_rows(initial, rows), *_range(spec, rows))
+    specs = env.full_action_spec
+    spec, rows = specs[key], spec_rows(specs, key)
+    if isinstance(spec, OneHot):
+        indices = spec.to_categorical_spec()
+        initial = indices.to_one_hot(_default_action(_range(indices), default)).to(spec.dtype)
+        low = torch.zeros_like(initial, dtype=torch.float32)
+        return ActionSpecs(rows, initial, low, torch.ones_like(low), True)
+    space = _range(spec)
+    low = space.low.float()
+    width = space.high.float() - low
+    bounded = space.bounded & width.isfinite()
+    low, width = torch.where(bounded, low, 0), torch.where(bounded & (width > 0), width, 1)
+    return ActionSpecs(rows, _default_action(space, default), low, width, bool(bounded.all()))
 
 
-def _range(spec: TensorSpec, rows: torch.Size) -> tuple[Tensor, Tensor, bool]:
-    """Lower bound and width of the range of each number of an action, and whether all have a range."""
+def _range(spec: TensorSpec) -> _Range:
+    """The range of each number of an action."""
+    if isinstance(spec, Stacked):  # agents with different ranges
+        parts = [_range(one) for one in spec._specs]  # type: ignore[arg-type]
+        return _Range(*(torch.stack(part, spec.dim) for part in zip(*parts, strict=True)))
+    bounded = isinstance(spec, Categorical | Bounded)
     if isinstance(spec, MultiCategorical):  # before Categorical, of which it is a subclass
-        width = spec.nvec.view(-1, spec.shape[-1])[0] - 1
-        return torch.zeros_like(width), width.clamp(min=1).to(spec.device), True
-    if isinstance(spec, Categorical):
-        width = torch.tensor(max(spec.n - 1, 1), device=spec.device)
-        return torch.zeros_like(width), width, True
-    if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
-        low, high = (as_rows(bound, rows)[0] for bound in (spec.low, spec.high))
-        bounded = (high - low).isfinite()
-        return torch.where(bounded, low, 0), torch.where(bounded, high - low, 1), bool(bounded.all())
-    one_hot = isinstance(spec, OneHot)
-    return torch.zeros((), device=spec.device), torch.ones((), device=spec.device), one_hot
+        low, high = 0, spec.nvec - 1
+    elif isinstance(spec, Categorical):
+        low, high = 0, spec.n - 1
+    else:
+        low, high = spec.space.low, spec.space.high  # type: ignore[union-attr]
+    low, high = (
+        torch.as_tensor(bound, dtype=spec.dtype, device=spec.device).expand(spec.shape)
+        for bound in (low, high)
+    )
+    return _Range(low, high, torch.full_like(low, bounded, dtype=torch.bool))
+
+
+def _default_action(space: _Range, default: Any) -> Tensor:
+    """The default action in the shape and type of the range.
+
+    Raises:
+        InputError: the default is no legal action.
+    """
+    low, high = space.low, space.high
+    if default is None:
+        return torch.maximum(torch.minimum(torch.zeros_like(low), high), low)
+    real = low.is_floating_point()
+    should = (
+        f"is not a legal default action: {'numbers' if real else 'whole numbers'} between {_shown(low)} and "
+        f"{_shown(high)}, one for all or in the shape {tuple(low.shape)}"
+    )
+    try:
+        value = torch.as_tensor(default, dtype=low.dtype if real else None, device=low.device)
+        value = value.expand(low.shape)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"default: {show(default)} {should}") from error
+    legal = (real or not value.is_floating_point()) and bool(((value >= low) & (value <= high)).all())
+    checks.require(legal, "default", show(default), should)
+    return value.to(low.dtype)
+
+
+def _shown(bound: Tensor) -> str:
+    """The bounds of all numbers, as one number if they are all the same."""
+    bound = bound + 0  # flags are 0 and 1
+    values = bound.unique()
+    return show(values.item() if len(values) == 1 else bound.tolist())
 
 
 class ActionTransform(StatefulTransform):
@@ -86,7 +140,24 @@ class ActionTransform(StatefulTransform):
         return self.action_key
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
-        return self.actions.rows
+        return rows_of_batch(tensordict.batch_size, self.env, self.actions.rows)
+
+    def action_rows(self, value: Tensor) -> Tensor:
+        """A value of ``actions`` for each of the M rows, [M, ...]."""
+        return expand_to_rows(value, self.actions.rows, self.rows)
+
+    def flag_to_require(self, key: NestedKey | None) -> list[NestedKey]:
+        """The key of a flag in the policy's input, if a reset must output it before this transform.
+
+        It need not if the specs of the whole environment name the flag: then a later transform may write it,
+        or it may be a part of the action.
+        """
+        if key is None:
+            return []
+        env = cast(EnvBase, self.container)
+        specs = (env.full_observation_spec, env.full_state_spec, env.full_action_spec, env.full_done_spec)
+        named = {key for spec in specs for key in spec.keys(True, True)}
+        return [] if key in named else [key]
 
     @property
     def actions(self) -> ActionSpecs:

@@ -6,12 +6,14 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite, Unbounded
 
 from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.delays.delay_line import advance_slot
 from damian.delays.laws import LOSES, law_of, sampler_of
 from damian.transforms.base import StatefulTransform
+from damian.transforms.batches import expand_to_rows, rows_of_batch
 from damian.transforms.context import ContextReader
 from damian.transforms.entries import (
     Change,
@@ -60,12 +62,28 @@ class RewardTransform(StatefulTransform):
         return []  # a reset outputs no reward
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
-        require_keys(type(self).__name__, [self.reward_key], self.env.full_reward_spec)
-        return spec_rows(self.env.full_reward_spec, self.reward_key)
+        specs = self.env.full_reward_spec
+        require_keys(type(self).__name__, [self.reward_key], specs)
+        return rows_of_batch(tensordict.batch_size, self.env, spec_rows(specs, self.reward_key))
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        example = as_rows(self.env.full_reward_spec[self.reward_key].zero(), self.rows)
-        return {"past": example.new_zeros(self.n_past, *example.shape)}
+        specs = self.env.full_reward_spec
+        zero = specs[self.reward_key].zero()
+        zero = expand_to_rows(zero, spec_rows(specs, self.reward_key), self.rows)
+        return {"past": zero.new_zeros(self.n_past, *zero.shape)}
+
+    def sum_dtype(self, dtype: torch.dtype) -> torch.dtype:
+        """The type of the rewards that the transform writes, given the type of those that it reads."""
+        return dtype
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
+        require_keys(type(self).__name__, [self.reward_key], reward_spec)
+        if self.n_past > 1:  # sums of rewards have other bounds than one reward
+            old = reward_spec[self.reward_key]
+            reward_spec[self.reward_key] = Unbounded(
+                old.shape, dtype=self.sum_dtype(old.dtype), device=old.device
+            )
+        return reward_spec
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         past = memory["past"]
@@ -172,7 +190,7 @@ class RewardDelay(RewardTransform):
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
             ended = expand_mask(any_flag(done, self.rows), received)
-            received = torch.where(ended, received + in_transit.sum(0), received)
+            received = torch.where(ended, received + in_transit.sum(0, dtype=received.dtype), received)
             in_transit = in_transit.masked_fill(ended, 0)
         memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "past": in_transit}
         return memory, {self.reward_key: from_rows(received, self.rows)}
@@ -182,7 +200,7 @@ class CumulativeReward(RewardTransform):
     """Replaces the reward by the discounted sum of the latest rewards (paper, eq. 4).
 
     R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode. With ``steps=1``
-    nothing changes.
+    nothing changes. Sums of integer rewards are float32; those of other rewards keep their type.
 
     Args:
         steps: number of rewards in the sum, T.
@@ -211,7 +229,10 @@ class CumulativeReward(RewardTransform):
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         reward = as_rows(entries[self.reward_key], self.rows)
         past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
-        dtype = reward.dtype if reward.dtype.is_floating_point else torch.get_default_dtype()
+        dtype = self.sum_dtype(reward.dtype)
         weights = torch.tensor(self.weights, dtype=dtype, device=reward.device)
-        total = (weights.view(-1, *[1] * reward.dim()) * past).sum(0)
-        return memory | {"past": past}, {self.reward_key: from_rows(total.to(reward.dtype), self.rows)}
+        total = (weights.view(-1, *[1] * reward.dim()) * past).sum(0, dtype=dtype)
+        return memory | {"past": past}, {self.reward_key: from_rows(total, self.rows)}
+
+    def sum_dtype(self, dtype: torch.dtype) -> torch.dtype:
+        return dtype if dtype.is_floating_point or self.n_past == 1 else torch.float32

@@ -10,6 +10,7 @@ from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
 from damian.delays.laws import Delay, in_steps
 from damian.transforms.base import StatefulTransform
+from damian.transforms.batches import expand_to_rows
 from damian.transforms.entries import (
     Change,
     Entries,
@@ -18,6 +19,7 @@ from damian.transforms.entries import (
     from_rows,
     require_keys,
     select_entries,
+    spec_rows,
 )
 from damian.transforms.order import KeyUsage
 
@@ -88,13 +90,14 @@ class SampleAndHold(StatefulTransform):
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         first = select_entries(tensordict, self.in_keys)
-        device = first[self.in_keys[0]].device
+        device = next((value.device for value in first.values()), self.env.device)
         elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
         held = {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(first.values())}
         specs = self.env.full_action_spec
         require_keys(type(self).__name__, self.in_keys_inv, specs)
         acted = {
-            f"acted_{i}": as_rows(specs[key].zero(), self.rows) for i, key in enumerate(self.in_keys_inv)
+            f"acted_{i}": expand_to_rows(specs[key].zero(), spec_rows(specs, key), self.rows)
+            for i, key in enumerate(self.in_keys_inv)
         }
         memory = {"elapsed": elapsed, **held, **acted}
         if not self.stagger:

@@ -1,7 +1,11 @@
 """A transform that names a key that the environment does not have is refused in one line."""
 
 import pytest
-from torchrl.envs import Compose, GymEnv, Transform, TransformedEnv
+import torch
+from delay_twin import Counting
+from torchrl.data import Categorical, Composite
+from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
+from transform_cases import ACTION
 
 from damian.common.errors import InputError
 from damian.transforms import (
@@ -31,7 +35,14 @@ def rollout(*transforms: Transform) -> None:
         (ObservationDelay(3, sent_key="sent"), "sent", OUTPUTS),
         (ActionHistory(2, append_to="observatoin"), "observatoin", OUTPUTS),
         (ActionHistory(2, append_to="observation", age_key="age"), "age", OUTPUTS),
+        (ActionHistory(2, recorded_key="redy"), "redy", OUTPUTS),
+        (
+            ActionHistory(2, append_to="observation", recorded_key=("agents", "ready")),
+            ("agents", "ready"),
+            OUTPUTS,
+        ),
         (ActionHistory(2, "act"), "act", "action"),
+        (ActionDelay(2, sent_key="redy"), "redy", OUTPUTS),
         (ActionDelay(2, ("agents", "action")), ("agents", "action"), "action"),
         (RewardDelay(2, "rewrad"), "rewrad", "reward"),
         (CumulativeReward(2, reward_key="rewrad"), "rewrad", "reward"),
@@ -50,3 +61,37 @@ def test_a_key_that_the_environment_does_not_have_is_one_line(transform, key, kn
 def test_keys_that_earlier_transforms_write_are_known():
     history = ActionHistory(2, append_to="observation", age_key="age")
     rollout(ActionDelay(1), ObservationDelay(2), RewardDelay(2), SampleAndHold(2), history)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: ActionHistory(2, recorded_key="fresh"), lambda: ActionDelay(2, sent_key="fresh")]
+)
+def test_flags_that_a_later_transform_writes_are_known(make):
+    rollout(make(), ObservationDelay(2, fresh_key="fresh"))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ActionHistory(2, ACTION, recorded_key="ready"),
+        lambda: ActionDelay(2, ACTION, sent_key="ready"),
+    ],
+)
+def test_flags_of_environments_in_a_vector_are_known(make):
+    vector = SerialEnv(2, lambda: Counting([3, 5]))
+    TransformedEnv(vector, make()).rollout(3)
+    SerialEnv(2, lambda: TransformedEnv(Counting([3, 5]), make())).rollout(3)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ActionHistory(2, ACTION, recorded_key="choose"),
+        lambda: ActionDelay(2, ACTION, sent_key="choose"),
+    ],
+)
+def test_a_flag_that_is_a_part_of_the_action_is_known(make):
+    env, shape = Counting([3, 5]), torch.Size((2, 2))
+    specs = {"action": Categorical(7, shape), "choose": Categorical(2, shape, dtype=torch.bool)}
+    env.action_spec = Composite(agents=Composite(specs, shape=shape), shape=(2,))
+    TransformedEnv(env, make()).rollout(3)

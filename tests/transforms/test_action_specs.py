@@ -1,0 +1,157 @@
+"""Ranges and defaults of actions, as they are read from action specs."""
+
+import pytest
+import torch
+from plain_env import GROUP, Plain
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    TensorSpec,
+    Unbounded,
+)
+from torchrl.envs import TransformedEnv
+from transform_cases import ACTION
+
+from damian.common.errors import InputError
+from damian.transforms import ActionDelay, ActionHistory
+
+HISTORY = ("agents", "action_history")
+NARROW_AND_WIDE = torch.tensor([1.0, 10.0]).view(2, 1).expand(*GROUP, 2)
+
+
+def numbered(first: int) -> torch.Tensor:
+    """Different whole numbers for each number of an action, [3, 2, 2]."""
+    return first + torch.arange(12).view(*GROUP, 2)
+
+
+RANGES: dict[str, tuple[TensorSpec, torch.Tensor, torch.Tensor]] = {
+    "numbers of agents": (
+        Bounded(-NARROW_AND_WIDE, NARROW_AND_WIDE, (*GROUP, 2)),
+        -NARROW_AND_WIDE,
+        NARROW_AND_WIDE,
+    ),
+    "stacked agents": (
+        torch.stack([Bounded(-1.0, 1.0, (3, 2)), Bounded(-10.0, 10.0, (3, 2))], 1),  # type: ignore[arg-type]
+        -NARROW_AND_WIDE,
+        NARROW_AND_WIDE,
+    ),
+    "different numbers": (
+        Bounded(-numbered(3).double(), numbered(5).double(), (*GROUP, 2), dtype=torch.float64),
+        -numbered(3),
+        numbered(5),
+    ),
+    "whole numbers": (
+        Bounded(-numbered(2), numbered(4), (*GROUP, 2), dtype=torch.int32),
+        -numbered(2),
+        numbered(4),
+    ),
+    "choices of agents": (
+        MultiCategorical(numbered(2), (*GROUP, 2)),
+        torch.zeros(*GROUP, 2),
+        numbered(1),
+    ),
+    "one possible value": (
+        Bounded(torch.full((*GROUP, 2), 2.0), torch.tensor([2.0, 4.0]).expand(*GROUP, 2), (*GROUP, 2)),
+        torch.full((*GROUP, 2), 2.0),
+        torch.tensor([2.0, 4.0]).expand(*GROUP, 2),
+    ),
+}
+
+
+@pytest.mark.parametrize(("spec", "low", "high"), RANGES.values(), ids=RANGES)
+def test_every_number_of_every_agent_is_scaled_by_its_own_bounds(spec, low, high):
+    env = TransformedEnv(Plain(spec), ActionHistory(1, ACTION))
+    for seed in range(5):
+        torch.manual_seed(seed)
+        action = (low + torch.rand(low.shape) * (high - low)).to(spec.dtype)
+        found = env.step(env.reset().set(ACTION, action))["next", *HISTORY]
+        assert found.shape == (*GROUP, 2)
+        for at in torch.cartesian_prod(*map(torch.arange, (*GROUP, 2))).tolist():
+            a, lowest, highest = (float(values[tuple(at)]) for values in (action, low, high))
+            expected = (a - lowest) / (highest - lowest) if highest > lowest else 0.0
+            assert found[tuple(at)].item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_history_of_the_lowest_and_the_highest_action_is_0_and_1():
+    for spec, low, high in list(RANGES.values())[:5]:
+        for bound, expected in ((low, 0.0), (high, 1.0)):
+            env = TransformedEnv(Plain(spec), ActionHistory(1, ACTION))
+            td = env.step(env.reset().set(ACTION, bound.to(spec.dtype)))
+            assert (td["next", *HISTORY] == expected).all()
+
+
+# Defaults.
+
+DISCRETE = "a legal default action: whole numbers between 0 and"
+LEGAL = {
+    "number": (Categorical(5, GROUP), 4, torch.full(GROUP, 4)),
+    "a number for each agent": (Categorical(5, GROUP), [3, 4], torch.tensor([3, 4]).expand(GROUP)),
+    "none": (Bounded(2, 7, GROUP, dtype=torch.int64), None, torch.full(GROUP, 2)),
+    "none, below 0": (Bounded(-7.0, -2.0, GROUP), None, torch.full(GROUP, -2.0)),
+    "none, stacked": (RANGES["stacked agents"][0], None, torch.zeros(*GROUP, 2)),
+    "at the bound": (
+        Bounded(0.3, 0.7, GROUP, dtype=torch.float64),
+        0.7,
+        torch.full(GROUP, 0.7, dtype=torch.float64),
+    ),
+    "index": (OneHot(3, (*GROUP, 3)), 2, torch.tensor([0, 0, 1]).expand(*GROUP, 3)),
+    "indices": (MultiOneHot([2, 3], (*GROUP, 5)), [1, 2], torch.tensor([0, 1, 0, 0, 1]).expand(*GROUP, 5)),
+    "none, one-hot": (
+        MultiOneHot([2, 3], (*GROUP, 5)),
+        None,
+        torch.tensor([1, 0, 1, 0, 0]).expand(*GROUP, 5),
+    ),
+    "flags": (Binary(3, (*GROUP, 3)), [0, 1, 1], torch.tensor([0, 1, 1]).expand(*GROUP, 3)),
+    "truth": (Binary(3, (*GROUP, 3), dtype=torch.bool), True, torch.ones(*GROUP, 3, dtype=torch.bool)),
+    "unbounded": (Unbounded((*GROUP, 1)), -1e9, torch.full((*GROUP, 1), -1e9)),
+}
+ILLEGAL = {
+    "too large": (Categorical(5, GROUP), 7, f"7 is not {DISCRETE} 4, one for all or in the shape (3, 2)"),
+    "negative": (Categorical(5, GROUP), -1, f"-1 is not {DISCRETE} 4, one for all or in the shape (3, 2)"),
+    "a float": (Categorical(5, GROUP), 2.0, f"2.0 is not {DISCRETE} 4, one for all or in the shape (3, 2)"),
+    "wrong shape": (Categorical(5, GROUP), [1, 2, 3], f"[1, 2, 3] is not {DISCRETE} 4"),
+    "a word": (Categorical(5, GROUP), "left", f"'left' is not {DISCRETE} 4"),
+    "index": (OneHot(3, (*GROUP, 3)), 3, f"3 is not {DISCRETE} 2, one for all or in the shape (3, 2)"),
+    "indices": (MultiOneHot([2, 2], (*GROUP, 4)), [0, 2], f"[0, 2] is not {DISCRETE} 1"),
+    "one of two": (MultiCategorical([3, 4], (*GROUP, 2)), 3, f"3 is not {DISCRETE} [[[2, 3], [2, 3]], [["),
+    "flags": (Binary(3, (*GROUP, 3), dtype=torch.bool), 7, f"7 is not {DISCRETE} 1, one for all"),
+    "small type": (
+        Bounded(0, 200, GROUP, dtype=torch.uint8),
+        300,
+        f"300 is not {DISCRETE} 200, one for all or in the shape (3, 2)",
+    ),
+    "outside": (
+        Bounded(-1.0, 1.0, (*GROUP, 2)),
+        99.0,
+        "99.0 is not a legal default action: numbers between -1.0 and 1.0, one for all or in the shape "
+        "(3, 2, 2)",
+    ),
+    "not a number": (Bounded(-1.0, 1.0, GROUP), float("nan"), "nan is not a legal default action"),
+}
+
+
+@pytest.mark.parametrize(("spec", "default", "expected"), LEGAL.values(), ids=LEGAL)
+def test_a_legal_default_is_executed_first(spec, default, expected):
+    delay = ActionDelay(2, ACTION, default=default)
+    env = TransformedEnv(Plain(spec), delay)
+    td = env.reset().set(ACTION, torch.zeros(expected.shape, dtype=spec.dtype))
+    executed = delay.inv(td)[ACTION]
+    assert executed.equal(expected.to(spec.dtype))
+    history = TransformedEnv(Plain(spec), ActionHistory(2, ACTION, default=default)).reset()[HISTORY]
+    assert history.isfinite().all()
+
+
+@pytest.mark.parametrize(("spec", "default", "message"), ILLEGAL.values(), ids=ILLEGAL)
+@pytest.mark.parametrize(
+    "make", [lambda d: ActionDelay(2, ACTION, default=d), lambda d: ActionHistory(2, ACTION, default=d)]
+)
+def test_an_illegal_default_is_one_line_at_the_first_use_of_the_specs(spec, default, message, make):
+    env = TransformedEnv(Plain(spec), make(default))
+    with pytest.raises(InputError) as error:
+        env.reset()
+    assert str(error.value).startswith(f"default: {message}")
+    assert "\n" not in str(error.value)
