@@ -20,7 +20,7 @@ from torchrl.envs import (
     Transform,
     TransformedEnv,
 )
-from transform_cases import ACTION, LAWS, N_AGENTS, OBSERVATION, REWARD, ROWS, STEPS, WORLDS, streams_of
+from transform_cases import ACTION, LAWS, N_AGENTS, OBSERVATION, REWARD, ROWS, STEPS, WORLDS, delayed
 
 from damian.common.errors import InputError
 from damian.delays.laws import Uniform
@@ -115,6 +115,12 @@ def law(request, tmp_path):
     return LAWS[request.param](tmp_path)
 
 
+def delays_of(late: Any) -> list:
+    """Delays that a transform draws in ``Counting``, which numbers its worlds, as nested lists [T][M]."""
+    delayed(late).reset()
+    return drawn(late.sampler, late.memory["streams"], STEPS).tolist()
+
+
 def listed(data: TensorDictBase, *key: str) -> list:
     """An entry [B, T, ...] as nested lists."""
     return data[key].tolist()
@@ -124,9 +130,7 @@ def listed(data: TensorDictBase, *key: str) -> list:
 def test_every_agent_holds_the_message_that_the_reference_receiver_holds(law, order):
     data = counted()
     late = ObservationDelay(law, [OBSERVATION], order=order, loss=0.2, sent_key="message_sent")
-    late.seed_worlds(torch.tensor(WORLDS))
-    found = delay_trajectories(data, late)
-    table = drawn(late.sampler, streams_of(WORLDS), STEPS).tolist()
+    table, found = delays_of(late), delay_trajectories(data, late)
     before, after = listed(data, *OBSERVATION), listed(data, "next", *OBSERVATION)
     done, sent = listed(data, "next", "done"), listed(data, "next", "agents", "message_sent")
     now_held, now_age = listed(found, *OBSERVATION), listed(found, "agents", "age")
@@ -148,9 +152,7 @@ def test_every_agent_holds_the_message_that_the_reference_receiver_holds(law, or
 
 def test_every_agent_is_paid_by_the_reference_purse_which_keeps_what_is_in_transit_at_the_end(law):
     data, late = counted(), RewardDelay(law, REWARD)
-    late.seed_worlds(torch.tensor(WORLDS))
-    received = listed(delay_trajectories(data, late), "next", *REWARD)
-    table = drawn(late.sampler, streams_of(WORLDS), STEPS).tolist()
+    table, received = delays_of(late), listed(delay_trajectories(data, late), "next", *REWARD)
     earned, done = listed(data, "next", *REWARD), listed(data, "next", "done")
     for row, (w, n) in enumerate(ROWS):
         purse = Purse()
