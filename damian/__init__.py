@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         RewardDelay,
         SampleAndHold,
         ServerNode,
+        delay_trajectories,
     )
     from damian.world.sensors import sensor
 
@@ -54,6 +55,7 @@ _MODULES = {
         "RewardDelay",
         "SampleAndHold",
         "ServerNode",
+        "delay_trajectories",
     ],
     "damian.world.sensors": ["sensor"],
 }
@@ -82,6 +84,7 @@ __all__ = [
     "Trace",
     "UavEnv",
     "Uniform",
+    "delay_trajectories",
     "feature",
     "make_env",
     "reward_term",

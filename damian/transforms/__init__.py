@@ -13,6 +13,7 @@ from damian.transforms.observation_delay import ObservationDelay
 from damian.transforms.order import check_order
 from damian.transforms.reward_delay import CumulativeReward, RewardDelay
 from damian.transforms.sample_and_hold import SampleAndHold
+from damian.transforms.stored import delay_trajectories
 
 if TYPE_CHECKING:
     from damian.transforms.server_node import ServerNode
@@ -27,6 +28,7 @@ __all__ = [
     "ServerNode",
     "StatefulTransform",
     "check_order",
+    "delay_trajectories",
 ]
 
 

@@ -336,5 +336,5 @@ class StatefulTransform(MemoryTransform):
         name = type(self).__name__
         raise RuntimeError(
             f"{name} remembers earlier steps, so it works only in an environment, after a reset: "
-            f"TransformedEnv(env, {name}(...))"
+            f"TransformedEnv(env, {name}(...)); for stored steps, call damian.delay_trajectories(data, ...)"
         )

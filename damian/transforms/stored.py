@@ -1,0 +1,237 @@
+"""Delays of stored steps: a replay buffer or a dataset of undelayed steps becomes a delayed one."""
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.transforms.action_specs import ActionTransform
+from damian.transforms.base import StatefulTransform
+from damian.transforms.entries import require_keys
+from damian.transforms.order import leaf_transforms
+
+_ENDS = ("done", "terminated", "truncated")
+"""Names of the flags that tell where episodes end."""
+
+_TRAJECTORY = ("collector", "traj_ids")
+"""Key under which TorchRL's collectors store the number of each step's episode."""
+
+
+@torch.no_grad()
+def delay_trajectories(
+    data: TensorDictBase,
+    transform: Transform,
+    *,
+    action_spec: TensorSpec | None = None,
+    start_key: NestedKey | None = None,
+) -> TensorDictBase:
+    """Apply transforms to stored steps, as if the environment had had them when the steps were collected.
+
+    The stored steps are played back in their order. The result equals, bit for bit, what the same transforms
+    with the same seeds give in the environment, if the actions are the same. A row of ``data`` is a world,
+    and may contain several episodes. A step begins an episode if it is the first of its row, if the step
+    before it is done, if ``is_init`` or the number ``("collector", "traj_ids")`` says so, or if an entry
+    differs from the one under ``"next"`` one step before, as where rows were cut and joined. The message of
+    such a step has no delay. Rewards in transit where the data ends or is cut are not paid.
+
+    Args:
+        data: steps as TorchRL stores them, [T] or [*, T] with time last: entries, actions, and under
+            ``"next"`` the outputs of each step. TensorDicts of agents have batch size [*, T, N].
+        transform: a transform, or a ``Compose`` of several. It is copied, so it can be used again.
+        action_spec: ``env.full_action_spec`` (or ``env.action_spec``) of the environment of the steps, of any
+            number of worlds; only ``ActionHistory`` needs it, for the range of the actions.
+        start_key: key of a flag, [*, T, 1] or [*, T] bool: does the step begin an episode. If given, nothing
+            else tells where episodes begin.
+
+    Returns:
+        The steps with what the transforms change or add; ``data`` stays as it is.
+
+    Raises:
+        InputError: the transform would have changed what happened, as ``ActionDelay`` does, or the data
+            lacks an entry.
+
+    Examples:
+        >>> steps = GymEnv("Pendulum-v1").rollout(400, break_when_any_done=False)
+        >>> late = delay_trajectories(steps, ObservationDelay(Uniform(1, 4), seed=0))
+        >>> late["next", "age"]  # steps since each observation was generated
+    """
+    _check_data(data)
+    leaves = leaf_transforms(transform) if isinstance(transform, Compose) else [transform]
+    for leaf in leaves:
+        _check_transform(leaf)
+    playback = _Playback(data, _read_action_specs(data, leaves, action_spec))
+    env = TransformedEnv(playback, transform.clone())
+    return _play(env, playback, _find_starts(data, start_key))
+
+
+def _play(env: EnvBase, playback: "_Playback", starts: Tensor) -> TensorDictBase:
+    """Step through all stored steps, and reset the rows of the mask of first steps [*, T]."""
+    now, steps = env.reset(), []
+    for time, any_starts in enumerate(starts.reshape(-1, starts.shape[-1]).any(0).tolist()):
+        if time and any_starts:
+            now = env.reset(now.set("_reset", starts[..., time].unsqueeze(-1)))
+        steps.append(env.step(playback.add_inputs(now)))
+        now = env.step_mdp(steps[-1])
+    played = cast(TensorDictBase, torch.stack(steps, starts.dim() - 1))
+    playback.check_ends(played)
+    return played.refine_names(..., "time")
+
+
+class _Playback(EnvBase):
+    """An environment that outputs stored steps in their order, whatever the actions are.
+
+    Args:
+        data: stored steps, [*, T].
+        action_spec: specs of the actions of one step.
+    """
+
+    def __init__(self, data: TensorDictBase, action_spec: Composite) -> None:
+        super().__init__(device=data.device, batch_size=data.batch_size[:-1])
+        self._steps, self._time, self._done = data.unbind(-1), 0, data.get(("next", "done"))
+        first, after = self._steps[0], self._steps[0]["next"]
+        self._outputs = _output_keys(first)
+        ends = [key for key in _leaves(after) if _name(key) in _ENDS]
+        self._inputs = [key for key in _leaves(first.exclude("next")) if key not in [*self._outputs, *ends]]
+        rewards = [key for key in _leaves(after) if key not in [*self._outputs, *ends]]
+        self.observation_spec = _specs_of(first, self._outputs)
+        self.reward_spec = _specs_of(after, rewards)
+        self.done_spec = _specs_of(after, ends)
+        self.action_spec = action_spec
+
+    def add_inputs(self, outputs: TensorDictBase) -> TensorDictBase:
+        """The outputs before a step, and what is stored beside them: actions, and what the policy wrote."""
+        return outputs.update(self._steps[self._time].select(*self._inputs))
+
+    def check_ends(self, played: TensorDictBase) -> None:
+        """Require that the steps as they were played end episodes where the stored ones do."""
+        if not played.get(("next", "done")).equal(self._done):
+            raise InputError(
+                "transform: it ends episodes where the stored steps go on; limit their length where "
+                "you collect the steps"
+            )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        return self._steps[self._time].select(*self._outputs)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._time += 1
+        return self._steps[self._time - 1]["next"].clone(False)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Stored steps have no randomness."""
+
+
+# The stored steps.
+
+
+def _check_data(data: TensorDictBase) -> None:
+    """Require steps [*, T], time last, with their ends."""
+    is_steps = isinstance(data, TensorDictBase) and data.dim() > 0 and ("next", "done") in data.keys(True)
+    if not is_steps:
+        raise InputError('data: it has no ("next", "done"): give steps as TorchRL stores them, [*, T]')
+    shape, done = tuple(data.batch_size), tuple(data.get(("next", "done")).shape)
+    checks.require(done == (*shape, 1), "data", f'("next", "done") of shape {done}', f"is not {(*shape, 1)}")
+    names = list(data.names)
+    checks.require("time" not in names[:-1], "data", f"dimensions {names}", "must have time last")
+
+
+def _find_starts(data: TensorDictBase, start_key: NestedKey | None) -> Tensor:
+    """Mask of the first steps of episodes, [*, T] bool."""
+    before, after = cast(TensorDictBase, data[..., :-1]), cast(TensorDictBase, data[..., 1:])
+    if start_key is not None:
+        checks.require(start_key in _leaves(data), "start_key", start_key, "is not in the data")
+        starts = _any(after, after.get(start_key))
+    else:
+        starts = _any(before, before.get(("next", "done")))
+        for key in [key for key in _leaves(data) if _name(key) == "is_init"]:
+            starts = starts | _any(after, after.get(key))
+        if _TRAJECTORY in _leaves(data):
+            starts = starts | _any(after, after.get(_TRAJECTORY) != before.get(_TRAJECTORY))
+        for key in _output_keys(data):
+            new, expected = after.get(key), before.get("next").get(key)
+            starts = starts | _any(after, ~torch.isclose(new, expected, rtol=0, atol=0, equal_nan=True))
+    first = torch.ones(*data.batch_size[:-1], 1, dtype=torch.bool, device=starts.device)
+    return torch.cat([first, starts], -1)
+
+
+def _any(data: TensorDictBase, flag: Tensor) -> Tensor:
+    """Is a flag [*, T, ...] true anywhere in a step, [*, T]."""
+    return flag.reshape(*data.batch_size, -1).bool().any(-1)
+
+
+def _output_keys(data: TensorDictBase) -> list[NestedKey]:
+    """Keys of the entries, ends excepted, that the data has both before and after each step."""
+    after = _leaves(data["next"])
+    return [key for key in _leaves(data.exclude("next")) if key in after and _name(key) not in _ENDS]
+
+
+def _leaves(tensordict: TensorDictBase) -> list[NestedKey]:
+    return list(tensordict.keys(True, True))
+
+
+def _name(key: NestedKey) -> NestedKey:
+    """The last part of a key."""
+    return key if isinstance(key, str) else key[-1]
+
+
+# The transforms, and the specs that they read.
+
+
+def _check_transform(transform: Transform) -> None:
+    """Refuse a transform that would have changed what happened."""
+    if not isinstance(transform, StatefulTransform):
+        return
+    name, usage = type(transform).__name__, transform.key_usage
+    remedy = f"use it where the steps are collected, TransformedEnv(env, {name}(...))"
+    if usage.replaces:
+        raise InputError(
+            f"transform: {name} changes which actions are executed, but stored steps show what followed from "
+            f"the stored ones; {remedy}"
+        )
+    skips = type(transform).skipped_worlds is not StatefulTransform.skipped_worlds
+    if skips or any(_name(key) in _ENDS for key in usage.creates):
+        raise InputError(
+            f"transform: {name} changes how long steps or episodes last, but stored steps are over; {remedy}"
+        )
+
+
+def _read_action_specs(
+    data: TensorDictBase, transforms: Sequence[Transform], action_spec: TensorSpec | None
+) -> Composite:
+    """Specs of the actions of one step of the data, from those of an environment of any number of worlds."""
+    step, n_batch = data.exclude("next").unbind(-1)[0], data.dim() - 1
+    keys = [transform.action_key for transform in transforms if isinstance(transform, ActionTransform)]
+    specs = _specs_of(step, [key for key in _leaves(step) if key in keys])
+    for key in keys:
+        require_keys("transform", [key], step)
+        if action_spec is None:
+            raise InputError(f"action_spec: it is needed for the range of {key}: pass env.full_action_spec")
+        spec: Any = action_spec[key] if isinstance(action_spec, Composite) else action_spec
+        action = step.get(key)
+        per_world = action.shape[n_batch:]
+        n_worlds = len(spec.shape) - len(per_world)
+        fits = n_worlds >= 0 and spec.shape[n_worlds:] == per_world
+        fits = fits and spec.dtype.is_floating_point == action.is_floating_point()
+        should = f"does not fit the stored {action.dtype} actions of shape {tuple(per_world)}"
+        checks.require(fits, "action_spec", f"{type(spec).__name__} of shape {tuple(spec.shape)}", should)
+        specs[key] = spec[(0,) * n_worlds].expand(action.shape) if n_worlds else spec.expand(action.shape)
+    return specs
+
+
+def _specs_of(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Composite:
+    """Specs without bounds of the entries of these keys."""
+    specs = Composite(shape=tensordict.batch_size, device=tensordict.device)
+    for key, value in tensordict.select(*keys).items():
+        if isinstance(value, TensorDictBase):
+            specs[key] = _specs_of(value, _leaves(value))
+        elif value.dtype == torch.bool:
+            specs[key] = Binary(shape=value.shape, dtype=torch.bool, device=value.device)
+        else:
+            specs[key] = Unbounded(value.shape, dtype=value.dtype, device=value.device)
+    return specs

@@ -1,0 +1,69 @@
+"""The examples of delays run, and docs/transforms.md shows their code."""
+
+import re
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+from torchrl.envs import SerialEnv
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples" / "transforms"
+
+
+def run(name: str) -> dict[str, Any]:
+    """Run an example; its globals."""
+    return runpy.run_path(str(EXAMPLES / f"{name}.py"))
+
+
+def test_a_late_pendulum_observes_what_is_some_steps_old(capsys):
+    steps = run("late_pendulum")["steps"]
+    assert 1 < steps["age"].mean() < 4
+    assert steps["observation"].shape == (200, 3 + 5)
+    assert f"{steps['age'].mean():.1f} steps" in capsys.readouterr().out
+
+
+def test_agents_of_vmas_have_ages_of_their_own():
+    pytest.importorskip("vmas")
+    age = run("late_vmas")["age"]
+    assert age.shape == (32, 50, 3, 1)
+    assert not age[:, :, 0].equal(age[:, :, 1])
+
+
+@pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested")
+def test_agents_of_pettingzoo_have_ages_of_their_own():
+    pytest.importorskip("mpe2")
+    age = run("late_pettingzoo")["age"]
+    assert age.shape == (25, 3, 1)
+    assert not age[:, 0].equal(age[:, 1])
+
+
+def test_a_replay_buffer_contains_late_steps():
+    example = run("late_replay_buffer")
+    stored = example["buffer"][:]
+    assert len(stored) == 500
+    assert 1 < stored["age"].mean() < 4
+    assert stored["age"][0] == stored["age"][1:][stored["next", "done"][:-1]].max() == 0
+
+
+def test_compiled_steps_have_no_graph_break(capsys):
+    run("late_compiled")["main"](num_worlds=4, backend="eager")
+    assert capsys.readouterr().out.endswith("steps of UAVs: 80\n")
+
+
+def test_workers_draw_the_same_delays_again_each_its_own():
+    one, other = run("late_workers")["draw"](SerialEnv)
+    assert one != other
+    assert run("late_workers")["draw"](SerialEnv) == [one, other]
+
+
+def test_the_document_shows_the_examples_code():
+    def stripped(text: str) -> str:
+        return "\n".join(line.strip() for line in text.splitlines())
+
+    blocks = re.findall(r"```python\n(.*?)\n```", (ROOT / "docs" / "transforms.md").read_text(), re.DOTALL)
+    examples = {path.name: stripped(path.read_text()) for path in EXAMPLES.glob("*.py")}
+    shown = [[name for name, code in examples.items() if stripped(block) in code] for block in blocks]
+    assert all(len(names) == 1 for names in shown)
+    assert {name for names in shown for name in names} == set(examples)
