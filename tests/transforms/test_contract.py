@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from contract import Drift
-from environments import KINDS, Kind
+from environments import KINDS, Kind, vmas
 from helpers import all_same, same
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
@@ -140,7 +140,8 @@ def test_the_seed_of_a_plain_environment_reaches_its_transforms(kind, make):
             outputs[-1] += [after["next"], td]
     assert streams[0].equal(streams[2])
     assert not set(streams[0].tolist()) & set(streams[1].tolist())
-    assert kind.stateless or all_same(outputs[0], outputs[2])
+    if not kind.stateless and kind.make is not vmas:  # VMAS itself goes on with its earlier random state
+        assert all_same(outputs[0], outputs[2])
 
 
 @pytest.mark.parametrize("wrap", [False, True], ids=["one environment", "nested environments"])
