@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from damian.delays.config import DelayConfig
-    from damian.delays.laws import Burst, Constant, Geometric, Law, Trace, Uniform
+    from damian.delays.laws import Burst, Constant, Distance, Geometric, Lag, Law, Trace, Uniform
     from damian.delays.samplers import ContextSampler, MessageContext
     from damian.envs.clocks import ClockConfig
     from damian.envs.pipeline import make_env
@@ -37,7 +37,7 @@ __version__ = "0.3.0"
 
 _MODULES = {
     "damian.delays.config": ["DelayConfig"],
-    "damian.delays.laws": ["Burst", "Constant", "Geometric", "Law", "Trace", "Uniform"],
+    "damian.delays.laws": ["Burst", "Constant", "Distance", "Geometric", "Lag", "Law", "Trace", "Uniform"],
     "damian.delays.samplers": ["ContextSampler", "MessageContext"],
     "damian.envs.clocks": ["ClockConfig"],
     "damian.envs.pipeline": ["make_env"],
@@ -71,7 +71,9 @@ __all__ = [
     "ContextSampler",
     "CumulativeReward",
     "DelayConfig",
+    "Distance",
     "Geometric",
+    "Lag",
     "Law",
     "LearnerConfig",
     "LearningSetup",

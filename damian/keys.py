@@ -34,6 +34,8 @@ MESSAGE_SENT = (AGENTS, "message_sent")
 """Did the UAV send that message in this step, [B, N] bool."""
 RECEIVED = (AGENTS, "received")
 """The message of each UAV that the server holds, packed (``Messages.pack``), [B, N, M]."""
+LINKED = (AGENTS, "linked")
+"""Messages that each UAV holds of each other with ``links=matrix``, [B, N, N, M] (receiver, sender)."""
 AGE = (AGENTS, "age")
 """Age of information: steps since the message that the server holds was generated, [B, N, 1]."""
 DELAY = (AGENTS, "delay")
@@ -50,6 +52,8 @@ SUCCESS = "success"
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 """TorchRL's flags of the end of an episode, [B, 1] bool each; only at the root, as TorchRL's transforms
 expect one reset key."""
+STEPPED = "_step"
+"""TorchRL's flag of the worlds that take this step, [B] bool; all of them if there is no such entry."""
 DURATION = "duration"
 """Number of simulation steps that ``SkipUntilReady`` merged into this step, [B, 1] long."""
 

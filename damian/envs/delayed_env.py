@@ -14,7 +14,7 @@ from damian.common.tensors import tree_where
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
 from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import STEPPED, Entries, Memory, drop_keys, select_entries
+from damian.transforms.entries import Entries, Memory, drop_keys, select_entries
 from damian.world.state import PackedState
 
 
@@ -134,7 +134,7 @@ class DelayedEnv(TransformedEnv):
         this step later, and what is in transit is written in place.
         """
         (stateful, _), memories = self._split_transforms(), list(memories)
-        mask: Entries = {} if stepped is None else {STEPPED: stepped}
+        mask: Entries = {} if stepped is None else {keys.STEPPED: stepped}
         for i, transform in reversed(list(enumerate(stateful))):
             memories[i], changed = transform.on_action(memories[i], entries | mask)
             entries = entries | changed

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from damian import keys
 from damian.common import counter_rng
 from damian.common.compiling import compiled
-from damian.common.tensors import gather_rows, tree_map
+from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
 from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
@@ -57,7 +57,7 @@ class UavEnv(EnvBase):
     actor), ``success``, and TorchRL's ``done``, ``terminated``, ``truncated``; with
     ``episode.end_with_source`` also ``source_over``. Besides the action, a step reads the flag
     ``("agents", "action_valid")`` [B, N] if it exists: a UAV with a false flag does not act, as if it were
-    not ready.
+    not ready; and TorchRL's ``_step`` [B]: a world with a false flag does not step.
 
     Args:
         scenario: all settings; the defaults if not given.
@@ -163,12 +163,22 @@ class UavEnv(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action, valid = tensordict.get(keys.ACTION), tensordict.get(keys.ACTION_VALID, None)
+        before = self.worlds
         if valid is None:
             self.worlds, outputs = self._step_fn(self.worlds, action)
         else:
             self.worlds, outputs = self._masked_step_fn(self.worlds, action, valid)
         if self.messages_only:  # TorchRL expects a reward from every environment
             outputs[keys.REWARD] = self.full_reward_spec[keys.REWARD].zero()
+        stepped = tensordict.get(keys.STEPPED, None)
+        if stepped is not None:  # the others keep their state, and repeat what they have output last
+            stepped = stepped.view(-1)
+            self.worlds = tree_where(stepped, self.worlds, before)
+            for key, new in outputs.items():
+                old = tensordict.get(key, None)
+                if old is None or old.shape != new.shape:  # transforms restore what they change
+                    old = torch.zeros_like(new)
+                outputs[key] = torch.where(expand_mask(stepped, new), new, old)
         return self.to_tensordict(outputs)
 
     @torch.no_grad()

@@ -9,8 +9,8 @@ from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
 from damian.common.tensors import expand_mask
+from damian.keys import STEPPED
 from damian.transforms.entries import (
-    STEPPED,
     Change,
     Entries,
     Memory,
@@ -265,8 +265,10 @@ class StatefulTransform(MemoryTransform):
         rows = self.expand_worlds(stepped)
         merged: Entries = {}
         for key, new in entries.items():
-            old = before.get(key, after.get(key, None))
-            old = torch.zeros_like(new) if old is None else old
+            # A later transform that widens an entry restores it itself.
+            found = (td.get(key, None) for td in (before, after))
+            same_shape = (value for value in found if value is not None and value.shape == new.shape)
+            old = next(same_shape, torch.zeros_like(new))
             mask, shape = expand_mask(rows, as_rows(new, self.rows)), self.rows
             merged[key] = from_rows(torch.where(mask, as_rows(new, shape), as_rows(old, shape)), shape)
         return memory, merged

@@ -21,9 +21,6 @@ Entries = dict[NestedKey, Tensor]
 Change = tuple[Memory, Entries]
 """The new memory of a transform, and the entries that it writes."""
 
-STEPPED = "_step"
-"""TorchRL's key of the worlds that take this step, [B] bool; all of them if there is no such entry."""
-
 
 def read_keys(written: NestedKey | Sequence[NestedKey]) -> list[NestedKey]:
     """Keys as TorchRL's transforms take them: a name or a tuple of names is one key, a list holds several."""

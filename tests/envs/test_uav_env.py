@@ -25,12 +25,35 @@ from helpers import (
 from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
+from damian.delays.config import DelayConfig
+from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
+from damian.keys import ACTION
 from damian.server.rewards import INDIVIDUAL, SYSTEM
 from damian.world.landing import ActionConfig
 
 # Specs and TorchRL's rules.
+
+
+@both_motions
+@pytest.mark.parametrize("delayed", [False, True], ids=["bare", "with delays"])
+def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion, delayed):
+    delay = DelayConfig(obs={"law": "burst"}, act={"law": "uniform", "low": 0, "high": 2}, rew=1, history=2)
+    scenario = everything(motion, **({"delay": delay} if delayed else {}))
+    skipping, steady = (make_env(scenario, 2, seed=4) for _ in range(2))
+    td, other = skipping.reset(), steady.reset()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(6):
+        action = random_actions(steady.base_env, generator)
+        after = steady.step(other.clone().set(ACTION, action))["next"]
+        for world in (0, 1):  # first the one, then the other
+            mask = torch.arange(2) == world
+            stepped = skipping.step(td.clone().set(ACTION, action).set("_step", mask))["next"]
+            assert same(stepped[world], after[world])
+            assert same(stepped[1 - world].select(*td.keys(True, True), strict=False), td[1 - world])
+            td = stepped.select(*td.keys(True, True), strict=False)
+        other = after.select(*other.keys(True, True), strict=False)
 
 
 @pytest.mark.parametrize("region", REGIONS)
