@@ -1,6 +1,7 @@
-"""Settings of the delays of a scenario, of its cumulative rewards and of the action history."""
+"""Settings of the delays of a scenario, of its links, of its cumulative rewards and of the action history."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 from damian import keys
@@ -80,3 +81,58 @@ class DelayConfig:
         names = ("obs", "act", "rew")
         laws = {name: law_of(getattr(self, name), f"delay.{name}") for name in names}
         return {name: sampler_of(law, dt, key=f"delay.{name}") for name, law in laws.items()}
+
+
+@dataclass
+class LinkConfig:
+    """How observations reach the UAVs. Rewards and the critic always follow from what the server holds."""
+
+    kind: str = "server"
+    """``server``: the server computes every UAV's observation and broadcasts it at once. ``updown``: this
+    broadcast reaches each UAV by a delay and loss of its own. ``matrix``: UAVs send their messages to each
+    other too, and each computes its observation from those that have reached it; it knows its own at once."""
+    delay: Any = 0
+    """Law of the delay from the server to a UAV (``updown``) or from a UAV to a UAV (``matrix``); with
+    ``matrix`` also a list of laws for each receiver, with one for each sender."""
+    loss: Any = 0.0
+    """Probability that such a message is lost; with ``matrix`` also a list for each receiver."""
+    range: float | None = None
+    """With ``matrix``: a UAV hears only UAVs within this distance when they send [m]."""
+    hears: Any = None
+    """With ``matrix``: whom each UAV hears, a list of true and false (per sender) for each receiver."""
+    limit: int | None = None
+    """With ``matrix``: at most so many UAVs of a world send in a step; chance decides which."""
+
+    def __post_init__(self) -> None:
+        checks.one_of("links.kind", self.kind, ("server", "updown", "matrix"))
+        meant = {"server": [], "updown": ["delay", "loss"]}.get(self.kind)
+        for field in fields(self)[1:]:
+            value = getattr(self, field.name)
+            idle = meant is not None and field.name not in meant and value != field.default
+            problem = f"means nothing with links={self.kind}"
+            checks.require(not idle, f"links.{field.name}", show(value), problem)
+        if self.kind == "updown":
+            checks.in_range("links.loss", self.loss, 0.0, 1.0)
+        if self.range is not None:
+            checks.above("links.range", self.range, 0.0, "m")
+        if self.limit is not None:
+            checks.whole("links.limit", self.limit, 1, unit="UAVs")
+        checks.require(self.range is None or self.hears is None, "links.range", self.range, _EITHER)
+
+    def laws(self) -> list[Law]:
+        """All laws of the links.
+
+        Raises:
+            InputError: one is not valid.
+        """
+        listed = isinstance(self.delay, Sequence) and not isinstance(self.delay, str)
+        laws = [law for row in self.delay for law in row] if listed else [self.delay]
+        return [law_of(law, "links.delay") for law in laws]
+
+    def reads(self, dt: float) -> set[str]:
+        """Names of the entries that the links read: what their laws do, and positions for a range."""
+        read = {name for law in self.laws() for name in sampler_of(law, dt, key="links.delay").reads}
+        return read | ({"position"} if self.range is not None else set())
+
+
+_EITHER = "does not go with links.hears: leave out one of them"

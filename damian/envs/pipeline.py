@@ -18,14 +18,18 @@ from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
+    Channel,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
     ServerNode,
 )
+from damian.transforms.onboard_node import OnboardNode
 from damian.transforms.skip_until_ready import SkipUntilReady
 from damian.world.landing import ActionConfig
+
+_SENT = [keys.MESSAGE, keys.MESSAGE_SENT]
 
 
 def make_env(
@@ -51,8 +55,10 @@ def make_env(
     """
     problem = "skips steps, but back-updating and evaluation need the messages of every step"
     checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
-    delayed = has_message_delay(scenario)
-    needed = {*(["message"] if delayed else []), *scenario.delay.reads(scenario.clock.dt)}
+    delayed, linked = has_message_delay(scenario), scenario.links.kind == "matrix"
+    dt = scenario.clock.dt
+    needed = {"message"} if delayed or linked else set()
+    needed |= {*scenario.delay.reads(dt), *scenario.links.reads(dt)}
     simulation = make_simulation(scenario, seed)
     server = make_server(scenario, simulation)
     env = UavEnv(
@@ -67,7 +73,7 @@ def make_env(
     )
     pipeline = DelayedEnv(env, make_transforms(scenario, server, extras))
     pipeline.set_seed(seed)
-    if scenario.delay.sees_context(scenario.clock.dt):
+    if scenario.delay.sees_context(dt) or scenario.links.reads(dt):
         pipeline.reset()  # tries the laws, so that a mistake in them is found here
         pipeline.set_seed(seed)
     return pipeline
@@ -78,6 +84,7 @@ def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
     transforms = [
         *action_transforms(scenario),
         *(server_transforms(scenario, server, extras) if has_message_delay(scenario) else []),
+        *(link_transforms(scenario, server, extras) if scenario.links.kind == "matrix" else []),
         *reward_transforms(scenario),
         *observation_transforms(scenario),
         *skip_transforms(scenario, extras),
@@ -109,8 +116,8 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
     delay, output_messages = scenario.delay, "message" in extras
     uplink = ObservationDelay(
         delay.uplink,
-        [keys.MESSAGE],
-        [keys.RECEIVED],
+        keys.MESSAGE,
+        keys.RECEIVED,
         loss=delay.loss,
         order=delay.order,
         dt=scenario.clock.dt,
@@ -119,8 +126,31 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         delay_key=keys.DELAY if output_messages else None,
         context_keys=CONTEXT_KEYS,
     )
-    dropped = [] if output_messages else [keys.MESSAGE, keys.RECEIVED, keys.MESSAGE_SENT]
+    linked = scenario.links.kind == "matrix"
+    dropped = [] if output_messages else [keys.RECEIVED, *([] if linked else _SENT)]
     return [uplink, ServerNode(server, dropped_keys=dropped, reward_terms="reward_terms" in extras)]
+
+
+def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
+    """The links over which UAVs hear each other, and the nodes that compute observations on board."""
+    links, dt = scenario.links, scenario.clock.dt
+    channel = Channel(
+        links.delay,
+        keys.MESSAGE,
+        keys.LINKED,
+        loss=links.loss,
+        topology="all" if links.hears is None else links.hears,
+        comm_range=links.range,
+        position_key=keys.POSITION if links.reads(dt) else None,
+        limit=links.limit,
+        sent_key=keys.MESSAGE_SENT,
+        known_at_reset=True,
+        dt=dt,
+        age_key=None,
+        mask_key=None,
+    )
+    dropped = [keys.LINKED, *([] if "message" in extras else _SENT)]
+    return [channel, OnboardNode(server, dropped_keys=dropped)]
 
 
 def reward_transforms(scenario: ScenarioConfig) -> list[Transform]:
@@ -142,6 +172,8 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     if clock.steps("server") > 1:
         observations = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION]
         transforms.append(SampleAndHold(clock.steps("server"), observations))
+    if scenario.links.kind == "updown" and (scenario.links.loss or has_delay(scenario.links.delay, clock.dt)):
+        transforms.append(downlink_transform(scenario))
     if clock.steps("agents") > 1:
         transforms.append(SampleAndHold(clock.steps("agents"), [keys.OBSERVATION], ready_key=keys.READY))
     if n_actions:
@@ -158,6 +190,20 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     return transforms
 
 
+def downlink_transform(scenario: ScenarioConfig) -> Transform:
+    """The delay of the server's broadcast to each UAV."""
+    links, dt = scenario.links, scenario.clock.dt
+    return ObservationDelay(
+        law_of(links.delay, "links.delay"),
+        keys.OBSERVATION,
+        loss=links.loss,
+        order=scenario.delay.order,
+        dt=dt,
+        age_key=None,
+        context_keys=CONTEXT_KEYS,
+    )
+
+
 def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
     """The transform that lets a step last until some UAV can choose again, if ``clock.skip`` is set."""
     if not scenario.clock.skip:
@@ -170,12 +216,13 @@ def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[T
 def history_since_message(scenario: ScenarioConfig) -> bool:
     """Whether a UAV's action history holds only actions newer than its message that the server holds.
 
-    The server's observation cannot reflect these actions yet. With delayed actions or slow clocks a UAV
-    cannot tell which actions are newer, and with ``observation.own`` it knows its own latest message anyway:
-    in these cases the history holds all of its latest actions.
+    The server's observation cannot reflect these actions yet. With delayed actions, slow clocks or a delayed
+    broadcast a UAV cannot tell which actions are newer, and with ``observation.own`` or ``links=matrix`` it
+    knows its own latest message anyway: in these cases the history holds all of its latest actions.
     """
     delay, clock = scenario.delay, scenario.clock
-    immediate = not has_delay(delay.act, clock.dt) and clock.steps("server") == clock.steps("agents") == 1
+    slow = clock.steps("server") > 1 or clock.steps("agents") > 1 or scenario.links.kind != "server"
+    immediate = not (slow or has_delay(delay.act, clock.dt))
     return delay.history > 0 and not scenario.observation.own and immediate and has_message_delay(scenario)
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from damian.common import checks
-from damian.delays.config import DelayConfig
+from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.clocks import ClockConfig
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
@@ -22,6 +22,7 @@ class ScenarioConfig(WorldConfig):
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
     delay: DelayConfig = field(default_factory=DelayConfig)
+    links: LinkConfig = field(default_factory=LinkConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -29,6 +30,9 @@ class ScenarioConfig(WorldConfig):
         self._check_ends()
         conflict = self.observation.own and self.clock.steps("server") > 1
         problem = "does not go with clock.server: between two broadcasts no observation changes"
+        checks.require(not conflict, "observation.own", True, problem)
+        conflict = self.observation.own and self.links.kind == "updown"
+        problem = "does not go with links=updown: the server has computed what a UAV receives"
         checks.require(not conflict, "observation.own", True, problem)
         empty = self.agents == 1 and self.observation.actor == ["agent_distances"]
         problem = "is empty for a single UAV: add another feature"

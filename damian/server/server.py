@@ -176,14 +176,23 @@ class Server:
                 bool; if not given, each UAV receives only its own without delay.
             fields: fields of these messages that are received without delay; the server provides the others.
         """
-        n_agents, names = received.shape[-2], self.observation.actor
+        n_agents = received.shape[-2]
         if on_time is None:
             on_time = torch.eye(n_agents, dtype=torch.bool, device=received.device)
         timely = torch.where(on_time.unsqueeze(-1), sent.unsqueeze(-3), received.unsqueeze(-3))
         known = self.messages(received.unsqueeze(-3).expand_as(timely))  # [*, N receivers, N senders]
         timely = self.messages(timely)._asdict()
-        known = known._replace(**{name: timely[name] for name in fields})
-        features = self.features(known, steps.unsqueeze(-1).expand(received.shape[:-1]), names)
+        return self.observe_each(known._replace(**{name: timely[name] for name in fields}), steps)
+
+    def observe_each(self, known: Messages, steps: Tensor) -> Tensor:
+        """Observations of actors each of which knows messages of its own, [*, N, F].
+
+        Args:
+            known: the message of each UAV that each UAV knows, [*, N, N] (receiver, sender).
+            steps: elapsed steps of the episode, [*].
+        """
+        names = self.observation.actor
+        features = self.features(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]), names)
         return stack(features, names).diagonal(dim1=-3, dim2=-2).movedim(-1, -2)
 
     def reward_and_status(

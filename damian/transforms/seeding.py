@@ -5,14 +5,10 @@ seeds the transforms of damian that the environment contains. All else stays as 
 """
 
 from functools import wraps
-from typing import TYPE_CHECKING
 
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from damian.transforms.order import leaf_transforms
-
-if TYPE_CHECKING:
-    from damian.transforms.memory import MemoryTransform
 
 
 def all_transforms(env: EnvBase | None) -> list[Transform]:
@@ -22,7 +18,7 @@ def all_transforms(env: EnvBase | None) -> list[Transform]:
     return [*all_transforms(env.base_env), *leaf_transforms(env.transform)]
 
 
-def stream_name(transform: "MemoryTransform") -> str:
+def stream_name(transform: Transform) -> str:
     """What tells the random streams of a transform from those of all others in its environment.
 
     It is made of the transform's class and keys and, if several have both in common, of its place among them,

@@ -264,8 +264,8 @@ def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, cha
     base = at_once.base_env
     uav_env = UavEnv(scenario, 4, extras=base.extras, messages_only=base.messages_only)
     one_by_one = TransformedEnv(uav_env, make_transforms(scenario, uav_env.server, EXTRAS))
-    for number, transform in enumerate(one_by_one.transform):
-        transform.set_seed(7919 * (number + 1))
+    for transform in one_by_one.transform:
+        transform.set_seed(0)
     for env in (one_by_one, at_once, graph):
         env.append_transform(RewardSum([REWARD], [("agents", "episode_reward")]))
         env.append_transform(StepCounter())

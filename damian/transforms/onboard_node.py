@@ -1,0 +1,70 @@
+"""UAVs that compute their observations themselves, from the messages that have reached each of them."""
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite
+
+from damian import keys
+from damian.server.server import Server
+from damian.transforms.base import StatefulTransform
+from damian.transforms.entries import Change, Entries, Memory
+from damian.transforms.order import KeyUsage
+
+
+class OnboardNode(StatefulTransform):
+    """Computes each UAV's observation from the messages that have reached it, by the server's formulas.
+
+    Rewards, the task's status and the critic's observation stay those of the server node. After a reset every
+    UAV knows the first message of every other, so the outputs of the environment's reset stay as they are.
+    ``damian.make_env`` adds the transform with ``links=matrix``.
+
+    Args:
+        server: server node whose features are computed.
+        linked_key: key of the packed messages that each UAV holds of each other, [B, N, N, M] (receiver,
+            sender), as ``Channel`` writes them.
+        dropped_keys: keys of entries to remove from the outputs, because nothing reads them later.
+
+    Examples:
+        >>> env = UavEnv(scenario, num_worlds=64, extras=["message"])
+        >>> channel = Channel(Uniform(1, 5), keys.MESSAGE, keys.LINKED, known_at_reset=True)
+        >>> env = TransformedEnv(env, Compose(channel, OnboardNode(env.server)))
+    """
+
+    def __init__(
+        self,
+        server: Server,
+        linked_key: NestedKey = keys.LINKED,
+        *,
+        dropped_keys: Sequence[NestedKey] = (),
+    ) -> None:
+        super().__init__(linked_key, keys.OBSERVATION)
+        self.server, self.dropped_keys, self.step_keys = server, list(dropped_keys), self.in_keys
+
+    @property
+    def row_key(self) -> NestedKey:
+        return keys.DONE
+
+    @property
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(reads=self.in_keys, creates=self.out_keys)
+
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        device = tensordict.get(self.in_keys[0]).device
+        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)}
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        return {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, {}
+
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
+        elapsed = memory["elapsed"] + 1
+        known = self.server.messages(entries[self.in_keys[0]])
+        observation = self.server.observe_each(known, elapsed.view(self.rows))
+        return {"elapsed": elapsed}, {keys.OBSERVATION: observation}
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        for key in self.dropped_keys:
+            del observation_spec[key]
+        return observation_spec
