@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from damian.transforms import (
         ActionDelay,
         ActionHistory,
+        Channel,
         CumulativeReward,
         ObservationDelay,
         RewardDelay,
@@ -49,6 +50,7 @@ _MODULES = {
     "damian.transforms": [
         "ActionDelay",
         "ActionHistory",
+        "Channel",
         "CumulativeReward",
         "ObservationDelay",
         "RewardDelay",
@@ -64,6 +66,7 @@ __all__ = [
     "ActionHistory",
     "BackupdateStorage",
     "Burst",
+    "Channel",
     "ClockConfig",
     "Constant",
     "ContextSampler",

@@ -1,0 +1,138 @@
+"""Delay laws and losses for each link between N agents."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from damian.common import checks, counter_rng
+from damian.common.errors import InputError
+from damian.delays.laws import Law, law_of, sampler_of
+from damian.delays.samplers import MessageContext, Sampler
+
+_LOSS_DRAW = 2
+"""Counter that tells the draw of a link's loss from those of its delay."""
+
+
+class LinkSampler(Sampler):
+    """Draws the delays of messages on the links between N agents, by a law and a loss for each link.
+
+    Links are numbered receiver * N + sender; of the M messages of a step, message m belongs to link m modulo
+    N * N. Every distinct law has one sampler, which draws for all links.
+
+    Args:
+        samplers: one for each distinct law.
+        law_index: index of each link's sampler, [N * N] long.
+        loss: probability that a message of each link is lost, beside what its sampler loses, [N * N].
+    """
+
+    _law_index: Tensor
+    _loss: Tensor
+
+    def __init__(self, samplers: Sequence[Sampler], law_index: Tensor, loss: Tensor) -> None:
+        longest = max(sampler.longest for sampler in samplers)
+        super().__init__([[0.0] * (longest + 1)])  # the worst case: every message may be lost
+        self.certain = None
+        self.samplers = torch.nn.ModuleList(samplers)
+        self.sees_context = any(sampler.sees_context for sampler in samplers)
+        self.reads = tuple(dict.fromkeys(name for sampler in samplers for name in sampler.reads))
+        self._loses = bool((loss > 0).any())
+        self.register_buffer("_law_index", law_index, persistent=False)
+        self.register_buffer("_loss", loss, persistent=False)
+
+    def initial_state(self, streams: Tensor) -> Tensor:
+        state = torch.zeros_like(streams)
+        for sampler, uses in self._pairs(streams):
+            state = torch.where(uses, sampler.initial_state(streams), state)
+        return state
+
+    def try_context(self, context: MessageContext) -> None:
+        for sampler in self.samplers:
+            sampler.try_context(context)  # type: ignore[operator]
+
+    def forward(
+        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
+        delay, state = torch.full_like(streams, self.lost), memory
+        for sampler, uses in self._pairs(streams):
+            # A sampler must not see the state of another law's channel.
+            drawn, turned = sampler(streams, clock, torch.where(uses, memory, 0), context)
+            drawn = torch.where(drawn < sampler.lost, drawn, self.lost)
+            delay, state = torch.where(uses, drawn, delay), torch.where(uses, turned, state)
+        if self._loses:
+            draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
+            delay = torch.where(draw < self._of_links(self._loss, streams), self.lost, delay)
+        return delay, state
+
+    def _pairs(self, streams: Tensor) -> list[tuple[Any, Tensor]]:
+        """Each sampler, with a mask of the links that use it, [M] bool."""
+        index = self._of_links(self._law_index, streams)
+        return [(sampler, index == k) for k, sampler in enumerate(self.samplers)]
+
+    def _of_links(self, values: Tensor, streams: Tensor) -> Tensor:
+        """Repeat values of links [N * N] for M messages."""
+        return values.repeat(len(streams) // len(values))
+
+
+def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> Sampler:
+    """Build the sampler of a law for all links, or of a law or a loss for each link.
+
+    Args:
+        delay: what ``law_of`` takes, or an N x N nested list of it (receiver, sender); its diagonal is not
+            used.
+        loss: probability that a message is lost, or an N x N nested list or tensor of it.
+        dt: length of a step [s].
+        key: name of the delay, for errors.
+
+    Raises:
+        InputError: a law or a probability is invalid, or the two are of different sizes.
+    """
+    n = same_size({key: delay, "loss": loss})
+    if n is None:
+        return sampler_of(law_of(delay, key), dt, loss, key)
+    laws, index = _distinct_laws(delay, n, key)
+    losses = torch.as_tensor(loss, dtype=torch.float64).expand(n, n)
+    for number in losses.flatten().tolist():
+        checks.in_range("loss", number, 0.0, 1.0)
+    samplers = [sampler_of(law, dt, key=key) for law in laws]
+    return LinkSampler(samplers, torch.tensor(index), losses.flatten().clone())
+
+
+def same_size(settings: Mapping[str, Any]) -> int | None:
+    """The number N of agents of those settings that are N x N, by name; None if none is.
+
+    Raises:
+        InputError: one is not square, or they are of different sizes.
+    """
+    sizes = {key: _matrix_size(key, value) for key, value in settings.items() if is_matrix(value)}
+    if len(set(sizes.values())) > 1:
+        found = ", ".join(f"{key} {n} x {n}" for key, n in sizes.items())
+        raise InputError(f"{found}: these are of different numbers of agents")
+    return next(iter(sizes.values()), None)
+
+
+def is_matrix(value: Any) -> bool:
+    """Is a setting given for each link."""
+    if isinstance(value, Tensor):
+        return value.dim() > 0
+    return isinstance(value, Sequence) and not isinstance(value, str)
+
+
+def _matrix_size(key: str, matrix: Any) -> int:
+    lengths = [len(row) if is_matrix(row) else 0 for row in matrix]
+    problem = "is not N x N: a list for each receiver, with an entry for each sender"
+    checks.require(bool(lengths) and set(lengths) == {len(lengths)}, key, matrix, problem)
+    return len(lengths)
+
+
+def _distinct_laws(delay: Any, n: int, key: str) -> tuple[list[Law], list[int]]:
+    """The distinct laws of a law or an n x n nested list of laws, and the index of each link's law."""
+    if not is_matrix(delay):
+        return [law_of(delay, key)], [0] * (n * n)
+    links = {i * n + j: law_of(delay[i][j], f"{key}[{i}][{j}]") for i in range(n) for j in range(n) if i != j}
+    laws: list[Law] = []
+    for law in links.values():
+        laws += [law] if law not in laws else []
+    laws = laws or [law_of(0)]
+    return laws, [laws.index(links[k]) if k in links else 0 for k in range(n * n)]
