@@ -91,12 +91,18 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
     n = same_size({key: delay, "loss": loss})
     if n is None:
         return sampler_of(law_of(delay, key), dt, loss, key)
-    laws, index = _distinct_laws(delay, n, key)
+    laws = _laws_of_links(delay, n, key)
+    distinct: list[Law] = []
+    samplers: list[Sampler] = []
+    for name, law in laws:
+        if law not in distinct:
+            distinct.append(law)
+            samplers.append(sampler_of(law, dt, key=name))
+    index = torch.tensor([distinct.index(law) for _, law in laws])
     losses = torch.as_tensor(loss, dtype=torch.float64).expand(n, n)
     for number in losses.flatten().tolist():
         checks.in_range("loss", number, 0.0, 1.0)
-    samplers = [sampler_of(law, dt, key=key) for law in laws]
-    return LinkSampler(samplers, torch.tensor(index), losses.flatten().clone())
+    return LinkSampler(samplers, index, losses.flatten().clone())
 
 
 def same_size(settings: Mapping[str, Any]) -> int | None:
@@ -126,13 +132,9 @@ def _matrix_size(key: str, matrix: Any) -> int:
     return len(lengths)
 
 
-def _distinct_laws(delay: Any, n: int, key: str) -> tuple[list[Law], list[int]]:
-    """The distinct laws of a law or an n x n nested list of laws, and the index of each link's law."""
+def _laws_of_links(delay: Any, n: int, key: str) -> list[tuple[str, Law]]:
+    """Name and law of each of the n * n links, of a law or an n x n nested list of laws."""
     if not is_matrix(delay):
-        return [law_of(delay, key)], [0] * (n * n)
-    links = {i * n + j: law_of(delay[i][j], f"{key}[{i}][{j}]") for i in range(n) for j in range(n) if i != j}
-    laws: list[Law] = []
-    for law in links.values():
-        laws += [law] if law not in laws else []
-    laws = laws or [law_of(0)]
-    return laws, [laws.index(links[k]) if k in links else 0 for k in range(n * n)]
+        return [(key, law_of(delay, key))] * (n * n)
+    links = {(i, j): f"{key}[{i}][{j}]" for i in range(n) for j in range(n)}
+    return [(name, law_of(0 if i == j else delay[i][j], name)) for (i, j), name in links.items()]
