@@ -43,7 +43,7 @@ class World:
         n_agents: int,
         delay: Callable[[int, Link, int], int | None],
         limit: int | None = None,
-        turn: Callable[[int, int], int] | None = None,
+        turn: Callable[[int, int], tuple] | None = None,
         known: bool = False,
         own_at_reset: bool = True,
     ) -> None:
@@ -133,10 +133,10 @@ def table(law: Any, streams: Tensor, n_steps: int, loss: float = 0.0) -> Callabl
     return lambda clock, row: None if (d := delays[clock - 1][row]) == sampler.lost else d
 
 
-def turns(streams: Tensor, n_steps: int) -> list[list[int]]:
-    """Random numbers by clock - 1 and row that decide who may send."""
-    clocks = torch.arange(1, n_steps + 1).unsqueeze(-1)
-    return counter_rng.bits(streams, clocks, torch.ones_like(clocks)).tolist()
+def turn(stream: Tensor, clock: int, sender: int) -> tuple[int, int]:
+    """Whoever has the smallest turn may send first."""
+    counters = (torch.tensor(counter) for counter in (clock, 4, sender))
+    return int(counter_rng.bits(stream, *counters)), sender
 
 
 Wants = Callable[[TensorDictBase, TensorDictBase | None, int], Collection[Link]]

@@ -4,14 +4,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from damian.common import checks, counter_rng
 from damian.common.errors import InputError
 from damian.delays.laws import Law, law_of, sampler_of
 from damian.delays.samplers import MessageContext, Sampler
 
-_LOSS_DRAW = 2
+_LOSS_DRAW = 3
 """Counter that tells the draw of a link's loss from those of its delay."""
 
 
@@ -19,7 +19,8 @@ class LinkSampler(Sampler):
     """Draws the delays of messages on the links between N agents, by a law and a loss for each link.
 
     Links are numbered receiver * N + sender; of the M messages of a step, message m belongs to link m modulo
-    N * N. Every distinct law has one sampler, which draws for all links.
+    N * N. Every distinct law has one sampler, which draws for all links. The state of a channel is that of
+    all samplers, side by side, [M, S].
 
     Args:
         samplers: one for each distinct law.
@@ -34,45 +35,59 @@ class LinkSampler(Sampler):
         longest = max(sampler.longest for sampler in samplers)
         super().__init__([[0.0] * (longest + 1)])  # the worst case: every message may be lost
         self.certain = None
-        self.samplers = torch.nn.ModuleList(samplers)
+        self.samplers = nn.ModuleList(samplers)
         self.sees_context = any(sampler.sees_context for sampler in samplers)
         self.reads = tuple(dict.fromkeys(name for sampler in samplers for name in sampler.reads))
         self._loses = bool((loss > 0).any())
+        example = torch.zeros(1, dtype=torch.long)
+        self._state_shapes = [sampler.initial_state(example).shape[1:] for sampler in samplers]
         self.register_buffer("_law_index", law_index, persistent=False)
         self.register_buffer("_loss", loss, persistent=False)
 
     def initial_state(self, streams: Tensor) -> Tensor:
-        state = torch.zeros_like(streams)
-        for sampler, uses in self._pairs(streams):
-            state = torch.where(uses, sampler.initial_state(streams), state)
-        return state
+        return _side_by_side([sampler.initial_state(streams) for sampler in self._samplers])
+
+    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
+        """The states [M, S] of channels, before the first message of an episode where the mask is true."""
+        pairs = zip(self._samplers, self._states(memory), strict=True)
+        return _side_by_side([sampler.begin_episode(state, mask) for sampler, state in pairs])
 
     def try_context(self, context: MessageContext) -> None:
-        for sampler in self.samplers:
-            sampler.try_context(context)  # type: ignore[operator]
+        for sampler in self._samplers:
+            sampler.try_context(context)
 
     def forward(
         self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
-        delay, state = torch.full_like(streams, self.lost), memory
-        for sampler, uses in self._pairs(streams):
-            # A sampler must not see the state of another law's channel.
-            drawn, turned = sampler(streams, clock, torch.where(uses, memory, 0), context)
+        index, delay, states = self._of_links(self._law_index, streams), torch.zeros_like(streams), []
+        for k, (sampler, state) in enumerate(zip(self._samplers, self._states(memory), strict=True)):
+            own = streams_for(sampler, streams, len(self._law_index))
+            drawn, turned = sampler(own, clock, state, context)
             drawn = torch.where(drawn < sampler.lost, drawn, self.lost)
-            delay, state = torch.where(uses, drawn, delay), torch.where(uses, turned, state)
+            delay = torch.where(index == k, drawn, delay)
+            states.append(turned)
         if self._loses:
             draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
             delay = torch.where(draw < self._of_links(self._loss, streams), self.lost, delay)
-        return delay, state
+        return delay, _side_by_side(states)
 
-    def _pairs(self, streams: Tensor) -> list[tuple[Any, Tensor]]:
-        """Each sampler, with a mask of the links that use it, [M] bool."""
-        index = self._of_links(self._law_index, streams)
-        return [(sampler, index == k) for k, sampler in enumerate(self.samplers)]
+    @property
+    def _samplers(self) -> list[Any]:
+        return list(self.samplers)
+
+    def _states(self, memory: Tensor) -> list[Tensor]:
+        """The state of each sampler, [M, ...]."""
+        parts = memory.split([shape.numel() for shape in self._state_shapes], -1)
+        pairs = zip(parts, self._state_shapes, strict=True)
+        return [part.reshape(len(part), *shape) for part, shape in pairs]
 
     def _of_links(self, values: Tensor, streams: Tensor) -> Tensor:
         """Repeat values of links [N * N] for M messages."""
         return values.repeat(len(streams) // len(values))
+
+
+def _side_by_side(states: list[Tensor]) -> Tensor:
+    return torch.cat([state.reshape(len(state), -1) for state in states], -1)
 
 
 def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> Sampler:
@@ -116,6 +131,16 @@ def same_size(settings: Mapping[str, Any]) -> int | None:
         found = ", ".join(f"{key} {n} x {n}" for key, n in sizes.items())
         raise InputError(f"{found}: these are of different numbers of agents")
     return next(iter(sizes.values()), None)
+
+
+def streams_for(sampler: Sampler, streams: Tensor, n_rows: int) -> Tensor:
+    """The random streams [M] from which a sampler draws, if a world has so many rows.
+
+    A sampler whose draws are ``shared`` draws the same numbers for all rows of a world.
+    """
+    if not getattr(sampler, "shared", False):
+        return streams
+    return streams.view(-1, n_rows)[:, :1].expand(-1, n_rows).reshape(-1)
 
 
 def is_matrix(value: Any) -> bool:

@@ -40,10 +40,10 @@ class Channel(StatefulTransform):
     The outputs of a reset are sent like those of a step; a chosen message exists from the first step on, in
     whose outputs it arrives with delay 0. With delay 0 everyone sees everyone's current message.
 
-    A message's content is stored once for all receivers: with a longest delay of K steps, N agents and
-    contents of F floats, a world takes 4 (K + 1) N F bytes for contents in transit, 8 (K + 2) N^2 for their
-    times, and 4 N^2 F for what the receivers hold. One ring for each link would take 4 (K + 2) N^2 F bytes
-    instead of the first term.
+    What an agent sends is stored once for all receivers. With a longest delay of K steps, N agents and
+    contents of F float32 numbers, a world takes 4 (K + 1) N F bytes for what is in transit, 4 N^2 F for what
+    is held, and about 8 (K + 10) N^2 for times and states of the links: 31 kB with K = 10, N = 10, F = 18. It
+    would take 109 kB if each link stored what is in transit on it.
 
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``); or an
@@ -92,6 +92,7 @@ class Channel(StatefulTransform):
     """
 
     draws = True
+    """The transform draws random numbers."""
 
     def __init__(
         self,

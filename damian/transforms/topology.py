@@ -10,10 +10,10 @@ from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
 from damian.delays.broadcast_line import BroadcastLine
 from damian.delays.delay_line import Memory
-from damian.delays.link_sampler import is_matrix, link_sampler
+from damian.delays.link_sampler import is_matrix, link_sampler, streams_for
 from damian.delays.samplers import MessageContext, Sampler
 
-_SERVER_STREAM, _TURN_DRAW = 1, 1
+_SERVER_STREAM, _TURN_DRAW = 1, 4
 """Counters that tell the server's random streams, and the draws of who may send, from those of the delays."""
 
 
@@ -116,8 +116,10 @@ class Topology(nn.Module, ABC):
         if self.rules.limit is None:
             return wants
         streams, clock = line["streams"][line["link"]], line["clock"][line["link"]] + 1
-        n, draw = wants.shape[-1], counter_rng.bits(streams, clock, torch.full_like(clock, _TURN_DRAW))
-        turn = draw.view(wants.shape) * n + torch.arange(n, device=wants.device)
+        n = wants.shape[-1]
+        agent = torch.arange(len(clock), device=clock.device) % n
+        draw = counter_rng.bits(streams, clock, torch.full_like(clock, _TURN_DRAW), agent)
+        turn = (draw * n + agent).view(wants.shape)
         before = wants.unsqueeze(1) & (turn.unsqueeze(1) < turn.unsqueeze(2))
         return wants & (before.sum(-1) < self.rules.limit)
 
@@ -177,6 +179,7 @@ class DirectLinks(Topology):
     def init_memory(self, contents: list[Tensor], streams: Tensor, n_agents: int) -> Memory:
         links = torch.arange(len(streams), device=streams.device)
         receiver, sender = links // n_agents, links % n_agents
+        streams = streams_for(self.sampler, streams, n_agents**2)
         memory = self.line.init_memory(contents, streams, receiver // n_agents * n_agents + sender)
         hears = receiver % n_agents != sender
         if self._hears is not None:
@@ -250,8 +253,9 @@ class ServerLinks(Topology):
 
     def init_memory(self, contents: list[Tensor], streams: Tensor, n_agents: int) -> Memory:
         agents = torch.arange(len(streams), device=streams.device)
-        up = self.line.init_memory(contents, streams, agents)
+        up = self.line.init_memory(contents, streams_for(self.sampler, streams, n_agents), agents)
         down_streams = counter_rng.bits(streams, torch.full_like(streams, _SERVER_STREAM))
+        down_streams = streams_for(self.down_sampler, down_streams, n_agents)
         examples = self._broadcast(up, n_agents)
         return _joined(up, self.down_line.init_memory(examples, down_streams, agents // n_agents))
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from channel_twin import ServedWorld, World, check_against_twin, table, turns
+from channel_twin import ServedWorld, World, check_against_twin, table, turn
 from delay_twin import Counting
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
@@ -37,15 +37,14 @@ def twin_of(law: Any, loss: float = 0.0, **rules: Any) -> Callable[[int, Tensor]
 
     def make(b: int, streams: Tensor) -> World:
         delays = table(law, streams, CLOCKS, loss)
-        order = turns(streams, CLOCKS)
 
-        def turn(clock: int, sender: int) -> tuple:
-            return order[clock - 1][b * N * N + (N - 1) * N + sender], sender
+        def order(clock: int, sender: int) -> tuple:
+            return turn(streams[b * N * N + (N - 1) * N + sender], clock, sender)
 
         def delay(clock: int, link: tuple, _: int) -> int | None:
             return delays(clock, b * N * N + link[0] * N + link[1])
 
-        return World(N, delay, turn=turn, **rules)
+        return World(N, delay, turn=order, **rules)
 
     return make
 
@@ -109,7 +108,7 @@ def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
 
         def delay(clock: int, link: tuple, _: int) -> int | None:
             row = b * N * N + link[0] * N + link[1]
-            draw = counter_rng.uniform(streams[row], torch.tensor(clock), torch.tensor(2))
+            draw = counter_rng.uniform(streams[row], torch.tensor(clock), torch.tensor(3))
             return None if draw < losses[link[0]][link[1]] else tables[link](clock, row)
 
         return World(N, delay)
@@ -136,13 +135,12 @@ def test_a_server_broadcasts_what_it_holds(up, down, limit, known):
     def make(b: int, streams: Tensor) -> World:
         ups = table(up, streams, CLOCKS, 0.2)
         downs = table(down, counter_rng.bits(streams, torch.ones_like(streams)), CLOCKS, 0.3)
-        order = turns(streams, CLOCKS)
         return ServedWorld(
             N,
             lambda clock, link, _: ups(clock, b * N + link[1]),
             down=lambda clock, i: downs(clock, b * N + i),
             limit=limit,
-            turn=lambda clock, j: (order[clock - 1][b * N + j], j),
+            turn=lambda clock, j: turn(streams[b * N + j], clock, j),
             known=known,
         )
 
@@ -241,6 +239,37 @@ def test_a_law_may_read_the_positions_of_sender_and_receiver(navigation):
             return None if metres > 1.5 else min(math.floor(metres / 0.3), 9)
 
         return World(N, delay)
+
+    def wants(outputs: Any, _: Any, b: int) -> set:
+        now["outputs"] = outputs
+        return ALL
+
+    check_against_twin(env, make, wants, forced=some_worlds)
+
+
+@dataclass(frozen=True)
+class Base(Law):
+    """A step per 0.5 m between an agent and a server at the origin, and one for every other agent."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> ContextSampler:
+        return ContextSampler(self.delays, 9, loss, reads=["position"])
+
+    def delays(self, context: MessageContext) -> Tensor:
+        metres = torch.linalg.vector_norm(context.entries["position"], dim=-1)
+        agent = torch.maximum(context.sender, context.receiver)
+        return (metres / 0.5).floor() + agent + context.n_sending - 1
+
+
+def test_the_laws_of_a_server_read_the_position_of_the_agent_that_sends_or_receives(navigation):
+    env = navigation(Channel(Base(), topology="server", down_delay=Base(), position_key="observation"))
+    now = {}
+
+    def delay(b: int, agent: int, n_sending: int) -> int:
+        return min(math.floor(math.hypot(*place(now["outputs"], b, agent)) / 0.5) + agent + n_sending - 1, 9)
+
+    def make(b: int, _: Tensor) -> World:
+        down = lambda _, i: delay(b, i, 1)  # noqa: E731
+        return ServedWorld(N, lambda _, link, n_sending: delay(b, link[1], n_sending), down=down)
 
     def wants(outputs: Any, _: Any, b: int) -> set:
         now["outputs"] = outputs
