@@ -38,7 +38,8 @@ class Channel(StatefulTransform):
     Each receiver holds, of each sender, the message that was generated last of those that have arrived, and
     observes it, its age, and whether any has arrived in this episode. An agent knows its own message at once.
     The outputs of a reset are sent like those of a step; a chosen message exists from the first step on, in
-    whose outputs it arrives with delay 0. With delay 0 everyone sees everyone's current message.
+    whose outputs it arrives with delay 0. With delay 0 everyone sees everyone's current message. No gradient
+    flows through the channel.
 
     What an agent sends is stored once for all receivers. With a longest delay of K steps, N agents and
     contents of F float32 numbers, a world takes 4 (K + 1) N F bytes for what is in transit, 4 N^2 F for what
@@ -48,8 +49,8 @@ class Channel(StatefulTransform):
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``); or an
             N x N nested list of them, ``delay[receiver][sender]``, whose diagonal is not used. A delay is
-            drawn for each receiver and message. A law that sees the context of messages may read ``position``
-            and ``receiver_position``, if there is a ``position_key``.
+            drawn for each receiver and message. With a ``position_key``, a law may read ``position`` and
+            ``receiver_position``; with a server, ``position`` is that of the agent that sends or receives.
         in_keys: keys of the entries [*B, N, ...] of a group of agents that every agent sends together; if
             neither this nor ``action_key`` is given, ``("agents", "observation")``.
         out_keys: keys under which the received entries are written, [*B, N, N, ...] (receiver, sender); if
@@ -278,18 +279,20 @@ class Channel(StatefulTransform):
         require_keys("Channel", self.required_keys, observation_spec)
         agents, device = spec_rows(observation_spec, self._beside), observation_spec.device
         self._check_agents(agents, len(observation_spec.shape))
-        shape = torch.Size((*agents, agents[-1]))
-        like = [
-            (observation_spec[key].shape[len(agents) :], observation_spec[key].dtype) for key in self.in_keys
-        ]
-        like += [((self.message_size,), torch.float32)] if self.message_size else []
-        for key, (size, dtype) in zip(
-            self._written, [*like, ((), torch.float32), ((), torch.bool)], strict=True
-        ):
-            full = torch.Size((*shape, *size))
-            flag = Binary(full[-1], full, device=device, dtype=dtype)
-            is_flag = dtype == torch.bool
-            observation_spec[key] = flag if is_flag else Unbounded(full, dtype=dtype, device=device)
+        for key in [*self._written, *([self.action_key] if self.action_key else [])]:
+            good = key not in observation_spec.keys(True, True)
+            checks.require(
+                good, "Channel", key, "is already an entry of the environment: choose another name"
+            )
+        sent = [observation_spec[key] for key in self.in_keys]
+        kinds = [(spec.shape[len(agents) :], spec.dtype) for spec in sent]
+        kinds += [((self.message_size,), torch.float32)] if self.message_size else []
+        kinds += [((), torch.float32), ((), torch.bool)]
+        for key, (size, dtype) in zip(self._written, kinds, strict=True):
+            shape = torch.Size((*agents, agents[-1], *size))
+            numbers = Unbounded(shape, dtype=dtype, device=device)
+            flags = Binary(shape[-1], shape, dtype=dtype, device=device)
+            observation_spec[key] = flags if dtype == torch.bool else numbers
         return observation_spec
 
 
@@ -310,6 +313,7 @@ def _keys_of(
 ) -> tuple[list[NestedKey], list[NestedKey], NestedKey]:
     """Keys of the entries that are sent and received, and the key beside which a bare name is meant."""
     sent = _listed(("agents", "observation") if in_keys is None else in_keys) if action_key is None else []
+    checks.require(bool(sent or action_key), "in_keys", in_keys, "name nothing to send")
     beside = sent[0] if sent else unravel_key(action_key)
     checks.require(isinstance(beside, tuple), "action_key" if not sent else "in_keys", beside, _NO_GROUP)
     names = [f"received_{key[-1]}" for key in sent] if len(sent) > 1 else ["received"]

@@ -188,6 +188,30 @@ def test_a_world_does_the_same_alone_as_among_others(name):
     assert all(same(together[b], written([name])[0]) for b, name in enumerate(WORLDS))
 
 
+@pytest.mark.parametrize("name", ["limit", "laws", "server"])
+def test_a_world_that_pauses_goes_on_as_if_it_had_not(name):
+    pausing, steady = (channel(**CHANNELS[name]) for _ in range(2))
+    for each in (pausing, steady):
+        each.seed_worlds(torch.tensor(WORLDS))
+        TransformedEnv(Counting(WORLDS, N), each).reset()
+    torch.manual_seed(0)
+    sent, truth, done = torch.randn(15, len(WORLDS), N, 7).double(), [], [0] * len(WORLDS)
+    for contents in sent:
+        memory, outputs = steady.on_step(steady.memory, {OBSERVATION: contents})
+        steady.set_memory(memory)
+        truth.append(outputs)
+    while min(done) < len(sent):
+        steps = torch.tensor([n < len(sent) and bool(torch.rand(()) < 0.5) for n in done])
+        contents = torch.stack([sent[min(n, len(sent) - 1), b] for b, n in enumerate(done)])
+        contents[~steps] = -1.0
+        before = pausing.memory
+        memory, outputs = pausing.on_step(before, {OBSERVATION: contents, "_step": steps})
+        pausing.set_memory(pausing.merge_worlds(before, memory, steps))
+        for b in steps.nonzero().flatten().tolist():
+            assert all(value[b].equal(truth[done[b]][key][b]) for key, value in outputs.items())
+            done[b] += 1
+
+
 def test_a_limited_medium_is_shared_fairly():
     env = TransformedEnv(Counting([*range(200)], N, ends=0.0), Channel(0, limit=1, seed=1))
     fresh = torch.stack([td[WRITTEN[1]] == 0 for td in outputs_of(env, 20)[::2]])
@@ -267,6 +291,7 @@ MISTAKES = {
     },
     "known_at_reset: True does not go": {"action_key": MESSAGE, "message_size": 1, "known_at_reset": True},
     "in_keys: observation is not in a group of agents": {"in_keys": "observation"},
+    "in_keys: .* name nothing to send": {"in_keys": []},
     "out_keys: .* are not 1 keys": {"out_keys": ["a", "b"]},
     "delay: a law that reads position .*position_key": {"delay": Reads("position")},
     "delay: a law that reads battery .*can read position, receiver_position": {
@@ -287,6 +312,8 @@ IN_USE = {
     "Channel: the links are given for 2 agents, but .* is of 3": {"delay": TWO},
     "Channel: .*words.* is not among the keys": {"in_keys": ("agents", "words")},
     "sent_key: .*observation.* has 63 values of torch.float64": {"sent_key": "observation"},
+    "Channel: .*ready.* is already an entry": {"out_keys": "ready"},
+    "Channel: .*sent.* is already an entry": {"action_key": ("agents", "message_sent"), "message_size": 1},
     "Channel: .*asks.* is neither an output of the environment nor written": {"request_key": "asks"},
     "action_key: .* is not a new name beside": {"action_key": ("agents", "action"), "message_size": 1},
 }
