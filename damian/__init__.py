@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from damian.transforms import (
         ActionDelay,
         ActionHistory,
+        Channel,
         CumulativeReward,
         ObservationDelay,
         RewardDelay,
@@ -50,6 +51,7 @@ _MODULES = {
     "damian.transforms": [
         "ActionDelay",
         "ActionHistory",
+        "Channel",
         "CumulativeReward",
         "ObservationDelay",
         "RewardDelay",
@@ -66,6 +68,7 @@ __all__ = [
     "ActionHistory",
     "BackupdateStorage",
     "Burst",
+    "Channel",
     "ClockConfig",
     "Constant",
     "ContextSampler",

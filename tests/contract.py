@@ -14,6 +14,7 @@ from damian.envs.uav_env import UavEnv
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
+    Channel,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
@@ -117,12 +118,24 @@ CASES = {
     "RewardDelay, one world": Case(cartpole, lambda: RewardDelay(LATE)),
     "RewardDelay, worlds": Case(Drift, lambda: RewardDelay({"law": "geometric"})),
     "RewardDelay, agents": Case(uavs, lambda: RewardDelay(LATE, REWARD)),
+    "Channel, links": Case(
+        uavs,
+        lambda: Channel(
+            [[0, LATE, 1], [3, 0, 0], [0, LATE, 0]], OBSERVATION, loss=0.2, limit=2, sent_key="message_sent"
+        ),
+    ),
+    "Channel, server": Case(
+        uavs, lambda: Channel(LATE, OBSERVATION, topology="server", down_delay=LATE, down_loss=0.1)
+    ),
+    "Channel, messages": Case(uavs, lambda: Channel(LATE, action_key=("agents", "words"), message_size=2)),
     "ServerNode": Case(unserved, _server_node),
 }
 """Every transform on every kind of environment that it works on; the name before the comma is its class."""
 
 DRAWS = [
-    CASES[name] for name in CASES if name.split(",")[0] in ("ActionDelay", "ObservationDelay", "RewardDelay")
+    CASES[name]
+    for name in CASES
+    if name.split(",")[0] in ("ActionDelay", "Channel", "ObservationDelay", "RewardDelay")
 ]
 """Cases whose transform draws random numbers."""
 

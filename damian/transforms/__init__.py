@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from damian.transforms.action_delay import ActionDelay
 from damian.transforms.action_history import ActionHistory
 from damian.transforms.base import StatefulTransform
+from damian.transforms.channel import Channel
 from damian.transforms.observation_delay import ObservationDelay
 from damian.transforms.order import check_order
 from damian.transforms.reward_delay import CumulativeReward, RewardDelay
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ActionDelay",
     "ActionHistory",
+    "Channel",
     "CumulativeReward",
     "ObservationDelay",
     "RewardDelay",

@@ -278,7 +278,7 @@ def test_all_memory_is_in_the_state_dict(case):
         assert fixed <= CONSTANT
 
 
-CONSTANT = {"chances", "_boundaries", "_delays", "codes"}
+CONSTANT = {"chances", "_boundaries", "_delays", "codes", "_law_index", "_loss"}
 """Tensors that never change after construction."""
 
 
@@ -317,8 +317,9 @@ def test_the_autograd_graph_does_not_grow_during_a_rollout(case):
     td, weight, sizes = begun(env, 0), torch.ones((), requires_grad=True), []
     for t in range(24):
         td = env.rand_action(td)
-        if td[env.action_key].is_floating_point():
-            td.set(env.action_key, td[env.action_key] * weight)
+        for key in env.action_keys:
+            if td[key].is_floating_point():
+                td.set(key, td[key] * weight)
         after, td = env.step_and_maybe_reset(td)
         assert not any(value.requires_grad for value in memory(env.transform)), t
         sizes.append(sum(nodes(value) for value in after["next"].values(True, True)))
@@ -367,6 +368,6 @@ def test_a_reset_of_some_worlds_does_not_change_the_others(case):
     reset = env.reset(td.clone().set("_reset", mask))
     assert same(reset[1:], td[1:].select(*reset.keys(True, True)))
     torch.manual_seed(0)
-    actions = twin.rand_action(td.clone()).select(env.action_key)
+    actions = twin.rand_action(td.clone()).select(*env.action_keys)
     outputs = [each.step(state.clone().update(actions))["next"] for each, state in ((env, reset), (twin, td))]
     assert same(outputs[0][1:], outputs[1][1:])

@@ -1,0 +1,202 @@
+"""Reference implementation of ``Channel`` in plain Python, for one world and one link at a time."""
+
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from delay_twin import drawn
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+from damian.common import counter_rng
+from damian.delays.laws import law_of, sampler_of
+
+Link = tuple[int, int]
+"""Receiver and sender."""
+
+
+class Packet(NamedTuple):
+    """What is in transit to somebody."""
+
+    arrives: int
+    sent: int
+    to: Any
+    content: Any
+
+
+class World:
+    """Agents that send to each other.
+
+    Args:
+        n_agents: number of agents, N.
+        delay: delay of what is sent on a link at a clock [steps], None if it is lost.
+        limit: number of agents that may send in a step.
+        turn: who may send first at a clock: the agent with the smallest number.
+        known: does everyone know everyone's first message.
+        own_at_reset: is there an own message at the reset.
+    """
+
+    def __init__(
+        self,
+        n_agents: int,
+        delay: Callable[[int, Link, int], int | None],
+        limit: int | None = None,
+        turn: Callable[[int, int], tuple] | None = None,
+        known: bool = False,
+        own_at_reset: bool = True,
+    ) -> None:
+        self.agents, self.delay, self.limit = range(n_agents), delay, limit
+        self.turn, self.known, self.own_at_reset = turn, known, own_at_reset
+        self.clock, self.began = 0, 0
+
+    def senders(self, wanted: Collection[Link]) -> list[int]:
+        """The agents that may send."""
+        waiting = {sender for _, sender in wanted}
+        if self.limit is None:
+            return sorted(waiting)
+        return sorted(waiting, key=lambda sender: self.turn(self.clock, sender))[: self.limit]
+
+    def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
+        """Send on the wanted links, and receive."""
+        self.clock += 1
+        if begins:
+            self.began, self.in_transit, self.holds = self.clock, [], {}
+        senders = self.senders(wanted)
+        for link in wanted:
+            delay = self.delay(self.clock, link, len(senders)) if link[1] in senders else None
+            if delay is not None:
+                self.in_transit.append(Packet(self.clock + delay, self.clock, link, contents[link[1]]))
+        for packet in self.in_transit:
+            if packet.arrives == self.clock and (
+                packet.to not in self.holds or self.holds[packet.to][0] < packet.sent
+            ):
+                self.holds[packet.to] = (packet.sent, packet.content)
+        if begins and self.known:
+            self.holds = {(i, j): (self.clock, contents[j]) for i in self.agents for j in self.agents}
+        self.own = contents
+
+    def seen(self, receiver: int, sender: int, zeros: Any) -> tuple[Any, int, bool]:
+        """Content and age of what a receiver holds of a sender, and whether it holds anything."""
+        since = self.clock - self.began
+        if receiver == sender:
+            return (self.own[sender], 0, True) if since or self.own_at_reset else (zeros, 0, False)
+        if (receiver, sender) not in self.holds:
+            return zeros, since, False
+        sent, content = self.holds[receiver, sender]
+        return content, self.clock - sent, True
+
+
+class ServedWorld(World):
+    """Agents that send to a server, which broadcasts what it holds.
+
+    Args:
+        down: delay of what is broadcast to an agent at a clock [steps], None if it is lost.
+        further: arguments of ``World``; the links to the server are (-1, sender).
+    """
+
+    def __init__(self, *further: Any, down: Callable[[int, int], int | None], **named: Any) -> None:
+        super().__init__(*further, **named)
+        self.down = down
+
+    def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
+        super().step(contents, {(-1, j) for _, j in wanted}, begins)
+        if begins:
+            self.broadcasts, self.got = [], {}
+            if self.known:
+                self.holds = {(-1, j): (self.clock, contents[j]) for j in self.agents}
+        snapshot = dict(self.holds)
+        for i in self.agents:
+            delay = self.down(self.clock, i)
+            if delay is not None:
+                self.broadcasts.append(Packet(self.clock + delay, self.clock, i, snapshot))
+        for packet in self.broadcasts:
+            if packet.arrives == self.clock and self.got.get(packet.to, (-1,))[0] < packet.sent:
+                self.got[packet.to] = (packet.sent, packet.content)
+        if begins and self.known:
+            self.got = dict.fromkeys(self.agents, (self.clock, snapshot))
+
+    def seen(self, receiver: int, sender: int, zeros: Any) -> tuple[Any, int, bool]:
+        _, known = self.got.get(receiver, (-1, {}))
+        mine, self.holds = self.holds, {(receiver, j): message for (_, j), message in known.items()}
+        try:
+            return super().seen(receiver, sender, zeros)
+        finally:
+            self.holds = mine
+
+
+def table(law: Any, streams: Tensor, n_steps: int, loss: float = 0.0) -> Callable[[int, int], int | None]:
+    """The delay that a law draws at a clock for a row; None if the message is lost."""
+    sampler = sampler_of(law_of(law), loss=loss)
+    delays = drawn(sampler, streams, n_steps).tolist()
+    return lambda clock, row: None if (d := delays[clock - 1][row]) == sampler.lost else d
+
+
+def turn(stream: Tensor, clock: int, sender: int) -> tuple[int, int]:
+    """Whoever has the smallest turn may send first."""
+    counters = (torch.tensor(counter) for counter in (clock, 4, sender))
+    return int(counter_rng.bits(stream, *counters)), sender
+
+
+Wants = Callable[[TensorDictBase, TensorDictBase | None, int], Collection[Link]]
+"""The links on which a world wants to send, from the outputs, from the inputs (None at a reset)."""
+
+
+def check_against_twin(
+    env: TransformedEnv,
+    make: Callable[[int, Tensor], World],
+    wants: Wants,
+    n_steps: int = 25,
+    forced: Callable[[int], list[int]] = lambda _: [],
+    sent: Any = ("agents", "observation"),
+    policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
+) -> list[TensorDictBase]:
+    """Compare every output of a rollout with partial resets with that of the twins.
+
+    Args:
+        env: environment with one ``Channel``.
+        make: the twin of a world, given its number and the channel's random streams.
+        wants: which links carry a message.
+        n_steps: number of steps.
+        forced: worlds to reset after a step, beside those that are done.
+        sent: key of what is sent, among the outputs, or among the inputs of a step.
+        policy: chooses actions; random if not given.
+    """
+    torch.manual_seed(0)
+    td, worlds = env.reset(), range(env.batch_size[0])
+    channel = env.transform[-1] if len(env.transform) else env.transform
+    memory = channel.memory
+    twins = [make(b, memory.get("streams", memory.get("up_streams"))) for b in worlds]
+
+    def follow(outputs: TensorDictBase, inputs: TensorDictBase | None, mask: list[bool]) -> None:
+        source = outputs if sent in outputs.keys(True) else inputs
+        for b in worlds:
+            n = len(twins[b].agents)
+            if mask[b]:
+                contents = source[sent][b].tolist() if source is not None else [[0.0]] * n
+                twins[b].step(contents, wants(outputs, inputs, b), begins=inputs is None)
+            got = [outputs["agents", name][b].tolist() for name in ("received", *FLAGS)]
+            zeros = [0.0] * len(got[0][0][0])
+            for i in range(n):
+                for j in range(n):
+                    expected = twins[b].seen(i, j, zeros)
+                    assert tuple(part[i][j] for part in got) == tuple(expected), (b, i, j)
+
+    follow(td, None, [True] * len(worlds))
+    seen = [td]
+    for t in range(n_steps):
+        td = policy(td) if policy else env.rand_action(td)
+        stepped = env.step(td)
+        follow(stepped["next"], stepped, [True] * len(worlds))
+        td = step_mdp(stepped)
+        mask = td["done"].view(-1).tolist()
+        mask = [done or b in forced(t) for b, done in enumerate(mask)]
+        if any(mask):
+            td = env.reset(td.set("_reset", torch.tensor(mask).unsqueeze(-1)))
+            follow(td, None, mask)
+        seen += [stepped["next"], td]
+    return seen
+
+
+FLAGS = ("received_age", "received_mask")

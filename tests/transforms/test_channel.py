@@ -1,0 +1,344 @@
+"""Messages between agents on environments of other packages, and what holds for every channel."""
+
+import math
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from delay_twin import Counting
+from helpers import all_same, same, square
+from tensordict import TensorDictBase
+from torchrl.data import Bounded
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from damian.common.errors import InputError
+from damian.delays.laws import Burst, Law, Uniform
+from damian.delays.samplers import ContextSampler
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.uav_env import UavEnv
+from damian.transforms import Channel, ObservationDelay
+
+LATE = Uniform(0, 3)
+MESSAGE, OBSERVATION, RECEIVED = (("agents", name) for name in ("message", "observation", "received"))
+WRITTEN = [("agents", name) for name in ("received", "received_age", "received_mask")]
+WORLDS, N = [3, 5, 8], 3
+HEARS = [[True, True, False], [False, True, True], [True, False, True]]
+CHANNELS = {
+    "all": {},
+    "limit": {"limit": 2, "loss": 0.2},
+    "matrix": {"topology": HEARS, "loss": [[0.0, 0.5, 0.1]] * 3},
+    "laws": {"delay": [[0, 3, LATE], [Burst(), 0, 1], ["2s", 0, 0]], "known_at_reset": True},
+    "server": {"topology": "server", "down_delay": LATE, "down_loss": 0.1},
+    "range": {"comm_range": 0.8, "position_key": "observation"},
+    "message": {"action_key": MESSAGE, "message_size": 2},
+}
+every_channel = pytest.mark.parametrize("options", CHANNELS.values(), ids=CHANNELS)
+
+
+def channel(**options: Any) -> Channel:
+    return Channel(options.pop("delay", LATE), seed=1, **options)
+
+
+def vmas() -> EnvBase:
+    pytest.importorskip("vmas")
+    from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
+
+    return VmasEnv("navigation", num_envs=2, n_agents=N, max_steps=6, seed=0)
+
+
+def pettingzoo() -> EnvBase:
+    pytest.importorskip("pettingzoo")
+    spread = pytest.importorskip("mpe2.simple_spread_v3")
+    from torchrl.envs.libs.pettingzoo import PettingZooWrapper  # noqa: PLC0415
+
+    game = spread.parallel_env(N=N, max_cycles=5, continuous_actions=True)
+    return PettingZooWrapper(game)
+
+
+def outputs_of(env: EnvBase, n_steps: int = 25) -> list[TensorDictBase]:
+    """What every step and every reset writes, under random actions, which are always the same."""
+    torch.manual_seed(0)
+    td, seen = env.reset(), []
+    for _ in range(n_steps):
+        stepped, td = env.step_and_maybe_reset(env.rand_action(td))
+        seen += [stepped["next"].clone(), td.clone()]
+    return seen
+
+
+# Environments.
+
+
+@every_channel
+def test_the_outputs_match_specs_that_can_be_indexed(options):
+    env = TransformedEnv(vmas(), channel(**options))
+    check_env_specs(env, break_when_any_done="both")
+    assert env.rollout(9, break_when_any_done=False)[WRITTEN[1]].shape == (2, 9, N, N)
+    for specs in (env.observation_spec, env.full_action_spec):
+        assert specs[0].shape == ()
+        assert specs["agents"][0, 1].shape == ()
+
+
+@pytest.mark.parametrize("options", [{"delay": 2}, {"delay": 0, "topology": "server", "down_delay": 2}])
+def test_a_channel_works_on_pettingzoo_without_a_batch_dimension(options):
+    env = TransformedEnv(pettingzoo(), channel(in_keys=("agent", "observation"), **options))
+    check_env_specs(env)
+    late = env.rollout(5)
+    sent, received = late["agent", "observation"], late["agent", "received"]
+    assert received[2:, 0, 1].equal(sent[:-2, 1])
+    assert received[:, 1, 1].equal(sent[:, 1])
+    assert late["agent", "received_age"][:, 0, 1].tolist() == [0, 1, 2, 2, 2]
+    assert late["agent", "received_mask"][:, 0, 1].tolist() == [False, False, True, True, True]
+
+
+@pytest.mark.parametrize("options", [{}, {"topology": "server", "down_delay": 0}])
+def test_with_delay_0_everyone_sees_everyones_current_message(options):
+    env = TransformedEnv(vmas(), channel(delay=0, **options))
+    for outputs in outputs_of(env):
+        sent, received = outputs[OBSERVATION], outputs[RECEIVED]
+        assert received.equal(sent.unsqueeze(1).expand_as(received))
+        assert not outputs[WRITTEN[1]].any()
+        assert outputs[WRITTEN[2]].all()
+
+
+def test_several_entries_are_sent_together():
+    keys = [OBSERVATION, ("agents", "ready")]
+    env, alone = (
+        TransformedEnv(Counting(WORLDS, N), channel(delay=2, in_keys=sent)) for sent in (keys, None)
+    )
+    for both, one in zip(outputs_of(env), outputs_of(alone), strict=True):
+        assert both["agents", "received_observation"].equal(one[RECEIVED])
+        assert both["agents", "received_ready"].dtype == torch.bool
+    check_env_specs(env, break_when_any_done="both")
+
+
+def test_a_chosen_message_is_an_action_that_the_environment_never_gets():
+    env = TransformedEnv(pettingzoo(), Channel(1, action_key=("agent", "message"), message_size=4))
+    assert isinstance(env.full_action_spec["agent", "message"], Bounded)
+    assert ("agent", "message") not in env.base_env.full_action_spec.keys(True)
+    check_env_specs(env)
+    got = []
+    step = env.base_env._step
+    env.base_env._step = lambda td: got.append(td) or step(td)
+    late = env.rollout(5)
+    assert all(("agent", "message") not in td.keys(True) for td in got)
+    sent, received = late["agent", "message"], late["next", "agent", "received"]
+    assert received[1:, 0, 2].equal(sent[:-1, 2])
+    assert received[:, 1, 1].equal(sent[:, 1])
+    assert not late["agent", "received_mask"][0].any()
+
+
+# Properties.
+
+
+@pytest.mark.parametrize("name", ["limit", "laws", "server", "message"])
+def test_a_step_with_uavs_compiles_into_one_graph_that_does_the_same(name):
+    options = CHANNELS[name] | (
+        {"in_keys": OBSERVATION} if name != "message" else {"action_key": ("agents", "words")}
+    )
+
+    def outputs(compile_: bool) -> list[TensorDictBase]:
+        env = DelayedEnv(UavEnv(square(), num_worlds=2), Compose(channel(**options)))
+        env.set_seed(3)
+        if compile_:
+            torch._dynamo.reset()
+            env.compile(backend="eager")
+        return outputs_of(env, 12)
+
+    assert all_same(outputs(True), outputs(False))
+
+
+@pytest.mark.parametrize("name", ["all", "limit", "matrix", "laws", "server"])
+def test_nothing_changes_before_a_falsified_message_arrives(name):
+    def outputs(**tampered: Any) -> list[TensorDictBase]:
+        return outputs_of(
+            TransformedEnv(Counting(WORLDS, N, ends=0.02, **tampered), channel(**CHANNELS[name]))
+        )
+
+    is_source = torch.zeros(len(WORLDS), N, N, dtype=torch.bool)
+    is_source[1, :, 2] = True
+    truth, heard = outputs(), 0
+    for step in range(3, 11):
+        for one, other in zip(truth, outputs(tampered=(1, 2, step)), strict=True):
+            falsified = other[RECEIVED][..., 2] < 0
+            generated = one[OBSERVATION][..., 2].unsqueeze(-1) - one[WRITTEN[1]]
+            assert falsified.equal(is_source & (generated == step) & one[WRITTEN[2]])
+            assert one[RECEIVED][~falsified].equal(other[RECEIVED][~falsified])
+            assert same(one.select(*WRITTEN[1:]), other.select(*WRITTEN[1:]))
+            heard += falsified[1, :2, 2].sum()
+    assert heard
+
+
+@pytest.mark.parametrize("name", ["all", "limit", "matrix", "laws", "server"])
+def test_a_world_does_the_same_alone_as_among_others(name):
+    def written(worlds: list[int]) -> torch.Tensor:
+        transform = channel(**CHANNELS[name])
+        transform.seed_worlds(torch.tensor(worlds))
+        env = TransformedEnv(Counting(worlds, N), transform)
+        td, seen = env.reset(), []
+        for t in range(20):
+            action = torch.tensor([[t % 7] * N] * len(worlds))
+            stepped, td = env.step_and_maybe_reset(td.set(("agents", "action"), action))
+            seen += [stepped["next"].clone(), td.clone()]
+        return torch.stack([outputs.select(*WRITTEN) for outputs in seen], 1)
+
+    together = written(WORLDS)
+    assert all(same(together[b], written([name])[0]) for b, name in enumerate(WORLDS))
+
+
+@pytest.mark.parametrize("name", ["limit", "laws", "server"])
+def test_a_world_that_pauses_goes_on_as_if_it_had_not(name):
+    pausing, steady = (channel(**CHANNELS[name]) for _ in range(2))
+    for each in (pausing, steady):
+        each.seed_worlds(torch.tensor(WORLDS))
+        TransformedEnv(Counting(WORLDS, N), each).reset()
+    torch.manual_seed(0)
+    sent, truth, done = torch.randn(15, len(WORLDS), N, 7).double(), [], [0] * len(WORLDS)
+    for contents in sent:
+        memory, outputs = steady.on_step(steady.memory, {OBSERVATION: contents})
+        steady.set_memory(memory)
+        truth.append(outputs)
+    while min(done) < len(sent):
+        steps = torch.tensor([n < len(sent) and bool(torch.rand(()) < 0.5) for n in done])
+        contents = torch.stack([sent[min(n, len(sent) - 1), b] for b, n in enumerate(done)])
+        contents[~steps] = -1.0
+        before = pausing.memory
+        memory, outputs = pausing.on_step(before, {OBSERVATION: contents, "_step": steps})
+        pausing.set_memory(pausing.merge_worlds(before, memory, steps))
+        for b in steps.nonzero().flatten().tolist():
+            assert all(value[b].equal(truth[done[b]][key][b]) for key, value in outputs.items())
+            done[b] += 1
+
+
+def test_a_limited_medium_is_shared_fairly():
+    env = TransformedEnv(Counting([*range(200)], N, ends=0.0), Channel(0, limit=1, seed=1))
+    fresh = torch.stack([td[WRITTEN[1]] == 0 for td in outputs_of(env, 20)[::2]])
+    others = ~torch.eye(N, dtype=torch.bool)
+    assert (fresh & others).flatten(-2).sum(-1).eq(N - 1).all()
+    counts = (fresh & others).flatten(0, 1)[:, [1, 2, 0], [0, 1, 2]].sum(0)
+    expected, n = 20 * 200 / N, 20 * 200
+    assert all(abs(count - expected) < 5 * math.sqrt(n * 2 / 9) for count in counts.tolist())
+
+
+def test_what_is_written_shares_no_memory_with_the_channel():
+    for options in ({}, CHANNELS["server"]):
+        env, twin = (TransformedEnv(Counting(WORLDS, N), channel(delay=0, **options)) for _ in range(2))
+        for outputs in (*outputs_of(env, 3), env.reset()):
+            outputs[RECEIVED].fill_(7)
+        for outputs in (*outputs_of(twin, 3), twin.reset()):
+            del outputs
+        assert all(a.equal(b) for a, b in zip(env.transform.buffers(), twin.transform.buffers(), strict=True))
+
+
+def test_contents_are_stored_once_for_all_receivers_as_the_docstring_says():
+    n, size, longest, worlds = 6, 5, 7, 4
+    env = TransformedEnv(vmas_of(n, worlds), Channel(longest, action_key=MESSAGE, message_size=size))
+    env.reset()
+    memory = env.transform.memory
+
+    def size_of(*names: str) -> int:
+        return sum(memory[name].nbytes for name in names)
+
+    assert size_of("contents_0") == worlds * 4 * (longest + 1) * n * size
+    assert size_of("stamps") == worlds * 8 * (longest + 2) * n**2
+    assert size_of("held_0") == worlds * 4 * n**2 * size
+
+
+def vmas_of(n_agents: int, worlds: int) -> EnvBase:
+    pytest.importorskip("vmas")
+    from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
+
+    return VmasEnv("navigation", num_envs=worlds, n_agents=n_agents, seed=0)
+
+
+# Errors.
+
+
+class Reads(Law):
+    """A law that reads an entry."""
+
+    def __init__(self, name: str) -> None:
+        object.__setattr__(self, "name", name)
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> ContextSampler:
+        return ContextSampler(lambda context: context.entries[self.name][:, 0], 5, reads=[self.name])
+
+
+TWO = [[0, 1], [1, 0]]
+MISTAKES = {
+    "topology: ring is not one of all, server": {"topology": "ring"},
+    "topology: .* is not N x N": {"topology": [[True, False]]},
+    "topology: .* is not a matrix of bool": {"topology": [[0, 1], [1, 0]]},
+    "delay 2 x 2, topology 3 x 3: these are of different numbers": {"delay": TWO, "topology": HEARS},
+    "delay: .* has an entry for each link.*server only": {"delay": TWO, "topology": "server"},
+    r"delay\[0\]\[1\]: soon is neither": {"delay": [[0, "soon"], [1, 0]]},
+    "loss: 1.5 is not between 0 and 1": {"loss": [[0, 1.5], [0, 0]]},
+    "down_delay: 2 goes only with topology='server'": {"down_delay": 2},
+    "down_loss: 0.1 goes only with topology='server'": {"down_loss": 0.1},
+    "comm_range: 5 does not go with topology='server'": {"comm_range": 5, "topology": "server"},
+    "comm_range: 5 needs a position_key": {"comm_range": 5},
+    "comm_range: -1 m is not above 0": {"comm_range": -1, "position_key": "observation"},
+    "request_key: asks does not go with topology='server'": {"request_key": "asks", "topology": "server"},
+    "limit: 0 agents is not at least 1": {"limit": 0},
+    "message_size: 3 needs an action_key": {"message_size": 3},
+    "message_size: None .*is not a whole number": {"action_key": MESSAGE},
+    "action_key: .* does not go with in_keys": {
+        "action_key": MESSAGE,
+        "message_size": 1,
+        "in_keys": OBSERVATION,
+    },
+    "known_at_reset: True does not go": {"action_key": MESSAGE, "message_size": 1, "known_at_reset": True},
+    "in_keys: observation is not in a group of agents": {"in_keys": "observation"},
+    "in_keys: .* name nothing to send": {"in_keys": []},
+    "out_keys: .* are not 1 keys": {"out_keys": ["a", "b"]},
+    "delay: a law that reads position .*position_key": {"delay": Reads("position")},
+    "delay: a law that reads battery .*can read position, receiver_position": {
+        "delay": Reads("battery"),
+        "position_key": "observation",
+    },
+}
+
+
+@pytest.mark.parametrize("line", MISTAKES)
+def test_a_wrong_argument_is_one_line(line):
+    with pytest.raises(InputError, match=line) as error:
+        channel(**MISTAKES[line])
+    assert "\n" not in str(error.value)
+
+
+IN_USE = {
+    "Channel: the links are given for 2 agents, but .* is of 3": {"delay": TWO},
+    "Channel: .*words.* is not among the keys": {"in_keys": ("agents", "words")},
+    "sent_key: .*observation.* has 63 values of torch.float64": {"sent_key": "observation"},
+    "Channel: .*ready.* is already an entry": {"out_keys": "ready"},
+    "Channel: .*sent.* is already an entry": {"action_key": ("agents", "message_sent"), "message_size": 1},
+    "Channel: .*asks.* is neither an output of the environment nor written": {"request_key": "asks"},
+    "action_key: .* is not a new name beside": {"action_key": ("agents", "action"), "message_size": 1},
+}
+
+
+@pytest.mark.parametrize("line", IN_USE)
+def test_what_does_not_fit_the_environment_is_one_line(line):
+    with pytest.raises(InputError, match=line):
+        TransformedEnv(Counting(WORLDS, N), channel(**IN_USE[line])).rollout(2)
+
+
+def test_an_observation_must_be_delayed_before_it_is_sent():
+    env = TransformedEnv(Counting(WORLDS, N), Compose(channel()))
+    with pytest.raises(InputError, match="Channel must come after"):
+        env.append_transform(ObservationDelay(1, [("agents", "ready")], [OBSERVATION]))
+
+
+# The example.
+
+
+def test_the_example_tells_what_each_channel_costs(capsys):
+    pytest.importorskip("vmas")
+    example = Path(__file__).parents[2] / "examples" / "channel.py"
+    results = runpy.run_path(str(example))["main"](n_worlds=16, n_steps=30)
+    ages = {name: age for name, (_, age) in results.items()}
+    assert ages["direct"] == min(ages.values())
+    assert results["within 0.8 m"][0] < results["direct"][0]
+    assert capsys.readouterr().out.count("steps old") == len(results)

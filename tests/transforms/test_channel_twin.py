@@ -1,0 +1,289 @@
+"""Messages between agents do what an obvious program does, which follows one link at a time."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any
+
+import pytest
+import torch
+from channel_twin import ServedWorld, World, check_against_twin, table, turn
+from delay_twin import Counting
+from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
+
+from damian.common import counter_rng
+from damian.delays.laws import Burst, Law, Trace, Uniform
+from damian.delays.samplers import ContextSampler, MessageContext
+from damian.transforms import Channel
+
+N, WORLDS, STEPS = 3, [3, 5, 8], 25
+CLOCKS = 2 * STEPS + 2
+ALL = set(permutations(range(N), 2))
+
+
+def counting(channel: Channel, **options: Any) -> TransformedEnv:
+    channel.set_seed(1)
+    return TransformedEnv(Counting(WORLDS, N, **options), Compose(channel))
+
+
+def everyone(*_: Any) -> set:
+    return ALL
+
+
+def twin_of(law: Any, loss: float = 0.0, **rules: Any) -> Callable[[int, Tensor], World]:
+    """Makes twins whose links all have one law."""
+
+    def make(b: int, streams: Tensor) -> World:
+        delays = table(law, streams, CLOCKS, loss)
+
+        def order(clock: int, sender: int) -> tuple:
+            return turn(streams[b * N * N + (N - 1) * N + sender], clock, sender)
+
+        def delay(clock: int, link: tuple, _: int) -> int | None:
+            return delays(clock, b * N * N + link[0] * N + link[1])
+
+        return World(N, delay, turn=order, **rules)
+
+    return make
+
+
+@pytest.mark.parametrize("law", [0, 2, Uniform(1, 4), Burst(0.3, 0.4, good=Uniform(0, 2), bad=5)])
+@pytest.mark.parametrize("known", [False, True])
+def test_messages_arrive_as_their_law_says(law, known):
+    env = counting(Channel(law, loss=0.2, known_at_reset=known))
+    check_against_twin(env, twin_of(law, 0.2, known=known), everyone)
+
+
+@pytest.mark.parametrize("limit", [1, 2])
+def test_a_limit_a_flag_and_requests_choose_who_sends(limit):
+    channel = Channel(
+        Uniform(0, 3),
+        limit=limit,
+        sent_key="message_sent",
+        request_key="ready",
+        loss=0.1,
+        known_at_reset=True,
+    )
+
+    def wants(outputs: Any, _: Any, b: int) -> set:
+        sent, asks = outputs["agents", "message_sent"][b], outputs["agents", "ready"][b]
+        return {(i, j) for i, j in ALL if sent[j] and asks[i]}
+
+    make = twin_of(Uniform(0, 3), 0.1, limit=limit, known=True)
+    check_against_twin(counting(channel), make, wants)
+
+
+def test_requests_of_links_may_come_from_the_policy_and_nothing_is_sent_at_a_reset():
+    env = counting(Channel(Uniform(0, 2), request_key="request"))
+
+    def policy(td: Any) -> Any:
+        return env.rand_action(td).set(("agents", "request"), torch.rand(len(WORLDS), N, N) < 0.4)
+
+    def wants(_: Any, inputs: Any, b: int) -> set:
+        asked = inputs["agents", "request"][b] if inputs is not None else torch.zeros(N, N)
+        return {(i, j) for i, j in ALL if asked[i, j]}
+
+    check_against_twin(env, twin_of(Uniform(0, 2)), wants, policy=policy)
+
+
+def test_a_matrix_says_who_hears_whom():
+    hears = [[False, True, False], [False, True, True], [True, False, False]]
+    env = counting(Channel(Uniform(0, 3), topology=hears))
+    links = {(i, j) for i, j in ALL if hears[i][j]}
+    check_against_twin(env, twin_of(Uniform(0, 3)), lambda *_: links)
+
+
+def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
+    file = tmp_path / "trace.csv"
+    file.write_text("\n".join(["delay", *"140203", "lost", "6"]))
+    burst, trace = Burst(0.3, 0.4, good=Uniform(0, 2), bad=5), Trace(str(file))
+    laws = [[None, 3, burst], [trace, None, 3], [Uniform(0, 4), burst, None]]
+    losses = [[0.0, 0.3, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    losses[2][1] = 0.5
+
+    def make(b: int, streams: Tensor) -> World:
+        tables = {link: table(laws[link[0]][link[1]], streams, CLOCKS) for link in ALL}
+
+        def delay(clock: int, link: tuple, _: int) -> int | None:
+            row = b * N * N + link[0] * N + link[1]
+            draw = counter_rng.uniform(streams[row], torch.tensor(clock), torch.tensor(3))
+            return None if draw < losses[link[0]][link[1]] else tables[link](clock, row)
+
+        return World(N, delay)
+
+    check_against_twin(counting(Channel(laws, loss=losses)), make, everyone)
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize(
+    ("up", "down", "limit"), [(0, 0, None), (Uniform(0, 3), Uniform(1, 2), None), (1, 2, 2)]
+)
+def test_a_server_broadcasts_what_it_holds(up, down, limit, known):
+    channel = Channel(
+        up,
+        loss=0.2,
+        topology="server",
+        down_delay=down,
+        down_loss=0.3,
+        limit=limit,
+        sent_key="message_sent",
+        known_at_reset=known,
+    )
+
+    def make(b: int, streams: Tensor) -> World:
+        ups = table(up, streams, CLOCKS, 0.2)
+        downs = table(down, counter_rng.bits(streams, torch.ones_like(streams)), CLOCKS, 0.3)
+        return ServedWorld(
+            N,
+            lambda clock, link, _: ups(clock, b * N + link[1]),
+            down=lambda clock, i: downs(clock, b * N + i),
+            limit=limit,
+            turn=lambda clock, j: turn(streams[b * N + j], clock, j),
+            known=known,
+        )
+
+    def wants(outputs: Any, _: Any, b: int) -> set:
+        return {(i, j) for i, j in ALL if outputs["agents", "message_sent"][b, j]}
+
+    check_against_twin(counting(channel), make, wants)
+
+
+@dataclass(frozen=True)
+class Crowd(Law):
+    """The delay depends on sender, receiver, the number of senders, and the time."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> ContextSampler:
+        return ContextSampler(self.delays, 9, loss)
+
+    def delays(self, context: MessageContext) -> Tensor:
+        early = (context.time < 2.5 * context.dt).long()
+        return context.sender + 2 * context.receiver.clamp(min=0) + context.n_sending - 1 - early
+
+
+@pytest.mark.parametrize("dt", [1.0, 0.5])
+def test_a_law_sees_the_context_of_a_link(dt):
+    env = counting(Channel(Crowd(), sent_key="message_sent", dt=dt))
+
+    def make(b: int, _: Tensor) -> World:
+        def delay(clock: int, link: tuple, n_sending: int) -> int | None:
+            early = clock - world.began < 2.5
+            steps = link[1] + 2 * link[0] + n_sending - 1 - early
+            return None if steps < 0 else min(steps, 9)
+
+        world = World(N, delay)
+        return world
+
+    def wants(outputs: Any, _: Any, b: int) -> set:
+        return {(i, j) for i, j in ALL if outputs["agents", "message_sent"][b, j]}
+
+    check_against_twin(env, make, wants)
+
+
+@dataclass(frozen=True)
+class Slow(Law):
+    """A step per 0.3 m between sender and receiver; messages over more than 1.5 m are lost."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> ContextSampler:
+        return ContextSampler(self.delays, 9, loss, reads=["position", "receiver_position"])
+
+    def delays(self, context: MessageContext) -> Tensor:
+        between = context.entries["position"] - context.entries["receiver_position"]
+        metres = torch.linalg.vector_norm(between, dim=-1)
+        return torch.where(metres > 1.5, -1, (metres / 0.3).floor())
+
+
+def place(outputs: Any, b: int, agent: int) -> list[float]:
+    return outputs["agents", "observation"][b, agent, :2].tolist()
+
+
+@pytest.fixture
+def navigation() -> Callable[..., TransformedEnv]:
+    """VMAS's navigation: the first two numbers of an observation are the agent's position."""
+    pytest.importorskip("vmas")
+    from torchrl.envs.libs.vmas import VmasEnv  # noqa: PLC0415
+
+    def make(channel: Channel) -> TransformedEnv:
+        env = VmasEnv("navigation", num_envs=len(WORLDS), n_agents=N, max_steps=9, seed=0)
+        channel.set_seed(1)
+        return TransformedEnv(env, Compose(channel))
+
+    return make
+
+
+def some_worlds(t: int) -> list[int]:
+    return [t % len(WORLDS)] if t % 4 == 1 else []
+
+
+def test_agents_hear_only_those_in_their_range(navigation):
+    env = navigation(Channel(Uniform(1, 5), comm_range=0.9, position_key="observation"))
+    heard = []
+
+    def wants(outputs: Any, _: Any, b: int) -> set:
+        links = {(i, j) for i, j in ALL if math.dist(place(outputs, b, i), place(outputs, b, j)) <= 0.9}
+        heard.append(len(links))
+        return links
+
+    check_against_twin(env, twin_of(Uniform(1, 5)), wants, forced=some_worlds)
+    assert 0 < sum(heard) < len(ALL) * len(heard)
+
+
+def test_a_law_may_read_the_positions_of_sender_and_receiver(navigation):
+    env = navigation(Channel(Slow(), position_key="observation"))
+    now = {}
+
+    def make(b: int, _: Tensor) -> World:
+        def delay(clock: int, link: tuple, n_sending: int) -> int | None:
+            metres = math.dist(*(place(now["outputs"], b, agent) for agent in link))
+            return None if metres > 1.5 else min(math.floor(metres / 0.3), 9)
+
+        return World(N, delay)
+
+    def wants(outputs: Any, _: Any, b: int) -> set:
+        now["outputs"] = outputs
+        return ALL
+
+    check_against_twin(env, make, wants, forced=some_worlds)
+
+
+@dataclass(frozen=True)
+class Base(Law):
+    """A step per 0.5 m between an agent and a server at the origin, and one for every other agent."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> ContextSampler:
+        return ContextSampler(self.delays, 9, loss, reads=["position"])
+
+    def delays(self, context: MessageContext) -> Tensor:
+        metres = torch.linalg.vector_norm(context.entries["position"], dim=-1)
+        agent = torch.maximum(context.sender, context.receiver)
+        return (metres / 0.5).floor() + agent + context.n_sending - 1
+
+
+def test_the_laws_of_a_server_read_the_position_of_the_agent_that_sends_or_receives(navigation):
+    env = navigation(Channel(Base(), topology="server", down_delay=Base(), position_key="observation"))
+    now = {}
+
+    def delay(b: int, agent: int, n_sending: int) -> int:
+        return min(math.floor(math.hypot(*place(now["outputs"], b, agent)) / 0.5) + agent + n_sending - 1, 9)
+
+    def make(b: int, _: Tensor) -> World:
+        down = lambda _, i: delay(b, i, 1)  # noqa: E731
+        return ServedWorld(N, lambda _, link, n_sending: delay(b, link[1], n_sending), down=down)
+
+    def wants(outputs: Any, _: Any, b: int) -> set:
+        now["outputs"] = outputs
+        return ALL
+
+    check_against_twin(env, make, wants, forced=some_worlds)
+
+
+def test_an_agent_sends_what_its_policy_chooses(navigation):
+    key = ("agents", "message")
+    env = navigation(Channel(Uniform(0, 3), action_key=key, message_size=2))
+
+    def wants(_: Any, inputs: Any, b: int) -> set:
+        return set() if inputs is None else ALL
+
+    make = twin_of(Uniform(0, 3), own_at_reset=False)
+    check_against_twin(env, make, wants, forced=some_worlds, sent=key)
