@@ -119,14 +119,30 @@ class LinkConfig:
             checks.whole("links.limit", self.limit, 1, unit="UAVs")
         checks.require(self.range is None or self.hears is None, "links.range", self.range, _EITHER)
 
+    def check(self, n_agents: int) -> None:
+        """Check what is given for each pair of UAVs.
+
+        Raises:
+            InputError: there is not one entry for each receiver and sender, or ``hears`` is not of bools.
+        """
+        for name in ("delay", "loss", "hears"):
+            matrix = getattr(self, name)
+            if not _is_list(matrix):
+                checks.require(name != "hears" or matrix is None, "links.hears", show(matrix), _NO_BOOLS)
+                continue
+            good = len(matrix) == n_agents and all(_is_list(row) and len(row) == n_agents for row in matrix)
+            should = f"is not {n_agents} lists (receivers) of {n_agents} entries (senders)"
+            checks.require(good, f"links.{name}", "it", should)
+            bools = name != "hears" or all(isinstance(hears, bool) for row in matrix for hears in row)
+            checks.require(bools, "links.hears", show(matrix), _NO_BOOLS)
+
     def laws(self) -> list[Law]:
         """All laws of the links.
 
         Raises:
             InputError: one is not valid.
         """
-        listed = isinstance(self.delay, Sequence) and not isinstance(self.delay, str)
-        laws = [law for row in self.delay for law in row] if listed else [self.delay]
+        laws = [law for row in self.delay for law in row] if _is_list(self.delay) else [self.delay]
         return [law_of(law, "links.delay") for law in laws]
 
     def reads(self, dt: float) -> set[str]:
@@ -135,4 +151,9 @@ class LinkConfig:
         return read | ({"position"} if self.range is not None else set())
 
 
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str)
+
+
+_NO_BOOLS = "is not a list of true and false for each receiver"
 _EITHER = "does not go with links.hears: leave out one of them"

@@ -138,7 +138,7 @@ def streams_for(sampler: Sampler, streams: Tensor, n_rows: int) -> Tensor:
 
     A sampler whose draws are ``shared`` draws the same numbers for all rows of a world.
     """
-    if not getattr(sampler, "shared", False):
+    if not sampler.shared:
         return streams
     return streams.view(-1, n_rows)[:, :1].expand(-1, n_rows).reshape(-1)
 

@@ -27,6 +27,7 @@ class ScenarioConfig(WorldConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.delay.check(self.clock.dt)
+        self.links.check(self.agents)
         self._check_ends()
         conflict = self.observation.own and self.clock.steps("server") > 1
         problem = "does not go with clock.server: between two broadcasts no observation changes"

@@ -12,12 +12,14 @@ from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.text_files import listed
 from damian.delays.link_sampler import same_size
+from damian.keys import STEPPED
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import (
     Change,
     Entries,
     Memory,
     as_rows,
+    read_keys,
     require_keys,
     row_shape,
     select_entries,
@@ -26,9 +28,6 @@ from damian.transforms.entries import (
 )
 from damian.transforms.order import KeyUsage
 from damian.transforms.topology import DirectLinks, Rules, Sending, make_topology
-
-_STEPPED = "_step"
-"""TorchRL's key of the worlds that take a step, [B] bool; all do if there is no such entry."""
 
 
 class Channel(StatefulTransform):
@@ -75,9 +74,11 @@ class Channel(StatefulTransform):
         known_at_reset: everyone knows everyone's first message, whatever the delay and the topology.
         dt: length of a step [s], for delays given as times.
         age_key: key for the age of the held messages, in steps, [*B, N, N] float; before one has arrived,
-            steps since the reset.
-        mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived.
-        seed: seed of all draws; if not given, it is drawn from torch's global generator at the first reset.
+            steps since the reset; None to leave it out.
+        mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived; None to leave it
+            out.
+        seed: seed of all draws until the environment is seeded; if there is none, it is drawn from torch's
+            global generator at the first reset.
 
     A bare name for one of the keys means an entry in the same TensorDict as ``in_keys[0]`` or ``action_key``.
     The flags ``sent_key`` and ``request_key`` are read from the outputs of a reset and of each step. If a
@@ -91,9 +92,6 @@ class Channel(StatefulTransform):
         >>> env = TransformedEnv(env, Channel(Uniform(1, 5), loss=0.1))
         >>> env.rollout(100)["agents", "received"]  # [32, 100, 3, 3, 18]
     """
-
-    draws = True
-    """The transform draws random numbers."""
 
     def __init__(
         self,
@@ -114,8 +112,8 @@ class Channel(StatefulTransform):
         message_size: int | None = None,
         known_at_reset: bool = False,
         dt: float = 1.0,
-        age_key: NestedKey = "received_age",
-        mask_key: NestedKey = "received_mask",
+        age_key: NestedKey | None = "received_age",
+        mask_key: NestedKey | None = "received_mask",
         seed: int | None = None,
     ) -> None:
         _check_action(action_key, message_size, in_keys, known_at_reset)
@@ -137,9 +135,14 @@ class Channel(StatefulTransform):
         should = "does not go with topology='server': requests go to agents"
         to_agents = isinstance(self.topology, DirectLinks)
         checks.require(request_key is None or to_agents, "request_key", request_key, should)
+        self.draws = self.topology.draws
         self.flag_keys = [key for key in (self.sent_key, self.request_key) if key is not None]
         self.action_keys = [*([self.action_key] if self.action_key else []), *self.flag_keys]
         self.step_keys = [*self.required_keys, *self.flag_keys]
+
+    @property
+    def memory_sizes(self) -> dict[str, int]:
+        return {"longest": self.topology.longest, "in_keys": len(self.in_keys)}
 
     @property
     def row_key(self) -> NestedKey:
@@ -155,7 +158,7 @@ class Channel(StatefulTransform):
 
     @property
     def _written(self) -> list[NestedKey]:
-        return [*self.out_keys, cast(NestedKey, self.age_key), cast(NestedKey, self.mask_key)]
+        return [*self.out_keys, *(key for key in (self.age_key, self.mask_key) if key is not None)]
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         agents = row_shape(tensordict, self.row_key)
@@ -211,8 +214,8 @@ class Channel(StatefulTransform):
             self.topology.write(memory, [as_rows(entries[key], self.agents) for key in self.in_keys])
         device = next(iter(memory.values())).device
         active = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
-        if _STEPPED in entries:
-            active = self.expand_worlds(entries[_STEPPED].reshape(-1))
+        if STEPPED in entries:
+            active = self.expand_worlds(entries[STEPPED].reshape(-1))
         sending = Sending(active, self._wanted(memory, entries, active), self._position(entries))
         memory = memory | self.topology.step(memory, sending)
         return memory, self._outputs(memory)
@@ -250,7 +253,8 @@ class Channel(StatefulTransform):
 
     def _outputs(self, memory: Memory) -> Entries:
         received, shape = self.topology.received(memory), (*self.agents, self.agents[-1])
-        values = [*received.contents, received.age.to(torch.float32), received.arrived]
+        flags = {self.age_key: received.age.to(torch.float32), self.mask_key: received.arrived}
+        values = [*received.contents, *(value for key, value in flags.items() if key is not None)]
         return {
             key: value.view(*shape, *value.shape[2:])
             for key, value in zip(self._written, values, strict=True)
@@ -287,7 +291,8 @@ class Channel(StatefulTransform):
         sent = [observation_spec[key] for key in self.in_keys]
         kinds = [(spec.shape[len(agents) :], spec.dtype) for spec in sent]
         kinds += [((self.message_size,), torch.float32)] if self.message_size else []
-        kinds += [((), torch.float32), ((), torch.bool)]
+        kinds += [((), torch.float32)] if self.age_key else []
+        kinds += [((), torch.bool)] if self.mask_key else []
         for key, (size, dtype) in zip(self._written, kinds, strict=True):
             shape = torch.Size((*agents, agents[-1], *size))
             numbers = Unbounded(shape, dtype=dtype, device=device)
@@ -312,21 +317,15 @@ def _keys_of(
     in_keys: Any, out_keys: Any, action_key: Any
 ) -> tuple[list[NestedKey], list[NestedKey], NestedKey]:
     """Keys of the entries that are sent and received, and the key beside which a bare name is meant."""
-    sent = _listed(("agents", "observation") if in_keys is None else in_keys) if action_key is None else []
+    sent = read_keys(("agents", "observation") if in_keys is None else in_keys) if action_key is None else []
     checks.require(bool(sent or action_key), "in_keys", in_keys, "name nothing to send")
     beside = sent[0] if sent else unravel_key(action_key)
     checks.require(isinstance(beside, tuple), "action_key" if not sent else "in_keys", beside, _NO_GROUP)
     names = [f"received_{key[-1]}" for key in sent] if len(sent) > 1 else ["received"]
-    written = [sibling_key(beside, key) for key in (names if out_keys is None else _listed(out_keys))]
+    written = [sibling_key(beside, key) for key in (names if out_keys is None else read_keys(out_keys))]
     should = f"are not {len(names)} keys, as many as what is sent"
     checks.require(len(written) == len(names), "out_keys", written, should)
     return sent, cast(list[NestedKey], written), beside
 
 
 _NO_GROUP = "is not in a group of agents, as ('agents', 'observation') is"
-
-
-def _listed(written: Any) -> list[NestedKey]:
-    """Keys: a name or a tuple of names is one key, a list has several."""
-    one = isinstance(written, str | tuple)
-    return [unravel_key(key) for key in ([written] if one else written)]

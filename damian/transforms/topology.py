@@ -66,6 +66,8 @@ class Topology(nn.Module, ABC):
     def __init__(self, sampler: Sampler, rules: Rules) -> None:
         super().__init__()
         self.sampler, self.rules, self.line = sampler, rules, BroadcastLine(sampler)
+        self.draws = sampler.certain is None or rules.limit is not None
+        self.longest = sampler.longest
 
     @abstractmethod
     def rows(self, agents: torch.Size) -> torch.Size:
@@ -247,6 +249,8 @@ class ServerLinks(Topology):
     def __init__(self, sampler: Sampler, down_sampler: Sampler, rules: Rules) -> None:
         super().__init__(sampler, rules)
         self.down_sampler, self.down_line = down_sampler, BroadcastLine(down_sampler)
+        self.draws = self.draws or down_sampler.certain is None
+        self.longest += down_sampler.longest
 
     def rows(self, agents: torch.Size) -> torch.Size:
         return agents

@@ -16,6 +16,7 @@ from damian.delays.laws import Burst, Uniform
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
+    Channel,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
@@ -24,6 +25,8 @@ from damian.transforms import (
 )
 
 LATE = Uniform(1, 3)
+GROUPS = {name: kind for name, kind in KINDS.items() if isinstance(kind.observation, tuple)}
+"""Kinds whose observations are those of a group of agents, for ``Channel``."""
 
 
 def observation_delay(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
@@ -58,11 +61,26 @@ IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
         else SampleAndHold(1, kind.observation)
     ),
 }
-DRAWING = ("ObservationDelay", "ActionDelay", "RewardDelay")
 
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+def channel(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
+    """A channel between the agents of a group; it works only where there is one."""
+    return Channel(law, kind.observation, loss=0.1, **options)
+
+
+def cases(transforms: dict[str, Callable[..., StatefulTransform]]) -> pytest.MarkDecorator:
+    """Every kind of environment with every one of the transforms, and with a channel where that works."""
+    pairs = {
+        f"{name}, {kind}": (KINDS[kind], make) for kind in KINDS for name, make in transforms.items()
+    } | {f"Channel, {name}": (kind, channel) for name, kind in GROUPS.items()}
+    return pytest.mark.parametrize(("kind", "make"), pairs.values(), ids=pairs)
+
+
+every_case = cases(TRANSFORMS)
 every_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=TRANSFORMS)
-drawing = pytest.mark.parametrize("make", [TRANSFORMS[name] for name in DRAWING], ids=DRAWING)
+drawing = cases({name: TRANSFORMS[name] for name in ("ObservationDelay", "ActionDelay", "RewardDelay")})
 
 
 def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> list[TensorDictBase]:
@@ -80,8 +98,7 @@ def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> 
 # Specs.
 
 
-@every_kind
-@every_transform
+@every_case
 def test_the_outputs_match_the_specs_and_every_spec_can_do_without_the_batch(kind, make):
     env = TransformedEnv(kind.make(), make(kind, LATE))
     if kind.stateless:
@@ -109,6 +126,19 @@ def test_the_outputs_match_the_specs_if_floats_have_64_bits(make):
 # Identity.
 
 
+@pytest.mark.parametrize("kind", GROUPS.values(), ids=GROUPS)
+def test_a_channel_without_delay_shows_current_messages_and_changes_nothing_else(kind):
+    undelayed = played(kind.make(), kind)
+    delayed = played(TransformedEnv(kind.make(), Channel(0, kind.observation)), kind)
+    group = kind.observation[0]
+    for td, other in zip(delayed, undelayed, strict=True):
+        assert same(td.select(*other.keys(True, True)), other)
+        sent = other[kind.observation]
+        assert td[group, "received"].equal(sent.unsqueeze(-3).expand_as(td[group, "received"]))
+        assert not td[group, "received_age"].any()
+        assert td[group, "received_mask"].all()
+
+
 @every_kind
 @pytest.mark.parametrize("identity", IDENTITIES.values(), ids=IDENTITIES)
 def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(kind, identity):
@@ -123,7 +153,6 @@ def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(k
 # Seeds.
 
 
-@every_kind
 @drawing
 def test_the_seed_of_a_plain_environment_reaches_its_transforms(kind, make):
     env = TransformedEnv(kind.make(), make(kind, Uniform(0, 20)))
@@ -216,8 +245,7 @@ def test_workers_have_streams_of_their_own_that_follow_from_one_seed(vector):
 # Memory.
 
 
-@every_kind
-@every_transform
+@every_case
 def test_what_is_written_shares_no_memory_with_the_buffers(kind, make):
     env = TransformedEnv(kind.make(), make(kind, LATE))
     env.set_seed(0)

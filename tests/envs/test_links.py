@@ -1,0 +1,173 @@
+"""How observations reach the UAVs: from the server at once or later, or over links of their own."""
+
+import pytest
+import torch
+from delayed_envs import choices
+from helpers import KEEPS_GOING, all_same, both_motions, everything, play, square
+from torchrl.envs.utils import check_env_specs
+
+from damian import keys
+from damian.delays.config import DelayConfig, LinkConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.pipeline import make_env
+from damian.server.features import ObservationConfig
+from damian.transforms import Channel, ObservationDelay
+
+LATE = {"law": "uniform", "low": 1, "high": 4}
+EXTRAS = ["message", "reward_terms"]
+
+
+def linked(motion: str = "instant", **links):
+    """An environment whose messages to the server are delayed too, and the outputs of its steps."""
+    delay = DelayConfig(obs=LATE, loss=0.1)
+    env = make_env(everything(motion, delay=delay, links=LinkConfig(**links)), 4, seed=2, extras=EXTRAS)
+    return env, play(env, choices(env, 20))
+
+
+LINKS = {
+    "updown": {"kind": "updown", "delay": LATE, "loss": 0.1},
+    "matrix": {"kind": "matrix", "delay": LATE, "loss": 0.1, "limit": 2},
+    "range": {"kind": "matrix", "delay": {"law": "distance", "speed": 40.0}, "range": 120.0},
+    "a law for each pair": {"kind": "matrix", "delay": [[0, 1, 2], [3, 0, LATE], [1, 1, 0]], "loss": 0.0},
+    "whom each hears": {
+        "kind": "matrix",
+        "hears": [[True, True, False], [False, True, True], [True, False, True]],
+    },
+}
+every_link = pytest.mark.parametrize("links", LINKS.values(), ids=LINKS)
+
+
+@every_link
+@both_motions
+@pytest.mark.parametrize("extras", [(), EXTRAS])
+def test_the_specs_are_right(links, motion, extras):
+    scenario = everything(motion, delay=DelayConfig(obs=1, history=2), links=LinkConfig(**links))
+    env = make_env(scenario, 2, extras=extras)
+    check_env_specs(env, break_when_any_done="both")
+    assert keys.LINKED not in env.reset().keys(True, True)
+    assert ("message" in extras) == (keys.MESSAGE in env.reset().keys(True, True))
+
+
+@both_motions
+@pytest.mark.parametrize("kind", ["updown", "matrix"])
+def test_links_without_delay_show_what_the_server_shows_if_nothing_is_delayed(motion, kind):
+    outputs = []
+    for name in ("server", kind):
+        env = make_env(everything(motion, links=LinkConfig(name)), 4, seed=2, extras=EXTRAS)
+        outputs.append(play(env, choices(env, 20)))
+    assert all_same(*outputs)
+
+
+@every_link
+def test_rewards_ends_and_the_critic_are_those_of_the_server(links):
+    _, expected = linked(kind="server")
+    _, found = linked(**links)
+    names = [keys.REWARD, keys.DONE, keys.GLOBAL_OBSERVATION, keys.RECEIVED]
+    assert all_same(*([td.select(*names, strict=False) for td in outputs] for outputs in (expected, found)))
+    pairs = zip(expected, found, strict=True)
+    assert any(not a[keys.OBSERVATION].equal(b[keys.OBSERVATION]) for a, b in pairs)
+
+
+@both_motions
+def test_updown_shows_the_observation_that_the_server_computed_some_steps_ago(motion):
+    _, at_once = linked(motion, kind="server")
+    env, late = linked(motion, kind="updown", delay=2)
+    assert isinstance(env.transform[-1], ObservationDelay)
+    ends = torch.stack([td[keys.DONE] for td in at_once[1::2]]).squeeze(-1)
+    compared = 0
+    for world in range(4):
+        since = 0  # steps since the reset
+        for t in range(20):
+            since += 1
+            if since > 2:
+                sent = at_once[2 * t - 3][world]  # two steps before
+                assert late[2 * t + 1][keys.OBSERVATION][world].equal(sent[keys.OBSERVATION])
+                compared += 1
+            since = 0 if ends[t, world] else since
+    assert compared > 10
+
+
+@both_motions
+def test_on_board_each_uav_computes_what_the_server_would_from_the_messages_that_have_reached_it(motion):
+    delay = DelayConfig(obs=LATE)
+    links = LinkConfig("matrix", delay=LATE, loss=0.2)
+    env = make_env(everything(motion, delay=delay, links=links), 4, seed=2, extras=EXTRAS)
+    onboard = env.transform[-1]
+    onboard.dropped_keys = []
+    n_old, steps = 0, torch.zeros(4, dtype=torch.long)
+    td = env.reset()
+    for action in choices(env, 20):
+        after, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+        steps = steps + 1
+        output = after["next"]
+        held = output[keys.LINKED]
+        for receiver in range(held.shape[1]):
+            known = env.server.messages(held[:, receiver])
+            alone = env.server(known, steps).observation[:, receiver]
+            assert output[keys.OBSERVATION][:, receiver].equal(alone)
+            assert held[:, receiver, receiver].equal(output[keys.MESSAGE][:, receiver])
+        n_old += (held != output[keys.MESSAGE].unsqueeze(1)).any(-1).sum().item()
+        steps = steps * ~output[keys.DONE].view(-1)
+    assert n_old > 50
+
+
+def test_out_of_range_a_uav_knows_only_the_first_message():
+    links = LinkConfig("matrix", range=1e-3)
+    env = make_env(square(episode=KEEPS_GOING, links=links), 2, extras=EXTRAS)
+    onboard = env.transform[-1]
+    onboard.dropped_keys = []
+    td = env.reset()
+    first = td[keys.MESSAGE].clone()
+    for action in choices(env, 5):
+        td = env.step(td.set(keys.ACTION, action))["next"]
+        others = ~torch.eye(3, dtype=torch.bool)
+        apart = others & (td[keys.LINKED] == first.unsqueeze(1)).all(-1)
+        assert apart.equal(others.expand(2, 3, 3))
+
+
+@every_link
+def test_a_compiled_step_does_the_same(links):
+    scenario = everything(delay=DelayConfig(obs=LATE), links=LinkConfig(**links))
+    eager, graph = (make_env(scenario, 2, seed=1) for _ in range(2))
+    graph.compile(backend="eager")
+    assert all_same(*(play(env, choices(env, 8)) for env in (eager, graph)))
+
+
+@pytest.mark.parametrize("links", [LINKS["updown"], LINKS["matrix"]])
+def test_merged_steps_show_the_same_at_decisions(links):
+    scenario = everything(
+        "polynomial", delay=DelayConfig(obs=1), links=LinkConfig(**links), clock=ClockConfig(skip=True)
+    )
+    env = make_env(scenario, 3, seed=1)
+    td = env.rollout(8, break_when_any_done=False)
+    assert (td["next", keys.DURATION] > 1).any()
+    assert td["next", *keys.OBSERVATION].isfinite().all()
+
+
+def test_the_channel_sends_only_what_uavs_send():
+    env, _ = linked("polynomial", kind="matrix", delay=1)
+    (channel,) = (transform for transform in env.transform if isinstance(transform, Channel))
+    assert channel.sent_key == keys.MESSAGE_SENT
+
+
+WRONG = {
+    "links.kind": {"kind": "mesh"},
+    "links.delay": {"delay": 3},
+    "links.range": {"kind": "updown", "range": 5.0},
+    "links.limit": {"kind": "matrix", "limit": 0},
+    "links.loss": {"kind": "updown", "loss": 1.5},
+    "links.hears": {"kind": "matrix", "hears": [[True, True], [True, True]]},
+    "links.loss: it": {"kind": "matrix", "loss": [[0.1, 0.2], [0.1, 0.1], [0.0, 0.0]]},
+    "links.delay: it": {"kind": "matrix", "delay": [[0, 1], [1]]},
+}
+
+
+@pytest.mark.parametrize(("key", "links"), WRONG.items(), ids=WRONG)
+def test_wrong_links_are_refused_in_one_line(key, links):
+    with pytest.raises(ValueError, match=key):
+        make_env(square(links=LinkConfig(**links)))
+
+
+def test_own_messages_do_not_go_with_a_broadcast():
+    with pytest.raises(ValueError, match=r"observation.own: True does not go with links=updown"):
+        square(observation=ObservationConfig(own=True), links=LinkConfig("updown"))
