@@ -182,7 +182,7 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
 
 def test_uavs_fly_where_their_footprints_hold_most_fresh_ground_by_the_shortest_flight():
     scenario = everything(reward=COVER, episode=EpisodeConfig(max_steps=9))
-    env = make_env(scenario, 8, extras=["message"])
+    env = make_env(scenario, 16, extras=["message"])
     policy, radius = Greedy(env.uav_env), env.uav_env.simulation.radius
     td = env.rollout(4, random_policy(env))["next"][:, -1]
     held, legal = sent_messages(td), td["agents", "action_mask"]

@@ -149,7 +149,7 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
         (["delay.los=0.1"], "delay.los: no such key; did you mean delay.loss?"),
         (["+delay.foo=3"], "delay.foo: no such key"),
         (["delay.obs=soon"], "delay.obs: soon is neither whole steps"),
-        (["delay=sometimes"], "delay: sometimes is not one of burst, none, paper"),
+        (["delay=sometimes"], "delay: sometimes is not one of burst, distance, lag, none, paper"),
         (["resume=runs/last"], "resume: the random policy is not trained, so there is no run to resume"),
         (["region.id=Nope"], "Nope"),
     ],

@@ -135,7 +135,7 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
     ("overrides", "message"),
     [
         ([listed("framess=3")], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
-        ([listed("delay=papers")], "delay: papers is not one of burst, none, paper"),
+        ([listed("delay=papers")], "delay: papers is not one of burst, distance, lag, none, paper"),
         ([listed("agents=two")], "agents: Value 'two'"),
         ([listed("delay.loss=0.1", "source.position=[1,2,3]")], "source.position: [1, 2, 3] is not"),
         (["overrides=[seed=3]"], "a value with = in it needs quotes"),

@@ -56,7 +56,7 @@ from damian.recipes.shared.settings import TrainConfig
             ["delay=paper", "delay.obs.enter=0.1"],
             "to write another law, choose delay=none first",
         ),
-        (["delay=papers"], "delay: papers is not one of burst, none, paper"),
+        (["delay=papers"], "delay: papers is not one of burst, distance, lag, none, paper"),
         (["delay=paper", "delay.obs.high=1s"], "delay.obs.low: 3s and high=1s are not two"),
         (["delay.obs={law: poisson}"], "delay.obs.law: poisson is not one of constant, uniform"),
         (["delay.obs={law: trace, path: nowhere.csv}"], "nowhere.csv: no such file"),
