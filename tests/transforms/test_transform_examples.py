@@ -39,6 +39,16 @@ def test_agents_of_pettingzoo_have_ages_of_their_own():
     assert not age[:, 0].equal(age[:, 1])
 
 
+def test_agents_of_vmas_hear_what_others_chose_to_say():
+    pytest.importorskip("vmas")
+    example = run("late_words")
+    agents, heard, age = example["agents"], example["heard"], example["age"]
+    assert heard.shape == (32, 50, 3, 3, 4)
+    assert heard[:, 1:, 0, 0].equal(agents["words"][:, :-1, 0])  # one's own message arrives at once
+    assert 1 < age[..., 0, 1:].mean() < 5
+    assert not agents["received_mask"][:, :, 0, 1].all()
+
+
 def test_a_replay_buffer_contains_late_steps():
     example = run("late_replay_buffer")
     stored = example["buffer"][:]
