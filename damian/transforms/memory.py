@@ -85,7 +85,7 @@ class MemoryTransform(Transform):
         if saved != self.memory_sizes:
             raise RuntimeError(
                 f"{type(self).__name__} has {_written(self.memory_sizes)}, but the loaded state is of one "
-                f"with {_written(saved)}: load it into a transform with the settings with which it was saved"
+                f"with {_written(saved) or 'none'}: load it into a transform with the settings that it had"
             )
         self._rows = torch.Size(numbers[n_sizes:])
 

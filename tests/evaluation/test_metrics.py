@@ -127,7 +127,7 @@ def test_an_evaluation_equals_counting_step_by_step(motion, delay):
 
 @both_motions
 def test_false_late_and_missed_successes_differ_from_true_ones(motion):
-    flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.2)), 64)
+    flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.2)), 256)
     expected, rows = by_hand(flight, server, needed=2)
     false = [row for row in rows if row["success"] and not row["true_success"]]
     late = [row for row in rows if row["success"] and row["true_steps"] < row["steps"]]
@@ -137,7 +137,7 @@ def test_false_late_and_missed_successes_differ_from_true_ones(motion):
     assert missed
     assert all(row["steps"] < row["true_steps"] == HORIZON for row in false)
     row = evaluation(flight, server)
-    assert row.true_success_rate - row.success_rate == pytest.approx((len(missed) - len(false)) / 64)
+    assert row.true_success_rate - row.success_rate == pytest.approx((len(missed) - len(false)) / 256)
     assert asdict(row) == pytest.approx(expected, rel=1e-5)
 
 
