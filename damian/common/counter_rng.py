@@ -26,22 +26,34 @@ def bits64(key: Tensor, *counters: Tensor) -> Tensor:
         counters: whole numbers, int64, that tell the draws of a stream apart; their order matters.
     """
     for counter in counters:
-        x = (counter * _WEYL) ^ key
-        x = (x ^ ((x >> 30) & 0x3FFFFFFFF)) * _FIRST  # int64 wraps; a shift fills up with the sign
-        x = x + key
-        x = (x ^ ((x >> 27) & 0x1FFFFFFFFF)) * _SECOND
-        key = x ^ ((x >> 31) & 0x1FFFFFFFF)
+        product = _product(key, counter)
+        key = product ^ ((product >> 31) & 0x1FFFFFFFF)  # a shift fills up with the sign
     return key
 
 
 def bits(key: Tensor, *counters: Tensor) -> Tensor:
     """Draw uniform integers in [0, 2^32); the arguments are those of ``bits64``."""
-    return (bits64(key, *counters) >> 32) & _MASK
+    return _high(key, counters) & _MASK
 
 
 def uniform(key: Tensor, *counters: Tensor) -> Tensor:
     """Draw uniform floats in [0, 1), multiples of 2^-24; the arguments are those of ``bits64``."""
-    return ((bits64(key, *counters) >> 40) & 0xFFFFFF).to(torch.float32) * 2.0**-24
+    return ((_high(key, counters) >> 8) & 0xFFFFFF).to(torch.float32) * 2.0**-24
+
+
+def _high(key: Tensor, counters: tuple[Tensor, ...]) -> Tensor:
+    """The upper 32 of 64 random bits, which need no last mixing, with the sign above them."""
+    if counters:
+        key = _product(bits64(key, *counters[:-1]), counters[-1])
+    return key >> 32
+
+
+def _product(key: Tensor, counter: Tensor) -> Tensor:
+    """The hash of a counter before the last mixing of the lower bits; int64 wraps."""
+    x = (counter * _WEYL) ^ key
+    x = (x ^ ((x >> 30) & 0x3FFFFFFFF)) * _FIRST
+    x = x + key
+    return (x ^ ((x >> 27) & 0x1FFFFFFFFF)) * _SECOND
 
 
 def world_seeds(seed: int, n_worlds: int, device: torch.device | None = None) -> Tensor:

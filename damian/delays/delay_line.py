@@ -54,6 +54,7 @@ class DelayLine:
     def __init__(self, sampler: Sampler, order: str, gradients: bool = False) -> None:
         self.sampler, self._gradients = sampler, gradients
         self._hold_last_generated = order == "generation"
+        self._may_lose = bool((sampler.chances[:, -1] > 1e-10).any())  # draws have 32 bits
 
     def init_memory(self, values: list[Tensor], streams: Tensor) -> Memory:
         """Create the memory for messages like ``values`` [M, ...] and senders with random ``streams`` [M]."""
@@ -111,7 +112,9 @@ class DelayLine:
         delay, channel = self.sampler(memory["streams"], clock, memory["channel"], context)
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
-        arrival = torch.where(delay < n_slots, advance_slot(slot_now, delay, n_slots), n_slots)
+        arrival = advance_slot(slot_now, delay, n_slots)
+        if sent is not None or self._may_lose:
+            arrival = torch.where(delay < n_slots, arrival, n_slots)
         row_sent, row_now = (slot * n_senders + memory["senders"] for slot in (arrival, slot_now))
         stamps = memory["stamps"].view(-1)
         stamp = stamps.index_copy_(0, row_sent, clock).index_select(0, row_now)

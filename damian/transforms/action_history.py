@@ -78,7 +78,7 @@ class ActionHistory(ActionTransform):
 
     @property
     def memory_sizes(self) -> dict[str, int]:
-        return {"steps": self.steps}
+        return {"steps": self.steps, "with_age": int(self.age_key is not None)}
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -91,9 +91,10 @@ class ActionHistory(ActionTransform):
         if self.codes is not None:
             scale = {"codes": self.codes.to(initial.device, torch.float32)}
         first = self._encode(scale, initial).repeat(1, self.steps)
-        # "since": steps since each recorded action was chosen
-        since = torch.zeros(len(first), self.steps, dtype=torch.long, device=first.device)
-        return scale | {"first": first, "recent": first, "since": since}
+        memory = scale | {"first": first, "recent": first}
+        if self.age_key:  # steps since each recorded action was chosen
+            memory["since"] = torch.zeros(len(first), self.steps, dtype=torch.long, device=first.device)
+        return memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         first = memory["first"]
@@ -103,13 +104,16 @@ class ActionHistory(ActionTransform):
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         recent = memory["recent"]
         latest = self._encode(memory, as_rows(entries[self.action_key], self.rows))
-        longer = torch.cat([recent[:, latest.shape[-1] :], latest], -1)
-        old, new = memory["since"], torch.ones_like(memory["since"][:, :1])
-        since = torch.cat([old[:, 1:] + 1, new], -1)
+        changed = {"recent": torch.cat([recent[:, latest.shape[-1] :], latest], -1)}
+        unchanged = {"recent": recent}
+        if self.age_key:
+            older = memory["since"] + 1
+            changed["since"] = torch.cat([older[:, 1:], torch.ones_like(older[:, :1])], -1)
+            unchanged["since"] = older
         if self.recorded_key in entries:
             recorded = entries[self.recorded_key].reshape(-1, 1)
-            longer, since = torch.where(recorded, longer, recent), torch.where(recorded, since, old + 1)
-        return memory | {"recent": longer, "since": since}, {}
+            changed = {name: torch.where(recorded, new, unchanged[name]) for name, new in changed.items()}
+        return memory | changed, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         recent, key = memory["recent"], self.out_keys[0]

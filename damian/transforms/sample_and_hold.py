@@ -99,38 +99,37 @@ class SampleAndHold(StatefulTransform):
             f"acted_{i}": expand_to_rows(specs[key].zero(), spec_rows(specs, key), self.rows)
             for i, key in enumerate(self.in_keys_inv)
         }
-        memory = {"elapsed": elapsed, **held, **acted}
+        memory = {"elapsed": elapsed, **held, **acted}  # "elapsed": steps since the latest tick
         if not self.stagger:
             return memory
         streams = self.streams(tensordict.batch_size, device)
-        return memory | {"streams": streams, "episode": elapsed.clone(), "phase": elapsed.clone()}
+        names = ("episode", "phase", "interval")  # "interval": steps from the latest tick to the next one
+        return memory | {"streams": streams} | {name: elapsed.clone() for name in names}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
         if self.stagger:
             episode = memory["episode"] + mask
             phase = counter_rng.bits(memory["streams"], episode) % self.period
-            memory = memory | {"episode": episode, "phase": torch.where(mask, phase, memory["phase"])}
+            new = {"phase": phase, "interval": self.period - phase}
+            memory = memory | {name: torch.where(mask, value, memory[name]) for name, value in new.items()}
+            memory["episode"] = episode
         return self._hold(memory, entries, self.in_keys, "held", mask)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
-        return self._hold(memory, entries, self.in_keys_inv, "acted", self._ticks(memory))
+        return self._hold(memory, entries, self.in_keys_inv, "acted", memory["elapsed"] == 0)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        memory = memory | {"elapsed": memory["elapsed"] + 1}
-        ticks = self._ticks(memory)
+        elapsed = memory["elapsed"] + 1
+        ticks = elapsed >= memory.get("interval", self.period)
+        memory = memory | {"elapsed": elapsed.masked_fill(ticks, 0)}
+        if self.stagger:
+            memory["interval"] = memory["interval"].masked_fill(ticks, self.period)
         memory, held = self._hold(memory, entries, self.in_keys, "held", ticks)
         if self.ready_key:
             ready = entries[self.ready_key]
             held[self.ready_key] = ready & ticks.view_as(ready)
         return memory, held
-
-    def _ticks(self, memory: Memory) -> Tensor:
-        """Is this step a tick, [M]."""
-        elapsed = memory["elapsed"]
-        if self.stagger:
-            return (elapsed == 0) | ((elapsed + memory["phase"]) % self.period == 0)
-        return elapsed % self.period == 0
 
     def _hold(
         self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, sampled: Tensor
