@@ -54,7 +54,8 @@ class DelayLine:
     def __init__(self, sampler: Sampler, order: str, gradients: bool = False) -> None:
         self.sampler, self._gradients = sampler, gradients
         self._hold_last_generated = order == "generation"
-        self._may_lose = bool((sampler.chances[:, -1] > 1e-10).any())  # draws have 32 bits
+        certainly_arrives = bool((sampler.chances[:, -1] < 1e-10).all())  # draws have 32 bits
+        self._may_lose = not (certainly_arrives and type(sampler).forward is Sampler.forward)
 
     def init_memory(self, values: list[Tensor], streams: Tensor) -> Memory:
         """Create the memory for messages like ``values`` [M, ...] and senders with random ``streams`` [M]."""
