@@ -20,6 +20,7 @@ from torch import Tensor
 from torchrl.envs import StepCounter
 
 from damian import keys
+from damian.common import checks
 from damian.common.errors import InputError
 from damian.envs.pipeline import has_message_delay
 from damian.evaluation.metrics import evaluate
@@ -41,6 +42,8 @@ def foresee(config: TrainConfig, folder: Path) -> None:
     """Evaluate the policy with ever more messages known on time, and fill the run folder."""
     if not has_message_delay(config):
         raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
+    should = "is not supported: the rows replace what the server broadcasts; choose links=server"
+    checks.require(config.links.kind == "server", "links", config.links.kind, should)
     env, actor = stored(config)
     save_config(config, folder)
     env.append_transform(StepCounter())

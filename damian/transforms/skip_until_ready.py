@@ -25,8 +25,7 @@ class SkipUntilReady(StatefulTransform):
     The transform works only in a ``DelayedEnv`` on a ``UavEnv``, where worlds with a ready agent can pause,
     with all of their messages in transit, while the others step on. Its place among damian's own transforms
     does not matter, but these must come before all others. Transforms of TorchRL that come later process only
-    the merged steps: ``StepCounter`` counts decisions. Delays of messages and actions whose law sees their
-    context need a ``sent_key``, so that paused worlds send nothing.
+    the merged steps: ``StepCounter`` counts decisions.
 
     Args:
         gamma: discount per merged step, in [0, 1]; with 1, returns are those of the single steps.

@@ -122,6 +122,11 @@ class TrainConfig(ScenarioConfig):
         hindsight = "hindsight" in self.learner.reads and not self.backupdates
         should = "reads hindsight, which needs aware=backupdate and a message delay (delay.obs)"
         checks.require(not hindsight, "learner", self.learner.name, should)
+        onboard = self.recompute_actor and self.links.kind != "server"
+        should = (
+            f"does not go with links={self.links.kind}: an actor sees what the links bring, not the server"
+        )
+        checks.require(not onboard, "recompute_actor", True, should)
         for key in ("settle", "recompute_actor"):
             alone = getattr(self, key) and not self.backupdate
             checks.require(not alone, key, True, "means nothing without backupdate=true")

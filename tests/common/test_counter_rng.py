@@ -4,6 +4,7 @@ import itertools
 
 import pytest
 import torch
+from streams import check_independent, overlaps
 from torch.func import vmap
 
 from damian.common import counter_rng
@@ -90,18 +91,23 @@ def test_a_changed_bit_of_key_or_counter_changes_half_of_the_bits():
             assert 0.48 < changed < 0.52
 
 
-def overlaps(draws):
-    """Number of draws of a stream that are also draws of another one."""
-    _, counts = draws.flatten().unique(return_counts=True)
-    return int((counts > 1).sum())
-
-
 def test_no_stream_is_a_section_of_another():
     """Streams that are sections of one sequence share runs of numbers; streams of their own share none."""
     keys = counter_rng.world_seeds(0, 4096)
     assert overlaps(counter_rng.bits64(keys.unsqueeze(-1), torch.arange(500))) == 0
     shifted = torch.arange(4096) * 100  # what the check would find otherwise
     assert overlaps(counter_rng.bits64(torch.tensor(0), shifted.unsqueeze(-1) + torch.arange(500))) > 1000
+
+
+def test_the_check_of_streams_fails_for_shared_and_for_shifted_streams(monkeypatch):
+    keys = counter_rng.world_seeds(0, 6)
+    check_independent(keys)
+    with pytest.raises(AssertionError):
+        check_independent(keys[[0, 1, 2, 0]])
+    draw = counter_rng.bits64
+    monkeypatch.setattr(counter_rng, "bits64", lambda key, clock: draw(keys[:1], clock + 500 * key))
+    with pytest.raises(AssertionError):
+        check_independent(torch.arange(4))
 
 
 def test_neighbouring_seeds_give_different_keys_to_all_worlds():

@@ -107,9 +107,18 @@ def test_the_table_has_a_row_for_each_set_of_messages_known_on_time(foresee, cap
     assert "what a UAV knows on time" in capsys.readouterr().out
 
 
-def test_a_scenario_without_late_messages_is_refused(foresee, capsys, tmp_path):
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("delay=none", "delay.obs: no message is late or lost"),
+        ("links=matrix", "links: matrix is not supported"),
+    ],
+)
+def test_a_scenario_whose_observations_do_not_wait_for_the_server_is_refused(
+    word, message, foresee, capsys, tmp_path
+):
     with pytest.raises(SystemExit) as stopped:
-        foresee("delay=none")
+        foresee(word)
     assert stopped.value.code == 2
-    assert "delay.obs: no message is late or lost" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "oracle").exists()

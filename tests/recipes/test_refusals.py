@@ -84,6 +84,12 @@ from damian.recipes.shared.settings import TrainConfig
         (["clock.longest=8s"], "clock.longest: 8s means nothing without clock.trigger"),
         (["clock.trigger=2s", "clock.shortest=64s"], "clock.system: 32 steps is out of clock.shortest"),
         (["recompute_actor=true"], "recompute_actor: True means nothing without backupdate=true"),
+        (
+            ["links=updown", "delay=paper", "backupdate=true", "recompute_actor=true"],
+            "recompute_actor: True does not go with links=updown",
+        ),
+        (["links=matrix", "links.hears=[[true]]"], "links.hears: it is not 3 lists"),
+        (["links.delay=3"], "links.delay: 3 means nothing with links=server"),
         (["settle=true", "backupdate=true", "delay.obs=32"], "settle: True needs more than 32 steps"),
         (["checkpoint=nowhere"], "checkpoint: nowhere"),
         (["device=abacus"], "device: abacus"),

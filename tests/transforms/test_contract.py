@@ -8,6 +8,7 @@ import torch
 from contract import Drift
 from environments import KINDS, Kind, vmas
 from helpers import all_same, same
+from streams import check_independent
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
@@ -79,6 +80,13 @@ def cases(transforms: dict[str, Callable[..., StatefulTransform]]) -> pytest.Mar
 
 
 every_case = cases(TRANSFORMS)
+FAST = {
+    "ObservationDelay, PettingZoo, state",
+    "RewardDelay, flags in the group, root entries",
+    "ActionDelay, batch chosen at reset",
+    "Channel, VMAS",
+}
+"""Cases that are compiled in every run of the tests; the others take a second each, and are slow tests."""
 every_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=TRANSFORMS)
 drawing = cases({name: TRANSFORMS[name] for name in ("ObservationDelay", "ActionDelay", "RewardDelay")})
 
@@ -194,6 +202,7 @@ def test_all_streams_of_an_environment_differ(wrap):
         env.reset()
         streams = torch.cat([transform.memory["streams"] for transform in transforms])
         assert len(streams.unique()) == len(streams) == 4 * 4 + 2 * 2
+        check_independent(streams)
 
 
 def test_another_transform_does_not_change_the_draws():
@@ -239,6 +248,7 @@ def test_workers_have_streams_of_their_own_that_follow_from_one_seed(vector):
         env.close()
     assert len(set(unseeded)) == len(unseeded) == 6
     assert len({*seeded[0], *seeded[1]}) == 12
+    check_independent(torch.tensor([*unseeded, *seeded[0], *seeded[1]]))
     assert seeded[0] == seeded[2]
 
 
@@ -310,6 +320,34 @@ def test_after_inference_mode_come_normal_steps(make, first):
             td = each.step_and_maybe_reset(each.rand_action(td.clone()))[1]
             outputs[-1].append(td.clone())
     assert all_same(*outputs)
+
+
+# Graphs.
+
+
+@pytest.mark.parametrize(
+    ("kind", "make"),
+    [
+        pytest.param(*pair, id=name, marks=() if name in FAST else pytest.mark.slow)
+        for name, pair in zip(every_case.kwargs["ids"], every_case.args[1], strict=True)
+    ],
+)
+def test_a_step_compiles_into_one_graph_that_does_the_same(kind, make):
+    env, twin = (TransformedEnv(kind.make(), make(kind, LATE)) for _ in range(2))
+    for each in (env, twin):
+        each.set_seed(0)
+        td = each.reset(kind.begin(each))
+    torch._dynamo.reset()
+
+    def step(transform, td, after):
+        return transform._step(transform.inv(td), after)
+
+    compiled = torch.compile(step, fullgraph=True, backend="eager")
+    for _ in range(3):
+        td = env.rand_action(td)
+        after = env.base_env.step(td.clone())["next"]
+        outputs = step(env.transform, td, after.clone()), compiled(twin.transform, td, after.clone())
+        assert same(*outputs)
 
 
 # Worlds that skip a step.

@@ -286,7 +286,7 @@ CONSTANT = {"chances", "_boundaries", "_delays", "codes", "_law_index", "_loss"}
 # Graphs.
 
 
-@in_agents
+@every_case
 def test_a_step_compiles_into_one_graph_that_does_the_same(case):
     env, twin = case.build(), case.build()
     td, _ = begun(env), begun(twin)
