@@ -190,7 +190,10 @@ class RewardDelay(RewardTransform):
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
             ended = expand_mask(any_flag(done, self.rows), received)
-            received = torch.where(ended, received + in_transit.sum(0, dtype=received.dtype), received)
+            # In double precision, so that the order of the sum, which depends on the batch, does not matter.
+            precise = torch.float64 if received.is_floating_point() else received.dtype
+            rest = in_transit.sum(0, dtype=precise).to(received.dtype)
+            received = torch.where(ended, received + rest, received)
             in_transit = in_transit.masked_fill(ended, 0)
         memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "past": in_transit}
         return memory, {self.reward_key: from_rows(received, self.rows)}
