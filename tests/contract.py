@@ -132,13 +132,6 @@ CASES = {
 }
 """Every transform on every kind of environment that it works on; the name before the comma is its class."""
 
-DRAWS = [
-    CASES[name]
-    for name in CASES
-    if name.split(",")[0] in ("ActionDelay", "Channel", "ObservationDelay", "RewardDelay")
-]
-"""Cases whose transform draws random numbers."""
-
 
 def onward(env: EnvBase, td: TensorDictBase, n_steps: int = 6, seed: int = 0) -> list[TensorDictBase]:
     """Step with random actions and partial resets; the outputs of every step and every reset."""

@@ -151,6 +151,7 @@ def test_in_a_scenario_each_message_is_as_late_as_the_twin_says():
     assert {-1, 1, 2} <= seen
 
 
+@pytest.mark.slow
 def test_a_compiled_environment_delays_the_same():
     scenario = square(delay=DelayConfig(obs=LAW, loss=0.1))
     eager, compiled = (make_env(scenario, 4, seed=5, extras=["message"]) for _ in range(2))

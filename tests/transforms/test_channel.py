@@ -133,6 +133,7 @@ def test_a_chosen_message_is_an_action_that_the_environment_never_gets():
 # Properties.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["limit", "laws", "server", "message"])
 def test_a_step_with_uavs_compiles_into_one_graph_that_does_the_same(name):
     options = CHANNELS[name] | (

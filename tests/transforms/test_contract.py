@@ -6,12 +6,21 @@ from typing import Any
 import pytest
 import torch
 from contract import Drift
-from environments import KINDS, Kind, vmas
+from environments import KINDS, Kind
+from every_transform import (
+    FAST,
+    GROUPS,
+    LATE,
+    TRANSFORMS,
+    every_case,
+    every_kind,
+    every_transform,
+    observation_delay,
+    played,
+)
 from helpers import all_same, same
-from streams import check_independent
-from tensordict import TensorDictBase
-from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from damian.delays.laws import Burst, Uniform
 from damian.transforms import (
@@ -25,30 +34,6 @@ from damian.transforms import (
     StatefulTransform,
 )
 
-LATE = Uniform(1, 3)
-GROUPS = {name: kind for name, kind in KINDS.items() if isinstance(kind.observation, tuple)}
-"""Kinds whose observations are those of a group of agents, for ``Channel``."""
-
-
-def observation_delay(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
-    """An observation delay; where the environment reads its state from the observation, under another key."""
-    out_keys = ["seen"] if kind.stateless else None
-    flags = {"fresh_key": "fresh", "delay_key": "delay"}
-    return ObservationDelay(law, kind.observation, out_keys, **flags, **options)
-
-
-TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
-    "ObservationDelay": observation_delay,
-    "ActionDelay": lambda kind, law, **options: ActionDelay(law, kind.action, **options),
-    "RewardDelay": lambda kind, law, **options: RewardDelay(law, kind.reward, **options),
-    "CumulativeReward": lambda kind, law, **options: CumulativeReward(3, 0.5, kind.reward, **options),
-    "ActionHistory": lambda kind, law, **options: ActionHistory(3, kind.action, **options),
-    "SampleAndHold": lambda kind, law, **options: (
-        SampleAndHold(2, (), kind.action, **options)
-        if kind.stateless
-        else SampleAndHold(2, kind.observation, **options)
-    ),
-}
 IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
     "ObservationDelay": lambda kind: observation_delay(kind, 0),
     "ObservationDelay, bursts": lambda kind: observation_delay(kind, Burst(good=0, bad=0, bad_loss=0.0)),
@@ -62,46 +47,6 @@ IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
         else SampleAndHold(1, kind.observation)
     ),
 }
-
-every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
-
-
-def channel(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
-    """A channel between the agents of a group; it works only where there is one."""
-    return Channel(law, kind.observation, loss=0.1, **options)
-
-
-def cases(transforms: dict[str, Callable[..., StatefulTransform]]) -> pytest.MarkDecorator:
-    """Every kind of environment with every one of the transforms, and with a channel where that works."""
-    pairs = {
-        f"{name}, {kind}": (KINDS[kind], make) for kind in KINDS for name, make in transforms.items()
-    } | {f"Channel, {name}": (kind, channel) for name, kind in GROUPS.items()}
-    return pytest.mark.parametrize(("kind", "make"), pairs.values(), ids=pairs)
-
-
-every_case = cases(TRANSFORMS)
-FAST = {
-    "ObservationDelay, PettingZoo, state",
-    "RewardDelay, flags in the group, root entries",
-    "ActionDelay, batch chosen at reset",
-    "Channel, VMAS",
-}
-"""Cases that are compiled in every run of the tests; the others take a second each, and are slow tests."""
-every_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=TRANSFORMS)
-drawing = cases({name: TRANSFORMS[name] for name in ("ObservationDelay", "ActionDelay", "RewardDelay")})
-
-
-def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> list[TensorDictBase]:
-    """Outputs of every step and every reset, with actions drawn from torch's generator."""
-    if seed is not None:
-        torch.manual_seed(seed)
-        env.set_seed(seed)
-    td, outputs = env.reset(kind.begin(env)), []
-    for _ in range(n_steps):
-        after, td = env.step_and_maybe_reset(env.rand_action(td))
-        outputs += [after["next"].clone(), td.clone()]
-    return outputs
-
 
 # Specs.
 
@@ -156,100 +101,6 @@ def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(k
     delayed = played(env, kind)
     pairs = zip(delayed, undelayed, strict=True)
     assert all_same([td.select(*other.keys(True, True)) for td, other in pairs], undelayed)
-
-
-# Seeds.
-
-
-@drawing
-def test_the_seed_of_a_plain_environment_reaches_its_transforms(kind, make):
-    env = TransformedEnv(kind.make(), make(kind, Uniform(0, 20)))
-    outputs, streams = [], []
-    for number, seed in enumerate((3, 4, 3)):
-        torch.manual_seed(number)  # the state of torch's generator does not matter
-        env.set_seed(seed)
-        begin = kind.begin(env)
-        outputs.append([env.reset(begin)])
-        streams.append(env.transform.memory["streams"].clone())
-        torch.manual_seed(0)
-        for _ in range(3):
-            after, td = env.step_and_maybe_reset(env.rand_action(outputs[-1][-1].clone()))
-            outputs[-1] += [after["next"], td]
-    assert streams[0].equal(streams[2])
-    assert not set(streams[0].tolist()) & set(streams[1].tolist())
-    if not kind.stateless and kind.make is not vmas:  # VMAS itself goes on with its earlier random state
-        assert all_same(outputs[0], outputs[2])
-
-
-@pytest.mark.parametrize("wrap", [False, True], ids=["one environment", "nested environments"])
-def test_all_streams_of_an_environment_differ(wrap):
-    def chain() -> list[StatefulTransform]:
-        return [
-            ActionDelay(LATE, ("agents", "action"), seed=0),
-            ObservationDelay(LATE, ("agents", "observation"), seed=0),
-            ObservationDelay(LATE, "state", seed=0),
-            RewardDelay(LATE, ("agents", "reward"), seed=0),
-            RewardDelay(LATE, "team_reward", seed=0),
-            ObservationDelay(LATE, ("agents", "observation"), seed=0),
-        ]
-
-    for seeded in (False, True):
-        env, transforms = KINDS["flags in the group"].make(), chain()
-        for transform in transforms if wrap else [Compose(*transforms)]:
-            env = TransformedEnv(env, transform, auto_unwrap=False)
-        if seeded:
-            env.set_seed(7919)
-        env.reset()
-        streams = torch.cat([transform.memory["streams"] for transform in transforms])
-        assert len(streams.unique()) == len(streams) == 4 * 4 + 2 * 2
-        check_independent(streams)
-
-
-def test_another_transform_does_not_change_the_draws():
-    alone = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(LATE))
-    beside = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ActionDelay(1), ObservationDelay(LATE)))
-    for env in (alone, beside):
-        env.set_seed(5)
-        env.reset()
-    assert alone.transform.memory["streams"].equal(beside.transform[1].memory["streams"])
-
-
-def pendulum() -> TransformedEnv:
-    return TransformedEnv(GymEnv("Pendulum-v1"), Compose(ObservationDelay(LATE), RewardDelay(LATE)))
-
-
-def worker_streams(env: EnvBase) -> list[int]:
-    """The streams of all transforms of all workers, read from the state of a reset environment."""
-    found: list[int] = []
-
-    def walk(state: Any) -> None:
-        for key, value in state.items():
-            if isinstance(value, dict):
-                walk(value)
-            elif key.endswith("streams"):
-                found.extend(value.flatten().tolist())
-
-    env.reset()
-    walk(env.state_dict())
-    return found
-
-
-@pytest.mark.parametrize("vector", [SerialEnv, ParallelEnv])
-def test_workers_have_streams_of_their_own_that_follow_from_one_seed(vector):
-    options = {"mp_start_method": "fork"} if vector is ParallelEnv else {}
-    env = vector(3, pendulum, **options)
-    try:
-        unseeded = worker_streams(env)
-        seeded = []
-        for seed in (0, 1, 0):
-            env.set_seed(seed)
-            seeded.append(worker_streams(env))
-    finally:
-        env.close()
-    assert len(set(unseeded)) == len(unseeded) == 6
-    assert len({*seeded[0], *seeded[1]}) == 12
-    check_independent(torch.tensor([*unseeded, *seeded[0], *seeded[1]]))
-    assert seeded[0] == seeded[2]
 
 
 # Memory.
@@ -350,37 +201,6 @@ def test_a_step_compiles_into_one_graph_that_does_the_same(kind, make):
         assert same(*outputs)
 
 
-# Worlds that skip a step.
-
-
-def two_worlds() -> EnvBase:
-    """Two CartPoles, of which some may skip a step."""
-    return SerialEnv(2, lambda: GymEnv("CartPole-v1", categorical_action_encoding=True))
-
-
-@every_transform
-def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(make):
-    kind, law = KINDS["CartPole"], Burst(0.4, 0.4, good=Uniform(0, 2), bad=3, bad_loss=0.0)
-    skipping, steady = (TransformedEnv(two_worlds(), make(kind, law)) for _ in range(2))
-    for env in (skipping, steady):
-        env.set_seed(1)
-        env.transform.seed_worlds(torch.tensor([5, 6]))
-    td, other = skipping.reset(), steady.reset()
-    actions = torch.randint(2, (8, 2), generator=torch.Generator().manual_seed(0))
-    for t in range(8):
-        after = steady.step(other.clone().set("action", actions[t]))["next"]
-        for world in (0, 1):  # first the one, then the other; and now and then none
-            mask = torch.tensor([world == 0, world == 1])
-            # What the other world would have chosen must have no effect.
-            chosen = torch.where(mask, actions[t], 1 - actions[t])
-            stepped = skipping.step(td.clone().set("action", chosen).set("_step", mask))["next"]
-            assert same(stepped[world], after[world])
-            td[world] = stepped[world].select(*td.keys(True, True), strict=False)
-            rest = skipping.step(td.clone().set("action", actions[t]).set("_step", torch.zeros(2).bool()))
-            assert rest["next", "observation"].equal(td["observation"])
-        other = other.clone().update(after.select(*other.keys(True, True), strict=False))
-
-
 # Gradients.
 
 
@@ -429,83 +249,6 @@ def test_gradients_reach_back_to_when_the_held_entry_was_made():
 def test_by_default_there_are_no_gradients():
     for name in ("ObservationDelay", "SampleAndHold"):
         assert not any(found.any() for found in action_gradients(TRANSFORMS[name](KINDS["Pendulum"], 1)))
-
-
-# Flags at any level.
-
-
-def test_a_root_reward_is_paid_whole_though_only_its_agents_are_done():
-    kind = KINDS["flags in the group"]
-    env = TransformedEnv(kind.make(), RewardDelay(3, "team_reward"))
-    paid = torch.stack([td["team_reward"] for td in played(env, kind, 30)[::2]])
-    assert paid[:, 0, 0].tolist() == [0.0, 0.0, 3.0] * 10
-    assert paid[:, 1, 0].tolist() == [0.0, 0.0, 0.0, 1.0, 4.0] * 6
-
-
-def test_a_reset_of_the_agents_of_one_world_resets_the_root_entries_of_that_world_only():
-    kind = KINDS["flags in the group, root entries"]
-    env = TransformedEnv(kind.make(), ObservationDelay(2, "state"))
-    td = env.reset()
-    for _ in range(2):
-        td = env.step(env.rand_action(td))["next"].exclude("team_reward")
-    assert td["age"].flatten().tolist() == [2.0, 2.0]
-    mask = torch.tensor([True, False]).view(2, 1, 1).expand(2, 2, 1)
-    env.reset(td.clone().set(("agents", "_reset"), mask))
-    assert env.transform.memory["reset_at"].tolist() == [2, 0]
-    td = env.step(env.rand_action(td))["next"]
-    assert td["age"].flatten().tolist() == [1.0, 2.0]
-    assert td["state"].flatten().tolist() == [0.0, 1.0]
-
-
-def test_where_flags_have_several_levels_the_outermost_reset_decides():
-    kind = KINDS["PettingZoo"]
-    env = TransformedEnv(kind.make(), ObservationDelay(2, kind.observation))
-    td = env.reset()
-    for _ in range(2):
-        td = env.step(env.rand_action(td))["next"]
-    flags = {"_reset": torch.tensor([True]), ("agent", "_reset"): torch.tensor([[True], [False]])}
-    for key, flag in flags.items():
-        td.set(key, flag)
-    env.reset(td)
-    assert env.transform.memory["reset_at"].tolist() == [2, 2]
-
-
-# A batch chosen at reset.
-
-
-@every_transform
-def test_a_batch_chosen_at_reset_does_what_its_worlds_do_alone(make):
-    kind = KINDS["batch chosen at reset"]
-    env, alone = (TransformedEnv(kind.make(), make(kind, LATE)) for _ in range(2))
-    torch.manual_seed(0)
-    first, actions = env.base_env.gen_params(batch_size=[3]), torch.rand(6, 3, 1) * 4 - 2
-    seeds, outputs = torch.tensor([4, 5, 6]), []
-    first.update(env.base_env.reset(first.clone()).select("th", "thdot"))
-    env.transform.seed_worlds(seeds)
-    begun = env.reset(first.clone())
-    td = begun.clone()
-    for action in actions:
-        td = step_mdp(env.step(td.clone().set("action", action)), exclude_reward=False)
-        outputs.append(td)
-    for world in range(3):
-        alone.transform.seed_worlds(seeds[world : world + 1])
-        td = alone.reset(first[world : world + 1].clone())
-        td.update(begun[world : world + 1].select("th", "thdot"))
-        for action, expected in zip(actions, outputs, strict=True):
-            chosen = td.clone().set("action", action[world : world + 1])
-            td = step_mdp(alone.step(chosen), exclude_reward=False)
-            assert same(td, expected[world : world + 1])
-
-
-@every_transform
-def test_another_batch_size_at_a_reset_begins_anew(make):
-    kind = KINDS["batch chosen at reset"]
-    env = TransformedEnv(kind.make(), make(kind, LATE))
-    for n_worlds in (3, 5, 2):
-        td = env.reset(env.gen_params(batch_size=[n_worlds]))
-        td = env.step(env.rand_action(td))["next"]
-        assert td.shape == (n_worlds,)
-        assert env.transform.rows.numel() == n_worlds
 
 
 # Keys.

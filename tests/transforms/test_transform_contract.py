@@ -88,7 +88,15 @@ def test_a_transform_works_inside_a_vector_of_environments(case):
     assert env.rollout(12, break_when_any_done=False).shape == (2, *case.env().batch_size, 12)
 
 
-@in_agents
+def some(cases, fast):
+    """The cases as a parameter; all but the ``fast`` ones are slow tests, because they take seconds."""
+    values = [
+        pytest.param(case, id=n, marks=() if n in fast else pytest.mark.slow) for n, case in cases.items()
+    ]
+    return pytest.mark.parametrize("case", values)
+
+
+@some(AGENTS, fast=["ActionDelay, agents", "ServerNode"])
 def test_a_transform_works_in_worker_processes(case):
     env = ParallelEnv(2, case.build, mp_start_method="fork")
     try:
@@ -115,7 +123,7 @@ def test_worker_processes_draw_different_numbers_and_the_same_again_from_the_sam
     assert all(a.equal(b) for a, b in zip(found, again, strict=True))
 
 
-@pytest.mark.parametrize("case", [case for case in AGENTS.values() if case.env is uavs])
+@some({name: case for name, case in AGENTS.items() if case.env is uavs}, fast=["ActionDelay, agents"])
 def test_a_transform_does_the_same_around_a_parallel_and_a_serial_environment(case):
     outputs = []
     for vector in (SerialEnv(2, case.env), ParallelEnv(2, case.env, mp_start_method="fork")):
@@ -285,7 +293,7 @@ CONSTANT = {"chances", "_boundaries", "_delays", "codes", "_law_index", "_loss"}
 # Graphs.
 
 
-@every_case
+@some(CASES, fast=AGENTS)
 def test_a_step_compiles_into_one_graph_that_does_the_same(case):
     env, twin = case.build(), case.build()
     td, _ = begun(env), begun(twin)

@@ -1,0 +1,85 @@
+"""Every transform on every kind of environment, for the contract that all of them keep."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from environments import KINDS, Kind
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from damian.delays.laws import Uniform
+from damian.transforms import (
+    ActionDelay,
+    ActionHistory,
+    Channel,
+    CumulativeReward,
+    ObservationDelay,
+    RewardDelay,
+    SampleAndHold,
+    StatefulTransform,
+)
+
+LATE = Uniform(1, 3)
+GROUPS = {name: kind for name, kind in KINDS.items() if isinstance(kind.observation, tuple)}
+"""Kinds whose observations are those of a group of agents, for ``Channel``."""
+
+
+def observation_delay(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
+    """An observation delay; where the environment reads its state from the observation, under another key."""
+    out_keys = ["seen"] if kind.stateless else None
+    flags = {"fresh_key": "fresh", "delay_key": "delay"}
+    return ObservationDelay(law, kind.observation, out_keys, **flags, **options)
+
+
+TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
+    "ObservationDelay": observation_delay,
+    "ActionDelay": lambda kind, law, **options: ActionDelay(law, kind.action, **options),
+    "RewardDelay": lambda kind, law, **options: RewardDelay(law, kind.reward, **options),
+    "CumulativeReward": lambda kind, law, **options: CumulativeReward(3, 0.5, kind.reward, **options),
+    "ActionHistory": lambda kind, law, **options: ActionHistory(3, kind.action, **options),
+    "SampleAndHold": lambda kind, law, **options: (
+        SampleAndHold(2, (), kind.action, **options)
+        if kind.stateless
+        else SampleAndHold(2, kind.observation, **options)
+    ),
+}
+every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+def channel(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
+    """A channel between the agents of a group; it works only where there is one."""
+    return Channel(law, kind.observation, loss=0.1, **options)
+
+
+def cases(transforms: dict[str, Callable[..., StatefulTransform]]) -> pytest.MarkDecorator:
+    """Every kind of environment with every one of the transforms, and with a channel where that works."""
+    pairs = {
+        f"{name}, {kind}": (KINDS[kind], make) for kind in KINDS for name, make in transforms.items()
+    } | {f"Channel, {name}": (kind, channel) for name, kind in GROUPS.items()}
+    return pytest.mark.parametrize(("kind", "make"), pairs.values(), ids=pairs)
+
+
+every_case = cases(TRANSFORMS)
+FAST = {
+    "ObservationDelay, PettingZoo, state",
+    "RewardDelay, flags in the group, root entries",
+    "ActionDelay, batch chosen at reset",
+    "Channel, VMAS",
+}
+"""Cases that are compiled in every run of the tests; the others take a second each, and are slow tests."""
+every_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=TRANSFORMS)
+drawing = cases({name: TRANSFORMS[name] for name in ("ObservationDelay", "ActionDelay", "RewardDelay")})
+
+
+def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> list[TensorDictBase]:
+    """Outputs of every step and every reset, with actions drawn from torch's generator."""
+    if seed is not None:
+        torch.manual_seed(seed)
+        env.set_seed(seed)
+    td, outputs = env.reset(kind.begin(env)), []
+    for _ in range(n_steps):
+        after, td = env.step_and_maybe_reset(env.rand_action(td))
+        outputs += [after["next"].clone(), td.clone()]
+    return outputs

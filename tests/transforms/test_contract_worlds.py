@@ -1,0 +1,226 @@
+"""Seeds, worlds that skip steps, flags at any level, and batches chosen at reset."""
+
+from typing import Any
+
+import pytest
+import torch
+from environments import KINDS, vmas
+from every_transform import (
+    LATE,
+    drawing,
+    every_transform,
+    played,
+)
+from helpers import all_same, same
+from streams import check_independent
+from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+from damian.delays.laws import Burst, Uniform
+from damian.transforms import (
+    ActionDelay,
+    ObservationDelay,
+    RewardDelay,
+    StatefulTransform,
+)
+
+# Seeds.
+
+
+@drawing
+def test_the_seed_of_a_plain_environment_reaches_its_transforms(kind, make):
+    env = TransformedEnv(kind.make(), make(kind, Uniform(0, 20)))
+    outputs, streams = [], []
+    for number, seed in enumerate((3, 4, 3)):
+        torch.manual_seed(number)  # the state of torch's generator does not matter
+        env.set_seed(seed)
+        begin = kind.begin(env)
+        outputs.append([env.reset(begin)])
+        streams.append(env.transform.memory["streams"].clone())
+        torch.manual_seed(0)
+        for _ in range(3):
+            after, td = env.step_and_maybe_reset(env.rand_action(outputs[-1][-1].clone()))
+            outputs[-1] += [after["next"], td]
+    assert streams[0].equal(streams[2])
+    assert not set(streams[0].tolist()) & set(streams[1].tolist())
+    if not kind.stateless and kind.make is not vmas:  # VMAS itself goes on with its earlier random state
+        assert all_same(outputs[0], outputs[2])
+
+
+@pytest.mark.parametrize("wrap", [False, True], ids=["one environment", "nested environments"])
+def test_all_streams_of_an_environment_differ(wrap):
+    def chain() -> list[StatefulTransform]:
+        return [
+            ActionDelay(LATE, ("agents", "action"), seed=0),
+            ObservationDelay(LATE, ("agents", "observation"), seed=0),
+            ObservationDelay(LATE, "state", seed=0),
+            RewardDelay(LATE, ("agents", "reward"), seed=0),
+            RewardDelay(LATE, "team_reward", seed=0),
+            ObservationDelay(LATE, ("agents", "observation"), seed=0),
+        ]
+
+    for seeded in (False, True):
+        env, transforms = KINDS["flags in the group"].make(), chain()
+        for transform in transforms if wrap else [Compose(*transforms)]:
+            env = TransformedEnv(env, transform, auto_unwrap=False)
+        if seeded:
+            env.set_seed(7919)
+        env.reset()
+        streams = torch.cat([transform.memory["streams"] for transform in transforms])
+        assert len(streams.unique()) == len(streams) == 4 * 4 + 2 * 2
+        check_independent(streams)
+
+
+def test_another_transform_does_not_change_the_draws():
+    alone = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(LATE))
+    beside = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ActionDelay(1), ObservationDelay(LATE)))
+    for env in (alone, beside):
+        env.set_seed(5)
+        env.reset()
+    assert alone.transform.memory["streams"].equal(beside.transform[1].memory["streams"])
+
+
+def pendulum() -> TransformedEnv:
+    return TransformedEnv(GymEnv("Pendulum-v1"), Compose(ObservationDelay(LATE), RewardDelay(LATE)))
+
+
+def worker_streams(env: EnvBase) -> list[int]:
+    """The streams of all transforms of all workers, read from the state of a reset environment."""
+    found: list[int] = []
+
+    def walk(state: Any) -> None:
+        for key, value in state.items():
+            if isinstance(value, dict):
+                walk(value)
+            elif key.endswith("streams"):
+                found.extend(value.flatten().tolist())
+
+    env.reset()
+    walk(env.state_dict())
+    return found
+
+
+@pytest.mark.parametrize("vector", [SerialEnv, ParallelEnv])
+def test_workers_have_streams_of_their_own_that_follow_from_one_seed(vector):
+    options = {"mp_start_method": "fork"} if vector is ParallelEnv else {}
+    env = vector(3, pendulum, **options)
+    try:
+        unseeded = worker_streams(env)
+        seeded = []
+        for seed in (0, 1, 0):
+            env.set_seed(seed)
+            seeded.append(worker_streams(env))
+    finally:
+        env.close()
+    assert len(set(unseeded)) == len(unseeded) == 6
+    assert len({*seeded[0], *seeded[1]}) == 12
+    check_independent(torch.tensor([*unseeded, *seeded[0], *seeded[1]]))
+    assert seeded[0] == seeded[2]
+
+
+# Worlds that skip a step.
+
+
+def two_worlds() -> EnvBase:
+    """Two CartPoles, of which some may skip a step."""
+    return SerialEnv(2, lambda: GymEnv("CartPole-v1", categorical_action_encoding=True))
+
+
+@every_transform
+def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(make):
+    kind, law = KINDS["CartPole"], Burst(0.4, 0.4, good=Uniform(0, 2), bad=3, bad_loss=0.0)
+    skipping, steady = (TransformedEnv(two_worlds(), make(kind, law)) for _ in range(2))
+    for env in (skipping, steady):
+        env.set_seed(1)
+        env.transform.seed_worlds(torch.tensor([5, 6]))
+    td, other = skipping.reset(), steady.reset()
+    actions = torch.randint(2, (8, 2), generator=torch.Generator().manual_seed(0))
+    for t in range(8):
+        after = steady.step(other.clone().set("action", actions[t]))["next"]
+        for world in (0, 1):  # first the one, then the other; and now and then none
+            mask = torch.tensor([world == 0, world == 1])
+            # What the other world would have chosen must have no effect.
+            chosen = torch.where(mask, actions[t], 1 - actions[t])
+            stepped = skipping.step(td.clone().set("action", chosen).set("_step", mask))["next"]
+            assert same(stepped[world], after[world])
+            td[world] = stepped[world].select(*td.keys(True, True), strict=False)
+            rest = skipping.step(td.clone().set("action", actions[t]).set("_step", torch.zeros(2).bool()))
+            assert rest["next", "observation"].equal(td["observation"])
+        other = other.clone().update(after.select(*other.keys(True, True), strict=False))
+
+
+# Flags at any level.
+
+
+def test_a_root_reward_is_paid_whole_though_only_its_agents_are_done():
+    kind = KINDS["flags in the group"]
+    env = TransformedEnv(kind.make(), RewardDelay(3, "team_reward"))
+    paid = torch.stack([td["team_reward"] for td in played(env, kind, 30)[::2]])
+    assert paid[:, 0, 0].tolist() == [0.0, 0.0, 3.0] * 10
+    assert paid[:, 1, 0].tolist() == [0.0, 0.0, 0.0, 1.0, 4.0] * 6
+
+
+def test_a_reset_of_the_agents_of_one_world_resets_the_root_entries_of_that_world_only():
+    kind = KINDS["flags in the group, root entries"]
+    env = TransformedEnv(kind.make(), ObservationDelay(2, "state"))
+    td = env.reset()
+    for _ in range(2):
+        td = env.step(env.rand_action(td))["next"].exclude("team_reward")
+    assert td["age"].flatten().tolist() == [2.0, 2.0]
+    mask = torch.tensor([True, False]).view(2, 1, 1).expand(2, 2, 1)
+    env.reset(td.clone().set(("agents", "_reset"), mask))
+    assert env.transform.memory["reset_at"].tolist() == [2, 0]
+    td = env.step(env.rand_action(td))["next"]
+    assert td["age"].flatten().tolist() == [1.0, 2.0]
+    assert td["state"].flatten().tolist() == [0.0, 1.0]
+
+
+def test_where_flags_have_several_levels_the_outermost_reset_decides():
+    kind = KINDS["PettingZoo"]
+    env = TransformedEnv(kind.make(), ObservationDelay(2, kind.observation))
+    td = env.reset()
+    for _ in range(2):
+        td = env.step(env.rand_action(td))["next"]
+    flags = {"_reset": torch.tensor([True]), ("agent", "_reset"): torch.tensor([[True], [False]])}
+    for key, flag in flags.items():
+        td.set(key, flag)
+    env.reset(td)
+    assert env.transform.memory["reset_at"].tolist() == [2, 2]
+
+
+# A batch chosen at reset.
+
+
+@every_transform
+def test_a_batch_chosen_at_reset_does_what_its_worlds_do_alone(make):
+    kind = KINDS["batch chosen at reset"]
+    env, alone = (TransformedEnv(kind.make(), make(kind, LATE)) for _ in range(2))
+    torch.manual_seed(0)
+    first, actions = env.base_env.gen_params(batch_size=[3]), torch.rand(6, 3, 1) * 4 - 2
+    seeds, outputs = torch.tensor([4, 5, 6]), []
+    first.update(env.base_env.reset(first.clone()).select("th", "thdot"))
+    env.transform.seed_worlds(seeds)
+    begun = env.reset(first.clone())
+    td = begun.clone()
+    for action in actions:
+        td = step_mdp(env.step(td.clone().set("action", action)), exclude_reward=False)
+        outputs.append(td)
+    for world in range(3):
+        alone.transform.seed_worlds(seeds[world : world + 1])
+        td = alone.reset(first[world : world + 1].clone())
+        td.update(begun[world : world + 1].select("th", "thdot"))
+        for action, expected in zip(actions, outputs, strict=True):
+            chosen = td.clone().set("action", action[world : world + 1])
+            td = step_mdp(alone.step(chosen), exclude_reward=False)
+            assert same(td, expected[world : world + 1])
+
+
+@every_transform
+def test_another_batch_size_at_a_reset_begins_anew(make):
+    kind = KINDS["batch chosen at reset"]
+    env = TransformedEnv(kind.make(), make(kind, LATE))
+    for n_worlds in (3, 5, 2):
+        td = env.reset(env.gen_params(batch_size=[n_worlds]))
+        td = env.step(env.rand_action(td))["next"]
+        assert td.shape == (n_worlds,)
+        assert env.transform.rows.numel() == n_worlds
