@@ -1,5 +1,6 @@
 """Seeds, worlds that skip steps, flags at any level, and batches chosen at reset."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from environments import KINDS, vmas
 from every_transform import (
     LATE,
+    TRANSFORMS,
     drawing,
     every_transform,
     played,
@@ -16,7 +18,8 @@ from streams import check_independent
 from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from damian.delays.laws import Burst, Uniform
+from damian.delays.laws import Burst, Law, Uniform
+from damian.delays.samplers import ContextSampler, Sampler
 from damian.transforms import (
     ActionDelay,
     ObservationDelay,
@@ -126,7 +129,22 @@ def two_worlds() -> EnvBase:
     return SerialEnv(2, lambda: GymEnv("CartPole-v1", categorical_action_encoding=True))
 
 
-@every_transform
+@dataclass(frozen=True)
+class ByContent(Law):
+    """Delays that follow from the message, so that what a skipped step would send arrives at another time."""
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        return ContextSampler(lambda c: (c.entries["seen"][:, 1] * 100).abs().floor() % 4, 3, reads=["seen"])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        *TRANSFORMS.values(),
+        lambda kind, _: ObservationDelay(ByContent(), context_keys={"seen": "observation"}),
+    ],
+    ids=[*TRANSFORMS, "ObservationDelay by content"],
+)
 def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(make):
     kind, law = KINDS["CartPole"], Burst(0.4, 0.4, good=Uniform(0, 2), bad=3, bad_loss=0.0)
     skipping, steady = (TransformedEnv(two_worlds(), make(kind, law)) for _ in range(2))
