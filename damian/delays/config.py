@@ -1,6 +1,5 @@
 """Settings of the delays of a scenario, of its links, of its cumulative rewards and of the action history."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -9,6 +8,7 @@ from damian.common import checks
 from damian.common.text_files import show
 from damian.delays.delay_line import ORDERS
 from damian.delays.laws import LONGEST, LOSES, Held, Law, law_of, sampler_of
+from damian.delays.link_sampler import is_matrix
 from damian.delays.samplers import Sampler
 
 CONTEXT_KEYS = {"position": keys.POSITION}
@@ -127,10 +127,10 @@ class LinkConfig:
         """
         for name in ("delay", "loss", "hears"):
             matrix = getattr(self, name)
-            if not _is_list(matrix):
+            if not is_matrix(matrix):
                 checks.require(name != "hears" or matrix is None, "links.hears", show(matrix), _NO_BOOLS)
                 continue
-            good = len(matrix) == n_agents and all(_is_list(row) and len(row) == n_agents for row in matrix)
+            good = len(matrix) == n_agents and all(is_matrix(row) and len(row) == n_agents for row in matrix)
             should = f"is not {n_agents} lists (receivers) of {n_agents} entries (senders)"
             checks.require(good, f"links.{name}", "it", should)
             bools = name != "hears" or all(isinstance(hears, bool) for row in matrix for hears in row)
@@ -142,17 +142,13 @@ class LinkConfig:
         Raises:
             InputError: one is not valid.
         """
-        laws = [law for row in self.delay for law in row] if _is_list(self.delay) else [self.delay]
+        laws = [law for row in self.delay for law in row] if is_matrix(self.delay) else [self.delay]
         return [law_of(law, "links.delay") for law in laws]
 
     def reads(self, dt: float) -> set[str]:
         """Names of the entries that the links read: what their laws do, and positions for a range."""
         read = {name for law in self.laws() for name in sampler_of(law, dt, key="links.delay").reads}
         return read | ({"position"} if self.range is not None else set())
-
-
-def _is_list(value: Any) -> bool:
-    return isinstance(value, Sequence) and not isinstance(value, str)
 
 
 _NO_BOOLS = "is not a list of true and false for each receiver"

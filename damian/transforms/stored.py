@@ -7,7 +7,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from damian.common import checks
 from damian.common.errors import InputError
@@ -62,7 +62,7 @@ def delay_trajectories(
         >>> late["next", "age"]  # steps since each observation was generated
     """
     _check_data(data)
-    leaves = leaf_transforms(transform) if isinstance(transform, Compose) else [transform]
+    leaves = leaf_transforms(transform)
     for leaf in leaves:
         _check_transform(leaf)
     playback = _Playback(data, _read_action_specs(data, leaves, action_spec))
