@@ -257,7 +257,13 @@ def test_an_action_delay_of_j_steps_has_the_effect_of_j_more_steps_of_observatio
 
 
 @both_motions
-@pytest.mark.parametrize("changed", [*DELAYS.values(), {}], ids=[*DELAYS, "nothing"])
+@pytest.mark.parametrize(
+    "changed",
+    [
+        pytest.param(changed, id=name, marks=() if name in ("everything", "nothing") else pytest.mark.slow)
+        for name, changed in {**DELAYS, "nothing": {}}.items()
+    ],
+)
 def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, changed):
     scenario = everything(motion, **changed)
     at_once, graph = delayed(scenario), delayed(scenario).compile(backend="eager")

@@ -33,6 +33,7 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_table_lists_every_arm_beside_its_reference(folder):
     with (folder / "results.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -45,6 +46,7 @@ def test_the_table_lists_every_arm_beside_its_reference(folder):
         assert f"| {' | '.join(row.values())} |" in (folder / "results.md").read_text()
 
 
+@pytest.mark.slow
 def test_finished_arms_are_kept_and_a_missing_one_is_reproduced_by_another_process(folder, capsys):
     files = [folder / f"seed4_{arm}.json" for arm in ARMS]
     before = [(file.stat().st_mtime_ns, file.read_text()) for file in files]
