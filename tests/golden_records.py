@@ -69,11 +69,11 @@ def column(records: list[Transition], field: str) -> torch.Tensor:
 
 def set_state(env: UavEnv, records: list[Transition], places: list) -> None:
     """Set world m to the state before transition m, with the UAVs standing at ``places[m]``."""
-    points = env.simulation.airspace.points[0].tolist()
+    points = settings_points(env).tolist()
     goal = torch.tensor([[nearest(points, place) for place in world] for world in places])
     place = env.simulation.airspace.points[0][goal]
     detected = torch.tensor([[-1.0 if m.detected is None else m.detected] for m in records])
-    estimate = torch.tensor([[m.estimate or [0.0, 0.0]] for m in records])
+    estimate = torch.tensor([[m.estimate or [0.0, 0.0]] for m in records]) - env.simulation.airspace.offset[0]
     state = env.state
     env.state = state._replace(
         steps=torch.tensor([m.number - 1 for m in records]),
@@ -86,6 +86,12 @@ def set_state(env: UavEnv, records: list[Transition], places: list) -> None:
             detected_position=estimate.expand(-1, env.n_agents, -1).contiguous(),
         ),
     )
+
+
+def settings_points(env: UavEnv) -> torch.Tensor:
+    """Landing points in the coordinates of the settings, which are those of the records, [L, 2]."""
+    airspace = env.simulation.airspace
+    return airspace.exact_points[0] + torch.tensor(airspace.regions[0].offset)
 
 
 def ready_env(scenario: ScenarioConfig, n_worlds: int) -> UavEnv:

@@ -53,6 +53,7 @@ def usecase(case: int, **changed: Any) -> ScenarioConfig:
         lattice_angle=golden["deg"],
         initial_conditions=1,
         start_positions=golden["uav_start_positions"],
+        start_together=case == 2,
     )
     observation = ObservationConfig(
         local_features=["spotted"],

@@ -48,7 +48,8 @@ class UavEnv(EnvBase):
     - ``observation``, ``global_observation``: features of the actor [B, N, F] and of the critic [B, N, G];
     - ``message``: the latest message of each UAV, [B, N, M] (``server.messages`` names its fields), and
       ``message_sent``: whether it was sent in this step, [B, N];
-    - ``position``: true position of each UAV, east and north [m], which delay laws may read, [B, N, 2];
+    - ``position``: true position of each UAV, east and north in the coordinates of the settings [m], which
+      delay laws may read, [B, N, 2];
     - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, and the true
       offset from the UAV to the source (east, north, over the region's size, in [-1, 1]), [B, N, G + 2];
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
@@ -242,7 +243,8 @@ class UavEnv(EnvBase):
         if "message" in self.extras:
             outputs |= {keys.MESSAGE: state.sent.pack(), keys.MESSAGE_SENT: state.message_sent}
         if "position" in self.extras:
-            outputs[keys.POSITION] = state.position[..., :2]
+            offset = gather_rows(self.simulation.airspace.offset, state.region).unsqueeze(-2)
+            outputs[keys.POSITION] = state.position[..., :2] + offset
         if "privileged" in self.extras:
             outputs[keys.PRIVILEGED_OBSERVATION] = self._privileged(state, features)
         if self.scenario.episode.end_with_source:

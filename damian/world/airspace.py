@@ -1,4 +1,4 @@
-"""Operative regions as padded tensors, with tests for inside a polygon and searches for landing points."""
+"""Operative regions as padded tensors, with a test for inside a polygon and a search for landing points."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from damian.common.errors import InputError
+from damian.common.tensors import tree_map
+from damian.world.nearest import LandingGrid, build_grid
 from damian.world.regions.polygon import landing_lattice, largest_vertex_distance
 from damian.world.regions.region import Region
 
@@ -19,17 +21,23 @@ class Airspace:
     A landing point's *flat id* is ``region * L + point``; padded points lie infinitely far away.
 
     Attributes:
-        points: landing points, [R, L, 2] metres.
+        points: landing points, [R, L, 2] metres east and north of the local origin of their region.
+        exact_points: the same in double precision, by which the nearest ones are found.
+        grid: the same sorted into cells, to search for the nearest ones.
         n_points: number of real landing points, [R].
-        edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres.
+        edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres, double precision.
         scale: largest distance between two vertices, [R] metres; features divide distances by it.
+        offset: place of the local origin in the coordinates of the settings, [R, 2] metres.
         regions: the R regions, with their polygons and names.
     """
 
     points: Tensor
+    exact_points: Tensor
+    grid: LandingGrid
     n_points: Tensor
     edges: Tensor
     scale: Tensor
+    offset: Tensor
     regions: tuple[Region, ...]
 
     @property
@@ -39,8 +47,9 @@ class Airspace:
 
     def to(self, device: torch.device) -> "Airspace":
         """Copy of the airspace on another device."""
-        moved = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "regions"}
-        return replace(self, **{name: tensor.to(device) for name, tensor in moved.items()})
+        moved = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("regions", "grid")}
+        grid = tree_map(lambda t: t.to(device), self.grid)
+        return replace(self, grid=grid, **{name: tensor.to(device) for name, tensor in moved.items()})
 
 
 def build_airspace(
@@ -66,12 +75,16 @@ def build_airspace(
                 f"{len(lattice)}; lower agents or region.lattice_step ({step_m:g} m)"
             )
     edges = [_edges(region.polygon) for region in regions]
+    points = _padded(lattices, torch.inf)
     return Airspace(
-        points=_padded(lattices, torch.inf),
+        points=points.float(),
+        exact_points=points,
+        grid=build_grid(lattices, [r.polygon.area for r in regions], 2 * n_agents - 1),
         n_points=torch.tensor([len(lattice) for lattice in lattices]),
         # A padded edge has zero length, so the inside test never counts it.
         edges=_padded(edges, 0.0),
         scale=torch.tensor([largest_vertex_distance(r.polygon) for r in regions], dtype=torch.float32),
+        offset=torch.tensor([r.offset for r in regions], dtype=torch.float32),
         regions=tuple(regions),
     )
 
@@ -94,22 +107,6 @@ def inside(edges: Tensor, target: Tensor) -> Tensor:
     return ((straddles & (x < crossing)).sum(-1) % 2).bool()
 
 
-def nearest_points(points: Tensor, target: Tensor, n: int) -> Tensor:
-    """The ``n`` landing points nearest each target, nearest first; of equal distances, the lowest id first.
-
-    Args:
-        points: [*, L, 2] metres; padded points lie infinitely far away.
-        target: [*, 2] metres.
-
-    Returns:
-        Point ids, [*, n].
-    """
-    east, north = (points[..., i].double() - target[..., i : i + 1].double() for i in (0, 1))
-    # This term is far below any real difference of squared distances, so it only breaks ties.
-    order = 1e-9 * torch.arange(points.shape[-2], device=points.device, dtype=torch.float64)
-    return (east.square() + north.square() + order).topk(n, dim=-1, largest=False).indices
-
-
 def _edges(polygon: shapely.Geometry) -> np.ndarray:
     """Every edge of every ring, [E, 4] metres."""
     rings = shapely.get_rings(shapely.get_parts(polygon))
@@ -118,9 +115,9 @@ def _edges(polygon: shapely.Geometry) -> np.ndarray:
 
 
 def _padded(arrays: list[np.ndarray], value: float) -> Tensor:
-    """Stack arrays of different lengths as float32, [R, longest, ...]."""
+    """Stack arrays of different lengths, [R, longest, ...]."""
     longest = max(len(a) for a in arrays)
     stacked = np.full((len(arrays), longest, *arrays[0].shape[1:]), value)
     for row, array in zip(stacked, arrays, strict=True):
         row[: len(array)] = array
-    return torch.as_tensor(stacked, dtype=torch.float32)
+    return torch.as_tensor(stacked)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
+from damian.world.regions.places import check_places
 
 _VERTICAL_FACTOR = 0.9
 """In takeoff and landing, the drain at full engine power is divided by this factor."""
@@ -34,7 +35,8 @@ class BatteryConfig:
     resolution: float = 5.0
     """Observed battery levels are rounded down to a multiple of this [%]."""
     charging_points: list | None = None
-    """Places [x, y] in metres; UAVs charge at the landing point nearest each, or anywhere if not given."""
+    """Places inside the region, [x, y] in metres or {lat: 53.1, lon: -4.5} in degrees (as for
+    region.start_positions); UAVs charge at the landing point nearest each, or anywhere if not given."""
 
     def __post_init__(self) -> None:
         checks.above("battery.engine_power_kw", self.engine_power_kw, 0.0, "kW")
@@ -50,8 +52,7 @@ class BatteryConfig:
             "[]",
             "is not a list of places; leave it out to charge anywhere",
         )
-        for point in self.charging_points or []:
-            checks.place("battery.charging_points", point)
+        check_places("battery.charging_points", self.charging_points or [])
 
 
 def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:

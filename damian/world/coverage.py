@@ -26,6 +26,9 @@ _GRID = 321
 # in its cache; 128 MiB on a GPU and in compiled graphs, which grow with the number of chunks.
 _CHUNK_WORDS, _CHUNK_WORDS_LARGE = 2**20, 2**24
 
+# Landing points whose samples are tested at once, which bounds the memory: arrays of 16 MiB.
+_POINTS_AT_ONCE = 1024
+
 
 class FootprintTables(NamedTuple):
     """Bit masks of a sampled footprint; a bit of 1 marks a sample that does not count.
@@ -162,11 +165,15 @@ def _unit_disc_samples(count: int) -> np.ndarray:
 
 def _outside(polygon: shapely.Geometry, points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Whether samples around each point lie outside, ``[L, 2]``, ``[S, 2]`` -> bool ``[L, S]``."""
-    shapely.prepare(polygon)
-    real = np.isfinite(points).all(-1)
-    outside = np.ones((len(points), len(offsets)), bool)
-    samples = points[real, None] + offsets
-    outside[real] = ~shapely.contains_xy(polygon, samples[..., 0], samples[..., 1])
+    boundary, radius = shapely.boundary(polygon), np.hypot(*offsets.T).max()
+    shapely.prepare([polygon, boundary])
+    real = np.flatnonzero(np.isfinite(points).all(-1))
+    # Far from the boundary all samples lie on the side of their centre.
+    outside = np.repeat(~shapely.contains_xy(polygon, points)[:, None], len(offsets), axis=1)
+    near = real[shapely.dwithin(boundary, shapely.points(points[real]), radius)]
+    for part in np.array_split(near, len(near) // _POINTS_AT_ONCE + 1):
+        samples = points[part, None] + offsets
+        outside[part] = ~shapely.contains_xy(polygon, samples[..., 0], samples[..., 1])
     return outside
 
 

@@ -4,15 +4,22 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import shapely
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from damian.common import checks
 from damian.common.tensors import gather_rows
-from damian.world.airspace import Airspace, inside, nearest_points
+from damian.world.airspace import Airspace, inside
+from damian.world.nearest import LandingGrid
 
-MAX_PAIRS = 2_000_000_000
-"""Most pairs of (landing point, action) and landing point compared at construction: about a minute."""
+MAX_TABLE_BYTES = 4_000_000_000
+"""Largest size of the tables of discrete actions [bytes]."""
+_POINTS_AT_ONCE = 1024
+"""Landing points whose actions are ranked together."""
+_EDGES_AT_ONCE = 2**18
+"""Pairs of target and polygon edge compared at once, which bounds the memory: a few arrays of 2 MB."""
 
 
 @dataclass
@@ -45,10 +52,10 @@ class ActionConfig:
         """Number of discrete actions."""
         return len(self.distances) * len(self.headings)
 
-    def table(self) -> Tensor:
+    def table(self, dtype: torch.dtype = torch.float32) -> Tensor:
         """Discrete actions as (distance [m], heading [rad]), [A, 2]; the heading changes fastest."""
         headings = [math.radians(heading) for heading in self.headings]
-        return torch.tensor([[d, h] for d in self.distances for h in headings])
+        return torch.tensor([[d, h] for d in self.distances for h in headings], dtype=dtype)
 
 
 def displacement(distance: Tensor, heading: Tensor) -> Tensor:
@@ -102,30 +109,18 @@ class Candidates:
         """
         if self.config.kind == "discrete":
             return self.ranking, flat * self.config.n_actions + action
-        distance = action[..., 0].clamp(0, 1) * self.max_distance
-        heading = action[..., 1].clamp(0, 1) * 2 * math.pi
-        ranking, _ = self._rank(
-            self.airspace.points[region].unsqueeze(1),
-            self.airspace.edges[region].unsqueeze(1),
-            self.airspace.points.flatten(0, 1)[flat],
-            flat % self.airspace.max_points,
-            displacement(distance, heading),
+        action = action.double().clamp(0, 1)
+        move = displacement(action[..., 0] * self.max_distance, action[..., 1] * 2 * math.pi).flatten(0, 1)
+        own, base = flat.flatten(), (flat - flat % self.airspace.max_points).flatten()
+        target = gather_rows(self.airspace.exact_points.flatten(0, 1), own) + move
+        regions = region.unsqueeze(-1).expand_as(flat).flatten()
+        nearest = _nearest_inside(
+            self.airspace.edges, [*self.airspace.grid], regions, target, own - base, self.n_candidates
         )
-        row = torch.arange(flat.numel(), device=flat.device).view_as(flat)
-        return Ranking(*(x.flatten(0, 1) for x in ranking)), row
-
-    def _rank(
-        self, points: Tensor, edges: Tensor, standing: Tensor, own: Tensor, move: Tensor
-    ) -> tuple[Ranking, Tensor]:
-        """Candidates [*, K], and whether the target lies inside [*]; if it does not, the UAV holds."""
-        target = standing + move
-        valid = inside(edges, target)
-        nearest = nearest_points(points, target, self.n_candidates)
-        nearest = torch.where(valid.unsqueeze(-1), nearest, own.unsqueeze(-1))
-        places = points.expand(*nearest.shape[:-1], *points.shape[-2:])
-        places = places.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, 2))
-        distance = torch.linalg.vector_norm(places - standing.unsqueeze(-2), dim=-1)
-        return Ranking(nearest, distance), valid
+        points = self.airspace.points.flatten(0, 1)
+        offset = gather_rows(points, nearest + base.unsqueeze(-1)) - gather_rows(points, own).unsqueeze(1)
+        distance = torch.linalg.vector_norm(offset, dim=-1)
+        return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
 
     def _rank_all(self) -> None:
         """Tabulate the candidates of every (landing point, action).
@@ -134,30 +129,65 @@ class Candidates:
         holds, infinite if its target lies outside; ``hold`` [A] marks one action that holds (the first
         action, if no listed distance is 0).
         """
-        table = self.config.table()
-        n_regions, n_points = self.airspace.points.shape[:2]
-        checks.require(
-            n_regions * n_points**2 * len(table) <= MAX_PAIRS,
-            "region.lattice_step",
-            f"{n_points} landing points",
-            "are too many to rank for every action: raise region.lattice_step or set "
-            "region.n_landing_points (or lower region.pool)",
+        table = self.config.table(torch.float64)
+        self._require_fitting(self.airspace.points.shape[:2].numel() * len(table))
+        # Adding 0 makes a negative 0 positive, so that actions which hold are equal, and are ranked once.
+        move, alike = torch.unique(displacement(table[:, 0], table[:, 1]) + 0.0, dim=0, return_inverse=True)
+        shape = (*self.airspace.points.shape[:2], len(table))
+        self.distance = torch.zeros(shape)
+        ranking = Ranking(
+            torch.zeros(*shape, self.n_candidates, dtype=torch.int32), torch.zeros(*shape, self.n_candidates)
         )
-        move = displacement(table[:, 0], table[:, 1])
+        counts = self.airspace.n_points.tolist()
+        with tqdm(total=sum(counts), desc="landing points", delay=1, leave=False) as bar:
+            for region, count in enumerate(counts):
+                for own in torch.arange(count).split(_POINTS_AT_ONCE):
+                    ranked, within = self._rank_from(region, own, move)
+                    for table_of_all, part in zip(ranking, ranked, strict=True):
+                        table_of_all[region, own] = part[:, alike].to(table_of_all.dtype)
+                    first = ranked.distance[..., 0].where(within, torch.inf)
+                    self.distance[region, own] = first[:, alike]
+                    bar.update(len(own))
+        self.ranking = Ranking(*(each.flatten(0, 2) for each in ranking))
+        self.distance = self.distance.flatten(0, 1)
         holds = table[:, 0] == 0
-        ranked_points, ranked_distances, first_distance = [], [], []
-        for points, edges in zip(self.airspace.points, self.airspace.edges, strict=True):
-            for own in torch.arange(len(points)).split(64):  # in parts, to bound the memory of the search
-                standing = torch.nan_to_num(points[own], posinf=0.0).unsqueeze(1)
-                own_point = own.unsqueeze(-1).expand(-1, len(table))
-                ranking, within = self._rank(points, edges, standing, own_point, move)
-                ranked_points.append(ranking.point.flatten(0, 1).to(torch.int32))
-                ranked_distances.append(ranking.distance.flatten(0, 1))
-                first_distance.append(ranking.distance[..., 0].where(within | holds, torch.inf))
-        self.ranking = Ranking(torch.cat(ranked_points), torch.cat(ranked_distances))
-        self.distance = torch.cat(first_distance)
         self.can_hold = bool(holds.any())
         self.hold = torch.arange(len(table)) == int(holds.int().argmax())
+
+    def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
+        """Rank the landing points for flights within a region; a UAV holds if its target lies outside.
+
+        Args:
+            region: index of the region.
+            own: landing points where UAVs stand, [P].
+            move: displacements east and north, [A, 2] metres.
+
+        Returns:
+            Candidates, [P, A, K], and whether each target lies inside, [P, A].
+        """
+        polygon, points = self.airspace.regions[region].polygon, self.airspace.points[region]
+        target = self.airspace.exact_points[region][own].unsqueeze(1) + move
+        shapely.prepare(polygon)
+        within = torch.as_tensor(shapely.contains_xy(polygon, *target.numpy().transpose(2, 0, 1)))
+        nearest = own.view(-1, 1, 1).repeat(1, len(move), self.n_candidates)
+        regions = torch.full((int(within.sum()),), region)
+        found = self.airspace.grid.nearest(regions, target[within], self.n_candidates)
+        nearest[within] = torch.where(found < 0, nearest[within], found)
+        offset = gather_rows(points, nearest) - points[own, None, None]
+        return Ranking(nearest, torch.linalg.vector_norm(offset, dim=-1)), within
+
+    def _require_fitting(self, n_lists: int) -> None:
+        """Refuse tables that are too large for the memory of a usual machine."""
+        size = n_lists * (8 * self.n_candidates + 4)
+        n_points, n_actions = n_lists // self.config.n_actions, self.config.n_actions
+        checks.require(
+            size <= MAX_TABLE_BYTES,
+            "region.lattice_step",
+            f"{n_points} landing points with {n_actions} actions and {self.n_candidates} candidates each",
+            f"need {size / 1e9:.1f} GB, more than {MAX_TABLE_BYTES / 1e9:g} GB: raise region.lattice_step, "
+            "set region.n_landing_points, list fewer actions.distances or actions.headings, lower "
+            "region.pool, or take actions.kind=continuous",
+        )
 
     def to(self, device: torch.device) -> "Candidates":
         """Move the tables to a device, in place."""
@@ -168,9 +198,38 @@ class Candidates:
         return self
 
 
-def assign_landing_points(
-    ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_points: int
+@torch.library.custom_op("damian::nearest_inside", mutates_args=())
+def _nearest_inside(
+    edges: Tensor, grid: list[Tensor], region: Tensor, target: Tensor, own: Tensor, n: int
 ) -> Tensor:
+    """Landing points nearest to targets, [M, n]; ``own`` instead of missing ones, and if a target is outside.
+
+    This is a custom operator because the number of cells searched depends on the data, which a compiler
+    cannot trace.
+
+    Args:
+        edges: of the polygons, [R, E, 4] metres.
+        grid: the fields of the landing points' ``LandingGrid``.
+        region: indices of the regions, [M].
+        target: [M, 2] metres.
+        own: landing points where the UAVs stand, [M].
+        n: number of points.
+    """
+    at_once = max(_EDGES_AT_ONCE // edges.shape[1], 1)
+    parts = zip(region.split(at_once), target.split(at_once), strict=True)
+    within = torch.cat([inside(edges.index_select(0, r), t) for r, t in parts])
+    nearest = own.unsqueeze(-1).repeat(1, n)
+    found = LandingGrid(*grid).nearest(region[within], target[within], n)
+    nearest[within] = torch.where(found < 0, nearest[within], found)
+    return nearest
+
+
+@_nearest_inside.register_fake
+def _(edges, grid, region, target, own, n):  # compilers need only the shape
+    return own.new_empty(len(own), n)
+
+
+def assign_landing_points(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point.
 
     A point is free to a UAV if no other UAV stands on it or is bound for it; its own point always is. Most
@@ -182,7 +241,6 @@ def assign_landing_points(
         standing: point that each UAV stands on or is bound for, [B, N].
         reach: largest distance that the UAV may fly now [m], negative if it may not choose, [B, N]. A
             candidate farther away does not count, and stays free for other UAVs.
-        n_points: number of landing points of a region; ids are below it.
 
     Returns:
         Point that each UAV books, [B, N].
@@ -190,12 +248,10 @@ def assign_landing_points(
     reached = gather_rows(ranking.distance[:, 0], row) <= reach
     choice = torch.where(reached, gather_rows(ranking.point[:, 0], row).long(), standing)
     departs = choice != standing
-    # Claims on each point: UAVs that stand there or choose it. A UAV that is not alone may have to yield.
-    claims = standing.new_zeros(len(standing), n_points, dtype=torch.int16)
-    claim = torch.cat([torch.ones_like(departs), departs], -1).to(claims.dtype)
-    claims = claims.scatter_add(1, torch.cat([standing, choice], -1), claim)
-    contested = (departs & (claims.gather(1, choice) > 1)).any(-1)
-    return _settle(*ranking, row, standing, reach, choice, contested, n_points)
+    # A UAV that is not alone in standing on a point or choosing it may have to yield.
+    claims = choice.unsqueeze(-1) == torch.cat([standing, choice], -1).unsqueeze(-2)
+    contested = (departs & (claims.sum(-1, dtype=torch.int32) > 1)).any(-1)
+    return _settle(*ranking, row, standing, reach, choice, contested)
 
 
 @torch.library.custom_op("damian::settle", mutates_args=())
@@ -207,7 +263,6 @@ def _settle(
     reach: Tensor,
     choice: Tensor,
     contested: Tensor,
-    n_points: int,
 ) -> Tensor:
     """The choices [B, N], with those of the contested worlds [B] made again in index order.
 
@@ -217,45 +272,34 @@ def _settle(
     settled = choice.clone()
     worlds = contested.nonzero().squeeze(-1)
     if len(worlds):
+        ranking = Ranking(point, distance)
         row, standing, reach = (t.index_select(0, worlds) for t in (row, standing, reach))
-        reached = gather_rows(distance, row) <= reach.unsqueeze(-1)
-        candidates = torch.where(reached, gather_rows(point, row), standing.unsqueeze(-1))
-        settled.index_copy_(0, worlds, _assign_in_order(candidates, standing, n_points))
+        settled.index_copy_(0, worlds, _assign_in_order(ranking, row, standing, reach))
     return settled
 
 
 @_settle.register_fake
-def _(point, distance, row, standing, reach, choice, contested, n_points):  # compilers need only the shape
+def _(point, distance, row, standing, reach, choice, contested):  # compilers need only the shape
     return torch.empty_like(choice)
 
 
-def _assign_in_order(candidates: Tensor, standing: Tensor, n_points: int) -> Tensor:
-    """Serial assignment as the fixed point of "take the best candidate that no earlier UAV has taken".
+def _assign_in_order(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
+    """Serial assignment by deferred acceptance (Gale and Shapley, 1962); arguments as above.
 
-    After r rounds the choices of the first r + 1 UAVs are final, so N - 1 rounds suffice.
-
-    Args:
-        candidates: landing points, preferred first, [B, N, K].
-        standing: point that each UAV stands on or is bound for, [B, N].
-        n_points: number of landing points of a region; ids are below it.
+    All UAVs ask for their best candidate; those that ask for a point on which another UAV stands, or for
+    which an earlier one asks too, ask for their next. As the earliest UAV that ever asks for a free point
+    keeps it, this ends with what the UAVs would take one after the other.
     """
-    n_agents = standing.shape[1]
-    index = torch.arange(n_agents, device=standing.device).expand_as(standing)
-    flat = candidates.flatten(1)
-    own = candidates == standing.unsqueeze(-1)
-    owner = index.new_full((len(index), n_points), n_agents).scatter_(1, standing, -1)
-
-    def choose(owner: Tensor) -> Tensor:
-        """Best candidate of each UAV that belongs to no earlier one; there always is one."""
-        owners = owner.gather(1, flat).view_as(candidates)
-        allowed = own | (owners >= index.unsqueeze(-1))
-        best = allowed.view(torch.uint8).argmax(-1, keepdim=True)
-        return candidates.gather(-1, best).squeeze(-1)
-
-    choice = choose(owner)
-    for _ in range(n_agents - 1):
-        settled = choose(owner.scatter_reduce(1, choice, index, "amin"))
-        if torch.equal(settled, choice):
-            break
-        choice = settled
-    return choice
+    n_agents, n_candidates = row.shape[1], ranking.point.shape[1]
+    points, distances = ranking.point.flatten(), ranking.distance.flatten()
+    earlier = torch.ones(n_agents, n_agents, dtype=torch.bool, device=row.device).tril(-1)
+    asked = row * n_candidates
+    while True:
+        reached = gather_rows(distances, asked) <= reach
+        choice = torch.where(reached, gather_rows(points, asked).long(), standing)
+        taken = choice.unsqueeze(-1) == standing.unsqueeze(-2)
+        taken = taken | ((choice.unsqueeze(-1) == choice.unsqueeze(-2)) & earlier)
+        refused = (choice != standing) & taken.any(-1)
+        if not refused.any():
+            return choice
+        asked = asked + refused

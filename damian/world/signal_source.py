@@ -8,7 +8,7 @@ polygon, the straight line between two stops may leave the polygon.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
+from damian.world.regions.places import check_place
 from damian.world.regions.polygon import sample_interior
 
 _Polygon = shapely.Polygon | shapely.MultiPolygon
@@ -38,8 +39,9 @@ class SourceConfig:
     """``constant``; ``per_stop`` or ``per_step``: on or off, drawn at each stop or simulation step."""
     emission_probability: float = 0.5
     """Probability that an intermittent source is on."""
-    position: list | None = None
-    """Position, or start of the walk, [x, y] in metres; drawn for each initial condition if not given."""
+    position: Any = None
+    """Position, or start of the walk: [x, y] in metres, or {lat: 53.1, lon: -4.5} in degrees (as for
+    region.start_positions); drawn for each initial condition if not given."""
     n_hotspots: int = 10
     """Number of hotspots of a walk."""
     min_stops: int = 3
@@ -80,7 +82,7 @@ class SourceConfig:
         )
         checks.in_range("source.emission_probability", self.emission_probability, 0.0, 1.0)
         if self.position is not None:
-            checks.place("source.position", self.position)
+            check_place("source.position", self.position)
         checks.in_range("source.n_hotspots", self.n_hotspots, 1, 1000)
         checks.in_range("source.min_stops", self.min_stops, 0)
         checks.in_range("source.max_stops", self.max_stops, self.min_stops, 1000)

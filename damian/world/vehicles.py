@@ -12,11 +12,12 @@ from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry
 from damian.common.tensors import gather_rows, tree_map, tree_where
-from damian.world.airspace import Airspace, nearest_points
+from damian.world.airspace import Airspace
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
 from damian.world.config import WorldConfig
 from damian.world.messages import Messages
 from damian.world.motion import flight_levels, fly, minimum_time
+from damian.world.regions.places import local_places
 from damian.world.regions.polygon import MAX_COORDINATE_M
 from damian.world.state import State
 
@@ -279,6 +280,12 @@ def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
     n_regions, n_points = airspace.points.shape[:2]
     if places is None:
         return torch.ones(n_regions * n_points, dtype=torch.bool)
-    nearest = nearest_points(airspace.points.unsqueeze(1), torch.tensor(places), 1).squeeze(-1)
-    flat = nearest + n_points * torch.arange(n_regions).unsqueeze(-1)
-    return torch.zeros(n_regions * n_points, dtype=torch.bool).index_fill(0, flat.flatten(), True)
+    charges = torch.zeros(n_regions, n_points, dtype=torch.bool)
+    for index, region in enumerate(airspace.regions):
+        local = torch.as_tensor(local_places("battery.charging_points", places, region))
+        for i, place in enumerate(local):
+            first = places[int((local == place).all(-1).nonzero()[0])]
+            problem = "are the same place: list each once"
+            checks.require(first is places[i], "battery.charging_points", f"{first} and {places[i]}", problem)
+        charges[index, airspace.grid.nearest(torch.full((len(local),), index), local, 1).squeeze(-1)] = True
+    return charges.flatten()

@@ -169,9 +169,13 @@ def test_float32_levels_stay_float32():
         (
             "charging_points",
             [[1.0, 2.0], [3.0]],
-            "battery.charging_points: [3.0] is not [x, y] in metres",
+            "battery.charging_points: [3.0] is not [x, y] in metres or {lat: ..., lon: ...} in degrees",
         ),
-        ("charging_points", [1.0, 2.0], "battery.charging_points: 1.0 is not [x, y] in metres"),
+        (
+            "charging_points",
+            [1.0, 2.0],
+            "battery.charging_points: 1.0 is not [x, y] in metres or {lat: ..., lon: ...} in degrees",
+        ),
         (
             "charging_points",
             [],

@@ -146,6 +146,18 @@ def test_a_hole_and_a_gap_between_parts_are_not_covered():
     np.testing.assert_allclose(share_at(parts, places), exact_share(parts, places), atol=0.01)
 
 
+def test_samples_far_from_the_boundary_are_outside_as_often_as_a_test_of_each_finds():
+    polygon = Polygon([(0, 0), (400, 0), (400, 300), (0, 300)], [[(150, 100), (250, 100), (200, 200)]])
+    points = np.random.default_rng(0).uniform(-100, 450, (1200, 2))
+    tables = build_tables([polygon], points[None], 30.0, words=2)
+    k = np.arange(128)
+    r, angle = 30 * np.sqrt((k + 0.5) / 128), k * np.pi * (3 - math.sqrt(5))
+    samples = points[:, None] + np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
+    outside = ~shapely.contains_xy(polygon, samples[..., 0], samples[..., 1])
+    words = tables.masks[-1200:].numpy().view(np.uint8)
+    np.testing.assert_array_equal(np.unpackbits(words, axis=-1, bitorder="little"), outside)
+
+
 @given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=1, max_size=40))
 def test_bits_are_counted_as_python_counts_them(words):
     expected = [bin(w % 2**64).count("1") for w in words]

@@ -96,7 +96,8 @@ def test_uavs_start_on_different_points_or_on_one_or_on_the_given_ones():
     place = sent_messages(together).position
     assert torch.cdist(place, place).max() == 0
     assert len({tuple(p) for p in place[:, 0].tolist()}) > 10
-    given = sent_messages(UavEnv(usecase(2)).reset()).position
+    env = UavEnv(usecase(2))
+    given = sent_messages(env.reset()).position + env.simulation.airspace.offset[0]
     expected = [pytest.approx([62.85586449, -119.2183645], abs=1e-4)] * 3
     assert given[0].tolist() == expected
 

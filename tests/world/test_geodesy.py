@@ -2,10 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon, to_local, wrap_longitude
+from damian.world.regions.geodesy import (
+    EARTH_RADIUS_M,
+    area_centroid,
+    to_latlon,
+    to_local,
+    wrap_longitude,
+)
 
 ONE_DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 OFFSETS_M = st.floats(-35_000, 35_000)
@@ -86,3 +92,83 @@ def test_both_conversions_work_on_arrays_of_any_shape():
     returned = to_local(*to_latlon(x, y, (52.8, -4.1)), (52.8, -4.1))
     assert returned[0].shape == (3, 5)
     np.testing.assert_allclose(returned, [x, y], atol=1e-6)
+
+
+# --- the centroid of an area --------------------------------------------------------------------
+
+
+def on_sphere(lon, lat):
+    """Unit vectors of places, [..., 3]."""
+    lon, lat = np.radians(lon), np.radians(lat)
+    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], -1)
+
+
+def centroid_by_integration(rings, depth=5):
+    """Mean of the unit vectors over the area, by fans of triangles cut into small flat ones: its direction.
+
+    Each ring is a fan about its first corner; triangles that turn clockwise count negative.
+    """
+    total = np.zeros(3)
+    for ring in rings:
+        corners = on_sphere(*ring[:-1].T)
+        fan = np.stack([np.repeat(corners[:1], len(corners) - 2, 0), corners[1:-1], corners[2:]], 1)
+        for _ in range(depth):
+            a, b, c = fan.swapaxes(0, 1)
+            ab, bc, ca = (
+                (x + y) / np.linalg.norm(x + y, axis=-1)[:, None] for x, y in [(a, b), (b, c), (c, a)]
+            )
+            fan = np.concatenate(
+                [np.stack(t, 1) for t in [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]]
+            )
+        normal, middle = np.cross(fan[:, 1] - fan[:, 0], fan[:, 2] - fan[:, 0]) / 2, fan.sum(1)
+        middle /= np.linalg.norm(middle, axis=1)[:, None]
+        total += (np.sum(normal * middle, 1)[:, None] * middle).sum(0)
+    return total / np.linalg.norm(total)
+
+
+def star_rings(rng, size_deg, lat, lon, hole):
+    """A ragged ring about a place, counter-clockwise, and if wanted a hole in it, clockwise; degrees."""
+    angle = np.sort(rng.uniform(0, 2 * np.pi, 9))
+    shell = np.stack([np.cos(angle) / np.cos(np.radians(lat)), np.sin(angle)], -1)
+    shell = [lon, lat] + size_deg * rng.uniform(0.3, 1, 9)[:, None] * shell
+    hole_ring = [lon, lat] + 0.2 * (shell[::-1] - [lon, lat]) + [0.02 * size_deg, 0]
+    return [np.vstack([ring, ring[:1]]) for ring in ([shell, hole_ring] if hole else [shell])]
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    size_km=st.sampled_from([0.03, 1.0, 100.0, 500.0]),
+    lat=st.floats(-70, 70),
+    lon=st.floats(-180, 180),
+    hole=st.booleans(),
+)
+@settings(max_examples=40)
+def test_the_centroid_of_an_area_is_that_of_a_numerical_integration(seed, size_km, lat, lon, hole):
+    rings = star_rings(np.random.default_rng(seed), size_km / 111, lat, lon, hole)
+    place = on_sphere(*area_centroid(rings)[::-1])
+    error_m = EARTH_RADIUS_M * np.linalg.norm(place - centroid_by_integration(rings))
+    assert error_m < max(1e-4 * size_km * 1000 / 100, 0.2)
+
+
+def test_a_cell_of_ten_degrees_has_its_centroid_10_km_poleward_of_the_middle_of_its_degrees():
+    ring = np.array([[0.0, 60.0], [10, 60], [10, 61], [0, 61], [0, 60]])
+    lat, lon = area_centroid([ring])
+    assert lon == pytest.approx(5, abs=1e-9)
+    assert (lat - 60.5) * ONE_DEGREE_M == pytest.approx(10_000, abs=1000)
+    lat_south, _ = area_centroid([(ring * [1, -1])[::-1]])
+    assert lat_south == pytest.approx(-lat, abs=1e-12)
+
+
+def test_the_centroid_of_an_area_across_the_antimeridian_or_around_the_pole_is_inside():
+    strait = np.array([[179.0, 10], [181, 10], [181, 12], [179, 12], [179, 10]])
+    shifted = area_centroid([strait - [20, 0]])
+    assert area_centroid([strait]) == pytest.approx((shifted[0], -180), abs=1e-9)
+    cap = np.array([[0.0, 80], [90, 80], [180, 80], [270, 80], [360, 80]])
+    assert area_centroid([cap])[0] == pytest.approx(90, abs=1e-6)
+
+
+def test_the_centroid_of_a_small_square_is_exact_to_a_millimetre():
+    lon, lat = np.array([[0.0, 0], [1e-4, 0], [1e-4, 1e-4], [0, 1e-4], [0, 0]]).T
+    ring = np.stack([7 + lon, 52 + lat], -1)
+    place = to_local(*area_centroid([ring]), (52.00005, 7.00005))
+    assert place == pytest.approx((0, 0), abs=1e-3)

@@ -7,14 +7,15 @@ import pytest
 import shapely
 import torch
 import twin
+from exact_distance import nearest_by_loop
 from helpers import heading
 from hypothesis import given
 from hypothesis import strategies as st
-from shapely.affinity import translate
+from shapely.affinity import scale, translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
-from damian.world.airspace import build_airspace, inside, nearest_points
+from damian.world.airspace import build_airspace, inside
 from damian.world.landing import ActionConfig, Candidates, Ranking, assign_landing_points, displacement
 from damian.world.regions.region import Region
 
@@ -34,10 +35,10 @@ def random_bookings(seed, n_worlds, n_agents, n_points, together):
     return ranked, row, standing, ready
 
 
-def booked(ranked, row, standing, ready, n_points):
+def booked(ranked, row, standing, ready):
     """Points booked by UAVs, ready or not, whose reach is unlimited."""
     ranking = Ranking(ranked, torch.zeros(ranked.shape))
-    return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0), n_points)
+    return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0))
 
 
 @given(
@@ -50,7 +51,7 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
     n_points = n_agents + spare
     case = random_bookings(seed, 6, n_agents, n_points, together)
     ranked, row, standing, ready = map(torch.as_tensor, case)
-    ours = booked(ranked.int(), row, standing, ready, n_points)
+    ours = booked(ranked.int(), row, standing, ready)
     expected = [
         twin.assign_landing_points(ranked[row[b]].tolist(), standing[b].tolist(), ready[b].tolist())
         for b in range(6)
@@ -62,7 +63,7 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
 def test_uavs_on_different_points_never_book_the_same(seed, n_agents, spare):
     case = random_bookings(seed, 20, n_agents, n_agents + spare, False)
     ranked, row, standing, ready = map(torch.as_tensor, case)
-    ours = booked(ranked.int(), row, standing, ready, n_agents + spare)
+    ours = booked(ranked.int(), row, standing, ready)
     assert all(len(set(world)) == n_agents for world in ours.tolist())
     assert ours[~ready].equal(standing[~ready])
 
@@ -71,47 +72,28 @@ def test_of_two_uavs_that_choose_one_point_the_first_gets_it_and_the_other_its_n
     ranked = torch.tensor([[5, 7, 1], [5, 0, 2]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 1], [1, 0]]), torch.tensor([[1, 2], [1, 2]])
     ready = torch.ones(2, 2, dtype=torch.bool)
-    assert booked(ranked, row, standing, ready, 8).tolist() == [[5, 0], [5, 7]]
+    assert booked(ranked, row, standing, ready).tolist() == [[5, 0], [5, 7]]
 
 
 def test_a_point_that_a_uav_leaves_in_this_step_is_not_free_yet():
     ranked = torch.tensor([[5, 7, 1], [1, 6, 2]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
     ready = torch.ones(1, 2, dtype=torch.bool)
-    assert booked(ranked, row, standing, ready, 8).tolist() == [[5, 6]]
+    assert booked(ranked, row, standing, ready).tolist() == [[5, 6]]
 
 
 def test_a_point_out_of_reach_of_one_uav_goes_to_another_that_can_fly_there():
     ranking = Ranking(torch.tensor([[5, 7, 1], [5, 2, 0]]), torch.tensor([[9.0, 4.0, 0.0], [9.0, 0.0, 4.0]]))
     row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
-    assert assign_landing_points(ranking, row, standing, torch.tensor([[8.0, 9.0]]), 8).tolist() == [[1, 5]]
-    assert assign_landing_points(ranking, row, standing, torch.tensor([[9.0, 9.0]]), 8).tolist() == [[5, 2]]
+    assert assign_landing_points(ranking, row, standing, torch.tensor([[8.0, 9.0]])).tolist() == [[1, 5]]
+    assert assign_landing_points(ranking, row, standing, torch.tensor([[9.0, 9.0]])).tolist() == [[5, 2]]
 
 
 def test_uavs_on_a_common_start_may_stay_there_or_leave():
     ranked = torch.tensor([[3, 0, 1, 2, 4], [4, 0, 1, 2, 3]], dtype=torch.int32)
     row, standing = torch.tensor([[0, 0, 1]]), torch.tensor([[3, 3, 3]])
     ready = torch.ones(1, 3, dtype=torch.bool)
-    assert booked(ranked, row, standing, ready, 5).tolist() == [[3, 3, 4]]
-
-
-@given(seed=st.integers(0, 2**32 - 1), n_points=st.integers(1, 40), integer_grid=st.booleans())
-def test_nearest_points_equal_numpys_and_ties_go_to_the_lowest_id(seed, n_points, integer_grid):
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-200, 200, (n_points, 2)).astype(np.float32)
-    targets = rng.uniform(-200, 200, (7, 2)).astype(np.float32)
-    if integer_grid:  # whole metres, with many equal distances
-        points, targets = (np.round(x / 50).astype(np.float32) for x in (points, targets))
-    squared = ((points.astype(float) - targets[:, None].astype(float)) ** 2).sum(-1)
-    expected = np.argsort(squared, axis=1, kind="stable")
-    n = int(rng.integers(1, n_points, endpoint=True))
-    ours = nearest_points(torch.as_tensor(points), torch.as_tensor(targets), n)
-    assert ours.tolist() == expected[:, :n].tolist()
-
-
-def test_padded_points_are_never_nearest():
-    points = torch.tensor([[9e3, 9e3], [torch.inf, torch.inf], [-9e3, 0.0]])
-    assert nearest_points(points, torch.zeros(1, 2), 2).tolist() == [[2, 0]]
+    assert booked(ranked, row, standing, ready).tolist() == [[3, 3, 4]]
 
 
 HORSESHOE = Polygon([(0, 0), (10, 0), (10, 8), (7, 8), (7, 3), (3, 3), (3, 8), (0, 8)])
@@ -218,6 +200,39 @@ def test_candidates_are_the_points_nearest_the_target_or_the_uavs_own_point(kind
             assert ranked == [own] * 5
             outside += 1
     assert 10 < outside < len(displacements) - 10
+
+
+@pytest.mark.parametrize("name", POLYGONS)
+def test_the_landing_points_of_actions_are_ranked_as_by_a_loop_in_exact_arithmetic(name):
+    polygon, actions = scale(POLYGONS[name], 20, 20), ActionConfig(distances=[0.0, 50.0, 97.0])
+    airspace = build_airspace([Region(polygon, name)], 30.0, 45.0, None, 3)
+    ranking = Candidates(airspace, actions, 3).ranking
+    points = airspace.exact_points[0].tolist()
+    moves = [(d, math.radians(h)) for d in actions.distances for h in actions.headings]
+    outside = 0
+    for row in np.random.default_rng(0).integers(len(points) * len(moves), size=100).tolist():
+        own, (distance, bearing) = row // len(moves), moves[row % len(moves)]
+        target = [
+            points[own][0] + distance * math.sin(bearing),
+            points[own][1] + distance * math.cos(bearing),
+        ]
+        inside_polygon = shapely.contains_xy(polygon, *target)
+        expected = nearest_by_loop(points, target, 5) if inside_polygon else [own] * 5
+        assert ranking.point[row].tolist() == expected
+        outside += not inside_polygon
+    assert 10 < outside < 80
+
+
+def test_tables_that_do_not_fit_are_refused_with_their_size():
+    airspace = build_airspace([Region(shapely.box(0, 0, 7000, 7000), "large")], 30.0, 45.0, None, 100)
+    with pytest.raises(InputError) as error:
+        Candidates(airspace, ActionConfig(), 100)
+    assert str(error.value) == (
+        "region.lattice_step: 76657 landing points with 40 actions and 199 candidates each need 4.9 GB, more "
+        "than 4 GB: raise region.lattice_step, set region.n_landing_points, list fewer actions.distances or "
+        "actions.headings, lower region.pool, or take actions.kind=continuous"
+    )
+    Candidates(airspace, ActionConfig(kind="continuous"), 100)
 
 
 def test_headings_are_clockwise_from_north():

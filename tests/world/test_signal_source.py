@@ -378,7 +378,10 @@ def test_locate_compiles_to_one_graph(n_hotspots):
             {"emission_probability": 1.5},
             "source.emission_probability: 1.5 is not between 0 and 1",
         ),
-        ({"position": [1.0, math.nan]}, "source.position: [1.0, nan] is not [x, y] in metres"),
+        (
+            {"position": [1.0, math.nan]},
+            "source.position: [1.0, nan] is not [x, y] in metres or {lat: ..., lon: ...} in degrees",
+        ),
         ({"n_hotspots": 0}, "source.n_hotspots: 0 is not between 1 and 1000"),
         ({"min_stops": -1}, "source.min_stops: -1 is not at least 0"),
         ({"max_stops": 2}, "source.max_stops: 2 is not between 3 and 1000"),

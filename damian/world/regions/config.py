@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.resources import files
 from typing import Any
 
@@ -13,8 +13,9 @@ from damian.common.errors import naming_errors
 from damian.common.registry import Registry
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geojson import read_geojson
+from damian.world.regions.places import check_places
 from damian.world.regions.polygon import polygon_from_vertices, random_polygon
-from damian.world.regions.region import Region, check_regions
+from damian.world.regions.region import Region, centred, check_regions
 
 
 @dataclass
@@ -49,9 +50,11 @@ class RegionConfig:
     initial_conditions: int = 1024
     """Number of initial conditions (UAV starts and source walk) drawn per seed, divided among the regions."""
     start_positions: list | None = None
-    """One [x, y] in metres per UAV, which starts on the nearest landing point; drawn if not given."""
+    """One place inside the region per UAV, which starts on the nearest landing point; drawn if not given. A
+    place is [x, y], metres east and north in the coordinates of the region's vertices, or of the centroid of
+    a region from a file; there it may also be {lat: 53.1, lon: -4.5} in degrees."""
     start_together: bool = False
-    """Whether all UAVs start on the same drawn landing point."""
+    """Whether all UAVs start on the same drawn landing point; given start positions may then share one."""
 
     options: Any = None
     """Settings of a region source of one's own, as a mapping."""
@@ -62,12 +65,6 @@ class RegionConfig:
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
         checks.in_range("region.pool", self.pool, 1)
         checks.in_range("region.initial_conditions", self.initial_conditions, self.pool, 1e6)
-        checks.require(
-            self.pool == 1 or self.kind == "random" or ":" in self.kind,
-            "region.pool",
-            self.pool,
-            f"means nothing with region.kind={self.kind}: only random regions are drawn",
-        )
         checks.above("region.lattice_step", self.lattice_step, 0.0, "m")
         checks.above("region.lattice_angle", self.lattice_angle, 0.0, "deg")
         checks.in_range("region.lattice_angle", self.lattice_angle, 0.0, 90.0, "deg")
@@ -77,8 +74,8 @@ class RegionConfig:
         for key in required_keys.get(self.kind, []):
             problem = f"is missing: region.kind={self.kind} needs it"
             checks.require(bool(getattr(self, key)), f"region.{key}", "it", problem)
-        for start in self.start_positions or []:
-            checks.place("region.start_positions", start)
+        self._refuse_unread()
+        check_places("region.start_positions", self.start_positions or [])
 
     def regions(self, rng: np.random.Generator) -> list[Region]:
         """Read the region from its file or vertices, or draw ``pool`` random regions.
@@ -89,13 +86,41 @@ class RegionConfig:
         """
         source, name = REGION_SOURCES.get(self.kind, "region.kind"), f"region.kind: {self.kind}"
         if ":" not in self.kind:
-            return source(self, rng)
+            return [centred(region) for region in source(self, rng)]
         with naming_errors(name):
             found = source(self, rng)
         check_regions(found, name)
         most, problem = self.initial_conditions, "regions, but each needs an initial condition of its own"
         checks.require(len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem)
-        return found
+        return [centred(region) for region in found]
+
+    def _refuse_unread(self) -> None:
+        """Refuse settings of other kinds of regions, which this kind would ignore."""
+        if ":" in self.kind:
+            return  # a source of one's own may read any of them
+        for setting in fields(self):
+            kinds = _READ_BY.get(setting.name, [self.kind])
+            default = [] if setting.name == "vertices" else setting.default
+            checks.require(
+                self.kind in kinds or getattr(self, setting.name) == default,
+                f"region.{setting.name}",
+                getattr(self, setting.name),
+                f"means nothing with region.kind={self.kind}: only {' or '.join(kinds)} reads it",
+            )
+
+
+_READ_BY = {
+    "min_area": ["random"],
+    "max_area": ["random"],
+    "pool": ["random"],
+    "vertices": ["vertices"],
+    "path": ["fir", "geojson"],
+    "id": ["fir"],
+    "index": ["geojson"],
+    "where": ["geojson"],
+    "options": ["a package.module:function of one's own"],
+}
+"""Settings that only some kinds of regions read, and these kinds."""
 
 
 RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]

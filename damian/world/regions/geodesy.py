@@ -6,6 +6,8 @@ and the direct geodesic problem on a sphere. Distances on the sphere differ by u
 WGS 84 ellipsoid.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -58,6 +60,38 @@ def to_latlon(x_m: ArrayLike, y_m: ArrayLike, origin: tuple[float, float]) -> tu
     up = np.cos(arc) * np.sin(lat_0) + north * np.cos(lat_0)
     lat = np.degrees(np.arctan2(up, np.hypot(out, east)))
     return lat, wrap_longitude(np.degrees(np.arctan2(east, out)) + origin[1])
+
+
+def area_centroid(rings: Sequence[Floats]) -> tuple[float, float]:
+    """Centroid of a polygon's area on the sphere, as (latitude, longitude) in degrees.
+
+    It is the place below the mean of all points of the area in space. For a polygon whose edges are great
+    circles this mean has a closed form, the sum over the edges of their length times the normal of their
+    plane (J. E. Brock, "The Inertia Tensor for a Spherical Triangle", 1975), so that regions of any size,
+    across the antimeridian or around a pole, have it exactly.
+
+    Args:
+        rings: closed rings, the area to the left of each, so that shells run counter-clockwise and holes
+            clockwise; each [V, 2] degrees (longitude, latitude).
+    """
+    base = (float(rings[0][0, 1]), float(rings[0][0, 0]))
+    moment = np.zeros(3)
+    for ring in rings:
+        x, y = to_local(ring[:, 1], ring[:, 0], base)
+        distance = np.hypot(x, y) / EARTH_RADIUS_M
+        outward = np.column_stack([x, y]) / EARTH_RADIUS_M * np.sinc(distance / np.pi)[:, None]
+        # Corners east, north and up of the base, in Earth radii. Near the base the closed form would lose
+        # all digits; the part of it that cancels over a closed ring is therefore left out.
+        offset = np.column_stack([outward, -2 * np.sin(distance / 2) ** 2])
+        start, end, up = offset[:-1], offset[1:], np.array([0.0, 0.0, 1.0])
+        bent = np.cross(start, end)
+        normal = np.cross(up, end - start) + bent
+        angle = 2 * np.arcsin(np.minimum(np.linalg.norm(end - start, axis=1) / 2, 1))
+        moment += ((1 / np.sinc(angle / np.pi) - 1)[:, None] * normal + bent).sum(0)
+    east, north, up = moment
+    arc, bearing = EARTH_RADIUS_M * np.arctan2(np.hypot(east, north), up), np.arctan2(east, north)
+    lat, lon = to_latlon(arc * np.sin(bearing), arc * np.cos(bearing), base)
+    return float(lat), float(lon)
 
 
 def wrap_longitude(lon_deg: ArrayLike) -> Floats:

@@ -220,7 +220,7 @@ def _lattice(bounds: tuple[float, float, float, float], step: float, slant: floa
     # Compared as products, since a quotient by a tiny step could overflow.
     if (width + 4 * step) * (height + rise) > MAX_CANDIDATES * step * rise:
         raise InputError(
-            f"lattice step: {step:g} m is too fine for a polygon of {width:g} m x {height:g} m: "
+            f"region.lattice_step: {step:g} m is too fine for a polygon of {width:g} m x {height:g} m: "
             f"more than {MAX_CANDIDATES} points; take a longer one"
         )
     rows, start, ends = [], min_x, itertools.cycle([(max_x, 1), (min_x, -1)])

@@ -1,7 +1,7 @@
-"""Operative regions in local metres, with the centroid as origin."""
+"""Operative regions in local metres about their centroid, and places that settings give in them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -11,7 +11,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
-from damian.world.regions.geodesy import Floats, to_local, wrap_longitude
+from damian.world.regions.geodesy import Floats, area_centroid, to_local
 from damian.world.regions.polygon import polygon_from_rings
 
 
@@ -20,17 +20,47 @@ class Region:
     """Region that the UAVs fly over.
 
     Attributes:
-        polygon: in local metres, x east and y north.
+        polygon: in local metres, x east and y north. The worlds compute in these coordinates.
         name: its name in the file, or one made up from its kind.
         origin: (latitude, longitude) of the local origin (0, 0) in degrees; ``None`` for a region without a
             position on Earth.
         levels: lowest and highest flight level [FL, hundreds of feet]; ``None`` if not known.
+        offset: place of the local origin in the coordinates of the settings (east, north) [m]; not (0, 0)
+            if vertices were given, or drawn, about another origin.
     """
 
     polygon: Polygon | MultiPolygon
     name: str
     origin: tuple[float, float] | None = None
     levels: tuple[float, float] | None = None
+    offset: tuple[float, float] = (0.0, 0.0)
+
+
+def centred(region: Region) -> Region:
+    """The region in metres about its centroid.
+
+    Corners are rounded to a grid of 1/65536 m about the lower left one. So the same shape has the same local
+    coordinates, bit for bit, wherever its origin lies: coordinates of 10 000 km carry rounding errors of
+    2e-9 m. A region with a position on Earth has local coordinates already.
+
+    Raises:
+        InputError: edges cross or areas vanish once rounded.
+    """
+    if region.origin is not None:
+        return region
+    corner = np.array(region.polygon.bounds[:2])
+    polygon = shapely.transform(region.polygon, lambda xy: to_grid(xy - corner))
+    centroid = to_grid(shapely.get_coordinates(polygon.centroid)[0])
+    reason = shapely.is_valid_reason(polygon)
+    checks.require(polygon.is_valid, region.name, reason, "[m] once rounded to 1/65536 m: draw it larger")
+    east, north = (corner + centroid).tolist()
+    polygon = shapely.transform(polygon, lambda xy: xy - centroid)
+    return replace(region, polygon=polygon, offset=(region.offset[0] + east, region.offset[1] + north))
+
+
+def to_grid(metres: Floats) -> Floats:
+    """Lengths [*] rounded to 1/65536 m."""
+    return np.round(metres * 65536) / 65536
 
 
 def check_regions(found: Any, name: str) -> None:
@@ -68,7 +98,9 @@ def local_region(
     levels: tuple[float, float] | None,
     source: str,
 ) -> Region:
-    """Build a region in metres about its centroid from polygon parts in degrees.
+    """Build a region in metres about the centroid of its area on the sphere from polygon parts in degrees.
+
+    Edges are straight in local metres: nearly great circles, not parallels of latitude.
 
     Args:
         parts: for each part its rings, the shell first; each [V, 2] degrees (longitude, latitude).
@@ -87,7 +119,8 @@ def local_region(
     shape = cast(Polygon | MultiPolygon, shapely.union_all(polygons))
     if shape.bounds[2] - shape.bounds[0] > 180:
         raise InputError(f"{source}: more than 180 deg of longitude wide; take a smaller region")
-    origin = (shape.centroid.y, float(wrap_longitude(shape.centroid.x)))
+    oriented = shapely.get_parts(shapely.orient_polygons(shape))
+    origin = area_centroid([shapely.get_coordinates(ring) for ring in shapely.get_rings(oriented)])
     local = shapely.transform(shape, lambda c: np.column_stack(to_local(c[:, 1], c[:, 0], origin)))
     if not local.is_valid:
         raise InputError(f"{source}: edges cross once laid out in metres; take a smaller region")

@@ -1,0 +1,91 @@
+"""Places that settings give, as metres or as latitude and longitude: checked, and in a region's local metres.
+
+A place is ``[x, y]``, metres east and north in the coordinates in which the region is given (those of
+``region.vertices``; of a FIR table or GeoJSON file: about the area's centroid), or, for these two kinds of
+region, ``{lat: 53.1, lon: -4.5}`` in degrees.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.world.regions.geodesy import Floats, to_local
+from damian.world.regions.region import Region, to_grid
+
+_DEGREES = {"lat": 90.0, "lon": 180.0}
+"""Keys of a place in degrees, with their largest value."""
+
+
+def check_place(key: str, place: Any) -> None:
+    """Require ``[x, y]`` of two finite numbers [m], or ``{lat: ..., lon: ...}`` in range [deg].
+
+    Args:
+        key: of the setting, for errors.
+        place: what the setting says.
+
+    Raises:
+        InputError: it is something else.
+    """
+    if not isinstance(place, Mapping):
+        good = isinstance(place, Sequence) and len(place) == 2 and all(map(_is_finite, place))
+        problem = "is not [x, y] in metres or {lat: ..., lon: ...} in degrees"
+        return checks.require(good, key, place, problem)
+    good = set(place) == set(_DEGREES)
+    checks.require(good, key, place, "is not {lat: ..., lon: ...} in degrees, such as {lat: 53.1, lon: -4.5}")
+    for name, largest in _DEGREES.items():
+        checks.require(_is_finite(place[name]), f"{key}.{name}", place[name], "is not a finite number")
+        checks.in_range(f"{key}.{name}", place[name], -largest, largest, "deg")
+    return None
+
+
+def check_places(key: str, places: Any) -> None:
+    """Require a list of places, each as ``check_place`` has it."""
+    is_list = isinstance(places, Sequence) and not isinstance(places, str)
+    checks.require(is_list, key, places, "is not a list of places such as [[0, 0], [100, 50]]")
+    for place in places:
+        check_place(key, place)
+
+
+def local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
+    """Places of the settings in local metres of a region, [P, 2].
+
+    Args:
+        key: of the setting, for errors.
+        places: each as ``check_place`` requires it.
+        region: all of them must lie inside.
+
+    Raises:
+        InputError: a place lies outside, or is in degrees while the region has no position on Earth.
+    """
+    local = np.array([_local(key, place, region) for place in places])
+    inside = shapely.contains_xy(region.polygon, local)
+    if not inside.all():
+        first = int(np.argmin(inside))
+        given, (x, y) = places[first], local[first]
+        shown = f"{given} (at [{x:g}, {y:g}] m)" if isinstance(given, Mapping) else f"{[*given]} m"
+        west, south, east, north = np.round(np.tile(region.offset, 2) + region.polygon.bounds, 2)
+        raise InputError(
+            f"{key}: {shown} is not inside {region.name} (x {west:.10g} to {east:.10g} m, y {south:.10g} to "
+            f"{north:.10g} m)"
+        )
+    return local
+
+
+def _local(key: str, place: Any, region: Region) -> Floats:
+    """A place in local metres, [2]."""
+    if not isinstance(place, Mapping):
+        return to_grid(np.array(place, float) - region.offset)
+    if region.origin is None:
+        raise InputError(
+            f"{key}: {place} has latitude and longitude, but {region.name} has no position on Earth: give "
+            "[x, y] in metres, or take a region from a FIR table or GeoJSON file"
+        )
+    return np.stack(to_local(place["lat"], place["lon"], region.origin))
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))

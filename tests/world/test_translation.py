@@ -1,0 +1,113 @@
+"""A region that is moved with everything in it gives the same worlds, bit for bit."""
+
+import functools
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from shapely.affinity import translate
+
+from damian.common.tensors import tree_map
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import UavEnv
+from damian.world.battery import BatteryConfig
+from damian.world.config import WorldConfig
+from damian.world.landing import ActionConfig
+from damian.world.regions.config import RegionConfig
+from damian.world.regions.region import Region, centred
+from damian.world.signal_source import SourceConfig
+from damian.world.simulation import Simulation
+
+SQUARE = [[0.0, 0.0], [210.0, 0.0], [210.0, 210.0], [0.0, 210.0]]
+"""A side is seven steps of the lattice: many points are equally near, and some lie on the boundary."""
+RAGGED = [[-33.42, -140.43], [-129.57, -16.79], [-60.0, 20.0], [-100.17, 108.35], [146.39, -17.27]]
+
+
+def simulation(vertices, offset, kind):
+    """Worlds with given places, moved by an offset [m]."""
+
+    def moved(*places):
+        return (np.array(places) + offset).tolist()
+
+    region = RegionConfig(
+        kind="vertices",
+        vertices=moved(*vertices),
+        start_positions=moved([0.5, 11.0], [30.25, 30.0], [61.0, 3.0]),
+        initial_conditions=1,
+    )
+    return Simulation(
+        WorldConfig(
+            region=region,
+            source=SourceConfig(motion="dynamic", position=moved([30.0, 20.7])[0]),
+            battery=BatteryConfig(
+                enabled=True, capacity_kwh=0.05, charging_points=moved([9.0, 9.0], [70, 8.5])
+            ),
+            actions=ActionConfig(kind=kind),
+        ),
+        dt=1.0,
+        trail=2,
+        seed=0,
+    )
+
+
+def rollout(worlds, kind, n_steps):
+    """States of four worlds over the steps, with random actions."""
+    generator = torch.Generator().manual_seed(0)
+    state = tree_map(lambda x: x.repeat_interleave(4, 0), worlds.initial)
+    for _ in range(n_steps):
+        shape = (4, 3, 2) if kind == "continuous" else (4, 3)
+        action = torch.rand(shape, generator=generator)
+        state = worlds.step(state, action if kind == "continuous" else (40 * action).long())
+        yield state
+
+
+@functools.cache
+def unmoved(shape, kind):
+    return list(rollout(simulation(shape, (0.0, 0.0), kind), kind, 200))
+
+
+def leaves(state):
+    return [*state[:-1], *state.sent]
+
+
+OFFSET = st.floats(-1e7, 1e7)
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@settings(max_examples=3)
+@given(vertices=st.sampled_from([SQUARE, RAGGED]), east=OFFSET, north=OFFSET)
+@example(vertices=SQUARE, east=1000.0, north=1000.0)
+@example(vertices=RAGGED, east=1e7, north=-1e7)
+def test_moving_the_region_and_all_places_changes_no_bit_of_a_rollout(kind, vertices, east, north):
+    moved = rollout(simulation(vertices, (east, north), kind), kind, 200)
+    before = unmoved(tuple(map(tuple, vertices)), kind)
+    for ours, expected in zip(moved, before, strict=True):
+        assert ours.goal.equal(expected.goal)
+    assert all(a.equal(b) for a, b in zip(leaves(ours), leaves(expected), strict=True))
+    assert len({*ours.goal.flatten().tolist()}) > 3
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (-3.5e6, 1e7)])
+def test_a_centred_region_has_its_centroid_at_the_origin_and_knows_where_it_was(offset):
+    hole = [[(10, 10), (30, 10), (30, 35)]]
+    polygon = translate(shapely.Polygon([(0, 0), (90, 0), (80, 70), (11.25, 60)], hole), *offset)
+    region = centred(Region(polygon, "test"))
+    assert region.polygon.centroid.coords[0] == pytest.approx((0, 0), abs=2e-5)
+    back = shapely.get_coordinates(translate(region.polygon, *region.offset))
+    np.testing.assert_allclose(back, shapely.get_coordinates(polygon), atol=2e-5)
+    assert len(region.polygon.interiors) == 1
+
+
+def test_positions_that_delay_laws_read_are_in_the_coordinates_of_the_settings():
+    region = RegionConfig(
+        kind="vertices",
+        vertices=[[500.0, 500.0], [900.0, 500.0], [900.0, 800.0]],
+        start_positions=[[700.0, 560.0]] * 3,
+        start_together=True,
+    )
+    env = UavEnv(ScenarioConfig(region=region), extras=("position",))
+    position = env.reset()["agents", "position"]
+    assert (position[0] - torch.tensor([700.0, 560.0])).norm(dim=-1).max() < 30
