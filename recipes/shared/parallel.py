@@ -19,12 +19,14 @@ from typing import Any
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from damian.common.errors import InputError
+from damian.common.errors import InputError, RunError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
+from damian.evaluation.run_lock import locked
 
 from .composition_errors import one_line
-from .launch import Program, perform, stored_config
+from .launch import Program, perform
 from .settings import TrainConfig
+from .stored_runs import stored_config
 
 LOG = "log.txt"
 _SPAWN = multiprocessing.get_context("spawn")
@@ -191,12 +193,13 @@ def _perform(run: Run) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
-            resumes = run.trains and (run.folder / CHECKPOINT).exists()
-            config = replace(run.config, resume=str(run.folder)) if resumes else run.config
-            perform(config, run.folder, run.program)
+            with locked(run.folder):
+                resumes = run.trains and (run.folder / CHECKPOINT).exists()
+                config = replace(run.config, resume=str(run.folder)) if resumes else run.config
+                perform(config, run.folder, run.program)
         except SystemExit as interrupted:
             raise KeyboardInterrupt from interrupted
-        except InputError as error:
+        except (InputError, RunError) as error:
             print(f"error: {error}")
             raise
         except BaseException:
