@@ -2,6 +2,7 @@
 
 import functools
 import os
+import random
 import signal
 import sys
 import traceback
@@ -13,6 +14,7 @@ from typing import Any, NoReturn
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``launch`` prints them
 
+import numpy as np
 import torch
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
@@ -98,7 +100,8 @@ def perform(config: TrainConfig, folder: Path, program: Program) -> None:
     A run that is refused before it has learnt or measured anything leaves no folder.
     """
     torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
+    for seed in (torch.manual_seed, np.random.seed, random.seed):  # components of one's own may use them
+        seed(config.seed)
     was_empty = not is_folder(folder) or not any(folder.iterdir())
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -209,6 +212,9 @@ def launch(main: Callable[[], Any], program: str = "train") -> None:
         if folder := sweep_folder(error):
             drop_sweep(folder)
         _give_up(error, program)
+    except KeyboardInterrupt:  # before a run began
+        print("interrupted", file=sys.stderr)
+        sys.exit(exit_code(signal.SIGINT))
 
 
 def _give_up(error: Exception, program: str) -> NoReturn:
