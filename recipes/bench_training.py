@@ -28,8 +28,8 @@ from tqdm import tqdm
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.schedule import SystemClock
 
-from .shared.known_settings import CONF
 from .shared.collecting import make_collector, ticks
+from .shared.known_settings import CONF
 from .shared.launch import checked
 from .shared.settings import TrainConfig
 from .train import learning_env, make_learner, replay_buffer

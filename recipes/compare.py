@@ -30,9 +30,9 @@ from omegaconf import MISSING, DictConfig
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.evaluation.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison, regime
-from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
 from damian.evaluation.interrupt import exit_code
 from damian.evaluation.metrics_log import read_metrics
+from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
 
 from .evaluate import fly
 from .shared.command_line import command, typed_words, whole_laws

@@ -9,8 +9,8 @@
 
 ``--help`` lists the groups of settings, ``--help KEY`` explains a setting or a section. The run folder,
 runs/DATE_TIME unless hydra.run.dir names another one, gets config.yaml, run.json (versions, machine, wall
-time), metrics.csv (a row for each update), TensorBoard events, checkpoint.pt, best.pt, learning_curve.png, and
-the evaluation as result.csv and result.md.
+time), metrics.csv (a row for each update), TensorBoard events, checkpoint.pt, best.pt, learning_curve.png,
+and the evaluation as result.csv and result.md (docs/runs.md).
 """
 
 import sys
@@ -196,8 +196,9 @@ def check_convergence(config: TrainConfig, state: TrainingState, losses: dict[st
     """
     if problem := divergence(state.components, losses):
         raise RunError(
-            f"update {state.progress.updates}: {problem}: the learner has diverged; choose a smaller learner.lr "
-            f"than {config.learner.lr:g}; {state.folder / CHECKPOINT} is of update {state.saved} and intact"
+            f"update {state.progress.updates}: {problem}: the learner has diverged; choose a smaller "
+            f"learner.lr than {config.learner.lr:g}; {state.folder / CHECKPOINT} is of update {state.saved} "
+            "and intact"
         )
 
 

@@ -1,4 +1,4 @@
-"""Checkpoint files: nested dictionaries of tensors and numbers behind a line that tells whether they are whole.
+"""Checkpoint files: dictionaries of tensors and numbers behind a line that tells whether they are whole.
 
 The first line names the format and its version, the version of damian that wrote the file, and the length and
 the SHA-256 of the rest, which is what ``torch.save`` writes. Nothing in a file is ever executed.

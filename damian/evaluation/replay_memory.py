@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
 
 from damian.common.atomic_files import remove_unfinished, writing
 from damian.evaluation.checkpoint import read_checkpoint, to_tensordict, write_checkpoint
@@ -46,7 +46,7 @@ class ReplayMemory:
         Raises:
             RunError: a segment cannot be written.
         """
-        storage, written = self._storage, cast(int, self._buffer.writer._write_count)
+        storage, written = self._storage, cast(RoundRobinWriter, self._buffer.writer)._write_count
         if not written:
             return {"written": 0}
         oldest, per_segment = written - cast(int, storage._len_along_dim0), self._rows_per_segment()
@@ -83,7 +83,8 @@ class ReplayMemory:
             rows = rows.to(storage.device)
         most_rows = storage._max_size_along_dim0(batched_data=rows)
         index = torch.arange(state["oldest"], state["written"]) % most_rows
-        LazyTensorStorage.set(storage, index, rows)  # a BackupdateStorage has corrected them already
+        # Not ``storage.set``: a BackupdateStorage has corrected these rows already.
+        LazyTensorStorage.set(storage, index, rows)  # type: ignore[arg-type]
         self._buffer.writer.load_state_dict(state["writer"])
         self._digests = dict(state["segments"])
 

@@ -10,6 +10,7 @@ try:
 except ImportError:  # Windows has no such locks
     fcntl = None
 
+from damian.common.atomic_files import writing
 from damian.common.errors import InputError
 
 
@@ -29,9 +30,11 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
     if not is_folder(folder):
         yield
         return
-    descriptor = os.open(folder, os.O_RDONLY)
+    with writing(folder):
+        descriptor = os.open(folder, os.O_RDONLY)
     try:
-        if not _lock(descriptor):
+        # The folder of a run that was refused may just have been removed by that run.
+        if not _lock(descriptor) or not os.fstat(descriptor).st_nlink:
             raise InputError(
                 f"{key}: {folder} is in use by another run: wait for its end, or choose another folder"
             )

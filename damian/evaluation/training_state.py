@@ -64,6 +64,8 @@ class TrainingState:
     ) -> None:
         self.folder, self.components = folder, components
         self.progress, self.episodes = Progress(), EpisodeLog()
+        self.saved = 0
+        """The update after which the checkpoint of the run was written."""
         self._replay = ReplayMemory(buffer, folder / REPLAY) if buffer is not None else None
         replay = {} if self._replay is None else {"replay": self._replay}
         self._parts = {
@@ -87,6 +89,7 @@ class TrainingState:
             for group in (self.components, self._parts)
         )
         write_checkpoint(self.folder / CHECKPOINT, {"components": networks, "training": parts})
+        self.saved = self.progress.updates
         if self._replay is not None:
             self._replay.remove_old()
 
@@ -113,6 +116,7 @@ class TrainingState:
         content = _content(path, "resume")
         restore(self.components, content["components"], path, "resume")
         restore(self._parts, content["training"], path, "resume")
+        self.saved = self.progress.updates
 
 
 def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> None:
@@ -168,7 +172,7 @@ def _content(path: Path, key: str) -> dict[str, Any]:
 
 
 class _CarriedStep:
-    """The TensorDict with which the next step of a collector begins: observations, hidden states, counters."""
+    """The TensorDict with which a collector takes its next step: observations, hidden states, counters."""
 
     def __init__(self, collector: Collector) -> None:
         self._collector = collector
@@ -188,7 +192,7 @@ class RandomState:
     """The states of the global random generators of torch, NumPy and Python."""
 
     def state_dict(self) -> dict[str, Any]:
-        name, numbers, *rest = np.random.get_state()
+        name, numbers, *rest = np.random.get_state()  # noqa: NPY002 (components of one's own may use it)
         return {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -201,5 +205,5 @@ class RandomState:
         if len(state["cuda"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(state["cuda"])
         name, numbers, *rest = state["numpy"]
-        np.random.set_state((name, np.array(numbers, dtype=np.uint32), *rest))
+        np.random.set_state((name, np.array(numbers, dtype=np.uint32), *rest))  # noqa: NPY002
         random.setstate(state["python"])

@@ -21,7 +21,9 @@ from damian.evaluation.training_state import checkpoint_file, load_networks
 
 @pytest.fixture
 def file(tmp_path) -> Path:
-    write_checkpoint(tmp_path / "checkpoint.pt", {"components": {}, "training": {"weights": torch.arange(99)}})
+    write_checkpoint(
+        tmp_path / "checkpoint.pt", {"components": {}, "training": {"weights": torch.arange(99)}}
+    )
     return tmp_path / "checkpoint.pt"
 
 
@@ -29,7 +31,11 @@ def test_everything_that_states_consist_of_is_read_as_it_was(tmp_path):
     whole = torch.arange(1000.0)
     step = TensorDict({"done": torch.zeros(2, 1, dtype=torch.bool)}, [2])
     step["agents"] = TensorDict({"x": whole[:6].view(2, 3)}, [2, 3])
-    numbers = {"a": [1, 2.5, None, "text", True, float("nan")], "b": (np.float64(3.5), np.int64(4)), 7: b"bytes"}
+    numbers = {
+        "a": [1, 2.5, None, "text", True, float("nan")],
+        "b": (np.float64(3.5), np.int64(4)),
+        7: b"bytes",
+    }
     module = nn.BatchNorm1d(3)
     content = {"step": step, **numbers, "module": module.state_dict(), "size": torch.Size([2])}
     write_checkpoint(tmp_path / "x.pt", content)
@@ -108,7 +114,7 @@ def test_a_file_that_would_run_code_is_refused(tmp_path, nested):
 def test_the_folder_of_an_older_version_is_refused_without_reading_it(tmp_path):
     (tmp_path / "checkpoint").mkdir()
     (tmp_path / "checkpoint" / "other.pickle").write_bytes(b"cos\nsystem\n(S'touch ran'\ntR.")
-    with pytest.raises(InputError, match="damian 0.4 or an older one wrote its checkpoint"):
+    with pytest.raises(InputError, match=r"damian 0\.4 or an older one wrote its checkpoint"):
         checkpoint_file(tmp_path, "resume")
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint"]
 

@@ -20,7 +20,13 @@ from damian.recipes.train import main
 
 TINY = ["worlds=4", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "checkpoint_every=3"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12", "frames=256", "logger=csv"]
-SAC = ["learner=sac", "learner.updates=1", "learner.batch_size=16", "learner.warm_up=40", "learner.buffer_steps=160"]
+SAC = [
+    "learner=sac",
+    "learner.updates=1",
+    "learner.batch_size=16",
+    "learner.warm_up=40",
+    "learner.buffer_steps=160",
+]
 FINISHED = {"config.yaml", "run.json", "metrics.csv", "checkpoint.pt", "best.pt", "learning_curve.png"}
 FINISHED |= {"result.csv", "result.md"}
 

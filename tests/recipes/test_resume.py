@@ -1,4 +1,4 @@
-"""A run that was stopped and resumed has the metrics, weights and results of one that never was, bit for bit."""
+"""A run that was stopped and resumed equals one that never was: metrics, weights and results, bit for bit."""
 
 import itertools
 import os
@@ -14,7 +14,14 @@ from stopped_runs import SAC, TINY, check_equal, ended, files, forked, killed_af
 
 from damian.evaluation import replay_memory
 
-WHOLE = ["delay=paper", "delay.obs.high=9s", "aware=both", "delay.act=1", "motion=polynomial", "model.rnn=gru"]
+WHOLE = [
+    "delay=paper",
+    "delay.obs.high=9s",
+    "aware=both",
+    "delay.act=1",
+    "motion=polynomial",
+    "model.rnn=gru",
+]
 TRIGGERED = ["learner.steps=4", "clock.trigger=2s", "clock.longest=10s", "source.level_db=106", "delay.obs=2"]
 SLOW_CLOCKS = ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"]
 CASES = {
@@ -73,7 +80,9 @@ def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int])
     """
     for stops in range(500):
         begun = Path(folder, "config.yaml").exists()
-        code = stop([f"resume={folder}", "hydra.run.dir=unused"] if begun else [*words, f"hydra.run.dir={folder}"])
+        code = stop(
+            [f"resume={folder}", "hydra.run.dir=unused"] if begun else [*words, f"hydra.run.dir={folder}"]
+        )
         assert code in STOPPED, Path("output.txt").read_text()[-2000:]
         if code == 0:
             return stops

@@ -161,7 +161,10 @@ def test_resuming_a_finished_run_trains_no_further(run, capsys, learner):
     [
         (lambda f: (f / "config.yaml").write_text("a: [1"), "config.yaml: "),
         (lambda f: (f / "config.yaml").write_text("- 1"), "config.yaml: "),
-        (lambda f: (f / "config.yaml").write_text(""), "config.yaml: it has no agents, so it is not the whole"),
+        (
+            lambda f: (f / "config.yaml").write_text(""),
+            "config.yaml: it has no agents, so it is not the whole",
+        ),
         (lambda f: (f / "config.yaml").unlink(), "first holds no config.yaml, so there is no run"),
         (lambda f: (f / "checkpoint.pt").write_text("{"), "checkpoint.pt: it is no checkpoint of damian"),
         (lambda f: (f / "metrics.csv").write_text("x,y\n1,2\n"), "metrics.csv, line 1: no column frames"),
