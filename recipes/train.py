@@ -131,15 +131,15 @@ def train(config: TrainConfig, folder: Path) -> None:
         for batch in ticks(collector, clock) if not enough(config, state) else ():
             update(config, learner, state, log, batch)
             show(bar, config, state)
-            finished = enough(config, state)
+            finished, asked = enough(config, state), interrupt.asked
             if finished or state.progress.updates % config.checkpoint_every == 0:
                 log.sync()
                 state.save_best()
                 state.save()
-            elif interrupt.asked:
+            elif asked:
                 log.sync()
                 state.save()
-            if finished or interrupt.asked:
+            if finished or asked:
                 break
     collector.shutdown()
     if interrupt.asked:
@@ -173,16 +173,16 @@ def update(
     Raises:
         RunError: the learner has diverged.
     """
-    state.episodes.add(batch)
     progress, episodes = state.progress, state.episodes
+    episodes.add(batch)
+    progress.frames += batch.numel()
+    progress.updates += 1
     try:
         with own_code(config.learner.name):
             losses = check_numbers(learner.learn(batch), config.learner.name)
     except (ValueError, RuntimeError):  # torch's distributions refuse a nan
         check_convergence(config, state, {})
         raise
-    progress.frames += batch.numel()
-    progress.updates += 1
     means = {"episodes": float(episodes.finished), **episodes.means()}
     log.add(progress.frames, {**means, **mean_terms(batch), **losses})
     check_convergence(config, state, losses)

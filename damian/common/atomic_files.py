@@ -54,6 +54,8 @@ def writing(path: Path) -> Iterator[None]:
 
 def _sync_folder(folder: Path) -> None:
     """Make the new name of a file last, even if the machine stops."""
+    if not hasattr(os, "O_DIRECTORY"):  # Windows cannot open a folder
+        return
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

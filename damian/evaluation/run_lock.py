@@ -27,7 +27,7 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
     Raises:
         InputError: another process has locked it.
     """
-    if not is_folder(folder):
+    if fcntl is None or not is_folder(folder):
         yield
         return
     with writing(folder):
@@ -62,8 +62,7 @@ def is_folder(path: Path) -> bool:
 
 def _lock(descriptor: int) -> bool:
     """Lock an open folder; False if another process has. Some file systems cannot lock: there it is true."""
-    if fcntl is None:
-        return True
+    assert fcntl is not None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -1,6 +1,7 @@
 """What a training needs to continue exactly where it was: learner, environment, progress, random numbers."""
 
 import math
+import os
 import random
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
@@ -107,7 +108,7 @@ class TrainingState:
             write_checkpoint(self.folder / BEST, {"components": networks, "training": progress})
 
     def load(self) -> None:
-        """Continue from the checkpoint of the run.
+        """Continue from the checkpoint of the run, and remove what a killed run has left beside it.
 
         Raises:
             InputError: it is missing, damaged, or does not fit.
@@ -117,6 +118,8 @@ class TrainingState:
         restore(self.components, content["components"], path, "resume")
         restore(self._parts, content["training"], path, "resume")
         self.saved = self.progress.updates
+        if self._replay is not None:
+            self._replay.remove_old()
 
 
 def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> None:
@@ -153,7 +156,7 @@ def checkpoint_file(written: Path, key: str) -> Path:
     Raises:
         InputError: there is none.
     """
-    if written.is_file():
+    if os.path.isfile(written):
         return written
     path = written / CHECKPOINT
     if path.exists():

@@ -1,5 +1,6 @@
 """Runs in their folders: writing the configuration of one, and reading that of an earlier one."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -49,7 +50,7 @@ def stored_run(written: Path) -> TrainConfig:
 
 def run_folder(written: Path) -> Path:
     """The run folder that a folder, or a checkpoint file in it, stands for."""
-    return written if is_folder(written) or not written.suffix else written.parent
+    return written.parent if os.path.isfile(written) else written
 
 
 def check_run(folder: Path, key: str) -> None:

@@ -64,7 +64,7 @@ def test_a_finished_run_that_goes_on_equals_a_longer_one(run):
     check_equal(longer, longer.with_name("other"))
 
 
-SMALL = [*TINY, "frames=768", "checkpoint_every=4"]
+SMALL = [*TINY, "frames=512", "checkpoint_every=4", "episode.max_steps=6"]
 LEARNERS = {"mappo": ["delay.obs=2", "aware=backupdate"], "sac": [*SAC, "delay.obs=2"]}
 STOPPED = (0, 130, 143, -signal.SIGTERM, -signal.SIGKILL)
 """Exit codes of a run that has ended, or that a signal has stopped before, in or after its training."""
