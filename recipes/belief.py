@@ -28,8 +28,9 @@ from damian.envs.uav_env import UavEnv
 from damian.evaluation.belief_figure import Beliefs, plot_beliefs
 
 from .shared.known_settings import CONF
-from .shared.launch import launch, perform, prepare, reported, save_config
+from .shared.launch import launch, perform, prepare, reported
 from .shared.settings import TrainConfig
+from .shared.stored_runs import save_config
 
 TABLE, FIGURE = "belief.csv", "belief.png"
 POSITIONS = ("true_east_m", "true_north_m", "believed_east_m", "believed_north_m")

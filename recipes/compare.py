@@ -14,6 +14,7 @@ with 95 % intervals, J_norm, recovery) and figure.png.
 
 import csv
 import re
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,20 +25,20 @@ import hydra
 from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig
 
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.evaluation.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison, regime
+from damian.evaluation.interrupt import exit_code
+from damian.evaluation.metrics_log import read_metrics
 from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
-from damian.evaluation.run_folder import read_metrics
 
 from .evaluate import fly
-from .shared.command_line import whole_laws
+from .shared.command_line import command, typed_words, whole_laws
 from .shared.composition_errors import COMPOSITION_ERRORS, one_line
 from .shared.known_settings import CONF
-from .shared.launch import checked, command, launch, reported, shown, typed_words
+from .shared.launch import checked, launch, reported, shown
 from .shared.parallel import LOG, Run, check_stored, perform_all
 from .train import train
 
@@ -241,8 +242,6 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
 @hydra.main(version_base=None, config_path=CONF, config_name="compare")
 @reported
 def main(composed: DictConfig) -> None:
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise InputError("-m: a comparison runs all of its arms and seeds anyway; leave it out")
     config: CompareConfig = checked(composed, "compare")
     folder = Path(HydraConfig.get().runtime.output_dir)
     runs = plan(config, folder)
@@ -253,7 +252,8 @@ def main(composed: DictConfig) -> None:
         if not config.report_only:
             failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score))
     except KeyboardInterrupt:
-        sys.exit("interrupted; run the same command again to continue")
+        print("interrupted; run the same command again to continue", file=sys.stderr)
+        sys.exit(exit_code(signal.SIGINT))
     for run in failed:
         print(f"failed: {run.name}; see {run.folder / LOG}", file=sys.stderr)
     if failed and not any(run.finished for run in runs):

@@ -13,15 +13,16 @@ from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
-from torchrl.checkpoint import Checkpoint
 from torchrl.modules import ProbabilisticActor
 
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
+from damian.evaluation.training_state import load_networks
 
 from .shared.known_settings import CONF
-from .shared.launch import launch, load, perform, prepare, reported, save_config
+from .shared.launch import launch, perform, prepare, reported
 from .shared.settings import TrainConfig
+from .shared.stored_runs import save_config
 from .train import make_eval_env, report
 
 
@@ -42,7 +43,7 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
     env = make_eval_env(config)
     actor = config.learner.make_actor(env, config.model)
-    load(Checkpoint(actor=actor), Path(config.checkpoint), "checkpoint")
+    load_networks(Path(config.checkpoint), "checkpoint", {"actor": actor})
     return env, actor
 
 

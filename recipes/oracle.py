@@ -30,8 +30,9 @@ from damian.world.messages import Messages
 
 from .evaluate import stored
 from .shared.known_settings import CONF
-from .shared.launch import launch, perform, prepare, reported, save_config
+from .shared.launch import launch, perform, prepare, reported
 from .shared.settings import TrainConfig
+from .shared.stored_runs import save_config
 
 ALL = Messages._fields
 PLACE = ("position", "target", "track", "trail")

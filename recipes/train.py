@@ -9,14 +9,12 @@
 
 ``--help`` lists the groups of settings, ``--help KEY`` explains a setting or a section. The run folder,
 runs/DATE_TIME unless hydra.run.dir names another one, gets config.yaml, run.json (versions, machine, wall
-time), metrics.csv (a row for each update), TensorBoard events, checkpoint, learning_curve.png, and the
-evaluation as result.csv and result.md.
+time), metrics.csv (a row for each update), TensorBoard events, checkpoint.pt, best.pt, learning_curve.png,
+and the evaluation as result.csv and result.md (docs/runs.md).
 """
 
 import sys
-from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -24,63 +22,42 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torchrl.checkpoint import Checkpoint, GlobalRNGState
-from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
-from torchrl.envs import RewardSum, StepCounter, TransformedEnv
+from torchrl.envs import RewardSum, StepCounter
 from tqdm import tqdm
 
 from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common import checks
-from damian.common.errors import naming_errors
+from damian.common.errors import RunError, naming_errors
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED
+from damian.evaluation.interrupt import Interrupt
 from damian.evaluation.loggers import make_loggers
-from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate
-from damian.evaluation.run_folder import (
-    CHECKPOINT,
-    CONFIG,
-    FIGURE,
-    Interrupt,
-    MetricsLog,
-    plot_learning_curve,
-    save_results,
-)
+from damian.evaluation.metrics import Evaluation, evaluate
+from damian.evaluation.metrics_log import MetricsLog
+from damian.evaluation.run_folder import CHECKPOINT, FIGURE, plot_learning_curve, save_results
+from damian.evaluation.training_state import TrainingState, load_networks
 from damian.keys import next_key
 from damian.learners.base import Learner, check_learner, check_numbers
-from damian.learners.recurrent import add_recurrent_state
+from damian.learners.finite import divergence
 from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.server.server import Server
 
+from .shared.collecting import make_collector, ticks
 from .shared.known_settings import CONF
-from .shared.launch import launch, load, perform, prepare, reported, save_config, stored_config
+from .shared.launch import interrupted, launch, perform, prepare, reported
 from .shared.settings import TrainConfig
+from .shared.stored_runs import run_folder, save_config, stored_config
 
 MEANING = """sampled: actions are drawn from the policy's distribution; mode: the most likely action is taken.
 Fly the one with the higher return: a policy without memory often needs chance to search."""
 """Lines under the table of an evaluation."""
-
-
-@dataclass
-class Progress:
-    """How far the training of a run has come; part of its checkpoint."""
-
-    frames: int = 0
-    """Environment steps, over all worlds."""
-    updates: int = 0
-    """Batches that the learner has learnt from."""
-
-    def state_dict(self) -> dict[str, int]:
-        return {"frames": self.frames, "updates": self.updates}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        self.frames, self.updates = int(state["frames"]), int(state["updates"])
 
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
@@ -97,14 +74,18 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     return env
 
 
-def make_learner(config: TrainConfig, env: DelayedEnv) -> Learner:
-    """The learner, with a replay buffer (back-updating or not) if it needs one."""
-    setup, name = config.learning_setup, config.learner.name
+def replay_buffer(config: TrainConfig, server: Server) -> ReplayBuffer | None:
+    """The replay buffer (back-updating or not) of the learner, if it needs one."""
+    with own_code(config.learner.name):
+        size = config.learner.buffer_size(config.learning_setup)
+    return None if size is None else make_buffer(config, server, size)
+
+
+def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
+    """The learner, with the replay buffer that it needs."""
+    name = config.learner.name
     with own_code(name):
-        size = config.learner.buffer_size(setup)
-    buffer = None if size is None else make_buffer(config, env.server, size)
-    with own_code(name):
-        learner = config.learner.make(env, setup, buffer)
+        learner = config.learner.make(env, config.learning_setup, buffer)
         check_learner(learner, name)
     return learner
 
@@ -129,78 +110,96 @@ def make_buffer(config: TrainConfig, server: Server, size: int) -> ReplayBuffer:
     return ReplayBuffer(storage=storage)
 
 
-def make_collector(env: TransformedEnv, actor: torch.nn.Module, frames: int) -> Collector:
-    """An endless collector of batches of ``frames`` environment steps."""
-    add_recurrent_state(env, actor)
-    return Collector(
-        env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
-    )
-
-
-def ticks(collector: Collector, clock: SystemClock) -> Iterator[TensorDictBase]:
-    """Batches [B, T], each collected between two ticks of the system clock (paper, section 3.6)."""
-    parts: list[TensorDictBase] = []
-    for part in collector:
-        parts.append(part)
-        if sum(part.shape[1] for part in parts) < clock.period:
-            continue
-        batch = cast(TensorDictBase, torch.cat(parts, 1)) if len(parts) > 1 else part  # type: ignore[arg-type]
-        if clock.change:
-            clock.tick(spotting(batch, cast(DelayedEnv, collector.env).server))
-        parts = []
-        yield batch
-
-
-def spotting(batch: TensorDictBase, server: Server) -> torch.Tensor:
-    """Which UAVs spot the source at the end of a batch [B, T], by what the server holds, [B, N] bool."""
-    after = cast(TensorDictBase, batch["next"][:, -1])
-    return server.messages(after.get(keys.RECEIVED, after[keys.MESSAGE])).spotted
-
-
 def train(config: TrainConfig, folder: Path) -> None:
     """Train, evaluate, and fill the run folder.
 
     Raises:
         InputError: the settings do not allow training, or the checkpoint cannot be loaded.
+        RunError: the learner has diverged, or a file cannot be written.
     """
     config.check_learning()
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    learner = make_learner(config, env)
-    progress, episodes = Progress(), EpisodeLog()
-    state = {"progress": progress, "episodes": episodes, "clock": clock, "rng": GlobalRNGState()}
-    checkpoint = Checkpoint(**learner.components(), **state)
-    if config.resume:
-        load(checkpoint, folder, "resume")
-        env.set_seed(config.seed + 1_000_003 * progress.updates)  # do not repeat the first episodes
-    elif config.checkpoint:
-        load(checkpoint, Path(config.checkpoint), "checkpoint", ["actor", *["critic"] * same_learner(config)])
-    save_config(config, folder)
-    loggers = make_loggers(config.logger.custom, folder)
-    log = MetricsLog(folder, config.logger.tensorboard, config.logger.csv, progress.frames, loggers)
+    buffer = replay_buffer(config, env.server)
+    learner = make_learner(config, env, buffer)
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
-    bar = progress_bar(config, progress, episodes)
+    state = TrainingState(folder, learner.components(), collector, clock, buffer)
+    begin(config, state)
+    loggers, log_to = make_loggers(config.logger.custom, folder), config.logger
+    log = MetricsLog(folder, log_to.tensorboard, log_to.csv, state.progress.frames, loggers)
+    bar = progress_bar(config, state)
     with closing(log), closing(bar), Interrupt() as interrupt:
-        for batch in ticks(collector, clock) if not enough(config, progress, episodes) else ():
-            episodes.add(batch)
-            with own_code(config.learner.name):
-                losses = check_numbers(learner.learn(batch), config.learner.name)
-            progress.frames += batch.numel()
-            progress.updates += 1
-            means = {"episodes": float(episodes.finished), **episodes.means()}
-            log.add(progress.frames, {**means, **mean_terms(batch), **losses})
-            bar.set_postfix({name: f"{mean:.2f}" for name, mean in episodes.means().items()})
-            bar.update((episodes.finished if config.episodes else progress.frames) - bar.n)
-            last = enough(config, progress, episodes) or interrupt.asked
-            if last or progress.updates % config.checkpoint_every == 0:
-                checkpoint.save(folder / CHECKPOINT)
-            if last:
+        for batch in ticks(collector, clock) if not enough(config, state) else ():
+            update(config, learner, state, log, batch)
+            show(bar, config, state)
+            finished, asked = enough(config, state), interrupt.asked
+            if finished or state.progress.updates % config.checkpoint_every == 0:
+                log.sync()
+                state.save_best()
+                state.save()
+            elif asked:
+                log.sync()
+                state.save()
+            if finished or asked:
                 break
     collector.shutdown()
     if interrupt.asked:
-        sys.exit(f"interrupted; continue with resume={folder}")
+        sys.exit(interrupted(folder, interrupt.asked))
     random = report(config, folder, make_eval_env(config), learner.actor)
     plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {learner_title(config)}")
     print(f"learning curve: {folder / FIGURE}")
+
+
+def begin(config: TrainConfig, state: TrainingState) -> None:
+    """Load what the run continues or starts from, and write the files with which a run folder begins.
+
+    A folder with a configuration has a checkpoint, whenever the run is stopped.
+    """
+    if config.resume:
+        state.load()
+    elif config.checkpoint:
+        names = ["actor", *["critic"] * same_learner(config)]
+        networks = {name: state.components[name] for name in names if name in state.components}
+        load_networks(Path(config.checkpoint), "checkpoint", networks)
+    if not config.resume:
+        state.save()
+    save_config(config, state.folder)
+
+
+def update(
+    config: TrainConfig, learner: Learner, state: TrainingState, log: MetricsLog, batch: TensorDictBase
+) -> None:
+    """Make one update from a batch [B, T], and log its numbers.
+
+    Raises:
+        RunError: the learner has diverged.
+    """
+    progress, episodes = state.progress, state.episodes
+    episodes.add(batch)
+    progress.frames += batch.numel()
+    progress.updates += 1
+    try:
+        with own_code(config.learner.name):
+            losses = check_numbers(learner.learn(batch), config.learner.name)
+    except (ValueError, RuntimeError):  # torch's distributions refuse a nan
+        check_convergence(config, state, {})
+        raise
+    means = {"episodes": float(episodes.finished), **episodes.means()}
+    log.add(progress.frames, {**means, **mean_terms(batch), **losses})
+    check_convergence(config, state, losses)
+
+
+def check_convergence(config: TrainConfig, state: TrainingState, losses: dict[str, float]) -> None:
+    """Stop a run whose learner has diverged, before its checkpoint is replaced.
+
+    Raises:
+        RunError: a loss or a weight is not finite, or too large.
+    """
+    if problem := divergence(state.components, losses):
+        raise RunError(
+            f"update {state.progress.updates}: {problem}: the learner has diverged; choose a smaller "
+            f"learner.lr than {config.learner.lr:g}; {state.folder / CHECKPOINT} is of update {state.saved} "
+            "and intact"
+        )
 
 
 def learner_title(config: TrainConfig) -> str:
@@ -211,22 +210,26 @@ def learner_title(config: TrainConfig) -> str:
 
 def same_learner(config: TrainConfig) -> bool:
     """Was ``config.checkpoint`` trained by the same learner, so that its critic can be loaded too?"""
-    folder = Path(str(config.checkpoint))
-    if not (folder / CONFIG).is_file():
-        return True
+    folder = run_folder(Path(str(config.checkpoint)))
     return stored_config(folder, "checkpoint").learner.name == config.learner.name
 
 
-def progress_bar(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> tqdm:
+def progress_bar(config: TrainConfig, state: TrainingState) -> tqdm:
     """A progress bar that counts episodes if ``config.episodes`` limits the run, else environment steps."""
     if config.episodes:
-        return tqdm(total=config.episodes, initial=episodes.finished, unit=" episodes")
-    return tqdm(total=config.frames, initial=progress.frames, unit=" steps", unit_scale=True)
+        return tqdm(total=config.episodes, initial=state.episodes.finished, unit=" episodes")
+    return tqdm(total=config.frames, initial=state.progress.frames, unit=" steps", unit_scale=True)
 
 
-def enough(config: TrainConfig, progress: Progress, episodes: EpisodeLog) -> bool:
+def show(bar: tqdm, config: TrainConfig, state: TrainingState) -> None:
+    """Show how far the training has come."""
+    bar.set_postfix({name: f"{mean:.2f}" for name, mean in state.episodes.means().items()})
+    bar.update((state.episodes.finished if config.episodes else state.progress.frames) - bar.n)
+
+
+def enough(config: TrainConfig, state: TrainingState) -> bool:
     """Has the run reached ``config.frames`` or ``config.episodes``?"""
-    return progress.frames >= config.frames or episodes.finished >= (config.episodes or torch.inf)
+    return state.progress.frames >= config.frames or state.episodes.finished >= (config.episodes or torch.inf)
 
 
 def mean_terms(batch: TensorDictBase) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The error raised for wrong input: a setting, a file, an argument, or a component of one's own."""
+"""The errors of one line: wrong input of any kind, and a run that cannot go on."""
 
 import sysconfig
 import traceback
@@ -15,6 +15,13 @@ class InputError(ValueError):
     """
 
 
+class RunError(RuntimeError):
+    """A run that cannot go on: a full disk, or numbers that are not finite; ``str(error)`` is one line.
+
+    A recipe prints that line and exits with code 3.
+    """
+
+
 @contextmanager
 def naming_errors(name: str) -> Iterator[None]:
     """Turn an error raised inside by a component of one's own into an ``InputError`` of one line.
@@ -26,11 +33,11 @@ def naming_errors(name: str) -> Iterator[None]:
         name: the setting and the component, such as ``delay.obs: law rush:BusyHour``.
 
     Raises:
-        InputError: anything was raised inside; an ``InputError`` stays as it is.
+        InputError: anything was raised inside; an ``InputError`` or a ``RunError`` stays as it is.
     """
     try:
         yield
-    except InputError:
+    except (InputError, RunError):
         raise
     except Exception as error:  # a component of one's own can raise anything
         raise InputError(f"{name}: {described(error)}") from error

@@ -1,6 +1,7 @@
 """A transformed environment that steps with its transforms as one compiled graph."""
 
-from collections.abc import Callable, Iterator
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, cast
 
 import torch
@@ -16,6 +17,9 @@ from damian.server.server import Server
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import Entries, Memory, drop_keys, select_entries
 from damian.world.state import PackedState
+
+_BASE = "base_env."
+"""Begin of the keys of the base environment in a ``state_dict``."""
 
 
 class DelayedEnv(TransformedEnv):
@@ -55,6 +59,27 @@ class DelayedEnv(TransformedEnv):
         self.uav_env.seed_worlds(seeds)
         for transform in self._all_stateful():
             transform.seed_worlds(seeds)
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> OrderedDict[str, Any]:
+        """The state of the transforms, as that of a ``TransformedEnv``, and of the environment under them.
+
+        An equal environment that loads it continues in the same way, with the TensorDict of the latest step.
+        """
+        state = cast(OrderedDict[str, Any], super().state_dict(*args, **kwargs))
+        self.base_env.state_dict(destination=state, prefix=kwargs.get("prefix", "") + _BASE)
+        return state
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> None:  # type: ignore[override]
+        """Load a state; one without the environment's, as TorchRL's collectors save it, leaves the worlds.
+
+        Raises:
+            InputError: it is the state of another number of worlds, or of another scenario.
+        """
+        base = {k.removeprefix(_BASE): value for k, value in state_dict.items() if k.startswith(_BASE)}
+        others = OrderedDict((k, value) for k, value in state_dict.items() if not k.startswith(_BASE))
+        if base:
+            self.base_env.load_state_dict(base, **kwargs)
+        super().load_state_dict(others, **kwargs)
 
     def compile(self, **options: Any) -> "DelayedEnv":
         """Compile a step of ``UavEnv`` with its transforms as one graph.

@@ -12,7 +12,7 @@ from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
 from damian import keys
-from damian.common import counter_rng
+from damian.common import checks, counter_rng
 from damian.common.compiling import compiled
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
@@ -145,6 +145,23 @@ class UavEnv(EnvBase):
     @state.setter
     def state(self, state: State) -> None:
         self.worlds = self.simulation.layout.pack(state)
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """The worlds, for ``state_dict``."""
+        return self.worlds._asdict()
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Put the worlds into the state of a ``state_dict``.
+
+        Raises:
+            InputError: it is that of another number of worlds or of another scenario.
+        """
+        for name, own in self.worlds._asdict().items():
+            shape = list(state[name].shape)
+            should = f"is not {list(own.shape)}: load it into as many worlds of the same scenario"
+            checks.require(shape == list(own.shape), f"UavEnv: shape of the loaded {name}", shape, should)
+        loaded = {name: state[name].to(own) for name, own in self.worlds._asdict().items()}
+        self.worlds = PackedState(**{name: table.clone() for name, table in loaded.items()})
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own random stream; the next reset begins its first episode.

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import damian
+from damian.common.atomic_files import write_atomically
 
 RECORD = "run.json"
 OF_FIRST_PART = ("command", "started")
@@ -114,4 +115,4 @@ def _wall_time(record: dict[str, Any]) -> float:
 
 
 def _write(folder: Path, record: dict[str, Any]) -> None:
-    (folder / RECORD).write_text(json.dumps(record, indent=2) + "\n")
+    write_atomically(folder / RECORD, json.dumps(record, indent=2) + "\n")

@@ -36,7 +36,13 @@ class Learner(Protocol):
         ...
 
     def components(self) -> dict[str, Any]:
-        """Networks and optimisers that a checkpoint stores, by name; one of them is ``actor``."""
+        """What a checkpoint stores, by name: networks, optimisers, and all else that changes in training.
+
+        One of them is ``actor``. Each has ``state_dict`` and ``load_state_dict``; its state consists of
+        tensors, numbers, strings, lists and dicts. A resumed run equals one that was never stopped only if
+        everything that changes is among the components. The replay buffer of ``LearnerConfig.make`` is stored
+        without them; what it holds must not be changed in place.
+        """
         ...
 
 
@@ -77,7 +83,8 @@ class LearnerConfig:
     """Settings of a learner, which make it; those that all learners share.
 
     A learner of one's own has a dataclass derived from this class, with fields for its own settings, that
-    implements ``make``. The settings ``learner=package.module:Name learner.lr=1e-3`` choose it.
+    implements ``make``. Whatever changes in the learner must be among its ``components``, or a resumed run
+    loses it. The settings ``learner=package.module:Name learner.lr=1e-3`` choose it.
     """
 
     name: str = ""

@@ -117,7 +117,7 @@ class Sac:
         self.observed = ["observation", setup.critic_key[-1], *["action_mask"] * masked]
 
     def components(self) -> dict[str, Any]:
-        """Networks and optimiser that a checkpoint stores; a resumed run fills a new replay buffer."""
+        """Networks and optimiser that a checkpoint stores, beside the replay buffer."""
         return {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:

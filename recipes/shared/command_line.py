@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from hydra.errors import HydraException
 
 from damian.common.errors import InputError
 from damian.evaluation.run_record import read_record
+
+from .known_settings import RECIPES
 
 
 def parsed(words: Sequence[str]) -> Namespace:
@@ -58,6 +61,34 @@ def prepared(words: Sequence[str]) -> list[str]:
     return [*(name if value is True else f"{name}={value}" for name, value in given), *overrides]
 
 
+_typed: list[str] = []
+"""The command line as it was typed; empty in a worker process of a comparison."""
+
+
+def remember_words() -> None:
+    """Remember the command line as it was typed, before it is prepared for Hydra."""
+    _typed[:] = sys.argv
+
+
+def typed_words() -> list[str]:
+    """The words of the command line as they were typed, without the name of the program."""
+    return (_typed or sys.argv)[1:]
+
+
+def typed_command() -> str:
+    """The command line as it was typed."""
+    return command(typed_words())
+
+
+def command(words: Sequence[str]) -> str:
+    """The command that runs this program with words, to be typed in a shell."""
+    program = Path(sys.argv[0])
+    if program.suffix == ".py":
+        is_ours = (RECIPES / program.name).exists()
+        return shlex.join([*(["damian", program.stem] if is_ours else ["python", str(program)]), *words])
+    return f"{program.name} {shlex.join(words)}".strip()
+
+
 def whole_laws(words: Sequence[str]) -> list[str]:
     """The words with a number before each delay law, because Hydra would merge it with the law before it."""
     pairs = [(re.fullmatch(r"(delay\.(?:obs|act|rew))=\{.*", word), word) for word in words]
@@ -68,8 +99,8 @@ def _quoted(word: str) -> str:
     """The word with quotes around the folders that it names, where Hydra needs them."""
     key, _, value = word.partition("=")
     if re.fullmatch(r"\+*(checkpoint|resume)", key):
-        names = [value] if os.path.isdir(value) else value.split(",")  # several in a sweep
-        if all(map(os.path.isdir, names)):
+        names = [value] if os.path.exists(value) else value.split(",")  # several in a sweep
+        if all(map(os.path.exists, names)):
             return f"{key}={','.join(map(_quoted_name, names))}"
     if key in ("hydra.run.dir", "hydra.sweep.dir") and _values(word) is None:
         return f"{key}={_quoted_name(value)}"
@@ -102,12 +133,14 @@ def _config_dir(overrides: Sequence[str]) -> str | None:
         InputError: there are several such folders.
     """
     policies = [word for word in overrides if re.match(r"\+*checkpoint=", word)]
-    records = [read_record(Path(folder)) for word in policies for folder in _values(word) or ()]
+    folders = [Path(folder) for word in policies for folder in _values(word) or ()]
+    records = [read_record(folder.parent if folder.suffix == ".pt" else folder) for folder in folders]
     used = [record.get("config_dir") for record in records]
-    folders = sorted({folder for folder in used if isinstance(folder, str) and os.path.isdir(folder)})
-    if len(folders) > 1:
+    used_folders = sorted({folder for folder in used if isinstance(folder, str) and os.path.isdir(folder)})
+    if len(used_folders) > 1:
+        names = " and ".join(used_folders)
         raise InputError(
-            f"checkpoint: the policies were trained with the configuration files of {' and '.join(folders)}: "
+            f"checkpoint: the policies were trained with the configuration files of {names}: "
             "evaluate them one after the other, or choose one folder with --config-dir"
         )
-    return folders[0] if folders else None
+    return used_folders[0] if used_folders else None

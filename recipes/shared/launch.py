@@ -2,40 +2,46 @@
 
 import functools
 import os
-import shlex
+import random
+import signal
 import sys
 import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``launch`` prints them
 
+import numpy as np
 import torch
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from torchrl.checkpoint import Checkpoint
 
-from damian.common.errors import InputError
+from damian.common.atomic_files import remove_unfinished, writing
+from damian.common.errors import InputError, RunError
+from damian.evaluation.interrupt import exit_code
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
-from damian.evaluation.run_record import RECORD, new_record, timed, write_record
-from damian.learners.base import LEARNERS
+from damian.evaluation.run_lock import is_folder, locked
+from damian.evaluation.run_record import timed
 
-from .command_line import own_folder, prepared
+from .command_line import parsed, prepared, remember_words
 from .composition_errors import COMPOSITION_ERRORS, foreign_cause, one_line
-from .inheritance import changes, check_policy_fits, inherited, key_of
-from .known_settings import RECIPES, SCHEMAS
+from .inheritance import changes, check_policy_fits, inherited
+from .known_settings import SCHEMAS
+from .leftovers import drop_empty, drop_sweep, drop_unused, remember_folders, sweep_folder
 from .misspelt import no_such_key
 from .settings import TrainConfig
+from .stored_runs import resumed_config, say_if_trained, stored_run
 
 Program = Callable[[TrainConfig, Path], None]
 """The work of a recipe: takes a checked configuration and the run folder to fill."""
-SWEEP = "multirun.yaml"
-"""File that Hydra writes into the folder of a sweep."""
+RUN_ERROR = 3
+"""Exit code of a run that could not go on: a full disk, or a learner that has diverged."""
 
 
 def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
@@ -55,10 +61,10 @@ def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
     if composed.resume is not None:
         if hydra.mode == RunMode.MULTIRUN:
             raise InputError("resume: only one run can be resumed at a time; leave out -m")
-        _drop_empty(folder)
+        drop_empty(folder)
         folder = shown(Path(composed.resume))
-        config: TrainConfig = checked(_resumed(folder, composed, overrides))
-        _say_if_trained(config, folder)
+        config: TrainConfig = checked(resumed_config(folder, composed, overrides))
+        say_if_trained(config, folder)
         return config, folder
     if (folder / CONFIG).exists():
         remedy = f"choose another folder, or continue the run with resume={folder}"
@@ -74,18 +80,6 @@ def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
         if changed := changes(config, stored):
             print(f"changed since the training: {changed}")
     return config, folder
-
-
-def stored_run(folder: Path) -> TrainConfig | None:
-    """The checked configuration of the run in a folder; None if there is no run.
-
-    Raises:
-        InputError: the run's configuration cannot be read.
-    """
-    _refuse_sweep(folder, "checkpoint")
-    if not (folder / CONFIG).is_file():
-        return None  # loading the checkpoint will report what is missing
-    return cast(TrainConfig, OmegaConf.to_object(stored_config(folder, "checkpoint")))
 
 
 def composed_with(config_name: str, overrides: Sequence[str]) -> DictConfig:
@@ -106,14 +100,18 @@ def perform(config: TrainConfig, folder: Path, program: Program) -> None:
     A run that is refused before it has learnt or measured anything leaves no folder.
     """
     torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
-    was_empty = not folder.is_dir() or not any(folder.iterdir())
+    for seed in (torch.manual_seed, np.random.seed, random.seed):  # components of one's own may use them
+        seed(config.seed)
+    was_empty = not is_folder(folder) or not any(folder.iterdir())
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    remove_unfinished(folder)
     try:
         with timed(folder):
             program(config, folder)
     except (InputError, OmegaConfBaseException):
         if was_empty:
-            _drop_unused(folder)
+            drop_unused(folder)
         raise
     print(f"results: {folder}")
 
@@ -152,130 +150,45 @@ def unknown_keys(composed: Any, config: Any, path: str = "") -> list[str]:
     return unknown
 
 
-def save_config(config: TrainConfig, folder: Path) -> None:
-    """Write the resolved configuration into the run folder, and the record of versions and machine."""
-    folder.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(OmegaConf.structured(config), folder / CONFIG)
-    is_gpu = config.device.startswith("cuda")
-    device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    write_record(folder, new_record(command(typed_words()), device, config.threads, own_folder()))
-
-
-def stored_config(folder: Path, key: str) -> DictConfig:
-    """The configuration of the run in a folder; keys that it lacks have their defaults.
-
-    Args:
-        folder: the run folder.
-        key: the setting that names the folder, for the error message.
-
-    Raises:
-        InputError: it cannot be read, or damian 0.1 has written it.
-    """
-    file = folder / CONFIG
-    try:
-        saved = cast(DictConfig, OmegaConf.load(file))
-        if "algo" in saved:
-            raise InputError("damian 0.1 wrote it, and settings have other names since: train again")
-        learner = LEARNERS.get(saved.learner.name, "learner")(name=saved.learner.name)
-        schema = OmegaConf.structured(TrainConfig(learner=learner))
-        return cast(DictConfig, OmegaConf.merge(schema, saved))
-    except Exception as error:  # a damaged file can raise anything
-        raise InputError(f"{key}: {file}: {one_line(error)}") from None
-
-
-def load(checkpoint: Checkpoint, folder: Path, key: str, components: Collection[str] | None = None) -> None:
-    """Restore a checkpoint from a run folder.
-
-    Args:
-        checkpoint: its components are restored in place.
-        folder: the run folder.
-        key: the setting that names the folder, for the error message.
-        components: names of the components to restore; all if not given.
-
-    Raises:
-        InputError: the checkpoint is missing or incomplete, or belongs to another configuration.
-    """
-    try:
-        checkpoint.load(folder / CHECKPOINT, components=components)
-    except Exception as error:  # a damaged file can raise anything
-        cause = None if isinstance(error, OSError) else error
-        raise InputError(f"{key}: {folder / CHECKPOINT}: {one_line(error)}") from cause
-
-
-def _resumed(folder: Path, composed: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    allowed = ("resume", "frames", "episodes")
-    refused = [override for override in overrides if key_of(override) not in allowed]
-    if refused:
-        raise InputError(
-            f"{refused[0]}: a resumed run keeps its configuration; only frames= and episodes= may change"
-        )
-    _refuse_sweep(folder, "resume")
-    for needed in (CONFIG, CHECKPOINT):
-        if not (folder / needed).exists():
-            raise InputError(f"resume: {folder} holds no {needed}, so there is no run to resume")
-    changed = {key: composed[key] for key in map(key_of, overrides)}
-    return cast(DictConfig, OmegaConf.merge(stored_config(folder, "resume"), changed))
-
-
-def _refuse_sweep(folder: Path, key: str) -> None:
-    if (folder / SWEEP).is_file() and not (folder / CONFIG).exists():
-        raise InputError(f"{key}: {folder} is a sweep: give one of the folders in it")
-
-
-class _Stored(dict[str, Any]):
-    """A component of a checkpoint as it was stored."""
-
-    state_dict = dict.copy
-    load_state_dict = dict.update
-
-
-def _say_if_trained(config: TrainConfig, folder: Path) -> None:
-    """Say that a resumed run has nothing left to train, if that is so."""
-    progress, episodes = _Stored(), _Stored()
-    load(Checkpoint(progress=progress, episodes=episodes), folder, "resume", ["progress", "episodes"])
-    done = {"frames": progress["frames"], "episodes": episodes["finished"]}
-    for key, number in done.items():
-        limit = getattr(config, key)
-        if limit is not None and number >= limit:
-            print(f"{key}: {limit} are asked for, and the run has {number} already: nothing is left to train")
-            return
-
-
 _composed: list[bool] = []
 """Not empty once Hydra has composed a configuration: a later error of Hydra's is not a wrong command line."""
 
 
-_typed: list[str] = []
-"""The command line as it was typed; empty in a worker process of a comparison."""
-
-
-def typed_words() -> list[str]:
-    """The words of the command line as they were typed, without the name of the program."""
-    return (_typed or sys.argv)[1:]
-
-
-def command(words: Sequence[str]) -> str:
-    """The command that runs this program with words, to be typed in a shell."""
-    program = Path(sys.argv[0])
-    if program.suffix == ".py":
-        is_ours = (RECIPES / program.name).exists()
-        return shlex.join([*(["damian", program.stem] if is_ours else ["python", str(program)]), *words])
-    return f"{program.name} {shlex.join(words)}".strip()
-
-
 def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-    """Turn wrong input into one line on stderr and exit code 2, and remove the empty run folder."""
+    """Lock the run folder, turn errors into one line on stderr, and remove a folder that stays empty.
+
+    The exit code is 2 for wrong input, ``RUN_ERROR`` if the run could not go on, 130 after Ctrl-C.
+    """
 
     @functools.wraps(main)
     def checked_main(composed: DictConfig) -> None:
         _composed.append(True)
+        own_folder = shown(Path(HydraConfig.get().runtime.output_dir))
+        resumed = composed.get("resume") if HydraConfig.get().mode != RunMode.MULTIRUN else None
+        folder, key = (Path(resumed), "resume") if resumed else (own_folder, "hydra.run.dir")
+        # A comparison may be reported on while it runs.
+        lock = nullcontext() if composed.get("report_only") else locked(folder, key)
         try:
-            main(composed)
+            with lock:
+                main(composed)
         except (InputError, OmegaConfBaseException) as error:
-            _drop_empty(Path(HydraConfig.get().runtime.output_dir))
+            drop_empty(own_folder)
             _give_up(error, str(HydraConfig.get().job.config_name))
+        except (RunError, OSError) as error:
+            drop_empty(own_folder)
+            _stop(error)
+        except KeyboardInterrupt:
+            drop_empty(own_folder)
+            sys.exit(interrupted(folder, signal.SIGINT))
 
     return checked_main
+
+
+def interrupted(folder: Path, number: int) -> int:
+    """Say that a signal has stopped a run, and how to continue it; returns the exit code."""
+    remedy = f"; continue with resume={folder}" if (folder / CHECKPOINT).exists() else ""
+    print(f"interrupted{remedy}", file=sys.stderr)
+    return exit_code(number)
 
 
 def launch(main: Callable[[], Any], program: str = "train") -> None:
@@ -285,17 +198,23 @@ def launch(main: Callable[[], Any], program: str = "train") -> None:
         main: the application.
         program: name of its file in conf/.
     """
-    _typed[:] = sys.argv
+    remember_words()
     _composed.clear()
     try:
         sys.argv[1:] = prepared(sys.argv[1:])
+        remember_folders(sys.argv[1:])
+        if program == "compare" and parsed(sys.argv[1:]).multirun:
+            raise InputError("-m: a comparison runs all of its arms and seeds anyway; leave it out")
         main()
     except COMPOSITION_ERRORS as error:
         if _composed:
             raise  # this is a bug, and its traceback is needed
-        if folder := _sweep_folder(error):
-            _drop_sweep(folder)
+        if folder := sweep_folder(error):
+            drop_sweep(folder)
         _give_up(error, program)
+    except KeyboardInterrupt:  # before a run began
+        print("interrupted", file=sys.stderr)
+        sys.exit(exit_code(signal.SIGINT))
 
 
 def _give_up(error: Exception, program: str) -> NoReturn:
@@ -308,33 +227,9 @@ def _give_up(error: Exception, program: str) -> NoReturn:
     sys.exit(2)
 
 
-def _sweep_folder(error: Exception) -> Path | None:
-    """The folder that Hydra made for a sweep that it then refused; only Hydra's frame knows its name."""
-    frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
-    return next((frame.f_locals["sweep_dir"] for frame in frames if "sweep_dir" in frame.f_locals), None)
-
-
-def _drop_unused(folder: Path) -> None:
-    """Remove a run folder with nothing in it but what is written before the first step."""
-    files = [*folder.iterdir()] if folder.is_dir() else []
-    if all(path.name in (CONFIG, RECORD) or path.name.startswith("events.out.tfevents") for path in files):
-        for path in files:
-            path.unlink()
-        _drop_empty(folder)
-
-
-def _drop_empty(folder: Path) -> None:
-    """Remove an empty run folder, and the folders that Hydra made around it."""
-    if not folder.is_dir() or any(folder.iterdir()):
-        return
-    folder.rmdir()
-    _drop_sweep(folder.parent)
-    if folder.parent.is_dir() and folder.parent.resolve() != Path.cwd() and not any(folder.parent.iterdir()):
-        folder.parent.rmdir()
-
-
-def _drop_sweep(folder: Path) -> None:
-    """Remove the folder of a sweep of which no run is left."""
-    if folder.is_dir() and [path.name for path in folder.iterdir()] == [SWEEP]:
-        (folder / SWEEP).unlink()
-        _drop_empty(folder)
+def _stop(error: Exception) -> NoReturn:
+    """End a run that cannot go on, with one line."""
+    if os.environ.get("DAMIAN_TRACEBACK"):
+        traceback.print_exception(error)
+    print(f"error: {one_line(error)}", file=sys.stderr)
+    sys.exit(RUN_ERROR)

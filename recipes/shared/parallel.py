@@ -10,7 +10,7 @@ import signal
 import traceback
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -19,12 +19,14 @@ from typing import Any
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from damian.common.errors import InputError
+from damian.common.errors import InputError, RunError
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
+from damian.evaluation.run_lock import locked
 
 from .composition_errors import one_line
-from .launch import Program, perform, stored_config
+from .launch import Program, perform
 from .settings import TrainConfig
+from .stored_runs import stored_config
 
 LOG = "log.txt"
 _SPAWN = multiprocessing.get_context("spawn")
@@ -117,11 +119,14 @@ def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> l
         told: policy and measure of the latest run that the progress bar shows.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C, when every training run has written a checkpoint.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
     """
     todo, failed = [run for run in runs if not run.finished], []
     ended = _in_turn(todo) if processes == 1 else _at_once(todo, processes)
-    with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
+    with (
+        _sigterm_as_ctrl_c(),
+        tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar,
+    ):
         for run, error in ended:
             bar.update()
             if error:
@@ -129,6 +134,16 @@ def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> l
             else:
                 bar.set_postfix_str(f"{run.name}: {run.score(*told):.3g}")
     return failed
+
+
+@contextmanager
+def _sigterm_as_ctrl_c() -> Iterator[None]:
+    """Stop the runs inside at SIGTERM, which batch systems send, as at Ctrl-C."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _in_turn(runs: Sequence[Run]) -> Iterator[tuple[Run, BaseException | None]]:
@@ -191,12 +206,13 @@ def _perform(run: Run) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
-            resumes = run.trains and (run.folder / CHECKPOINT).exists()
-            config = replace(run.config, resume=str(run.folder)) if resumes else run.config
-            perform(config, run.folder, run.program)
+            with locked(run.folder):
+                resumes = run.trains and (run.folder / CHECKPOINT).exists()
+                config = replace(run.config, resume=str(run.folder)) if resumes else run.config
+                perform(config, run.folder, run.program)
         except SystemExit as interrupted:
             raise KeyboardInterrupt from interrupted
-        except InputError as error:
+        except (InputError, RunError) as error:
             print(f"error: {error}")
             raise
         except BaseException:

@@ -59,7 +59,7 @@ class TrainConfig(ScenarioConfig):
     eval_episodes: int = 200
     """Episodes of each evaluation after the training."""
     checkpoint_every: int = 20
-    """Updates between two checkpoints."""
+    """Updates between two checkpoints: what a killed run loses at most."""
     backupdate: bool = False
     """Back-updating (paper, section 3.4): late messages correct stored steps before the learner uses them.
     They correct the critic's observations, rewards and ends of episodes, but not the actor's observations."""
@@ -69,7 +69,8 @@ class TrainConfig(ScenarioConfig):
     """With ``backupdate``, the original authors' variant: late messages correct the actor's observations too,
     and the log-probabilities of its actions follow from these."""
     checkpoint: str | None = None
-    """Run folder of the policy to start from; that run's overrides apply too, unless others are given."""
+    """Run folder of the policy to start from, or the ``best.pt`` in it; that run's overrides apply too,
+    unless others are given."""
     overrides: list[str] = field(default_factory=list)
     """Overrides on the command line; filled in by the recipe."""
     resume: str | None = None

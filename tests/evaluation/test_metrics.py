@@ -18,7 +18,8 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate, evaluation
-from damian.evaluation.run_folder import MetricsLog, read_metrics, results_table, save_results
+from damian.evaluation.metrics_log import MetricsLog, read_metrics
+from damian.evaluation.run_folder import results_table, save_results
 from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig

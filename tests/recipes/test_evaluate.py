@@ -175,7 +175,7 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tm
 
 @pytest.mark.parametrize(
     ("policy", "message"),
-    [(None, "checkpoint: it is missing"), ("nowhere", "checkpoint: nowhere/checkpoint: ")],
+    [(None, "checkpoint: it is missing"), ("nowhere", "checkpoint: nowhere holds no config.yaml")],
 )
 def test_without_a_policy_nothing_is_evaluated(fly, capsys, tmp_path, policy, message):
     check_refused(lambda: fly(of=policy), message, capsys)
@@ -184,14 +184,16 @@ def test_without_a_policy_nothing_is_evaluated(fly, capsys, tmp_path, policy, me
 
 def test_a_damaged_checkpoint_is_refused(fly, trained, capsys, tmp_path):
     damaged = shutil.copytree(trained, tmp_path / "damaged")
-    (damaged / "checkpoint" / "manifest.json").write_text("{")
-    check_refused(lambda: fly(of=damaged), "checkpoint: ", capsys)
-    shutil.rmtree(damaged / "checkpoint")
-    check_refused(lambda: fly(of=damaged), "checkpoint: ", capsys)
+    (damaged / "checkpoint.pt").write_text("{")
+    check_refused(lambda: fly(of=damaged), "checkpoint.pt: it is no checkpoint of damian", capsys)
+    (damaged / "checkpoint.pt").unlink()
+    check_refused(lambda: fly(of=damaged), "checkpoint.pt: there is no such file", capsys)
+    (damaged / "config.yaml").unlink()
+    check_refused(lambda: fly(of=damaged), "damaged holds no config.yaml, so there is no run", capsys)
     assert list(tmp_path.iterdir()) == [damaged]
 
 
-@pytest.mark.parametrize("text", ["a: [1", "- 1", "overrides: null"])
+@pytest.mark.parametrize("text", ["a: [1", "- 1", "overrides: null", "", "agents: 3"])
 def test_a_damaged_configuration_beside_a_checkpoint_is_refused(fly, trained, capsys, tmp_path, text):
     damaged = shutil.copytree(trained, tmp_path / "damaged")
     (damaged / "config.yaml").write_text(text)

@@ -6,8 +6,9 @@ import pytest
 from helpers import check_refused
 
 from damian.common.errors import InputError
-from damian.recipes.shared.launch import perform, save_config
+from damian.recipes.shared.launch import perform
 from damian.recipes.shared.settings import TrainConfig
+from damian.recipes.shared.stored_runs import save_config
 
 
 @pytest.mark.parametrize(
@@ -131,7 +132,7 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(run, capsys, tm
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("kept", [None, "checkpoint", "metrics.csv", "notes.txt"])
+@pytest.mark.parametrize("kept", [None, "checkpoint.pt", "metrics.csv", "notes.txt"])
 def test_a_run_that_is_refused_before_its_first_step_leaves_no_folder(tmp_path, kept):
     folder = tmp_path / "runs" / "sweep" / "seed=0"
     folder.mkdir(parents=True)

@@ -7,8 +7,7 @@ import sys
 import pytest
 
 from damian.evaluation.run_record import RECORD, new_record, read_record, timed, write_record
-from damian.recipes.shared.command_line import prepared
-from damian.recipes.shared.launch import command
+from damian.recipes.shared.command_line import command, prepared
 
 
 def record(command: str, config_dir: str | None = None) -> dict:

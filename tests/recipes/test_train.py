@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 from torch import Tensor
-from torchrl.checkpoint import Checkpoint
 
 from damian.envs.pipeline import make_env
+from damian.evaluation.training_state import load_networks
 from damian.learners.networks import make_actor, make_critic
-from damian.recipes.shared.launch import stored_config
 from damian.recipes.shared.settings import TrainConfig
+from damian.recipes.shared.stored_runs import stored_config
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
@@ -33,7 +33,7 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
     env = make_env(config)
     make = {"actor": make_actor, "critic": make_critic}
     networks = {name: make[name](env, config.model) for name in names}
-    Checkpoint(**networks).load(folder / "checkpoint", components=names)
+    load_networks(folder, "folder", networks)
     return {f"{key}.{name}": w for key, net in networks.items() for name, w in net.state_dict().items()}
 
 
@@ -57,7 +57,7 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, ca
     folder = run(*TINY, *overrides)
     printed = capsys.readouterr().out
     written = {path.name for path in folder.iterdir()}
-    assert {"config.yaml", "metrics.csv", "checkpoint", "learning_curve.png"} <= written
+    assert {"config.yaml", "metrics.csv", "checkpoint.pt", "learning_curve.png"} <= written
     assert (folder / "result.md").read_text().strip() in printed
     assert "| random |" in printed
     assert "| greedy |" in printed
@@ -161,7 +161,12 @@ def test_resuming_a_finished_run_trains_no_further(run, capsys, learner):
     [
         (lambda f: (f / "config.yaml").write_text("a: [1"), "config.yaml: "),
         (lambda f: (f / "config.yaml").write_text("- 1"), "config.yaml: "),
-        (lambda f: (f / "checkpoint" / "manifest.json").write_text("{"), "checkpoint: "),
+        (
+            lambda f: (f / "config.yaml").write_text(""),
+            "config.yaml: it has no agents, so it is not the whole",
+        ),
+        (lambda f: (f / "config.yaml").unlink(), "first holds no config.yaml, so there is no run"),
+        (lambda f: (f / "checkpoint.pt").write_text("{"), "checkpoint.pt: it is no checkpoint of damian"),
         (lambda f: (f / "metrics.csv").write_text("x,y\n1,2\n"), "metrics.csv, line 1: no column frames"),
     ],
 )

@@ -1,0 +1,164 @@
+"""Numbers of a training, written row by row: ``metrics.csv``, TensorBoard events, loggers of one's own."""
+
+import csv
+import io
+import os
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog  # type: ignore[attr-defined]
+from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+from damian.common.atomic_files import write_atomically, writing
+from damian.common.errors import InputError, naming_errors
+from damian.evaluation.loggers import Logger
+
+METRICS = "metrics.csv"
+_FIRST_COLUMN = "frames"
+EVENTS = "events.out.tfevents."
+"""Beginning of the names of TensorBoard's files."""
+
+
+class MetricsLog:
+    """Writes named numbers to ``metrics.csv``, TensorBoard and other loggers; a resumed run appends to them.
+
+    Args:
+        folder: the run folder.
+        tensorboard: whether to write TensorBoard events.
+        to_csv: whether to write ``metrics.csv``.
+        frames: environment steps, over all worlds, at the checkpoint from which the run resumes; rows of
+            later steps are dropped.
+        loggers: further loggers, which get every number.
+
+    Raises:
+        InputError: the rows of the run cannot be read.
+        RunError: a file cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        tensorboard: bool,
+        to_csv: bool,
+        frames: int = 0,
+        loggers: Sequence[Logger] = (),
+    ) -> None:
+        self._loggers = loggers
+        self._path = folder / METRICS if to_csv else None
+        self.rows = [row for row in read_metrics(folder) if row["frames"] <= frames]
+        if self._path and self.rows:
+            write_atomically(self._path, "".join([_line(self.rows[0]), *map(_values, self.rows)]))
+        elif self._path:
+            with writing(self._path):
+                self._path.unlink(missing_ok=True)
+        self._events = EventFile(folder, frames) if tensorboard else None
+
+    def add(self, frames: int, numbers: dict[str, float]) -> None:
+        """Log numbers by name, after so many environment steps over all worlds.
+
+        Raises:
+            RunError: a file cannot be written.
+        """
+        for name, number in numbers.items():
+            for logger in self._loggers:
+                with naming_errors(f"logger {type(logger).__name__}"):
+                    logger.log_scalar(name, number, frames)
+        if self._events:
+            self._events.add(frames, numbers)
+        row = {_FIRST_COLUMN: float(frames), **numbers}
+        self.rows.append(row)
+        if self._path:
+            with writing(self._path), self._path.open("a", newline="") as file:
+                file.write((_line(row) if file.tell() == 0 else "") + _values(row))
+
+    def sync(self) -> None:
+        """Make the rows last, even if the machine stops; a checkpoint comes after its rows."""
+        if self._path and self._path.exists():
+            with writing(self._path), self._path.open("rb") as file:
+                os.fsync(file.fileno())
+
+    def close(self) -> None:
+        """Close all files, and all loggers that can be closed."""
+        if self._events:
+            self._events.close()
+        for logger in self._loggers:
+            with naming_errors(f"logger {type(logger).__name__}"):
+                getattr(logger, "close", lambda: None)()
+
+
+class EventFile:
+    """A file of TensorBoard events, written at once: without a thread, an error can stop the run.
+
+    Args:
+        folder: the run folder.
+        frames: environment steps from which the run resumes: TensorBoard hides later ones of older files.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+
+    def __init__(self, folder: Path, frames: int = 0) -> None:
+        self._path = folder / f"{EVENTS}{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
+        with writing(self._path):
+            self._file = self._path.open("wb")
+        self._records = RecordWriter(self._file)
+        self._write(Event(file_version="brain.Event:2"))
+        if frames:
+            self._write(Event(step=frames + 1, session_log=SessionLog(status=SessionLog.START)))
+
+    def add(self, frames: int, numbers: Mapping[str, float]) -> None:
+        """Write numbers by name, after so many environment steps."""
+        values = [Summary.Value(tag=name, simple_value=number) for name, number in numbers.items()]
+        self._write(Event(step=frames, summary=Summary(value=values)))
+
+    def close(self) -> None:
+        with writing(self._path):
+            self._file.close()
+
+    def _write(self, event: Event) -> None:
+        event.wall_time = time.time()
+        with writing(self._path):
+            self._records.write(event.SerializeToString())
+            self._file.flush()
+
+
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """Read the rows of a run's ``metrics.csv``; an empty list if the file does not exist.
+
+    A last line without an end is not read: a killed run leaves it behind.
+
+    Raises:
+        InputError: the file has no column ``frames``, or a row that is not all numbers.
+    """
+    path = folder / METRICS
+    if not path.exists():
+        return []
+    try:
+        text = path.read_bytes().decode()
+    except (OSError, UnicodeDecodeError) as error:
+        problem = "it is not text" if isinstance(error, ValueError) else error.strerror
+        raise InputError(f"{path}: it cannot be read: {problem}") from None
+    reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+    try:
+        if not _FIRST_COLUMN.startswith(text[: len(_FIRST_COLUMN)]):
+            raise InputError(f"{path}, line 1: no column frames")
+        return [{name: float(number) for name, number in row.items()} for row in reader]
+    except InputError:
+        raise
+    except (TypeError, ValueError, csv.Error) as error:
+        line = f"{path}, line {reader.line_num}"
+        raise InputError(f"{line}: not a row of numbers ({error})") from None
+
+
+def _line(cells: Sequence[object] | Mapping[str, float]) -> str:
+    """Cells, or the names of numbers, as a line of a CSV file."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerow(list(cells))
+    return text.getvalue()
+
+
+def _values(row: Mapping[str, float]) -> str:
+    return _line(list(row.values()))

@@ -1,0 +1,43 @@
+"""Collects the batches that a learner learns from, one between two ticks of the system clock."""
+
+from collections.abc import Iterator
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+
+from damian import keys
+from damian.envs.delayed_env import DelayedEnv
+from damian.learners.recurrent import add_recurrent_state
+from damian.learners.schedule import SystemClock
+from damian.server.server import Server
+
+
+def make_collector(env: TransformedEnv, actor: torch.nn.Module, frames: int) -> Collector:
+    """An endless collector of batches of ``frames`` environment steps."""
+    add_recurrent_state(env, actor)
+    return Collector(
+        env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
+    )
+
+
+def ticks(collector: Collector, clock: SystemClock) -> Iterator[TensorDictBase]:
+    """Batches [B, T], each collected between two ticks of the system clock (paper, section 3.6)."""
+    parts: list[TensorDictBase] = []
+    for part in collector:
+        parts.append(part)
+        if sum(part.shape[1] for part in parts) < clock.period:
+            continue
+        batch = cast(TensorDictBase, torch.cat(parts, 1)) if len(parts) > 1 else part  # type: ignore[arg-type]
+        if clock.change:
+            clock.tick(spotting(batch, cast(DelayedEnv, collector.env).server))
+        parts = []
+        yield batch
+
+
+def spotting(batch: TensorDictBase, server: Server) -> torch.Tensor:
+    """Which UAVs spot the source at the end of a batch [B, T], by what the server holds, [B, N] bool."""
+    after = cast(TensorDictBase, batch["next"][:, -1])
+    return server.messages(after.get(keys.RECEIVED, after[keys.MESSAGE])).spotted

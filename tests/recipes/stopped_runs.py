@@ -1,0 +1,130 @@
+"""Runs of the training recipe that are stopped in the middle: in this process, or in a forked child."""
+
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from damian.evaluation.checkpoint import read_checkpoint
+from damian.evaluation.metrics_log import MetricsLog
+from damian.recipes.shared.launch import launch
+from damian.recipes.train import main
+
+TINY = ["worlds=4", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "checkpoint_every=3"]
+TINY += ["region.lattice_step=60", "episode.max_steps=12", "frames=256", "logger=csv"]
+SAC = [
+    "learner=sac",
+    "learner.updates=1",
+    "learner.batch_size=16",
+    "learner.warm_up=40",
+    "learner.buffer_steps=160",
+]
+FINISHED = {"config.yaml", "run.json", "metrics.csv", "checkpoint.pt", "best.pt", "learning_curve.png"}
+FINISHED |= {"result.csv", "result.md"}
+
+
+class Killed(BaseException):
+    """Stops a run at once; no handler of the program knows it."""
+
+
+@contextmanager
+def killed_after(rows: int) -> Iterator[None]:
+    """Stop the run inside when it has logged so many updates in all; its files stay as they are."""
+    add = MetricsLog.add
+
+    def add_or_stop(log: MetricsLog, frames: int, numbers: dict[str, float]) -> None:
+        add(log, frames, numbers)
+        if len(log.rows) == rows:
+            raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MetricsLog, "add", add_or_stop)
+        with pytest.raises(Killed):
+            yield
+
+
+def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
+    """Start the recipe with words in a forked child, which needs no second for imports; returns its id."""
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+        output = os.open("output.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        sys.stdout = os.fdopen(1, "w", buffering=1)
+        sys.stderr = os.fdopen(2, "w", buffering=1)
+        sys.argv = ["train.py", *words]
+        prepare()
+        launch(main)
+        code = 0
+    except SystemExit as stopped:
+        code = stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def ended(child: int, limit: float = 120.0) -> int:
+    """Wait for a child; returns its exit code, or minus the signal that killed it."""
+    until = time.monotonic() + limit
+    while time.monotonic() < until:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.005)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    raise TimeoutError("the run did not end")
+
+
+def stored(folder: Path) -> dict[str, Tensor]:
+    """Every tensor of the checkpoint and of the best policy of a run, by path."""
+    return {
+        f"{name}.{path}": tensor
+        for name in ("checkpoint.pt", "best.pt")
+        for path, tensor in leaves(read_checkpoint(folder / name, "test"))
+    }
+
+
+def leaves(value: object, path: str = "") -> Iterator[tuple[str, Tensor]]:
+    """Every tensor and number of nested dictionaries and lists, with its path."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from leaves(each, f"{path}.{key}")
+    elif isinstance(value, list | tuple) and not isinstance(value, torch.Size):
+        for i, each in enumerate(value):
+            yield from leaves(each, f"{path}.{i}")
+    elif isinstance(value, Tensor):
+        yield path, value
+    elif isinstance(value, int | float):
+        yield path, torch.tensor(value, dtype=torch.float64)
+
+
+def check_equal(whole: Path, other: Path) -> None:
+    """Check that two runs have the same metrics, results, checkpoints and files, bit for bit."""
+    for name in ("metrics.csv", "result.csv"):
+        assert (other / name).read_bytes() == (whole / name).read_bytes(), name
+    one, two = stored(whole), stored(other)
+    assert one.keys() == two.keys()
+    differ = [name for name in one if not torch.equal(one[name].nan_to_num(9), two[name].nan_to_num(9))]
+    assert differ == []
+    assert files(other) == files(whole)
+    assert {str(path) for path in FINISHED} <= files(whole)
+
+
+def files(folder: Path) -> set[str]:
+    """The files of a run folder."""
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}

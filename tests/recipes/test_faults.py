@@ -1,0 +1,301 @@
+"""Faults around a run: a full disk, a folder in use, a learner that diverges, damaged folders, signals."""
+
+import os
+import resource
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import check_refused
+from stopped_runs import TINY, ended, files, forked, killed_after
+from torch import nn
+
+from damian.common.errors import InputError, RunError
+from damian.evaluation.checkpoint import read_checkpoint
+from damian.evaluation.interrupt import Interrupt
+from damian.evaluation.metrics_log import EventFile, MetricsLog, read_metrics
+from damian.evaluation.run_lock import is_locked, locked
+from damian.learners.finite import divergence
+from damian.learners.mappo import Mappo
+from damian.recipes import evaluate, train
+from damian.recipes.shared.launch import launch
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory) -> Path:
+    """The folder of a run that was killed after its fourth update."""
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("begun")
+        patch.chdir(folder)
+        patch.setattr("sys.argv", ["train.py", *TINY, "hydra.run.dir=run"])
+        with killed_after(4):
+            launch(train.main)
+    return folder / "run"
+
+
+@pytest.fixture
+def copied(begun, tmp_path, monkeypatch) -> Path:
+    """A copy of that run as the folder ``run`` in the current one."""
+    monkeypatch.chdir(tmp_path)
+    return shutil.copytree(begun, tmp_path / "run")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in files(folder)}
+
+
+def stopped_with(run, capsys, code: int, *words: str) -> str:
+    """Run the recipe, which must end with an exit code and one line on stderr; returns that line."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        run(*words, folder="unused")
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert stopped.value.code == code
+    assert len(errors) == 1
+    assert not Path("unused").exists()
+    return errors[0]
+
+
+# Two runs in one folder.
+
+
+def test_a_folder_in_use_is_refused_and_stays_as_it_is(run, capsys, copied):
+    before = contents(copied)
+    with locked(copied):
+        line = stopped_with(run, capsys, 2, "resume=run")
+    assert line.startswith("error: resume: run is in use by another run")
+    assert contents(copied) == before
+    Path("empty").mkdir()
+    with locked(Path("empty")):
+        check_refused(lambda: run(*TINY, folder="empty"), "hydra.run.dir: empty is in use", capsys)
+        assert Path("empty").is_dir()
+
+
+def test_a_lock_leaves_no_file_and_ends_with_its_process(tmp_path):
+    child = os.fork()
+    if not child:
+        with locked(tmp_path):
+            os.kill(os.getpid(), signal.SIGKILL)
+    assert ended(child) == -signal.SIGKILL
+    assert not is_locked(tmp_path)
+    assert [*tmp_path.iterdir()] == []
+
+
+# Full disks and folders that cannot be written.
+
+
+def limit_files_to(n_bytes: int) -> None:
+    """Let this process write no file beyond a size, as a full disk would; Python ignores the signal."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
+
+
+def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
+    before = contents(copied)
+    n_bytes = len(before["checkpoint.pt"]) // 2
+    assert ended(forked(["resume=run", "hydra.run.dir=unused"], lambda: limit_files_to(n_bytes))) == 3
+    errors = [line for line in Path("output.txt").read_text().splitlines() if "error" in line.lower()]
+    assert len(errors) == 1
+    assert errors[0].startswith("error: run/checkpoint.pt: it cannot be written: File too large")
+    assert "Traceback" not in Path("output.txt").read_text()
+    after = contents(copied)
+    assert {name for name in after if after[name] != before.get(name)} <= {
+        "metrics.csv",
+        "run.json",
+        "config.yaml",
+    }
+    assert after["checkpoint.pt"] == before["checkpoint.pt"]
+
+
+def test_a_disk_that_is_full_from_the_start_leaves_no_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert ended(forked([*TINY, "hydra.run.dir=run"], lambda: limit_files_to(500))) == 3
+    assert "error: run/checkpoint.pt: it cannot be written" in Path("output.txt").read_text()
+    assert [path.name for path in tmp_path.iterdir()] == ["output.txt"]
+
+
+def test_rows_and_events_that_cannot_be_written_are_one_error(tmp_path):
+    (tmp_path / "metrics.csv").symlink_to("/dev/full")
+    log = MetricsLog.__new__(MetricsLog)
+    log._path, log._events, log._loggers, log.rows = tmp_path / "metrics.csv", None, (), []
+    with pytest.raises(RunError, match=r"metrics\.csv: it cannot be written: No space left"):
+        log.add(1, {"loss": 2.0})
+    events = EventFile(tmp_path)
+    events.close()
+    events._file = events._records._writer = open("/dev/full", "wb")  # noqa: SIM115
+    for write in (lambda: events.add(1, {"loss": 2.0}), events.close):
+        with pytest.raises(RunError, match=r"events.*: it cannot be written: No space left"):
+            write()
+
+
+@pytest.mark.parametrize("folder", ["file/run", "/proc/run"])
+def test_a_folder_that_cannot_be_made_is_one_line(run, capsys, tmp_path, folder):
+    (tmp_path / "file").touch()
+    check_refused(lambda: run(*TINY, folder=folder), folder, capsys)
+
+
+# Learners that diverge.
+
+
+def test_a_learning_rate_of_a_million_stops_the_run(run, capsys):
+    line = stopped_with_learner(run, capsys, "learner.lr=1e6")
+    assert line.startswith("error: update 1: actor: ")
+    assert "beyond 100000: the learner has diverged; choose a smaller learner.lr than 1e+06" in line
+    assert line.endswith("bad/checkpoint.pt is of update 0 and intact")
+    assert read_checkpoint(Path("bad/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 0
+
+
+def stopped_with_learner(run, capsys, *words: str) -> str:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        run(*TINY, *words, folder="bad")
+    assert stopped.value.code == 3
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatch):
+    learn, calls = Mappo.learn, []
+
+    def diverge(learner: Mappo, batch) -> dict[str, float]:
+        calls.append(1)
+        return learn(learner, batch) | ({"loss_critic": float("inf")} if len(calls) == 2 else {})
+
+    monkeypatch.setattr(Mappo, "learn", diverge)
+    line = stopped_with_learner(run, capsys, "checkpoint_every=1")
+    assert line.startswith("error: update 2: loss_critic is inf: the learner has diverged")
+    assert line.endswith("bad/checkpoint.pt is of update 1 and intact")
+    assert read_checkpoint(Path("bad/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 1
+
+
+def test_a_nan_counts_only_if_weights_are_wrong():
+    network = nn.Linear(2, 2)
+    optimizer = torch.optim.Adam(network.parameters())
+    network(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    components = {"actor": network, "optimizer": optimizer, "other": object()}
+    nan, inf = float("nan"), float("inf")
+    assert divergence(components, {"loss": 1.0, "not known yet": nan}) is None
+    assert divergence(components, {"a": 1.0, "b": -inf}) == "b is -inf"
+    optimizer.state[network.bias]["exp_avg_sq"][0] = inf
+    assert divergence(components, {}) == "optimizer: exp_avg_sq has the value inf"
+    optimizer.state.clear()
+    for value, text in ((nan, "nan"), (inf, "inf"), (-2e5, "2e+05, beyond 100000")):
+        with torch.no_grad():
+            network.bias[1] = value
+        assert divergence(components, {}) == f"actor: bias has the value {text}"
+        assert divergence(components, {"loss": nan}) == "loss is nan"
+    assert divergence({"actor": nn.ReLU()}, {}) is None
+
+
+# Damaged folders.
+
+
+def make_folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda f: make_folder(f / "metrics.csv"), "metrics.csv: it cannot be read: Is a directory"),
+        (lambda f: make_folder(f / "checkpoint.pt"), "checkpoint.pt: it cannot be read: Is a directory"),
+        (lambda f: (f / "checkpoint.pt").unlink(), "checkpoint.pt: there is no such file"),
+        (lambda f: (f / "config.yaml").write_text("agents: 3\n"), "config.yaml: it has no learner"),
+    ],
+)
+def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, message):
+    damage(copied)
+    names = files(copied)
+    assert message in stopped_with(run, capsys, 2, "resume=run")
+    assert files(copied) == names
+
+
+@pytest.mark.parametrize("key", ["resume", "checkpoint"])
+def test_a_name_that_no_folder_can_have_is_refused_in_one_line(run, capsys, tmp_path, key):
+    line = stopped_with(run, capsys, 2, f"{key}={'x' * 5000}")
+    assert line.startswith(f"error: {key}: xxx")
+    assert len(line) < 400
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_cut_last_line_is_no_row(tmp_path):
+    for text, rows in (
+        ("", 0),
+        ("fra", 0),
+        ("frames,x\n1,", 0),
+        ("frames,x\n1,2\n3", 1),
+        ("frames,x\n1,2\n3,4\n", 2),
+    ):
+        (tmp_path / "metrics.csv").write_text(text)
+        assert len(read_metrics(tmp_path)) == rows
+
+
+@pytest.mark.parametrize(
+    ("damaged", "problem"),
+    [
+        (b"nonsense", "metrics.csv, line 1: no column frames"),
+        (b"\xff\xfe\x00\x01", "metrics.csv: it cannot be read: it is not text"),
+        (b"frames,x\n1\x00,2\n", "metrics.csv, line 2: not a row of numbers"),
+        (b"frames\n" + b"1" * 200_000 + b"\n", "metrics.csv, line 1: not a row of numbers"),
+    ],
+)
+def test_damaged_metrics_are_refused_in_one_line(tmp_path, damaged, problem):
+    (tmp_path / "metrics.csv").write_bytes(damaged)
+    with pytest.raises(InputError, match=problem) as refused:
+        read_metrics(tmp_path)
+    assert len(str(refused.value)) < 400
+
+
+# Signals.
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_asks_and_the_second_one_stops_at_once(number):
+    def handler(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {each: signal.signal(each, handler) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with Interrupt() as interrupt:
+            assert interrupt.asked is None
+            os.kill(os.getpid(), number)
+            assert interrupt.asked == number
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), number)
+        assert signal.getsignal(number) == handler
+    finally:
+        for each, old in before.items():
+            signal.signal(each, old)
+
+
+def test_sigterm_stops_a_run_after_its_update(run, capsys, monkeypatch):
+    add = MetricsLog.add
+
+    def signalled(log: MetricsLog, frames: int, numbers: dict[str, float]) -> None:
+        if len(log.rows) == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        add(log, frames, numbers)
+
+    monkeypatch.setattr(MetricsLog, "add", signalled)
+    with pytest.raises(SystemExit) as stopped:
+        run(*TINY)
+    assert stopped.value.code == 143
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted; continue with resume=run"
+    assert read_checkpoint(Path("run/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 2
+
+
+# The best policy.
+
+
+@pytest.mark.slow
+def test_the_best_policy_of_a_run_can_be_flown(run, monkeypatch):
+    folder = run(*TINY, "frames=640")
+    best = read_checkpoint(folder / "best.pt", "test")
+    assert best["training"]["progress"]["best"] == max(
+        row["episode_return"] for row in read_metrics(folder)[2::3]
+    )
+    monkeypatch.setattr("sys.argv", ["evaluate.py", "checkpoint=run/best.pt", "hydra.run.dir=flown"])
+    launch(evaluate.main)
+    assert Path("flown/result.csv").exists()

@@ -1,0 +1,145 @@
+"""A run that was stopped and resumed equals one that never was: metrics, weights and results, bit for bit."""
+
+import itertools
+import os
+import random
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stopped_runs import SAC, TINY, check_equal, ended, files, forked, killed_after
+
+from damian.evaluation import replay_memory
+
+WHOLE = [
+    "delay=paper",
+    "delay.obs.high=9s",
+    "aware=both",
+    "delay.act=1",
+    "motion=polynomial",
+    "model.rnn=gru",
+]
+TRIGGERED = ["learner.steps=4", "clock.trigger=2s", "clock.longest=10s", "source.level_db=106", "delay.obs=2"]
+SLOW_CLOCKS = ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"]
+CASES = {
+    "recurrent": ["delay.obs=2", "aware=backupdate", "delay.act=1", "delay.history=2", "model.rnn=gru"],
+    "sac": [*SAC, "delay.obs=3", "aware=backupdate", "delay.loss=0.1"],
+    "sac bursts": [*SAC, "scenario=tracking", "delay=burst", "delay.history=2"],
+    "everything": [*WHOLE, "settle=true", "learner.steps=16", "frames=512"],
+    "triggered": TRIGGERED,
+    "slow clocks": [*SLOW_CLOCKS, "frames=512"],
+    "skipped": ["clock.skip=true", "motion=polynomial", "scenario=energy"],
+    "lags": ["delay=lag", "delay.rew=2", "scenario=coverage", "region=random", "region.pool=2"],
+    "matrix": ["links=matrix", "links.delay=2", "scenario=mixed", "actions=continuous"],
+    "privileged": ["critic=privileged", "source.motion=dynamic", "observation.own=true", "delay.obs=2"],
+}
+QUICK = ("recurrent", "sac")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in CASES]
+)
+def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case, monkeypatch):
+    monkeypatch.setattr(replay_memory, "SEGMENT_BYTES", 1000)  # else a short run has no segments
+    words = [*TINY, *CASES[case]]
+    whole = run(*words, folder="whole")
+    with killed_after(2):
+        run(*words, folder="other")
+    with killed_after(5):
+        run("resume=other", folder="unused")
+    other = run("resume=other", folder="unused").with_name("other")
+    check_equal(whole, other)
+    has_memory = case in ("recurrent", "sac", "sac bursts", "everything")
+    assert any(name.startswith("replay/") for name in files(whole)) == has_memory
+
+
+@pytest.mark.slow
+def test_a_finished_run_that_goes_on_equals_a_longer_one(run):
+    longer = run(*TINY, *SAC, "frames=384", folder="longer")
+    run(*TINY, *SAC, "frames=192", folder="other")
+    run("resume=other", "frames=384", folder="unused")
+    check_equal(longer, longer.with_name("other"))
+
+
+SMALL = [*TINY, "frames=512", "checkpoint_every=4", "episode.max_steps=6"]
+LEARNERS = {"mappo": ["delay.obs=2", "aware=backupdate"], "sac": [*SAC, "delay.obs=2"]}
+STOPPED = (0, 130, 143, -signal.SIGTERM, -signal.SIGKILL)
+"""Exit codes of a run that has ended, or that a signal has stopped before, in or after its training."""
+
+
+def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int]) -> int:
+    """Start and resume a run until it is finished; returns how often it was stopped.
+
+    Args:
+        words: of the command line.
+        folder: the run folder.
+        stop: starts the recipe with words, and may stop it; returns the exit code.
+    """
+    for stops in range(500):
+        begun = Path(folder, "config.yaml").exists()
+        code = stop(
+            [f"resume={folder}", "hydra.run.dir=unused"] if begun else [*words, f"hydra.run.dir={folder}"]
+        )
+        assert code in STOPPED, Path("output.txt").read_text()[-2000:]
+        if code == 0:
+            return stops
+    raise AssertionError("the run makes no progress")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name)
+def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, number, monkeypatch):
+    monkeypatch.setattr(replay_memory, "SEGMENT_BYTES", 1000)
+    words, moments = [*SMALL, *LEARNERS[learner]], random.Random(f"{learner} {number}")
+    begin = time.monotonic()
+    whole = run(*words, folder="whole")
+    longest, stops = time.monotonic() - begin, 0
+
+    def stop(words: list[str]) -> int:
+        child = forked(words)
+        time.sleep(moments.uniform(0, longest))
+        os.kill(child, number)
+        return ended(child)
+
+    for trial in itertools.count():
+        if stops >= 20:
+            break
+        stops += run_through(words, f"run_{trial}", stop)
+        check_equal(whole, whole.with_name(f"run_{trial}"))
+    print(f"{learner}, {number.name}: {stops} stops in {trial} runs of {longest:.1f} s")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_a_run_killed_in_the_middle_of_writing_loses_nothing(run, learner, monkeypatch):
+    monkeypatch.setattr(replay_memory, "SEGMENT_BYTES", 1000)
+    words, moments = [*SMALL, *LEARNERS[learner]], random.Random(learner)
+    whole, stops = run(*words, folder="whole"), 0
+
+    def stop(words: list[str]) -> int:
+        return ended(forked(words, lambda: kill_at_write(moments.randrange(60))))
+
+    for trial in itertools.count():
+        if stops >= 20:
+            break
+        stops += run_through(words, f"run_{trial}", stop)
+        check_equal(whole, whole.with_name(f"run_{trial}"))
+    print(f"{learner}: {stops} kills in the middle of writing in {trial} runs")
+
+
+def kill_at_write(number: int) -> None:
+    """Kill this process before the call of this number that makes a file last or gives it its name."""
+    calls = itertools.count()
+    for name in ("fsync", "replace", "unlink"):
+        original = getattr(os, name)
+
+        def call(*arguments: Any, original: Callable[..., Any] = original, **options: Any) -> Any:
+            if next(calls) == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return original(*arguments, **options)
+
+        setattr(os, name, call)
