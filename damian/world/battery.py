@@ -50,8 +50,7 @@ class BatteryConfig:
             "[]",
             "is not a list of places; leave it out to charge anywhere",
         )
-        for point in self.charging_points or []:
-            checks.place("battery.charging_points", point)
+        checks.places("battery.charging_points", self.charging_points)
 
 
 def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:

@@ -89,12 +89,12 @@ class TrainConfig(ScenarioConfig):
         checks.one_of("critic", self.critic, ("server", "privileged"))
         checks.in_range("seed", self.seed, 0, 2**31)
         for name in ("worlds", "eval_episodes"):
-            checks.in_range(name, getattr(self, name), 1, 1e6)
+            checks.in_range(name, getattr(self, name), 1, checks.WORLDS)
         for name in ("frames", "checkpoint_every"):
             checks.in_range(name, getattr(self, name), 1, 1e12)
         checks.in_range("threads", self.threads, 1, 1024)
         if self.episodes is not None:
-            checks.in_range("episodes", self.episodes, 1)
+            checks.in_range("episodes", self.episodes, 1, 1e12)
         checks.device("device", self.device)
 
     def check_learning(self) -> None:

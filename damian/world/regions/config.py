@@ -60,8 +60,8 @@ class RegionConfig:
         REGION_SOURCES.get(self.kind, "region.kind")
         checks.above("region.min_area", self.min_area, 0.0, "m^2")
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
-        checks.in_range("region.pool", self.pool, 1)
-        checks.in_range("region.initial_conditions", self.initial_conditions, self.pool, 1e6)
+        checks.in_range("region.pool", self.pool, 1, 10_000)
+        checks.in_range("region.initial_conditions", self.initial_conditions, self.pool, checks.WORLDS)
         checks.require(
             self.pool == 1 or self.kind == "random" or ":" in self.kind,
             "region.pool",
@@ -77,8 +77,7 @@ class RegionConfig:
         for key in required_keys.get(self.kind, []):
             problem = f"is missing: region.kind={self.kind} needs it"
             checks.require(bool(getattr(self, key)), f"region.{key}", "it", problem)
-        for start in self.start_positions or []:
-            checks.place("region.start_positions", start)
+        checks.places("region.start_positions", self.start_positions)
 
     def regions(self, rng: np.random.Generator) -> list[Region]:
         """Read the region from its file or vertices, or draw ``pool`` random regions.
