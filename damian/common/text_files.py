@@ -71,7 +71,9 @@ def read_table(file: Path, columns: Iterable[str]) -> list[Row]:
     if missing := [column for column in columns if column not in header]:
         raise InputError(f"line {first}: no column {', '.join(missing)}; {near(missing[0], header)}")
     if doubled := [column for column in header if column and header.count(column) > 1]:
-        raise InputError(f"line {first}: the column {show(doubled[0])} appears {header.count(doubled[0])} times")
+        raise InputError(
+            f"line {first}: the column {show(doubled[0])} appears {header.count(doubled[0])} times"
+        )
     for number, cells in lines:
         if len(cells) != len(header):
             raise InputError(f"line {number}: {len(cells)} values for {len(header)} columns")

@@ -3,8 +3,9 @@
 import os
 import re
 import sys
-from argparse import Namespace
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -14,7 +15,25 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from damian.common.errors import InputError
+from damian.common.text_files import one_line
 from damian.evaluation.run_record import read_record
+
+
+@contextmanager
+def exits_with_one_line() -> Iterator[None]:
+    """End the program with one line on stderr and exit code 2 where wrong input is found inside."""
+    try:
+        yield
+    except InputError as error:
+        print(f"error: {one_line(str(error))}", file=sys.stderr)
+        sys.exit(2)
+
+
+class Parser(ArgumentParser):
+    """Raises an ``InputError`` instead of printing its usage."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message)
 
 
 def parsed(words: Sequence[str]) -> Namespace:
@@ -52,6 +71,13 @@ def prepared(words: Sequence[str]) -> list[str]:
         InputError: an option is wrong, or policies were trained with different folders of files.
     """
     options = vars(parsed(words))
+    for word in options["overrides"]:
+        if not word.lstrip("+~").partition("=")[0].strip():
+            raise InputError(f"{word!r}: this word is not of the form KEY=VALUE")
+        if "\0" in word:
+            raise InputError(f"{word!r}: a NUL byte is not text")
+        if re.fullmatch(r"hydra\.(run|sweep)\.dir=(['\"]?)\s*\2", word):
+            raise InputError(f"{word.partition('=')[0]}: it is empty: name a folder, or leave it out")
     overrides = whole_laws([_quoted(word) for word in options.pop("overrides")])
     options["config_dir"] = options["config_dir"] or _config_dir(overrides)
     given = ((f"--{name.replace('_', '-')}", value) for name, value in options.items() if value)
@@ -77,11 +103,13 @@ def _quoted(word: str) -> str:
 
 
 def _quoted_name(name: str) -> str:
-    is_plain = re.fullmatch(r"[A-Za-z_][\w./-]*|[./][\w./-]+", name, re.ASCII) and name.lower() not in _WORDS
+    is_plain = (
+        re.fullmatch(r"[A-Za-z_][\w./-]*|[./][\w./-]+", name, re.ASCII) and name.lower() not in NO_NAMES
+    )
     return name if is_plain else QuotedString(name, Quote.single).with_quotes()
 
 
-_WORDS = ("null", "true", "false", "nan", "inf")
+NO_NAMES = ("null", "true", "false", "nan", "inf")
 """Names that Hydra would read as values."""
 
 

@@ -19,6 +19,9 @@ from damian.learners.networks import ModelConfig
 from damian.learners.sac import SacConfig  # noqa: F401 (registers the learner)
 from damian.learners.schedule import SystemClock
 
+MAX_BATCH = 100_000_000
+"""Most environment steps, over all worlds, that are collected before an update; they lie in memory."""
+
 
 @dataclass
 class LoggerConfig:
@@ -103,7 +106,10 @@ class TrainConfig(ScenarioConfig):
         Raises:
             InputError: names the key that does not fit.
         """
-        self.learner.check(self.learning_setup)
+        setup = self.learning_setup
+        batch, should = setup.worlds * setup.longest_period, "environment steps between two updates"
+        checks.in_range("worlds", batch, 1, MAX_BATCH, should)
+        self.learner.check(setup)
         self._check_skip()
         self._check_backupdate()
         useless = self.delay.hold == "max" and self.longest_delay == 0

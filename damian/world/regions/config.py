@@ -77,6 +77,12 @@ class RegionConfig:
         for key in required_keys.get(self.kind, []):
             problem = f"is missing: region.kind={self.kind} needs it"
             checks.require(bool(getattr(self, key)), f"region.{key}", "it", problem)
+        optional_keys = {"geojson": ["index", "where"]}
+        known_keys = required_keys.get(self.kind, []) + optional_keys.get(self.kind, [])
+        for key in ("vertices", "path", "id", "index", "where", "options") if ":" not in self.kind else ():
+            value, problem = getattr(self, key), f"means nothing with region.kind={self.kind}"
+            given = value is not None and value not in ("", [])
+            checks.require(key in known_keys or not given, f"region.{key}", value, problem)
         checks.places("region.start_positions", self.start_positions)
 
     def regions(self, rng: np.random.Generator) -> list[Region]:
