@@ -15,6 +15,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -293,3 +294,9 @@ def fly(given: list[str]) -> None:
         rollout = env.rollout(3, break_when_any_done=False)
     for key in (keys.OBSERVATION, keys.GLOBAL_OBSERVATION, next_key(keys.REWARD)):
         assert rollout[key].isfinite().all(), (key, given)
+
+
+def examples(quick: int, deep: int) -> settings:
+    """How many examples a test tries in ``make test``, and in ``make test-deep``."""
+    is_deep = settings().max_examples > 100
+    return settings(max_examples=deep if is_deep else quick, suppress_health_check=list(HealthCheck))

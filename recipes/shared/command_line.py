@@ -15,7 +15,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from damian.common.errors import InputError
-from damian.common.text_files import one_line
+from damian.common.text_files import one_line, show
 from damian.evaluation.run_record import read_record
 
 
@@ -78,10 +78,23 @@ def prepared(words: Sequence[str]) -> list[str]:
             raise InputError(f"{word!r}: a NUL byte is not text")
         if re.fullmatch(r"hydra\.(run|sweep)\.dir=(['\"]?)\s*\2", word):
             raise InputError(f"{word.partition('=')[0]}: it is empty: name a folder, or leave it out")
+        _check_folder(word)
     overrides = whole_laws([_quoted(word) for word in options.pop("overrides")])
     options["config_dir"] = options["config_dir"] or _config_dir(overrides)
     given = ((f"--{name.replace('_', '-')}", value) for name, value in options.items() if value)
     return [*(name if value is True else f"{name}={value}" for name, value in given), *overrides]
+
+
+def _check_folder(word: str) -> None:
+    """Refuse a run folder that the file system cannot look up, because its name is too long for instance."""
+    key, _, folder = word.lstrip("+").partition("=")
+    try:
+        if key in ("checkpoint", "resume"):
+            os.stat(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        return  # it may be quoted, or several in a sweep
+    except (OSError, ValueError) as error:
+        raise InputError(f"{key}: {show(folder)}: {getattr(error, 'strerror', error)}") from None
 
 
 def whole_laws(words: Sequence[str]) -> list[str]:

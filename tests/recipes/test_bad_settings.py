@@ -6,15 +6,14 @@
 from unittest.mock import patch
 
 import pytest
-from fuzzing import SMALL, composed, fly, refusal, settings_of, words
-from hypothesis import HealthCheck, given, settings
+from fuzzing import SMALL, composed, examples, fly, refusal, settings_of, words
+from hypothesis import given
 
 from damian.recipes.command import _answered
 from damian.recipes.compare import CompareConfig
 from damian.recipes.shared.launch import checked
 
 LEARNERS = {"mappo": SMALL, "sac": (*SMALL, "learner=sac")}
-quick = settings(suppress_health_check=list(HealthCheck))
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
@@ -98,13 +97,13 @@ def test_a_batch_has_a_limit():
     assert line.startswith("worlds: 1000000000000 environment steps between two updates is not between 1 and")
 
 
-@quick
+@examples(40, 4000)
 @given(words("train"))
 def test_any_words_are_refused_in_one_line_or_fly(given_words):
     refusal(given_words, fly)
 
 
-@quick
+@examples(15, 1000)
 @given(words("compare"))
 def test_any_words_of_a_comparison_are_refused_in_one_line_or_make_a_plan(given_words):
     def compare(given_words):
@@ -114,7 +113,7 @@ def test_any_words_of_a_comparison_are_refused_in_one_line_or_make_a_plan(given_
     refusal(given_words, compare, "compare")
 
 
-@quick
+@examples(20, 1000)
 @given(words("train"))
 def test_the_quick_look_at_any_words_ends_without_a_traceback(given_words):
     """``damian PROGRAM`` looks at its words before it loads torch; it prints help, refuses, or goes on."""
