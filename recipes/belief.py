@@ -4,8 +4,9 @@
     damian belief delay=paper scenario=tracking agents=2 seed=1
     damian belief delay.obs=3 delay.loss=0.2 motion=polynomial
 
-Every override of damian train may be given, except resume. The run folder gets config.yaml, belief.png (a
-map, the positions over time, the age of information) and belief.csv (a row for each time and UAV).
+Every override of damian train may be given, except resume and checkpoint. The run folder gets config.yaml,
+belief.png (a map, the positions over time, the age of information) and belief.csv (a row for each time and
+UAV).
 """
 
 import csv
@@ -108,10 +109,9 @@ def show(config: TrainConfig, folder: Path) -> None:
 @hydra.main(version_base=None, config_path=CONF, config_name="belief")
 @reported
 def main(composed: DictConfig) -> None:
-    if composed.resume is not None:
-        raise InputError(
-            "resume: the random policy is not trained, so there is no run to resume; leave it out"
-        )
+    for key in ("resume", "checkpoint"):
+        if composed[key] is not None:
+            raise InputError(f"{key}: the random policy flies, which is not trained; leave it out")
     perform(*prepare(composed), show)
 
 

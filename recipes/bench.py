@@ -8,7 +8,6 @@ measured by ``bench_training.py``. The measured environments take turns, so that
 them, and medians are reported. The tables are printed and written to runs/bench.md; there is no run folder.
 """
 
-import argparse
 import importlib.util
 import statistics
 import time
@@ -38,6 +37,7 @@ from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 
 from .bench_training import HEADER, training
+from .shared.command_line import Parser, exits_with_one_line
 from .shared.known_settings import CONF
 from .shared.settings import TrainConfig
 
@@ -277,9 +277,10 @@ def _cost_header(first: str, presets: Scenarios) -> tuple[str, ...]:
 
 def main() -> None:
     """Measure everything, print the tables and write them to runs/bench.md."""
-    parser = argparse.ArgumentParser(description="Measure the speed of the environment and of training.")
+    parser = Parser(description="Measure the speed of the environment and of training.")
     parser.add_argument("--quick", action="store_true", help="small sizes, only to check that it runs")
-    sizes = QUICK if parser.parse_args().quick else Sizes()
+    with exits_with_one_line():
+        sizes = QUICK if parser.parse_args().quick else Sizes()
     torch.set_num_threads(1)
     presets = scenarios()
     report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]

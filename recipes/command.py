@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from damian.common.errors import InputError
+from damian.common.text_files import one_line
 
 from .shared.command_line import parsed, prepared
 from .shared.help_text import help_text
@@ -79,5 +80,5 @@ MORE = "damian PROGRAM --help explains a program's settings, damian --version pr
 
 def _refuse(problem: str) -> int:
     """Print an error, and return the exit code of wrong input."""
-    print(f"error: {problem}", file=sys.stderr)
+    print(f"error: {one_line(problem)}", file=sys.stderr)
     return 2

@@ -114,7 +114,7 @@ class CompareConfig:
         checks.one_of("score", self.score, SCORES)
         checks.one_of("policy", self.policy, POLICIES)
         for word in self.overrides:
-            ours = re.match(r"\+*(seed|resume|checkpoint|logger)\b", word)
+            ours = re.match(r"[+~]*(seed|resume|checkpoint|logger|overrides|hydra)\b", word)
             should = "cannot be the same for every run: the comparison sets it; leave it out"
             checks.require(not ours, "overrides", word, should)
         for kind in ("tasks", "delays", "arms"):

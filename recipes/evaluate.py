@@ -39,12 +39,21 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
     Raises:
         InputError: no checkpoint is given, or its actor has other observations, actions or layers.
     """
-    if not config.checkpoint:
-        raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
+    require_checkpoint(config)
     env = make_eval_env(config)
     actor = config.learner.make_actor(env, config.model)
     load_networks(Path(config.checkpoint), "checkpoint", {"actor": actor})
     return env, actor
+
+
+def require_checkpoint(config: TrainConfig) -> None:
+    """Require the name of a run folder.
+
+    Raises:
+        InputError: no checkpoint is given.
+    """
+    if not config.checkpoint:
+        raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

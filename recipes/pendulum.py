@@ -9,15 +9,15 @@ folder (runs/pendulum, unless --out names another one) gets the table of mean re
 results.csv, and a JSON file for each arm and seed; an arm and seed that has its file is not trained again.
 """
 
-import argparse
 import csv
 import json
 import multiprocessing
+import re
 import statistics
-import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import torch
 from torch import nn
@@ -39,11 +39,14 @@ from damian import keys
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.markdown import markdown_table
+from damian.common.text_files import named, read_text, show
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.transforms import ActionHistory, ObservationDelay
+
+from .shared.command_line import Parser, exits_with_one_line
 
 ARMS = ("undelayed", "naive", "history")
 DEPLOYED = {0: -145, 2: -153, 3: -324, 4: -757, 6: -777, 8: -977}
@@ -173,11 +176,43 @@ def returns_of(run: Run, folder: Path) -> dict[str, float] | None:
     file = run.file(folder)
     if not file.exists():
         return None
-    saved = json.loads(file.read_text())
+    saved = read_result(file)
     for name, value in run._asdict().items():
         should = f"is not the {saved[name]} of {file}; choose another folder with --out"
         checks.require(saved[name] == value, f"--{name}", value, should)
     return saved["returns"]
+
+
+def read_result(file: Path) -> dict[str, Any]:
+    """The result of a finished run, with every setting of it.
+
+    Raises:
+        InputError: the file holds something else.
+    """
+    with named(file):
+        try:
+            saved = json.loads(read_text(file))
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"is not the result of a run ({type(error).__name__}); delete it") from None
+        returns = saved.get("returns") if isinstance(saved, dict) else None
+        whole = isinstance(returns, dict) and {*Run._fields} <= {*saved}
+        numbers = whole and all(isinstance(number, int | float) for number in returns.values())
+        checks.require(numbers, "it", show(saved), "is not the result of a run; delete it")
+        return saved
+
+
+def make_folder(folder: Path) -> None:
+    """Make the run folder.
+
+    Raises:
+        InputError: it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, ValueError) as error:
+        raise InputError(f"--out: {folder}: {getattr(error, 'strerror', error)}") from None
 
 
 def table(runs: Sequence[Run], folder: Path) -> str:
@@ -199,13 +234,6 @@ def table(runs: Sequence[Run], folder: Path) -> str:
     return text
 
 
-class Parser(argparse.ArgumentParser):
-    """Raises an ``InputError`` instead of printing its usage."""
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(message)
-
-
 def parse(words: Sequence[str] | None) -> tuple[list[Run], Path, int]:
     """The runs that the command line asks for, their folder, and the number of processes.
 
@@ -222,25 +250,23 @@ def parse(words: Sequence[str] | None) -> tuple[list[Run], Path, int]:
     parser.add_argument("--jobs", type=int, default=1, help="number of processes, each with one thread")
     args = parser.parse_args(words)
     seeds = args.seeds.split(",")
-    valid = all(seed.isdecimal() for seed in seeds) and len({*map(int, seeds)}) == len(seeds)
+    valid = all(re.fullmatch(r"[0-9]{1,9}", seed) for seed in seeds)
+    valid = valid and len({*map(int, seeds)}) == len(seeds)
     checks.require(valid, "--seeds", args.seeds, "is not a list of different whole numbers such as 0,1,2")
-    checks.above("--steps", args.steps, RANDOM_STEPS)
+    checks.in_range("--steps", args.steps, RANDOM_STEPS + 1, 100_000_000)
     checks.in_range("--delay", args.delay, 1, HORIZON, "steps")
-    for name in ("episodes", "hidden", "jobs"):
-        checks.in_range(f"--{name}", getattr(args, name), 1)
+    for name, most in (("episodes", 10_000), ("hidden", 16_384), ("jobs", 1024)):
+        checks.in_range(f"--{name}", getattr(args, name), 1, most)
     settings = args.steps, args.delay, args.episodes, args.hidden
     return [Run(arm, int(seed), *settings) for seed in seeds for arm in ARMS], args.out, args.jobs
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Train, evaluate and print the table; wrong input ends with one line on stderr and exit code 2."""
-    try:
+    with exits_with_one_line():
         runs, folder, jobs = parse(words)
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         run_all(runs, folder, jobs)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
     print(f"{table(runs, folder)}\nresults: {folder}")
 
 

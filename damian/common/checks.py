@@ -1,4 +1,8 @@
-"""Checks of settings; a failed check raises one line that names the key, the value and its unit."""
+"""Checks of settings; a failed check raises one line that names the key, the value and its unit.
+
+Every number has a largest sensible value, even where a check names none, because single precision overflows,
+and time and memory run out, long before a computer refuses a number.
+"""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,37 +12,71 @@ import torch
 
 from damian.common.errors import InputError
 
+METRES = 2.0e7
+"""Half the circumference of the Earth [m]; no two places are farther apart."""
+SECONDS = 1.0e6
+"""Longest time: eleven days [s], which single precision still resolves to a sixteenth of a second."""
+STEPS = 1_000_000
+"""Most steps of an episode, or between two updates of a learner."""
+WORLDS = 1_000_000
+"""Most worlds, or initial conditions."""
+LARGEST = {"m": METRES, "m^2": METRES**2, "s": SECONDS, "dB": 300.0, "deg": 360.0}
+"""Largest number allowed by its unit, where a check names none."""
+HUGE, TINY = 1e9, 1e-9
+"""Largest number of any other unit or of none, and smallest one where a check asks for one above 0.
+
+Products and ratios of a few such numbers do not overflow in single precision, nor vanish.
+"""
+
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+_SHOWN = 100
+"""Characters of a value that an error shows."""
 
 
 def require(condition: bool, key: str, value: Any, should: str) -> None:
-    """Raise ``InputError("<key>: <value> <should>")`` unless the condition holds."""
-    if not condition:
-        raise InputError(f"{key}: {value} {should}")
+    """Raise ``InputError("<key>: <value> <should>")`` unless the condition holds; a long value is cut."""
+    if condition:
+        return
+    text = str(value)
+    shown = text if len(text) <= _SHOWN else f"{text[: _SHOWN // 2]}...{text[-_SHOWN // 4 :]}"
+    raise InputError(f"{key}: {shown} {should}")
 
 
-def in_range(key: str, value: float, low: float, high: float = math.inf, unit: str = "") -> None:
-    """Require a finite number ``low <= value <= high``."""
-    _require_bounds(key, value, low, high)
+def in_range(key: str, value: float, low: float, high: float | None = None, unit: str = "") -> None:
+    """Require a number ``low <= value <= high``; without ``high``, the largest number of the unit."""
+    _require_bounds(key, value, low, *(() if high is None else (high,)))
+    most = max(low, LARGEST.get(unit, HUGE)) if high is None else high
+    good = _is_number(value) and low <= value <= most
     unit = f" {unit}" if unit else ""
-    bounds = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
-    good = isinstance(value, int | float) and low <= value <= high and value < math.inf
+    one_sided = high is None and not (_is_number(value) and most < value < math.inf)
+    bounds = f"at least {low:g}" if one_sided else f"between {low:g} and {most:g}"
     require(good, key, f"{value}{unit}", f"is not {bounds}{unit}")
 
 
-def whole(key: str, value: Any, low: int, high: float = math.inf, unit: str = "") -> None:
-    """Require a whole number ``low <= value <= high``."""
+def whole(key: str, value: Any, low: int, high: float | None = None, unit: str = "") -> None:
+    """Require a whole number ``low <= value <= high``; without ``high``, the largest number of the unit."""
     good = isinstance(value, int) and not isinstance(value, bool)
     require(good, key, f"{value} {unit}".strip(), "is not a whole number")
     in_range(key, value, low, high, unit)
 
 
 def above(key: str, value: float, low: float, unit: str = "") -> None:
-    """Require a finite number above ``low``."""
+    """Require a number above ``low``, by ``TINY`` at least, up to the largest number of the unit."""
     _require_bounds(key, value, low)
-    unit = f" {unit}" if unit else ""
-    good = isinstance(value, int | float) and low < value < math.inf
-    require(good, key, f"{value}{unit}", f"is not above {low:g}{unit}")
+    good = _is_number(value) and low < value < math.inf
+    require(good, key, f"{value} {unit}".strip(), f"is not above {low:g} {unit}".strip())
+    in_range(key, value, low + TINY, max(low + TINY, LARGEST.get(unit, HUGE)), unit)
+
+
+def weight(key: str, value: float) -> None:
+    """Require a weight of a reward or a loss: a finite number that is not huge."""
+    good = _is_number(value) and math.isfinite(value)
+    require(good, key, value, "is not a finite weight")
+    in_range(key, value, -1e6, 1e6)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:
@@ -65,21 +103,29 @@ def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:
 def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:
     """Require that the value is one of the choices."""
     choices = list(choices)
-    require(value in choices, key, value, f"is not one of {', '.join(map(str, choices))}")
+    names = ", ".join(map(str, choices))
+    problem = f"is not one of {names}" if choices else "is not known, because there is none"
+    require(value in choices, key, value, problem)
+
+
+def distinct(key: str, values: Sequence[Any]) -> None:
+    """Require that no value of a list appears twice."""
+    again = next((value for i, value in enumerate(values) if value in values[:i]), None)
+    require(again is None, key, again, "appears twice")
 
 
 def place(key: str, value: Any) -> None:
-    """Require a position ``[x, y]`` of two finite numbers [m]."""
-    good = isinstance(value, Sequence) and len(value) == 2
-    good = good and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
-    require(good, key, value, "is not [x, y] in metres")
+    """Require a position ``[x, y]`` of two numbers [m] between ``-METRES`` and ``METRES``."""
+    good = isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value))
+    require(good and all(map(math.isfinite, value)), key, value, "is not [x, y] in metres")
+    require(all(abs(v) <= METRES for v in value), key, value, f"is not within {METRES:g} m of the origin")
 
 
 def seconds(key: str, value: str | float) -> float:
     """Convert a time to seconds: ``"2s"``, ``"0.5m"``, ``"1h"``, or a bare number of seconds.
 
     Raises:
-        InputError: the value is no time, or not above 0 s.
+        InputError: the value is no time, not above 0 s, or longer than ``SECONDS``.
     """
     text = str(value).strip()
     number, unit = (text[:-1], text[-1]) if text[-1:] in _SECONDS else (text, "s")

@@ -94,7 +94,7 @@ class Registry(Generic[T]):
         return iter(self._components)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._components
+        return isinstance(name, str) and name in self._components
 
     def items(self) -> Iterator[tuple[str, T]]:
         """Registered names and components."""

@@ -1,17 +1,21 @@
-"""Reads input files as text, and helps to put the file, the place and a hint into one-line errors."""
+"""Reads input files as text and tables, and puts the file, the place and a hint into one-line errors."""
 
+import csv
 import difflib
+import io
 import os
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from damian.common.errors import InputError
 
 MAX_BYTES = 50_000_000
 """Size limit [bytes]; larger files are refused without reading them."""
+MAX_LINE = 1000
+"""Characters of an error; the middle of a longer one is left out."""
 
 
 def read_text(file: Path) -> str:
@@ -35,7 +39,45 @@ def read_text(file: Path) -> str:
         raise InputError(f"cannot be read: {error.strerror}") from None
     if not text.strip():
         raise InputError("is empty")
+    if "\0" in text:
+        raise InputError(f"line {text[: text.index(chr(0))].count(chr(10)) + 1}: a NUL byte is not text")
     return text
+
+
+class Row(NamedTuple):
+    """A row of a table: its line number in the file, and its cells, stripped, by column name."""
+
+    line: int
+    cells: dict[str, str]
+
+
+def read_table(file: Path, columns: Iterable[str]) -> list[Row]:
+    """Read a whole CSV file with a header; empty rows are left out.
+
+    Args:
+        file: the file.
+        columns: that it must have; it may have others.
+
+    Raises:
+        InputError: the file is no text, a quote stays open, a column is missing or doubled, or a row has more
+            or fewer cells than the header.
+    """
+    reader = csv.reader(io.StringIO(read_text(file), newline=""), strict=True)
+    try:
+        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except csv.Error as error:
+        raise InputError(f"line {reader.line_num}: {error}; give comma-separated values") from None
+    (first, header), *lines = [row for row in lines if any(row[1])] or [(1, [])]
+    if missing := [column for column in columns if column not in header]:
+        raise InputError(f"line {first}: no column {', '.join(missing)}; {near(missing[0], header)}")
+    if doubled := [column for column in header if column and header.count(column) > 1]:
+        raise InputError(
+            f"line {first}: the column {show(doubled[0])} appears {header.count(doubled[0])} times"
+        )
+    for number, cells in lines:
+        if len(cells) != len(header):
+            raise InputError(f"line {number}: {len(cells)} values for {len(header)} columns")
+    return [Row(number, dict(zip(header, cells, strict=True))) for number, cells in lines]
 
 
 @contextmanager
@@ -48,8 +90,14 @@ def named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def one_line(text: str) -> str:
-    """Remove line breaks, and escape lone surrogates, which JSON may hold and which cannot be printed."""
-    return " ".join(text.encode(errors="backslashreplace").decode().split())
+    """Remove line breaks, escape what a terminal would not print, and leave out the middle of a long text.
+
+    Control characters and lone surrogates, which JSON may hold, are escaped as Python would.
+    """
+    line = " ".join(text.split())
+    if len(line) > MAX_LINE:
+        line = f"{line[: MAX_LINE // 2]} ... {line[-MAX_LINE // 3 :]}"
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in line)
 
 
 def show(value: Any) -> str:

@@ -116,7 +116,7 @@ class LinkConfig:
         if self.range is not None:
             checks.above("links.range", self.range, 0.0, "m")
         if self.limit is not None:
-            checks.whole("links.limit", self.limit, 1, unit="UAVs")
+            checks.whole("links.limit", self.limit, 1, 1000, "UAVs")
         checks.require(self.range is None or self.hears is None, "links.range", self.range, _EITHER)
 
     def check(self, n_agents: int) -> None:

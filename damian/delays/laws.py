@@ -5,8 +5,6 @@ message, or into a function of the message's context (``ContextSampler``). The t
 observations, actions and rewards are in ``damian.transforms``.
 """
 
-import csv
-import io
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -21,7 +19,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry
-from damian.common.text_files import named, near, read_text, show
+from damian.common.text_files import named, read_table, show
 from damian.delays.lag_sampler import LagSampler
 from damian.delays.samplers import ContextSampler, HeldSampler, MessageContext, Recorded, Sampler
 from damian.delays.times import LONGEST, Delay, in_steps, seconds  # noqa: F401 (others import all of them here)
@@ -190,16 +188,13 @@ class Trace(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.require(bool(self.path), f"{key}.path", "it", "is missing: the file with the delays")
         with named(self.path):
-            table = csv.DictReader(io.StringIO(read_text(Path(self.path))))
-            if "delay" not in (table.fieldnames or ()):
-                raise InputError(f"line 1: no column delay; {near('delay', table.fieldnames or ())}")
-            delays = [self._read(row["delay"], f"line {table.line_num}: delay", dt) for row in table]
+            table = read_table(Path(self.path), ["delay"])
+            delays = [self._read(row.cells["delay"], f"line {row.line}: delay", dt) for row in table]
             if not delays:
                 raise InputError("line 2: there is no delay under the header")
         return Recorded(delays, loss)
 
-    def _read(self, written: str | None, key: str, dt: float) -> int:
-        written = (written or "").strip()
+    def _read(self, written: str, key: str, dt: float) -> int:
         return -1 if written == LOST else in_steps(key, _number(written), dt)
 
 

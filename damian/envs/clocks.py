@@ -42,6 +42,7 @@ class ClockConfig:
         for name, faster in itertools.product(given, fast):
             checks.seconds(f"clock.{name}", getattr(self, name))
             self._check_multiple(name, faster)
+        checks.in_range("clock.simulation", self.dt, 1e-3, 86_400, "s")  # a millisecond to a day
         checks.in_range("clock.skip_discount", self.skip_discount, 0.0, 1.0)
         problem = "means nothing without clock.skip=true"
         checks.require(

@@ -103,8 +103,9 @@ class LearnerConfig:
 
     def __post_init__(self) -> None:
         checks.above("learner.lr", self.lr, 0.0)
+        checks.in_range("learner.lr", self.lr, 0.0, 1.0)  # Adam moves a weight by up to this much at once
         checks.in_range("learner.gamma", self.gamma, 0.0, 1.0)
-        checks.in_range("learner.steps", self.steps, 1)
+        checks.in_range("learner.steps", self.steps, 1, checks.STEPS)
         key, reads = f"{type(self).__name__}.reads", self.reads
         checks.require(isinstance(reads, tuple | list), key, reads, "is not a tuple such as ('message',)")
         for name in reads:

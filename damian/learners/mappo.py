@@ -60,10 +60,11 @@ class MappoConfig(LearnerConfig):
         super().__post_init__()
         checks.above("learner.max_grad_norm", self.max_grad_norm, 0.0)
         checks.in_range("learner.lmbda", self.lmbda, 0.0, 1.0)
-        for name in ("clip_epsilon", "entropy_coeff", "critic_coeff"):
+        checks.in_range("learner.clip_epsilon", self.clip_epsilon, 0.0, 1.0)  # a ratio is not negative
+        for name in ("entropy_coeff", "critic_coeff"):
             checks.in_range(f"learner.{name}", getattr(self, name), 0.0)
         for name in ("epochs", "minibatches"):
-            checks.in_range(f"learner.{name}", getattr(self, name), 1)
+            checks.in_range(f"learner.{name}", getattr(self, name), 1, checks.STEPS)
 
     def check(self, setup: LearningSetup) -> None:
         recurrent, shortest, longest = setup.model.recurrent, setup.shortest_period, setup.longest_delay

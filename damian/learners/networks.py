@@ -40,6 +40,7 @@ class ModelConfig:
             [],
             "needs at least one layer for model.rnn=gru",
         )
+        checks.in_range("model.hidden (number of layers)", len(self.hidden), 0, 64)
         for width in self.hidden:
             checks.in_range("model.hidden", width, 1, 16384)
 

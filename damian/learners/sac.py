@@ -60,10 +60,11 @@ class SacConfig(LearnerConfig):
         super().__post_init__()
         for name in ("alpha_lr", "tau", "alpha_init"):
             checks.above(f"learner.{name}", getattr(self, name), 0.0)
-        for name in ("tau", "target_entropy"):
+        for name in ("alpha_lr", "tau", "target_entropy"):
             checks.in_range(f"learner.{name}", getattr(self, name), 0.0, 1.0)
-        for name in ("n_steps", "updates", "batch_size", "buffer_steps"):
-            checks.in_range(f"learner.{name}", getattr(self, name), 1)
+        for name in ("n_steps", "updates", "batch_size"):
+            checks.in_range(f"learner.{name}", getattr(self, name), 1, checks.STEPS)
+        checks.in_range("learner.buffer_steps", self.buffer_steps, 1)
         checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_steps)
 
     def check(self, setup: LearningSetup) -> None:

@@ -55,6 +55,7 @@ class ObservationConfig:
         for scope in ("local", "global"):
             for name in getattr(self, f"{scope}_features"):
                 check_feature(f"observation.{scope}_features", name, scope)
+            checks.distinct(f"observation.{scope}_features", getattr(self, f"{scope}_features"))
         if self.time_scale is not None:
             checks.above("observation.time_scale", self.time_scale, 0.0, "s")
         checks.above("observation.age_scale", self.age_scale, 0.0, "s")

@@ -1,6 +1,5 @@
 """Reward terms of one's own: a function of features and counters, with parameters beside its weight."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -99,8 +98,7 @@ def custom_term(written: Any, key: str) -> CustomTerm:
     for read in term.reads:
         FEATURES.get(read, f"{key}.term: reads of {path}")
     weight = parameters.pop("weight", 1.0)
-    finite = isinstance(weight, int | float) and math.isfinite(weight)
-    checks.require(finite, f"{key}.weight", weight, f"is not a finite weight of {path}")
+    checks.weight(f"{key}.weight", weight)
     name = name_of(parameters, path.rpartition(":")[2], key)
     check_parameters(term.compute, parameters, path, key)
     return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)

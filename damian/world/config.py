@@ -34,7 +34,7 @@ class WorldConfig:
     ``package.module:name``, or ``{sensor: package.module:name, ...}`` with parameters of the sensor."""
 
     def __post_init__(self) -> None:
-        checks.in_range("agents", self.agents, 1)
+        checks.in_range("agents", self.agents, 1, 1000)  # their distances grow with the square
         flight_levels(self.motion, self.agents)
         sensors_of(self.sensors)  # refuses what is no sensor
         starts = self.region.start_positions
@@ -44,6 +44,10 @@ class WorldConfig:
             f"{len(starts or [])} places",
             f"are not one for each of the {self.agents} UAVs (agents)",
         )
+        n_places = len({tuple(start) for start in starts or ()})
+        should = "are equal for some UAVs only: give each UAV its own place, or all of them the same"
+        together = starts is None or n_places in (1, self.agents)
+        checks.require(together, "region.start_positions", starts, should)
 
     def airspace(self, rng: np.random.Generator) -> Airspace:
         """Build the regions and their landing points.

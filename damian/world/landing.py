@@ -46,6 +46,8 @@ class ActionConfig:
         for heading in self.headings:
             checks.in_range("actions.headings", heading, -360.0, 360.0, unit="deg")
         checks.above("actions.distances (largest)", max(self.distances), 0.0, "m")
+        for name in ("distances", "headings"):
+            checks.distinct(f"actions.{name}", getattr(self, name))
 
     @property
     def n_actions(self) -> int:

@@ -48,6 +48,8 @@ class MotionConfig:
     def __post_init__(self) -> None:
         if ":" not in self.kind:  # ``damian.world.vehicles`` imports one's own
             checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
+            problem = f"mean nothing with motion.kind={self.kind}"
+            checks.require(self.options is None, "motion.options", self.options, problem)
         checks.one_of("motion.degree", self.degree, [3, 5, 7])
         checks.in_range("motion.max_speed", self.max_speed, 1e-3, unit="m/s")
         checks.in_range("motion.max_acceleration", self.max_acceleration, 1e-3, unit="m/s^2")

@@ -84,7 +84,7 @@ class SourceConfig:
         if self.position is not None:
             check_place("source.position", self.position)
         checks.in_range("source.n_hotspots", self.n_hotspots, 1, 1000)
-        checks.in_range("source.min_stops", self.min_stops, 0)
+        checks.in_range("source.min_stops", self.min_stops, 1)
         checks.in_range("source.max_stops", self.max_stops, self.min_stops, 1000)
         for name in ("speed", "local_speed"):
             checks.above(f"source.{name}", getattr(self, name), 0.0, "m/s")

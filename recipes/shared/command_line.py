@@ -4,8 +4,9 @@ import os
 import re
 import shlex
 import sys
-from argparse import Namespace
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -15,9 +16,27 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from damian.common.errors import InputError
+from damian.common.text_files import one_line, show
 from damian.evaluation.run_record import read_record
 
 from .known_settings import RECIPES
+
+
+@contextmanager
+def exits_with_one_line() -> Iterator[None]:
+    """End the program with one line on stderr and exit code 2 where wrong input is found inside."""
+    try:
+        yield
+    except InputError as error:
+        print(f"error: {one_line(str(error))}", file=sys.stderr)
+        sys.exit(2)
+
+
+class Parser(ArgumentParser):
+    """Raises an ``InputError`` instead of printing its usage."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message)
 
 
 def parsed(words: Sequence[str]) -> Namespace:
@@ -55,6 +74,14 @@ def prepared(words: Sequence[str]) -> list[str]:
         InputError: an option is wrong, or policies were trained with different folders of files.
     """
     options = vars(parsed(words))
+    for word in options["overrides"]:
+        if not word.lstrip("+~").partition("=")[0].strip():
+            raise InputError(f"{word!r}: this word is not of the form KEY=VALUE")
+        if "\0" in word:
+            raise InputError(f"{word!r}: a NUL byte is not text")
+        if re.fullmatch(r"hydra\.(run|sweep)\.dir=(['\"]?)\s*\2", word):
+            raise InputError(f"{word.partition('=')[0]}: it is empty: name a folder, or leave it out")
+        _check_folder(word)
     overrides = whole_laws([_quoted(word) for word in options.pop("overrides")])
     options["config_dir"] = options["config_dir"] or _config_dir(overrides)
     given = ((f"--{name.replace('_', '-')}", value) for name, value in options.items() if value)
@@ -89,6 +116,18 @@ def command(words: Sequence[str]) -> str:
     return f"{program.name} {shlex.join(words)}".strip()
 
 
+def _check_folder(word: str) -> None:
+    """Refuse a run folder that the file system cannot look up, because its name is too long for instance."""
+    key, _, folder = word.lstrip("+").partition("=")
+    try:
+        if key in ("checkpoint", "resume"):
+            os.stat(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        return  # it may be quoted, or several in a sweep
+    except (OSError, ValueError) as error:
+        raise InputError(f"{key}: {show(folder)}: {getattr(error, 'strerror', error)}") from None
+
+
 def whole_laws(words: Sequence[str]) -> list[str]:
     """The words with a number before each delay law, because Hydra would merge it with the law before it."""
     pairs = [(re.fullmatch(r"(delay\.(?:obs|act|rew))=\{.*", word), word) for word in words]
@@ -108,11 +147,13 @@ def _quoted(word: str) -> str:
 
 
 def _quoted_name(name: str) -> str:
-    is_plain = re.fullmatch(r"[A-Za-z_][\w./-]*|[./][\w./-]+", name, re.ASCII) and name.lower() not in _WORDS
+    is_plain = (
+        re.fullmatch(r"[A-Za-z_][\w./-]*|[./][\w./-]+", name, re.ASCII) and name.lower() not in NO_NAMES
+    )
     return name if is_plain else QuotedString(name, Quote.single).with_quotes()
 
 
-_WORDS = ("null", "true", "false", "nan", "inf")
+NO_NAMES = ("null", "true", "false", "nan", "inf")
 """Names that Hydra would read as values."""
 
 

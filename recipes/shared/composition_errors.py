@@ -3,25 +3,30 @@
 import re
 import sys
 
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError
 
+from damian.common import text_files
 from damian.common.errors import InputError
 
-from .command_line import own_folder
+from .command_line import NO_NAMES, own_folder
 from .known_settings import default_options, groups
 from .misspelt import RENAMED, no_such_key, no_such_option
 
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, MarkedYAMLError, ValueError, TypeError, OSError)
 """What Hydra raises for overrides and files that it cannot compose."""
-REMEDIES = {
+QUOTES = {
     r"mismatched input '='|no viable alternative at input '\[\w+='": (
         "a value with = in it needs quotes, such as \"overrides=['frames=1000','worlds=8']\""
     ),
     r"input '[^']*\{|LexerNoViableAltException: .*\{": (
         'a mapping needs quotes, such as "delay.obs={law: uniform, low: 3s, high: 7s}"'
     ),
+    "": "put quotes around a value with special characters, as in \"KEY='VALUE'\"",
+}
+"""What to do about a value that Hydra cannot read, by a pattern of Hydra's message; the first that fits."""
+REMEDIES = {
     r"Error parsing override '(.*)'\nmissing EQUAL": (
         r"\1: this word is not of the form KEY=VALUE; a value with spaces needs quotes"
     ),
@@ -37,19 +42,33 @@ _LIST = r"is not a ListConfig|merge DictConfig with ListConfig[^=]*reference_typ
 
 
 def one_line(error: BaseException, program: str = "train") -> str:
-    """The deepest cause of an error on one line, without Hydra's lines of types, paths and hints.
+    """The deepest cause of an error on one printable line, without Hydra's lines of types, paths and hints.
 
     Args:
         error: what was raised.
         program: one of ``SCHEMAS``, whose settings were composed.
     """
+    return text_files.one_line(_cause(error, program))
+
+
+def _cause(error: BaseException, program: str) -> str:
     outer = str(error)
     while isinstance(error.__cause__, OmegaConfBaseException):
         error = error.__cause__
     if isinstance(error, MarkedYAMLError) and (mark := error.problem_mark):
         return f"{mark.name}, line {mark.line + 1}, column {mark.column + 1}: {error.problem}"
     text, _, _ = _INSTANCE.sub(r"\1: ", str(error)).partition("Config search path")
-    return _about_words(text, program) or _about_key(text, error, outer, program) or _plain(text, error)
+    found = _about_words(text, program) or _about_key(text, error, outer, program)
+    return found or _unreadable(error) or _plain(text, error)
+
+
+def _unreadable(error: BaseException) -> str | None:
+    """The message for a word that Hydra's grammar does not allow."""
+    if not isinstance(error, OverrideParseException):
+        return None
+    key, _, value = str(error.override).partition("=")
+    remedy = next(remedy for pattern, remedy in QUOTES.items() if re.search(pattern, str(error)))
+    return f"{key[:80]}: Hydra cannot read {text_files.show(value)}: {remedy}"
 
 
 def _about_words(text: str, program: str) -> str | None:
@@ -61,7 +80,20 @@ def _about_words(text: str, program: str) -> str | None:
         return no_such_option(option[1], option[2], own_folder())
     if group := re.search(r"Could not override '([\w/]+)'\. No match in the defaults list", text):
         return no_such_key(group[1], program)
-    if "Config group override must be a string" in text:
+    return _about_unnamed(text)
+
+
+def _about_unnamed(text: str) -> str | None:
+    """The message for Python's errors inside Hydra; they name no word, but the command line tells which."""
+    if "Exceeds the limit (4300 digits)" in text:
+        long = (word for word in sys.argv[1:] if re.search(r"\d{4300}", word))
+        return f"{next(long, '').partition('=')[0] or 'a number'}: it has more than 4300 digits"
+    if index := re.search(r"invalid literal for int\(\) with base 10: '(.*)'$", text):
+        keys = (word.partition("=")[0].lstrip("+~") for word in sys.argv[1:])
+        key = next((key for key in keys if key.endswith(f".{index[1]}")), index[1])
+        return f"{key}: no such key: it is below a list, whose entries are counted from 0"
+    no_name = r"Config group override must be a string|type '\w+' is not iterable|can only concatenate"
+    if re.search(no_name, text):
         return next(map(_not_an_option, filter(_gives_group_no_name, sys.argv[1:])), None)
     return None
 
@@ -94,7 +126,11 @@ def foreign_cause(error: BaseException) -> BaseException | None:
     elif isinstance(error, InputError):
         cause = error.__cause__
     else:
-        cause = None if isinstance(error, OSError) or _about_words(str(error), "train") else error
+        cause = (
+            None
+            if isinstance(error, OSError | OverrideParseException) or _about_words(str(error), "train")
+            else error
+        )
     return None if isinstance(cause, known) else cause
 
 
@@ -109,9 +145,10 @@ def _unknown(key: str, text: str, error: BaseException, program: str) -> str:
 
 
 def _gives_group_no_name(override: str) -> bool:
-    """Does an override set a group to a number or null, which Hydra refuses without naming the group?"""
-    match = re.fullmatch(r"\+?(\w+)=([\d,.]+|null)", override)
-    return match is not None and (match[1] in RENAMED or match[1] in groups())
+    """Does an override set a group to no word, which Hydra refuses without naming the group?"""
+    group, equals, value = override.lstrip("+").partition("=")
+    is_name = re.fullmatch(r"[^\W\d][\w/-]*", value) and value.lower() not in NO_NAMES
+    return bool(equals) and not is_name and (group in RENAMED or group in groups())
 
 
 def _not_an_option(override: str) -> str:

@@ -19,6 +19,9 @@ from damian.learners.networks import ModelConfig
 from damian.learners.sac import SacConfig  # noqa: F401 (registers the learner)
 from damian.learners.schedule import SystemClock
 
+MAX_BATCH = 100_000_000
+"""Most environment steps, over all worlds, that are collected before an update; they lie in memory."""
+
 
 @dataclass
 class LoggerConfig:
@@ -90,12 +93,12 @@ class TrainConfig(ScenarioConfig):
         checks.one_of("critic", self.critic, ("server", "privileged"))
         checks.in_range("seed", self.seed, 0, 2**31)
         for name in ("worlds", "eval_episodes"):
-            checks.in_range(name, getattr(self, name), 1, 1e6)
+            checks.in_range(name, getattr(self, name), 1, checks.WORLDS)
         for name in ("frames", "checkpoint_every"):
             checks.in_range(name, getattr(self, name), 1, 1e12)
         checks.in_range("threads", self.threads, 1, 1024)
         if self.episodes is not None:
-            checks.in_range("episodes", self.episodes, 1)
+            checks.in_range("episodes", self.episodes, 1, 1e12)
         checks.device("device", self.device)
 
     def check_learning(self) -> None:
@@ -104,7 +107,10 @@ class TrainConfig(ScenarioConfig):
         Raises:
             InputError: names the key that does not fit.
         """
-        self.learner.check(self.learning_setup)
+        setup = self.learning_setup
+        batch, should = setup.worlds * setup.longest_period, "environment steps between two updates"
+        checks.in_range("worlds", batch, 1, MAX_BATCH, should)
+        self.learner.check(setup)
         self._check_skip()
         self._check_backupdate()
         useless = self.delay.hold == "max" and self.longest_delay == 0

@@ -371,7 +371,7 @@ NO_EFFECT = "has no effect with update_period=episode, which draws one lag per e
     ("settings", "error"),
     [
         ({"hold_probability": 1.5}, "hold_probability: 1.5 is not between 0 and 1"),
-        ({"hold_probability": True, "shared": "yes"}, "shared: yes is not one of True, False"),
+        ({"hold_probability": 0.5, "shared": "yes"}, "shared: yes is not one of True, False"),
         ({"stagger": 3}, "stagger: 3 is not one of True, False"),
         ({"update_period": 0}, "update_period: 0 is not above 0"),
         ({"update_period": "0s"}, "update_period: 0s is not above 0"),

@@ -62,7 +62,7 @@ from damian.recipes.shared.stored_runs import save_config
         (["delay.obs={law: poisson}"], "delay.obs.law: poisson is not one of constant, uniform"),
         (["delay.obs={law: trace, path: nowhere.csv}"], "nowhere.csv: no such file"),
         (["agents=two"], "agents: Value 'two'"),
-        (["agents=0"], "agents: 0 is not at least 1"),
+        (["agents=0"], "agents: 0 is not between 1 and 1000"),
         (["reward=foo"], "reward: foo is not one of coverage, energy"),
         (["scenario=paper/usecase3"], "scenario: paper/usecase3 is not one of coverage, delaybench/common"),
         (["motion.degree=4"], "motion.degree: 4 is not one of 3, 5, 7"),

@@ -203,7 +203,7 @@ def test_every_end_without_success_costs_the_penalty(terminated):
         ),
         (
             lambda: EpisodeConfig(max_steps=0),
-            "episode.max_steps: 0 is not at least 1",
+            "episode.max_steps: 0 is not between 1 and 1e+06",
         ),
         (
             lambda: EpisodeConfig(success_share=0.0),

@@ -130,11 +130,11 @@ def test_shifting_a_symmetric_polygon_keeps_the_order_of_its_landing_points():
         (-3, 45, None, "lattice step: -3 m"),
         (math.nan, 45, None, "lattice step: nan m"),
         (1e300, 45, None, "lattice step: 1e+300 m"),
-        (1e-320, 45, None, "too fine"),
+        (1e-320, 45, None, "lattice step: 1e-320 m is not between"),
         (0.01, 45, None, "region.lattice_step: 0.01 m is too fine for a polygon of 100 m x 100 m"),
         (30, 0, None, "lattice angle: 0 deg"),
         (30, 91, None, "lattice angle: 91 deg"),
-        (30, 1e-300, None, "too fine"),
+        (30, 1e-300, None, "lattice angle: 1e-300 deg is not between"),
     ],
 )
 def test_an_impossible_lattice_raises_one_line(step, degrees, n, message):

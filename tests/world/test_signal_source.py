@@ -242,7 +242,7 @@ def test_padded_stops_repeat_the_last_one_and_are_never_reached():
     seed=st.integers(0, 10**6),
     speed=st.floats(0.5, 40),
     acceleration=st.floats(0.05, 5),
-    max_stops=st.integers(0, 3),
+    max_stops=st.integers(1, 3),
     n_hotspots=st.integers(1, 3),
     share=st.floats(0, 1.1),
 )
@@ -256,7 +256,7 @@ def test_a_position_equals_the_integrated_speed_profile(
             speed=speed,
             acceleration=acceleration,
             n_hotspots=n_hotspots,
-            min_stops=0,
+            min_stops=1,
             max_stops=max_stops,
             min_wait=0.0,
             max_wait=5.0,
@@ -325,11 +325,11 @@ def test_a_walk_is_over_after_its_last_wait_and_the_source_stays_there():
         assert (located.stop == n_stops(walk) - 1).all()
 
 
-def test_a_walk_of_one_stop_ends_too():
-    walk = dynamic_walks(n_hotspots=1, min_stops=0, max_stops=0)
-    assert walk.stop.shape == (8, 1, 2)
+def test_a_walk_around_one_hotspot_ends_too():
+    walk = dynamic_walks(n_hotspots=1, min_stops=1, max_stops=1)
+    assert walk.stop.shape == (8, 2, 2)
     assert not locate(walk, torch.zeros(8)).finished.any()
-    assert locate(walk, torch.full((8,), 361.0)).finished.all()
+    assert locate(walk, torch.full((8,), 1000.0)).finished.all()
 
 
 def test_walks_contain_random_emission_only_if_it_is_per_stop():
@@ -349,7 +349,7 @@ def test_the_same_seed_draws_the_same_walks_in_float32():
 
 @pytest.mark.parametrize("n_hotspots", [1, 4])
 def test_locate_compiles_to_one_graph(n_hotspots):
-    walk = dynamic_walks(n_hotspots=n_hotspots, min_stops=0, max_stops=n_hotspots - 1)
+    walk = dynamic_walks(n_hotspots=n_hotspots, min_stops=1, max_stops=n_hotspots)
     compiled = torch.compile(locate, fullgraph=True, backend="eager")
     time = torch.linspace(0, 2000, 8)
     for one, other in zip(compiled(walk, time), locate(walk, time), strict=True):
@@ -383,7 +383,7 @@ def test_locate_compiles_to_one_graph(n_hotspots):
             "source.position: [1.0, nan] is not [x, y] in metres or {lat: ..., lon: ...} in degrees",
         ),
         ({"n_hotspots": 0}, "source.n_hotspots: 0 is not between 1 and 1000"),
-        ({"min_stops": -1}, "source.min_stops: -1 is not at least 0"),
+        ({"min_stops": 0}, "source.min_stops: 0 is not at least 1"),
         ({"max_stops": 2}, "source.max_stops: 2 is not between 3 and 1000"),
         ({"local_distance": 0.0}, "source.local_distance: 0.0 m is not above 0 m"),
         ({"speed": 0.0}, "source.speed: 0.0 m/s is not above 0 m/s"),

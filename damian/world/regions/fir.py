@@ -1,15 +1,12 @@
 """Reads Eurocontrol FIR tables (CSV); any fault raises one `InputError` that says where in the file it is."""
 
-import csv
-import io
 import os
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from damian.common.errors import InputError
-from damian.common.text_files import listed, named, near, read_text, show
+from damian.common.text_files import Row, named, near, read_table, show
 from damian.world.regions.region import Region, local_region
 
 _ID, _SEQUENCE = "Airspace ID", "Sequence Number"
@@ -25,13 +22,6 @@ _BOUNDS = {
 }
 
 
-class _Row(NamedTuple):
-    """One row of a FIR table: its line number in the file, and its cells by column name."""
-
-    line: int
-    cells: dict[str, str]
-
-
 def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
     """Read one airspace of a FIR table as a region in local metres.
 
@@ -43,7 +33,7 @@ def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
         InputError: the file cannot be read, its table is malformed, or the airspace is missing or invalid.
     """
     with named(path):
-        table = _read_table(read_text(Path(path)))
+        table = read_table(Path(path), _COLUMNS)
         rows = [row for row in table if row.cells[_ID] == airspace_id]
         if not rows:
             known_ids = {row.cells[_ID] for row in table}
@@ -53,27 +43,7 @@ def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
         return local_region([[np.array(corners)]], airspace_id, levels, airspace_id)
 
 
-def _read_table(text: str) -> list[_Row]:
-    """Parse all rows; cells are stripped and keyed by column."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
-    except csv.Error as error:
-        raise InputError(f"line {reader.line_num}: {error}; give comma-separated values") from None
-    (first, header), *lines = [row for row in lines if any(row[1])] or [(1, [])]
-    not_unique = [column for column in _COLUMNS if header.count(column) != 1]
-    if not_unique:
-        found = listed(map(show, header))
-        raise InputError(
-            f"line {first}: column {', '.join(not_unique)} missing or doubled; the columns are {found}"
-        )
-    for number, cells in lines:
-        if len(cells) != len(header):
-            raise InputError(f"line {number}: {len(cells)} values for {len(header)} columns")
-    return [_Row(number, dict(zip(header, cells, strict=True))) for number, cells in lines]
-
-
-def _in_sequence(rows: list[_Row]) -> list[_Row]:
+def _in_sequence(rows: list[Row]) -> list[Row]:
     """Sort the rows by their sequence numbers, which must be 0, 1, 2, ..."""
     numbered = sorted((_number(row, _SEQUENCE), row) for row in rows)
     for expected, (number, row) in enumerate(numbered):
@@ -86,7 +56,7 @@ def _in_sequence(rows: list[_Row]) -> list[_Row]:
     return [row for _, row in numbered]
 
 
-def _levels(rows: list[_Row]) -> tuple[float, float]:
+def _levels(rows: list[Row]) -> tuple[float, float]:
     """Lowest and highest flight level, each of which must be the same in all rows."""
     first = min(rows)
     low, high = (_same_in_all_rows(rows, first, column) for column in (_LOWEST, _HIGHEST))
@@ -95,7 +65,7 @@ def _levels(rows: list[_Row]) -> tuple[float, float]:
     return low, high
 
 
-def _same_in_all_rows(rows: list[_Row], first: _Row, column: str) -> float:
+def _same_in_all_rows(rows: list[Row], first: Row, column: str) -> float:
     level = _number(first, column)
     for row in rows:
         value = _number(row, column)
@@ -107,7 +77,7 @@ def _same_in_all_rows(rows: list[_Row], first: _Row, column: str) -> float:
     return level
 
 
-def _number(row: _Row, column: str) -> float:
+def _number(row: Row, column: str) -> float:
     """Read a cell as a number within its column's bounds."""
     text, (low, high, unit) = row.cells[column], _BOUNDS[column]
     try:

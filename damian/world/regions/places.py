@@ -32,8 +32,8 @@ def check_place(key: str, place: Any) -> None:
     """
     if not isinstance(place, Mapping):
         good = isinstance(place, Sequence) and len(place) == 2 and all(map(_is_finite, place))
-        problem = "is not [x, y] in metres or {lat: ..., lon: ...} in degrees"
-        return checks.require(good, key, place, problem)
+        checks.require(good, key, place, "is not [x, y] in metres or {lat: ..., lon: ...} in degrees")
+        return checks.place(key, place)
     good = set(place) == set(_DEGREES)
     checks.require(good, key, place, "is not {lat: ..., lon: ...} in degrees, such as {lat: 53.1, lon: -4.5}")
     for name, largest in _DEGREES.items():

@@ -18,8 +18,8 @@ from damian.common.errors import InputError
 
 Floats = NDArray[np.float64]
 
-MAX_COORDINATE_M = 2.0e7
-"""Half the circumference of the Earth [m]; no local coordinate is larger."""
+MAX_COORDINATE_M = checks.METRES
+"""No local coordinate is larger [m]."""
 MAX_CANDIDATES = 5_000_000
 """Largest number of lattice points in the bounding box of a polygon."""
 _MAX_POINTS = 1000
