@@ -1,6 +1,6 @@
 """Initial conditions (start points of the UAVs, walk of the source), drawn once so that a reset picks one."""
 
-from dataclasses import replace
+import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +67,9 @@ def _in_region(source: SourceConfig, region: Region) -> SourceConfig:
     """The source with its given position, if any, in local metres of a region."""
     if source.position is None:
         return source
-    return replace(source, position=local_places("source.position", [source.position], region)[0].tolist())
+    moved = copy.copy(source)  # not checked again
+    moved.position = local_places("source.position", [source.position], region)[0].tolist()
+    return moved
 
 
 def _draw_starts(

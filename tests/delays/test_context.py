@@ -137,7 +137,9 @@ def test_in_a_scenario_a_law_reads_the_true_position_at_the_instant_of_sending()
         stepped, td = env.step_and_maybe_reset(td.set(ACTION, action))
         found, truth = stepped["next"], stepped["next", "agents", "position"]
         ended = found["done"].view(-1)
-        assert truth[~ended].equal(env.uav_env.state.position[..., :2][~ended])
+        state = env.uav_env.state
+        place = state.position[..., :2] + env.uav_env.simulation.airspace.offset[state.region].unsqueeze(1)
+        assert truth[~ended].equal(place[~ended])
         sent = found["agents", "message_sent"].tolist()
         for w in range(4):
             elapsed[w] += 1
