@@ -39,21 +39,22 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
     Raises:
         InputError: no checkpoint is given, or its actor has other observations, actions or layers.
     """
-    require_checkpoint(config)
+    written = required_checkpoint(config)
     env = make_eval_env(config)
     actor = config.learner.make_actor(env, config.model)
-    load_networks(Path(config.checkpoint), "checkpoint", {"actor": actor})
+    load_networks(written, "checkpoint", {"actor": actor})
     return env, actor
 
 
-def require_checkpoint(config: TrainConfig) -> None:
-    """Require the name of a run folder.
+def required_checkpoint(config: TrainConfig) -> Path:
+    """The run folder, or checkpoint file, that the settings name.
 
     Raises:
         InputError: no checkpoint is given.
     """
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
+    return Path(config.checkpoint)
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

@@ -195,8 +195,8 @@ def read_result(file: Path) -> dict[str, Any]:
         except (ValueError, RecursionError) as error:
             raise InputError(f"is not the result of a run ({type(error).__name__}); delete it") from None
         returns = saved.get("returns") if isinstance(saved, dict) else None
-        whole = isinstance(returns, dict) and {*Run._fields} <= {*saved}
-        numbers = whole and all(isinstance(number, int | float) for number in returns.values())
+        numbers = isinstance(returns, dict) and all(isinstance(n, int | float) for n in returns.values())
+        numbers = numbers and {*Run._fields} <= {*saved}
         checks.require(numbers, "it", show(saved), "is not the result of a run; delete it")
         return saved
 
