@@ -24,7 +24,7 @@ class EpisodeConfig:
     discharged_share: float | None = None
     """Share of the UAVs whose empty batteries end the episode; if not given, batteries never end it."""
     end_with_source: bool = False
-    """End the episode when the source has finished its walk."""
+    """End the episode when the source has finished its walk and stops for good (``source.after_walk``)."""
 
     def __post_init__(self) -> None:
         if self.max_steps is not None:

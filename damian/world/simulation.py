@@ -139,7 +139,7 @@ class Simulation:
     def _sense(self, state: State, action_valid: Tensor | None = None) -> State:
         """Move the source, let UAVs on the ground detect it, and send messages."""
         now = (state.steps * self.dt).to(state.track.dtype)
-        place, emits, over = self._source(state, now)
+        place, emits, over = self._source(state)
         state = state._replace(source=place, source_over=over)
         on_ground = self.vehicles.on_ground(state)
         position = state.position[..., :2]
@@ -183,7 +183,7 @@ class Simulation:
         state = self.layout.unpack(worlds)
         return self.layout.pack(state._replace(sent=state.sent._replace(readings=self._readings(state))))
 
-    def _source(self, state: State, now: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _source(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """Position of the source [B, 2], whether it emits [B], and whether its walk is over [B]."""
         config = self.config.source
         emits = torch.ones_like(state.source_over)
@@ -191,9 +191,12 @@ class Simulation:
             place, over = state.source, state.source_over
         else:
             walk = tree_map(lambda t: t.index_select(0, state.initial_condition), self.walk)
-            place, stop, over = locate(walk, now)
+            time = state.steps.double() * self.dt
+            place, stop, tour, over = locate(walk, time, config.after_walk == "loop")
             if config.emission == "per_stop":
-                emits = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
+                first = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
+                draw = counter_rng.uniform(state.seed, state.episode, tour, stop)
+                emits = torch.where(tour == 0, first, draw < config.emission_probability)
         if config.emission == "per_step":
             draw = counter_rng.uniform(state.seed, state.episode, state.steps)
             emits = draw < config.emission_probability
