@@ -26,6 +26,12 @@ def in_range(key: str, value: float, low: float, high: float = math.inf, unit: s
     require(good, key, f"{value}{unit}", f"is not {bounds}{unit}")
 
 
+def finite(key: str, value: Any, unit: str = "") -> None:
+    """Require a finite number."""
+    good = isinstance(value, int | float) and math.isfinite(value)
+    require(good, key, f"{value} {unit}".strip(), "is not a finite number")
+
+
 def whole(key: str, value: Any, low: int, high: float = math.inf, unit: str = "") -> None:
     """Require a whole number ``low <= value <= high``."""
     good = isinstance(value, int) and not isinstance(value, bool)

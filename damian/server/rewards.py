@@ -5,7 +5,6 @@ configuration and its tag in the logs have the same name.
 """
 
 import itertools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -95,10 +94,11 @@ class RewardConfig:
             "must differ from each other and the built-in terms; a name does, as in {term: ..., name: low}",
         )
         for name in (*INDIVIDUAL, *SYSTEM, "individual", "system", "bonus", "penalty"):
-            value = getattr(self, name)
-            checks.require(math.isfinite(value), f"reward.{name}", value, "is not a finite weight")
+            checks.finite(f"reward.{name}", getattr(self, name))
         checks.one_of("reward.drift", self.drift, ["smooth", "printed"])
         checks.in_range("reward.desired_spotting", self.desired_spotting, 0.0, 1.0)
+        for name in ("distance", "distance_not_spotting", "distance_spotting"):
+            checks.in_range(f"reward.desired_{name}", getattr(self, f"desired_{name}"), 0.0)
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings alone, because a worker process finds the functions by their paths."""

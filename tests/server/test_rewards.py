@@ -191,7 +191,7 @@ def test_every_end_without_success_costs_the_penalty(terminated):
     [
         (
             lambda: RewardConfig(coverage=math.nan),
-            "reward.coverage: nan is not a finite weight",
+            "reward.coverage: nan is not a finite number",
         ),
         (
             lambda: RewardConfig(drift="rough"),
@@ -200,6 +200,14 @@ def test_every_end_without_success_costs_the_penalty(terminated):
         (
             lambda: RewardConfig(desired_spotting=1.5),
             "reward.desired_spotting: 1.5 is not between 0 and 1",
+        ),
+        (
+            lambda: RewardConfig(desired_distance=math.nan),
+            "reward.desired_distance: nan is not at least 0",
+        ),
+        (
+            lambda: RewardConfig(desired_distance_spotting=-3.0),
+            "reward.desired_distance_spotting: -3.0 is not at least 0",
         ),
         (
             lambda: EpisodeConfig(max_steps=0),
