@@ -20,6 +20,9 @@ from damian.world.motion import flight_levels, fly, minimum_time
 from damian.world.regions.polygon import MAX_COORDINATE_M
 from damian.world.state import State
 
+FLIGHT_LEVEL_M = 30.48
+"""Metres per flight level of a published region (one flight level is 100 feet)."""
+
 TIME_EPS = 1e-4
 """Tolerance of times [s]; far below any step, far above float32 error within an episode."""
 
@@ -36,12 +39,16 @@ class MotionModel(ABC):
     """
 
     instant: bool
-    """Whether a UAV is at its target as soon as a step ends."""
+    """Whether a UAV is at its target as soon as a step ends; if not, each UAV needs a flight level of its
+    own, within those of the region."""
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         self.motion, self.battery, self.dt = config.motion, config.battery, dt
         self.points = airspace.points.flatten(0, 1)
-        self.levels = torch.tensor(flight_levels(config.motion, config.agents))
+        levels = flight_levels(config.motion, config.agents, shared=self.instant)
+        if not self.instant:
+            _check_levels(levels, airspace)
+        self.levels = torch.tensor(levels)
         self.vertical = self.shortest_time(self.levels)
         self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
         self.charge = float(charge_gain(torch.tensor(dt), config.battery))
@@ -282,3 +289,9 @@ def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
     nearest = nearest_points(airspace.points.unsqueeze(1), torch.tensor(places), 1).squeeze(-1)
     flat = nearest + n_points * torch.arange(n_regions).unsqueeze(-1)
     return torch.zeros(n_regions * n_points, dtype=torch.bool).index_fill(0, flat.flatten(), True)
+def _check_levels(levels: list[float], airspace: Airspace) -> None:
+    """Require that each flight level lies within those of every region."""
+    key = "motion.min_level + i * motion.level_separation"
+    for low, high in (region.levels for region in airspace.regions if region.levels is not None):
+        for level in levels:
+            checks.in_range(key, level, low * FLIGHT_LEVEL_M, high * FLIGHT_LEVEL_M, "m")
