@@ -57,7 +57,6 @@ class Status(NamedTuple):
 def status(
     messages: Messages,
     steps: Tensor,
-    now: Tensor,
     source_over: Tensor,
     dt: float,
     config: EpisodeConfig,
@@ -69,7 +68,6 @@ def status(
     Args:
         messages: messages that the server holds, [*, N].
         steps: elapsed steps of the episode, [*].
-        now: current time [s], [*].
         source_over: has the source finished its walk, [*].
         dt: length of a step [s].
         config: conditions that end an episode.
@@ -85,8 +83,10 @@ def status(
     if config.max_steps is not None:
         elapsed = steps
         if config.since_detection:
-            elapsed = (now - messages.detected_time.amax(-1).clamp(min=0)) / dt
-        timed_out = elapsed >= config.max_steps - 1e-3
+            # Times in messages are float32, so the step of the latest detection is the nearest whole number.
+            latest = messages.detected_time.amax(-1).clamp(min=0).double()
+            elapsed = steps - (latest / dt).round().long()
+        timed_out = elapsed >= config.max_steps
     return Status(success, success | ended, timed_out & ~(success | ended))
 
 

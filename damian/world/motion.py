@@ -140,7 +140,7 @@ def fly(
         origin: takeoff points, [*, 2] metres.
         target: landing points, [*, 2] metres.
         level: flight levels above 0, [*] metres.
-        elapsed: time since takeoff, [*] seconds.
+        elapsed: time since takeoff, [*] seconds; long flights need double precision.
         vertical: duration of takeoff, and of landing, above 0, [*] seconds.
         cruise: duration of the cruise, [*] seconds; 0 if origin and target are the same.
         degree: degree of the time law, 3, 5 or 7.
@@ -149,7 +149,8 @@ def fly(
     remaining = torch.add(cruise, vertical, alpha=2) - elapsed
     climbing = torch.minimum(elapsed, remaining) / vertical
     cruising = (elapsed - vertical) / cruise.clamp_min(_TINY)
-    climbed, crossed = time_law(torch.stack([climbing, cruising]), degree).unbind(0)
+    shares = torch.stack([climbing, cruising]).to(origin.dtype)
+    climbed, crossed = time_law(shares, degree).unbind(0)
     place = torch.lerp(origin, target, crossed.unsqueeze(-1))
     position = torch.cat([place, (level * climbed).unsqueeze(-1)], dim=-1)
     return Pose(position, crossed * torch.linalg.vector_norm(target - origin, dim=-1))

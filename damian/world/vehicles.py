@@ -23,8 +23,10 @@ from damian.world.state import State
 FLIGHT_LEVEL_M = 30.48
 """Metres per flight level of a published region (one flight level is 100 feet)."""
 
-TIME_EPS = 1e-4
-"""Tolerance of times [s]; far below any step, far above float32 error within an episode."""
+_FLIGHT_ERROR = 1e-6
+"""Largest relative error of the duration of a flight, which is computed in float32."""
+_ROUNDING = 1e-12
+"""Largest relative error of a number of steps, which is computed in double precision."""
 
 Model = TypeVar("Model", bound="MotionModel")
 
@@ -114,10 +116,17 @@ class MotionModel(ABC):
         motion = self.motion
         return minimum_time(length, motion.degree, motion.max_speed, motion.max_acceleration)
 
-    def drain_or_charge(self, state: State, drain: Tensor, rests: Tensor) -> State:
-        """State after a step that drains batteries by ``drain`` [%] and charges UAVs at rest, each [B, N]."""
-        gain = self.charge * (rests & gather_rows(self.chargers, state.goal))
-        return state._replace(battery=(state.battery - drain + gain).clamp(0, 100))
+    def battery_after(self, level: Tensor, drain: Tensor, rested: Tensor, goal: Tensor) -> Tensor:
+        """Battery levels [%] after a flight and a rest, [B, N].
+
+        Args:
+            level: before the flight, [B, N] percent.
+            drain: of the flight, [B, N] percent.
+            rested: steps at rest since the flight, [B, N].
+            goal: flat id of the landing point of the rest, [B, N].
+        """
+        gain = self.charge * (rested * gather_rows(self.chargers, goal))
+        return (level - drain + gain).clamp(0, 100)
 
 
 def _not_a_model(found: Any) -> str | None:
@@ -214,7 +223,8 @@ class InstantMotion(MotionModel):
             return state
         length = self.length(state.origin, state.goal)
         drain = flight_drain(self.vertical, length, self.battery) * (length > 0)
-        return self.drain_or_charge(state, drain, length == 0)
+        battery = self.battery_after(state.battery, drain, length == 0, state.goal)
+        return state._replace(battery=battery)
 
     def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
         return messages
@@ -230,10 +240,10 @@ class PolynomialFlight(MotionModel):
     instant = False
 
     def ready(self, state: State) -> Tensor:
-        return state.elapsed >= self.duration(state) + self.motion.sensing_time - TIME_EPS
+        return state.elapsed >= self.steps(state, self.motion.sensing_time)
 
     def on_ground(self, state: State) -> Tensor:
-        return state.elapsed >= self.duration(state) - TIME_EPS
+        return state.elapsed >= self.steps(state)
 
     def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
         return torch.where(ready, valid, hold)
@@ -242,14 +252,15 @@ class PolynomialFlight(MotionModel):
         state = state._replace(origin=torch.where(ready, state.goal, state.origin), goal=goal)
         cruise = self.shortest_time(self.length(state.origin, state.goal))
         return state._replace(
-            elapsed=torch.where(ready, 0.0, state.elapsed),
+            elapsed=torch.where(ready, 0, state.elapsed),
             vertical=torch.where(ready, self.vertical * departs, state.vertical),
             cruise=torch.where(ready, cruise, state.cruise),
-            used=torch.where(ready, 0.0, state.used),
+            battery_before=torch.where(ready, state.battery, state.battery_before),
         )
 
     def move(self, state: State) -> State:
-        elapsed = state.elapsed + self.dt
+        state = state._replace(elapsed=state.elapsed + 1)
+        elapsed = state.elapsed.double() * self.dt
         position, cruised = fly(
             gather_rows(self.points, state.origin),
             gather_rows(self.points, state.goal),
@@ -259,25 +270,38 @@ class PolynomialFlight(MotionModel):
             state.cruise,
             self.motion.degree,
         )
-        state = state._replace(elapsed=elapsed, position=position)
+        state = state._replace(position=position)
         if not self.battery.enabled:
             return state
+        # From the latest decision on, not from step to step, because rounding errors would add up.
         used = used_so_far(elapsed, state.vertical, state.cruise, cruised, self.battery)
-        landed_before = elapsed - self.dt >= self.duration(state) - TIME_EPS
-        drained = self.drain_or_charge(state, used - state.used, landed_before)
-        return drained._replace(used=used)
+        rested = (state.elapsed - self.steps(state)).clamp(min=0)
+        battery = self.battery_after(state.battery_before, used.to(cruised.dtype), rested, state.goal)
+        return state._replace(battery=battery)
 
     def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
         return tree_where(on_ground, messages, before)
 
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
         """Each decision adds one landing point, however long the UAV then senses there."""
-        waited = (state.elapsed > self.dt + TIME_EPS) & state.message_sent
-        return on_ground & ~waited
+        return on_ground & (state.elapsed == self.steps(state).clamp(min=1))
+
+    def steps(self, state: State, sensing_time: float = 0.0) -> Tensor:
+        """Least number of steps after which the latest flight, and a time [s] behind it, are over, [B, N]."""
+        seconds = self.duration(state).double() * (1 - _FLIGHT_ERROR) + sensing_time
+        return (seconds * ((1 - _ROUNDING) / self.dt)).ceil().long()
 
     def duration(self, state: State) -> Tensor:
         """Duration of the latest flight [s], [B, N]; 0 if the UAV held."""
         return 2 * state.vertical + state.cruise
+
+
+def _check_levels(levels: list[float], airspace: Airspace) -> None:
+    """Require that each flight level lies within those of every region."""
+    key = "motion.min_level + i * motion.level_separation"
+    for low, high in (region.levels for region in airspace.regions if region.levels is not None):
+        for level in levels:
+            checks.in_range(key, level, low * FLIGHT_LEVEL_M, high * FLIGHT_LEVEL_M, "m")
 
 
 def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
@@ -289,9 +313,3 @@ def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
     nearest = nearest_points(airspace.points.unsqueeze(1), torch.tensor(places), 1).squeeze(-1)
     flat = nearest + n_points * torch.arange(n_regions).unsqueeze(-1)
     return torch.zeros(n_regions * n_points, dtype=torch.bool).index_fill(0, flat.flatten(), True)
-def _check_levels(levels: list[float], airspace: Airspace) -> None:
-    """Require that each flight level lies within those of every region."""
-    key = "motion.min_level + i * motion.level_separation"
-    for low, high in (region.levels for region in airspace.regions if region.levels is not None):
-        for level in levels:
-            checks.in_range(key, level, low * FLIGHT_LEVEL_M, high * FLIGHT_LEVEL_M, "m")

@@ -219,7 +219,7 @@ def test_a_region_source_with_other_arguments_is_one_line():
         ({"mistake": "none"}, "take_off: a NoneType is not a State"),
         (
             {"mistake": "double"},
-            "move: elapsed: torch.float64 [8, 3] is not a tensor of torch.float32 [8, 3]",
+            "move: elapsed: torch.float64 [8, 3] is not a tensor of torch.int64 [8, 3]",
         ),
         ({"mistake": "raise"}, "ValueError: Got unexpected field names: ['height']" + line("height=0")),
     ],

@@ -116,9 +116,9 @@ def test_every_end_of_an_episode_equals_that_of_a_plain_loop(
         for uav in uavs:
             if uav.heard_at is not None:  # All detections happen at the end of a step.
                 uav.heard_at = now if uav.spots else float(rng.integers(round(now / dt) + 1)) * dt
-    messages, server = messages_of(worlds)
+    messages, _ = messages_of(worlds)
     over = torch.zeros(6, dtype=torch.bool)
-    ours = status(messages, torch.as_tensor(steps), server.now, over, dt, episode)
+    ours = status(messages, torch.as_tensor(steps), over, dt, episode)
     expected = [
         twin.end(uavs, int(n), now, dt, episode) for n, (now, uavs) in zip(steps, worlds, strict=True)
     ]
@@ -131,9 +131,9 @@ def status_of(spots, battery=100.0, steps=5, over=False, **ends):
     (_, uavs), *_ = random_worlds(0, len(spots), 0.0, 0.0)
     for uav, flag in zip(uavs, spots, strict=True):
         uav.spots, uav.battery = flag, battery
-    messages, server = messages_of([(float(steps), uavs)])
+    messages, _ = messages_of([(float(steps), uavs)])
     config = EpisodeConfig(**ends)
-    ended = status(messages, torch.tensor([steps]), server.now, torch.tensor([over]), 1.0, config)
+    ended = status(messages, torch.tensor([steps]), torch.tensor([over]), 1.0, config)
     return tuple(flag.item() for flag in ended)
 
 
