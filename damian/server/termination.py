@@ -22,7 +22,8 @@ class EpisodeConfig:
     success_share: float | None = None
     """Share of the UAVs that must spot the source at the same time for success; if not given, no success."""
     discharged_share: float | None = None
-    """Share of the UAVs whose empty batteries end the episode; if not given, batteries never end it."""
+    """Share of the UAVs whose empty batteries end the episode; if not given, batteries never end it. A
+    battery is empty if its observed level is 0, or if it allows nothing but holding."""
     end_with_source: bool = False
     """End the episode when the source has finished its walk and stops for good (``source.after_walk``)."""
 
@@ -77,7 +78,7 @@ def status(
     if config.success_share is not None:
         success = messages.spotted.sum(-1) >= share_of(config.success_share, n_agents)
     if config.discharged_share is not None:
-        ended = (messages.battery <= 0).sum(-1) >= share_of(config.discharged_share, n_agents)
+        ended = messages.empty.sum(-1) >= share_of(config.discharged_share, n_agents)
     if config.end_with_source:
         ended = ended | source_over
     if config.max_steps is not None:

@@ -41,6 +41,8 @@ class Messages(NamedTuple):
     """Battery level, not rounded [%]."""
     spotted: Annotated[Tensor, Column(dtype=torch.bool)]
     """Whether the UAV spots the source."""
+    empty: Annotated[Tensor, Column(dtype=torch.bool)]
+    """Whether the observed battery level is 0, or the battery allows nothing but holding."""
     motions: Annotated[Tensor, Column(dtype=torch.long)]
     """Motions (holding included) since the latest detection before this message."""
     detected_time: Annotated[Tensor, Column()]

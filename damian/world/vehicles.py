@@ -100,11 +100,13 @@ class MotionModel(ABC):
 
     def reach(self, state: State) -> Tensor:
         """Longest cruise of each UAV now [m], [B, N]; 0: it can only hold; negative: it may not choose."""
-        if self.battery.enabled:
-            left = cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
-        else:
-            left = torch.full_like(state.battery, MAX_COORDINATE_M)
-        return torch.where(self.ready(state), left, -1.0)
+        return torch.where(self.ready(state), self.battery_reach(state), -1.0)
+
+    def battery_reach(self, state: State) -> Tensor:
+        """Longest cruise that each battery allows [m], [B, N]; 0: it allows only holding."""
+        if not self.battery.enabled:
+            return torch.full_like(state.battery, MAX_COORDINATE_M)
+        return cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
 
     def length(self, origin: Tensor, goal: Tensor) -> Tensor:
         """Distance between two landing points, given by flat ids [B, N], in metres [B, N]."""
@@ -172,6 +174,7 @@ def check_model(model: MotionModel, kind: str, state: State) -> None:
         _require_alike(f"{name}: ready", ready := model.ready(state), flag)
         _require_alike(f"{name}: on_ground", on_ground := model.on_ground(state), flag)
         _require_alike(f"{name}: reach", model.reach(state), state.battery)
+        _require_alike(f"{name}: battery_reach", model.battery_reach(state), state.battery)
         valid = flag.unsqueeze(-1).repeat(1, 1, 2)
         _require_alike(f"{name}: mask_busy", model.mask_busy(valid, ready.unsqueeze(-1), valid[0, 0]), valid)
         flying = model.take_off(state, goal, ready, ready & (goal != state.goal))
