@@ -85,6 +85,11 @@ class Messages(NamedTuple):
         parts = rows.split([*(column.width for column in _COLUMNS[:-2]), window, n_readings], -1)
         return cls._make(_read(part, column) for part, column in zip(parts, _COLUMNS, strict=True))
 
+    @property
+    def in_flight(self) -> Tensor:
+        """Whether the message was sent at a takeoff, so that its UAV is bound for another point, [*, N]."""
+        return (self.position != self.target).any(-1)
+
     def age(self, now: Tensor) -> Tensor:
         """Age of information: time since each message was generated [s], [*, N].
 

@@ -165,11 +165,8 @@ class Simulation:
             trail=self._trail(state, on_ground, action_valid),
             readings=self._readings(state),
         )
-        return state._replace(
-            message_sent=on_ground,
-            motions=torch.where(spotted, 0, state.motions),
-            sent=self.vehicles.latest_messages(on_ground, messages, state.sent),
-        )
+        sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
+        return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
 
     def _trail(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor:
         """The latest landing points of each UAV, newest first."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry
-from damian.common.tensors import gather_rows, tree_map, tree_where
+from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.world.airspace import Airspace, nearest_points
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
 from damian.world.config import WorldConfig
@@ -91,8 +91,19 @@ class MotionModel(ABC):
         """State with the positions and batteries after a step of ``dt``."""
 
     @abstractmethod
-    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
-        """New messages of UAVs on the ground [B, N], and the messages ``before`` of UAVs in flight."""
+    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
+        """Which UAVs send a message in this step, and the latest message of each UAV.
+
+        A UAV that is not on the ground must not spot the source in its latest message.
+
+        Args:
+            state: after the step; ``state.sent`` are the latest messages before it.
+            on_ground: whether each UAV stands on its landing point, [B, N] bool.
+            messages: what each UAV would send now, [B, N].
+
+        Returns:
+            Flags [B, N], and messages [B, N].
+        """
 
     @abstractmethod
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
@@ -181,8 +192,18 @@ def check_model(model: MotionModel, kind: str, state: State) -> None:
         _require_alike(f"{name}: take_off", flying, state)
         moved = model.move(flying)
         _require_alike(f"{name}: move", moved, state)
-        sent = model.latest_messages(on_ground, state.sent, state.sent)
-        _require_alike(f"{name}: latest_messages", sent, state.sent)
+        landed = model.on_ground(moved)
+        heard, here = (state.sent._replace(spotted=spotted) for spotted in (torch.ones_like(flag), landed))
+        key, found = (
+            f"{name}: latest_messages",
+            model.latest_messages(moved._replace(sent=heard), landed, here),
+        )
+        pair = isinstance(found, tuple) and len(found) == 2
+        checks.require(pair, key, f"a {type(found).__name__}", "is not a pair of flags and Messages")
+        _require_alike(key, found[0], flag)
+        _require_alike(key, found[1], state.sent)
+        problem = "still spots the source: let it send a message at its takeoff"
+        checks.require(not (found[1].spotted & ~landed).any(), key, "a UAV in flight", problem)
         if (stop := model.new_stop(moved, on_ground, None)) is not None:
             _require_alike(f"{name}: new_stop", stop, flag)
 
@@ -229,8 +250,8 @@ class InstantMotion(MotionModel):
         battery = self.battery_after(state.battery, drain, length == 0, state.goal)
         return state._replace(battery=battery)
 
-    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
-        return messages
+    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
+        return on_ground, messages
 
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
         return action_valid
@@ -282,8 +303,12 @@ class PolynomialFlight(MotionModel):
         battery = self.battery_after(state.battery_before, used.to(cruised.dtype), rested, state.goal)
         return state._replace(battery=battery)
 
-    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
-        return tree_where(on_ground, messages, before)
+    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
+        """A UAV sends messages while it is on the ground, and one from its takeoff point as it departs."""
+        sends = on_ground | (state.elapsed == 1)
+        start = gather_rows(self.points, state.origin)
+        position = torch.where(expand_mask(on_ground, start), messages.position, start)
+        return sends, tree_where(sends, messages._replace(position=position), state.sent)
 
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
         """Each decision adds one landing point, however long the UAV then senses there."""
