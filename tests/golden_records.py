@@ -119,6 +119,7 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         track=zeros,
         battery=zeros + 100,
         spotted=torch.tensor(flags),
+        empty=torch.zeros_like(place[..., 0], dtype=torch.bool),
         motions=motions,
         detected_time=zeros + detected[:, None],
         detected_position=zeros[..., None] + estimate[:, None],

@@ -220,6 +220,7 @@ def random_worlds(
             place = tuple(rng.uniform(-150, 150, 2).astype(np.float32).tolist())
             uav = Uav(place, track=float(rng.uniform(0, 2 * math.pi)))
             uav.battery = float(rng.choice([0.0, 35.0, 100.0, rng.uniform(0, 100)]))
+            uav.empty = uav.battery < 40
             if rng.random() < heard:
                 uav.heard_at = float(rng.uniform(0, now))
                 uav.heard_from = tuple(rng.uniform(-150, 150, 2).tolist())
@@ -244,6 +245,7 @@ def messages_of(worlds: list[tuple[float, list[Uav]]]) -> tuple[Messages, Server
         track=column(lambda uav: uav.track),
         battery=column(lambda uav: uav.battery),
         spotted=column(lambda uav: uav.spots, torch.bool),
+        empty=column(lambda uav: uav.empty, torch.bool),
         motions=column(lambda uav: uav.motions, torch.long),
         detected_time=column(lambda uav: -1.0 if uav.heard_at is None else uav.heard_at),
         detected_position=column(lambda uav: uav.heard_from),

@@ -18,6 +18,7 @@ class Uav:
     point: int = 0
     track: float = 0.0
     battery: float = 100.0
+    empty: bool = False
     spots: bool = False
     motions: int = 0
     """Motions since the latest detection before this message."""
@@ -127,7 +128,7 @@ def end(
     if episode.success_share is not None:
         success = enough(episode.success_share, [u.spots for u in uavs])
     if episode.discharged_share is not None:
-        failure = enough(episode.discharged_share, [u.battery <= 0 for u in uavs])
+        failure = enough(episode.discharged_share, [u.empty for u in uavs])
     if episode.max_steps is not None:
         counted = steps
         if episode.since_detection:

@@ -84,7 +84,9 @@ class Greedy:
         goal = (gain - _FLIGHT_COST * flown).argmax(-1)
         left = _distances(_places_at(ground, goal), ground)
         if self.actions.kind == "discrete":
-            return self.best_action(held, gain, left, mask)
+            # A UAV that the server has last heard of at its takeoff stands on its target when it chooses.
+            standing = flown.argmin(-1) + region.unsqueeze(-1) * self.points.shape[1]
+            return self.best_action(standing, gain, left, mask)
         return self.best_move(held, gain, flown, left, ground)
 
     def fresh(self, held: Messages, ground: Tensor) -> Tensor:
@@ -106,8 +108,8 @@ class Greedy:
         """How likely the source is at each landing point.
 
         The place of a detection grows uncertain with its age: the way of the source at full speed counts as
-        two standard deviations. A footprint in which a UAV hears nothing now makes the source less likely
-        there, but by less if the source may be there without emitting.
+        two standard deviations. A footprint in which a UAV on the ground hears nothing now makes the source
+        less likely there, but by less if the source may be there without emitting.
 
         Args:
             held: messages [B, N].
@@ -123,7 +125,7 @@ class Greedy:
         outside = (_distances(held.detected_position, ground) - self.radius).clamp(min=0)
         log_detected = -(outside / (BLUR_M + self.speed * since / 2)).square() / 2
         log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0).sum(1, keepdim=True)
-        silent = ~held.spotted & (held.time > now - self.dt / 2)
+        silent = ~held.spotted & ~held.in_flight & (held.time > now - self.dt / 2)
         covered = (_distances(held.position, ground) <= self.radius) & silent.unsqueeze(-1)
         latest = since.amin(1, keepdim=True)
         confidence = TRUST * torch.where(latest < self.dt / 2, 1.0, self.emits)
@@ -131,17 +133,17 @@ class Greedy:
         moved = torch.where(latest.isfinite(), latest * self.speed, torch.inf)
         return (log - log.amax(-1, keepdim=True)).exp(), moved <= RECENT * self.radius
 
-    def best_action(self, held: Messages, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
+    def best_action(self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
         """The best legal discrete action, [B, N].
 
         Args:
-            held: messages [B, N].
+            standing: flat ids of the landing points on which the UAVs stand or will land, [B, N].
             gain: weight in the footprint of each landing point, [B, N, L].
             left: distance from each landing point to the best one [m], [B, N, L].
             mask: legal actions, [B, N, A]; all if not given.
         """
         action = torch.arange(self.actions.n_actions, device=gain.device)
-        row = held.trail[..., :1] * len(action) + action
+        row = standing.unsqueeze(-1) * len(action) + action
         point, flown = (gather_rows(table[:, 0], row) for table in self.candidates.ranking)
         gain, left = (values.gather(-1, point.long()) for values in (gain, left))
         return _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)

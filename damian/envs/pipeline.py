@@ -28,6 +28,7 @@ from damian.transforms import (
 from damian.transforms.onboard_node import OnboardNode
 from damian.transforms.skip_until_ready import SkipUntilReady
 from damian.world.landing import ActionConfig
+from damian.world.vehicles import MOTION_MODELS
 
 _SENT = [keys.MESSAGE, keys.MESSAGE_SENT]
 
@@ -185,6 +186,8 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
             default=hold_action(scenario.actions),
             recorded_key="ready",
             age_key=keys.AGE if history_since_message(scenario) else None,
+            # Features do not reflect a flight before it has ended, though a message is sent as it begins.
+            reflected_after=1 if MOTION_MODELS.get(scenario.motion.kind, "motion.kind").instant else 2,
         )
         transforms.append(history)
     return transforms

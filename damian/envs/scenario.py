@@ -47,11 +47,12 @@ class ScenarioConfig(WorldConfig):
             self.episode.discharged_share,
             "needs battery.enabled=true: the batteries stay full",
         )
+        stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
         checks.require(
-            not self.episode.end_with_source or self.source.motion == "dynamic",
+            not self.episode.end_with_source or stops,
             "episode.end_with_source",
             True,
-            "needs source.motion=dynamic: a static source never ends its walk",
+            "needs source.motion=dynamic and source.after_walk=stop: another source never ends its walk",
         )
 
     @property

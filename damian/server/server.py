@@ -207,7 +207,7 @@ class Server:
             source_over: has the source finished its walk, [*].
         """
         counters = Counters(steps, messages.motions)
-        ended = status(messages, steps, steps * self.dt, source_over, self.dt, self.episode)
+        ended = status(messages, steps, source_over, self.dt, self.episode)
         terms = reward(features, counters, self.reward)
         final = final_reward(ended, counters, self.reward).unsqueeze(-1).expand_as(messages.track)
         return RewardAndStatus(sum(terms.values(), start=final), terms, ended)

@@ -22,9 +22,10 @@ class EpisodeConfig:
     success_share: float | None = None
     """Share of the UAVs that must spot the source at the same time for success; if not given, no success."""
     discharged_share: float | None = None
-    """Share of the UAVs whose empty batteries end the episode; if not given, batteries never end it."""
+    """Share of the UAVs whose empty batteries end the episode; if not given, batteries never end it. A
+    battery is empty if its observed level is 0, or if it allows nothing but holding."""
     end_with_source: bool = False
-    """End the episode when the source has finished its walk."""
+    """End the episode when the source has finished its walk and stops for good (``source.after_walk``)."""
 
     def __post_init__(self) -> None:
         if self.max_steps is not None:
@@ -57,7 +58,6 @@ class Status(NamedTuple):
 def status(
     messages: Messages,
     steps: Tensor,
-    now: Tensor,
     source_over: Tensor,
     dt: float,
     config: EpisodeConfig,
@@ -69,7 +69,6 @@ def status(
     Args:
         messages: messages that the server holds, [*, N].
         steps: elapsed steps of the episode, [*].
-        now: current time [s], [*].
         source_over: has the source finished its walk, [*].
         dt: length of a step [s].
         config: conditions that end an episode.
@@ -79,14 +78,16 @@ def status(
     if config.success_share is not None:
         success = messages.spotted.sum(-1) >= share_of(config.success_share, n_agents)
     if config.discharged_share is not None:
-        ended = (messages.battery <= 0).sum(-1) >= share_of(config.discharged_share, n_agents)
+        ended = messages.empty.sum(-1) >= share_of(config.discharged_share, n_agents)
     if config.end_with_source:
         ended = ended | source_over
     if config.max_steps is not None:
         elapsed = steps
         if config.since_detection:
-            elapsed = (now - messages.detected_time.amax(-1).clamp(min=0)) / dt
-        timed_out = elapsed >= config.max_steps - 1e-3
+            # Times in messages are float32, so the step of the latest detection is the nearest whole number.
+            latest = messages.detected_time.amax(-1).clamp(min=0).double()
+            elapsed = steps - (latest / dt).round().long()
+        timed_out = elapsed >= config.max_steps
     return Status(success, success | ended, timed_out & ~(success | ended))
 
 

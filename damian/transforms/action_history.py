@@ -35,8 +35,10 @@ class ActionHistory(ActionTransform):
         recorded_key: key of a flag in the policy's input, [...] bool: an action is recorded only where it is
             true; a bare name means an entry beside the action. If not given, every action is recorded.
         age_key: key of the age of the observation [steps], [..., 1], as ``ObservationDelay`` writes it. The
-            history then contains only the actions chosen since the observation was generated: older actions,
-            which the observation already reflects, are replaced by the default.
+            history then contains only the actions that the observation cannot reflect yet: older ones are
+            replaced by the default.
+        reflected_after: an observation reflects an action if it was generated at least this many steps after
+            the action was chosen (only with ``age_key``).
 
     Raises:
         InputError: the number of steps is not a positive integer; at the first use of the environment also:
@@ -60,8 +62,10 @@ class ActionHistory(ActionTransform):
         default: Any = None,
         recorded_key: NestedKey | None = None,
         age_key: NestedKey | None = None,
+        reflected_after: int = 1,
     ) -> None:
         checks.whole("steps", steps, 1)
+        checks.whole("reflected_after", reflected_after, 1, unit="steps")
         super().__init__(action_key, default)
         appended = [append_to] if append_to is not None else []
         self.in_keys, self.out_keys = appended, appended or [sibling_key(self.action_key, out_key)]
@@ -69,7 +73,7 @@ class ActionHistory(ActionTransform):
         self.codes = codes
         self.action_keys = [self.action_key, *([self.recorded_key] if self.recorded_key else [])]
         self.age_key = sibling_key(self.action_key, age_key)
-        self._reads = [self.age_key] if self.age_key else []
+        self._reads, self.reflected_after = [self.age_key] if self.age_key else [], reflected_after
         self.step_keys = [*self.in_keys, *self._reads]
 
     @property
@@ -118,7 +122,9 @@ class ActionHistory(ActionTransform):
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         recent, key = memory["recent"], self.out_keys[0]
         if self.age_key:
-            not_reflected = memory["since"] <= entries[self.age_key].reshape(-1, 1)
+            # An observation of this age was generated ``since - age`` steps after the action was chosen.
+            since_chosen = memory["since"] - entries[self.age_key].reshape(-1, 1)
+            not_reflected = since_chosen < self.reflected_after
             width = recent.shape[-1] // self.steps
             recent = torch.where(not_reflected.repeat_interleave(width, -1), recent, memory["first"])
         history = from_rows(recent, self.rows)

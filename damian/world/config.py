@@ -14,9 +14,6 @@ from damian.world.regions.config import RegionConfig
 from damian.world.sensors import sensors_of
 from damian.world.signal_source import SourceConfig
 
-FLIGHT_LEVEL_M = 30.48
-"""Metres per flight level of a published region (one flight level is 100 feet)."""
-
 
 @dataclass
 class WorldConfig:
@@ -35,7 +32,8 @@ class WorldConfig:
 
     def __post_init__(self) -> None:
         checks.in_range("agents", self.agents, 1, 1000)  # their distances grow with the square
-        flight_levels(self.motion, self.agents)
+        if self.motion.kind == "polynomial":  # a model of one's own refuses them when it is built
+            flight_levels(self.motion, self.agents)
         sensors_of(self.sensors)  # refuses what is no sensor
         starts = self.region.start_positions
         checks.require(
@@ -56,22 +54,11 @@ class WorldConfig:
             rng: random generator, for random regions.
 
         Raises:
-            InputError: a wrong file or polygon, fewer landing points than UAVs, or a flight level of a
-                UAV outside those of its region.
+            InputError: a wrong file or polygon, or fewer landing points than UAVs.
         """
         region = self.region
-        regions = region.regions(rng)
-        for level in flight_levels(self.motion, self.agents):
-            for low, high in (r.levels for r in regions if r.levels is not None):
-                checks.in_range(
-                    "motion.min_level + i * motion.level_separation",
-                    level,
-                    low * FLIGHT_LEVEL_M,
-                    high * FLIGHT_LEVEL_M,
-                    "m",
-                )
         return build_airspace(
-            regions,
+            region.regions(rng),
             region.lattice_step,
             region.lattice_angle,
             region.n_landing_points,

@@ -41,6 +41,8 @@ class Messages(NamedTuple):
     """Battery level, not rounded [%]."""
     spotted: Annotated[Tensor, Column(dtype=torch.bool)]
     """Whether the UAV spots the source."""
+    empty: Annotated[Tensor, Column(dtype=torch.bool)]
+    """Whether the observed battery level is 0, or the battery allows nothing but holding."""
     motions: Annotated[Tensor, Column(dtype=torch.long)]
     """Motions (holding included) since the latest detection before this message."""
     detected_time: Annotated[Tensor, Column()]
@@ -82,6 +84,11 @@ class Messages(NamedTuple):
         window = rows.shape[-1] - _FIXED - n_readings
         parts = rows.split([*(column.width for column in _COLUMNS[:-2]), window, n_readings], -1)
         return cls._make(_read(part, column) for part, column in zip(parts, _COLUMNS, strict=True))
+
+    @property
+    def in_flight(self) -> Tensor:
+        """Whether the message was sent at a takeoff, so that its UAV is bound for another point, [*, N]."""
+        return (self.position != self.target).any(-1)
 
     def age(self, now: Tensor) -> Tensor:
         """Age of information: time since each message was generated [s], [*, N].

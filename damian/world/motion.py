@@ -38,7 +38,7 @@ class MotionConfig:
     min_level: float = 1.0
     """Flight level of the first UAV [m]."""
     max_level: float = 20.0
-    """Highest flight level [m]."""
+    """Highest flight level [m]. UAVs that fly instantly share levels if there are too few for all of them."""
     level_separation: float = 0.5
     """Vertical distance between the flight levels of two UAVs [m]."""
 
@@ -66,22 +66,28 @@ class Pose(NamedTuple):
     cruised: Tensor
 
 
-def flight_levels(config: MotionConfig, n_agents: int) -> list[float]:
+def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> list[float]:
     """One flight level per UAV [m], from the lowest upward.
 
+    Args:
+        config: settings of the levels.
+        n_agents: number of UAVs.
+        shared: where the levels are too few, begin with the lowest one again, as for UAVs that never meet in
+            the air.
+
     Raises:
-        InputError: the levels do not fit under the highest one.
+        InputError: the levels do not fit under the highest one, and are not shared.
     """
     room = (config.max_level - config.min_level) / config.level_separation
     n_fit = math.floor(room + _TINY) + 1
     checks.require(
-        n_agents <= n_fit,
+        shared or n_agents <= n_fit,
         "motion.max_level",
         f"{config.max_level:g} m",
         f"leaves room for {n_fit} flight levels from min_level={config.min_level:g} m, "
         f"level_separation={config.level_separation:g} m apart, but there are {n_agents} UAVs",
     )
-    return [config.min_level + i * config.level_separation for i in range(n_agents)]
+    return [config.min_level + i % n_fit * config.level_separation for i in range(n_agents)]
 
 
 def time_law(tau: Tensor, degree: int) -> Tensor:
@@ -136,7 +142,7 @@ def fly(
         origin: takeoff points, [*, 2] metres.
         target: landing points, [*, 2] metres.
         level: flight levels above 0, [*] metres.
-        elapsed: time since takeoff, [*] seconds.
+        elapsed: time since takeoff, [*] seconds; long flights need double precision.
         vertical: duration of takeoff, and of landing, above 0, [*] seconds.
         cruise: duration of the cruise, [*] seconds; 0 if origin and target are the same.
         degree: degree of the time law, 3, 5 or 7.
@@ -145,7 +151,8 @@ def fly(
     remaining = torch.add(cruise, vertical, alpha=2) - elapsed
     climbing = torch.minimum(elapsed, remaining) / vertical
     cruising = (elapsed - vertical) / cruise.clamp_min(_TINY)
-    climbed, crossed = time_law(torch.stack([climbing, cruising]), degree).unbind(0)
+    shares = torch.stack([climbing, cruising]).to(origin.dtype)
+    climbed, crossed = time_law(shares, degree).unbind(0)
     place = torch.lerp(origin, target, crossed.unsqueeze(-1))
     position = torch.cat([place, (level * climbed).unsqueeze(-1)], dim=-1)
     return Pose(position, crossed * torch.linalg.vector_norm(target - origin, dim=-1))

@@ -39,6 +39,10 @@ class SourceConfig:
     """``constant``; ``per_stop`` or ``per_step``: on or off, drawn at each stop or simulation step."""
     emission_probability: float = 0.5
     """Probability that an intermittent source is on."""
+    after_walk: str = "loop"
+    """What a dynamic source does after the last stop of its walk. ``loop``: it goes straight back to its
+    first hotspot and makes the same round again, with the same waits (an emission per stop is drawn anew);
+    ``stop``: it stays there, silent for good."""
     position: Any = None
     """Position, or start of the walk: [x, y] in metres, or {lat: 53.1, lon: -4.5} in degrees (as for
     region.start_positions); drawn for each initial condition if not given."""
@@ -74,6 +78,13 @@ class SourceConfig:
         )
         checks.one_of("source.motion", self.motion, ["static", "dynamic"])
         checks.one_of("source.emission", self.emission, ["constant", "per_stop", "per_step"])
+        checks.one_of("source.after_walk", self.after_walk, ["loop", "stop"])
+        checks.require(
+            self.motion == "dynamic" or self.after_walk == "loop",
+            "source.after_walk",
+            "stop",
+            "needs source.motion=dynamic: a static source does not walk",
+        )
         checks.require(
             self.motion == "dynamic" or self.emission != "per_stop",
             "source.emission",
@@ -98,7 +109,9 @@ class SourceConfig:
 class Walk(NamedTuple):
     """Walks of ``W`` sources over at most ``K`` stops; a static source has one stop and never leaves it.
 
-    Padded stops repeat the place and departure time of the last real stop; their arrival time is infinite.
+    Walks end with at least one padded stop if they begin anew, and may if not. Their places are that of the
+    first stop, to which the walk then returns, or of the last one; their departure time is the end of the
+    walk, and their arrival time is infinite.
 
     Attributes:
         stop: places, [W, K, 2] metres.
@@ -119,10 +132,18 @@ class Walk(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Positions of B sources [B, 2] m, index of the latest stop [B] int64, is the walk over [B] bool."""
+    """Where B sources are on their walks.
+
+    Attributes:
+        position: [B, 2] metres.
+        stop: index of the latest stop, [B] int64.
+        tour: number of walks that the source has finished before this one, [B] int64.
+        finished: whether the source has stopped for good, [B] bool.
+    """
 
     position: Tensor
     stop: Tensor
+    tour: Tensor
     finished: Tensor
 
 
@@ -184,17 +205,24 @@ def leg_duration(length: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
     return _profile(length, speed, acceleration)[1]
 
 
-def locate(walk: Walk, time: Tensor) -> Located:
-    """Positions of sources at a time; a source whose walk is over stays at its last stop.
+def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
+    """Positions of sources at a time.
 
     Args:
         walk: one walk per world, leading dimension ``B``.
-        time: time since the walk began, not negative, [B] seconds.
+        time: time since the first walk began, not negative, [B] seconds; in double precision, the last of
+            many walks is as exact as the first one.
+        loops: whether a source whose walk is over begins it anew (``draw_walks`` must have drawn it so); if
+            not, it stays at its last stop.
     """
-    finished = time >= walk.depart[..., -1]
-    last = walk.stop.shape[-2] - 1
+    last, end = walk.stop.shape[-2] - 1, walk.depart[..., -1].to(time.dtype)
+    finished, tour = time >= end, torch.zeros_like(time)
+    if loops:
+        tour, finished = (time / end).floor(), torch.zeros_like(finished)
+        time = time - tour * end
+    tour, time = tour.long(), time.to(walk.depart.dtype)
     if last == 0:
-        return Located(walk.stop[..., 0, :], torch.zeros_like(time, dtype=torch.long), finished)
+        return Located(walk.stop[..., 0, :], tour, tour, finished)
     stop = (walk.arrive[..., 1:] <= time.unsqueeze(-1)).sum(-1)
     here = stop.unsqueeze(-1)
     ends = torch.cat([here, (here + 1).clamp_max(last)], dim=-1)
@@ -205,7 +233,7 @@ def locate(walk: Walk, time: Tensor) -> Located:
     )
     length = torch.linalg.vector_norm(target - origin, dim=-1)
     share = _covered(length, speed, acceleration, time - depart) / length.clamp_min(_TINY)
-    return Located(torch.lerp(origin, target, share.unsqueeze(-1)), stop, finished)
+    return Located(torch.lerp(origin, target, share.unsqueeze(-1)), stop, tour, finished)
 
 
 def _profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
@@ -304,22 +332,28 @@ def _in_disc(n: int, radius: float, rng: np.random.Generator) -> np.ndarray:
 
 def _timed_walk(stops: _Stops, config: SourceConfig, rng: np.random.Generator) -> Walk:
     """Add waiting times, legs and emission to the stops."""
-    shape = stops.hotspot.shape
-    padded = np.arange(shape[1]) >= stops.n[:, None]
-    last = (stops.n - 1)[:, None]
-    place = np.where(padded[..., None], np.take_along_axis(stops.place, last[..., None], axis=1), stops.place)
-    to_hotspot = np.roll(stops.hotspot, -1, axis=1)
+    shape, loops = stops.hotspot.shape, config.after_walk == "loop"
+    per_stop = config.emission == "per_stop"
+    wait = rng.uniform(config.min_wait, config.max_wait, shape)
+    emits = rng.random(shape) < (config.emission_probability if per_stop else 1.0)
+    drawn = stops.place, stops.hotspot, wait, emits
+    if loops:  # room for the return to the first stop
+        drawn = (np.concatenate([each, each[:, -1:]], axis=1) for each in drawn)
+    place, hotspot, wait, emits = drawn
+    last, column = (stops.n - 1)[:, None], np.arange(hotspot.shape[1])
+    padded = column > last
+    after = np.zeros_like(last) if loops else last
+    place = np.where(padded[..., None], np.take_along_axis(place, after[..., None], axis=1), place)
+    to_hotspot = np.roll(hotspot, -1, axis=1) | (loops & (column == last))
     speed = np.where(to_hotspot, config.speed, config.local_speed)
     acceleration = np.where(to_hotspot, config.acceleration, config.local_acceleration)
     length = np.linalg.norm(np.diff(place, axis=1), axis=2)
     leg = leg_duration(*(torch.as_tensor(x) for x in (length, speed[:, :-1], acceleration[:, :-1])))
-    wait = rng.uniform(config.min_wait, config.max_wait, shape)
-    arrive = np.zeros(shape)
+    arrive = np.zeros(hotspot.shape)
     arrive[:, 1:] = np.cumsum(wait[:, :-1] + leg.numpy(), axis=1)
     depart = arrive + wait
-    depart = np.where(padded, np.take_along_axis(depart, last, axis=1), depart)
+    end = np.take_along_axis(arrive, last + 1, axis=1) if loops else np.take_along_axis(depart, last, axis=1)
+    depart = np.where(padded, np.maximum(end, _TINY), depart)
     arrive = np.where(padded, math.inf, arrive)
-    per_stop = config.emission == "per_stop"
-    emits = rng.random(shape) < (config.emission_probability if per_stop else 1.0)
     walk = Walk(*map(torch.as_tensor, (place, arrive, depart, speed, acceleration, emits)))
     return Walk(*(x if x.dtype == torch.bool else x.float() for x in walk))

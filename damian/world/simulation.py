@@ -7,11 +7,13 @@ import math
 from typing import Any
 
 import numpy as np
+import shapely
 import torch
 from torch import Tensor
 
 from damian.common import counter_rng
 from damian.common.tensors import gather_rows, tree_map
+from damian.world.battery import observed
 from damian.world.config import WorldConfig
 from damian.world.initial import InitialConditions, draw_initial_conditions
 from damian.world.landing import Candidates, assign_landing_points
@@ -46,6 +48,7 @@ class Simulation:
         self.walk = drawn.walk
         self.vehicles = make_model(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
+        self.shortest_flight = self._shortest_flights() if config.battery.enabled else None
         self.initial = self._initial_state(drawn, trail, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)
@@ -64,6 +67,8 @@ class Simulation:
         self.candidates.to(device)
         self.vehicles.to(device)
         self.points = self.points.to(device)
+        if self.shortest_flight is not None:
+            self.shortest_flight = self.shortest_flight.to(device)
         for name in ("walk", "initial", "packed_initial"):
             setattr(self, name, tree_map(lambda t: t.to(device), getattr(self, name)))
         return self
@@ -139,7 +144,7 @@ class Simulation:
     def _sense(self, state: State, action_valid: Tensor | None = None) -> State:
         """Move the source, let UAVs on the ground detect it, and send messages."""
         now = (state.steps * self.dt).to(state.track.dtype)
-        place, emits, over = self._source(state, now)
+        place, emits, over = self._source(state)
         state = state._replace(source=place, source_over=over)
         on_ground = self.vehicles.on_ground(state)
         position = state.position[..., :2]
@@ -153,17 +158,15 @@ class Simulation:
             track=state.track,
             battery=state.battery,
             spotted=spotted,
+            empty=self._empty(state, on_ground),
             motions=state.motions,
             detected_time=torch.where(spotted, times, state.sent.detected_time),
             detected_position=torch.where(spotted.unsqueeze(-1), position, state.sent.detected_position),
             trail=self._trail(state, on_ground, action_valid),
             readings=self._readings(state),
         )
-        return state._replace(
-            message_sent=on_ground,
-            motions=torch.where(spotted, 0, state.motions),
-            sent=self.vehicles.latest_messages(on_ground, messages, state.sent),
-        )
+        sends, sent = self.vehicles.latest_messages(state, on_ground, messages)
+        return state._replace(message_sent=sends, motions=torch.where(spotted, 0, state.motions), sent=sent)
 
     def _trail(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor:
         """The latest landing points of each UAV, newest first."""
@@ -171,6 +174,26 @@ class Simulation:
         longer = torch.cat([state.goal.unsqueeze(-1), before[..., :-1]], -1)
         added = self.vehicles.new_stop(state, on_ground, action_valid)
         return longer if added is None else torch.where(added.unsqueeze(-1), longer, before)
+
+    def _empty(self, state: State, on_ground: Tensor) -> Tensor:
+        """Whether each UAV's observed battery level is 0, or allows nothing but holding, [B, N]."""
+        if self.shortest_flight is None:
+            return state.sent.empty
+        reach = self.vehicles.battery_reach(state)
+        stuck = on_ground & (reach < gather_rows(self.shortest_flight, state.goal))
+        return stuck | (observed(state.battery, self.config.battery) <= 0)
+
+    def _shortest_flights(self) -> Tensor:
+        """Length of the shortest flight from each landing point to which an action leads [m], [R*L].
+
+        It is 0 where no action leads to another landing point, which no battery can change.
+        """
+        if self.config.actions.kind == "discrete":
+            length = self.candidates.ranking.distance.view(len(self.points), -1)
+            length = length.where(length > 0, torch.inf).amin(-1)
+        else:
+            length = torch.cat([_nearest_other(points) for points in self.airspace.points])
+        return length.where(length.isfinite(), 0.0)
 
     def _readings(self, state: State) -> Tensor:
         """Readings of all sensors beside each other, [B, N, K]."""
@@ -183,7 +206,7 @@ class Simulation:
         state = self.layout.unpack(worlds)
         return self.layout.pack(state._replace(sent=state.sent._replace(readings=self._readings(state))))
 
-    def _source(self, state: State, now: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _source(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """Position of the source [B, 2], whether it emits [B], and whether its walk is over [B]."""
         config = self.config.source
         emits = torch.ones_like(state.source_over)
@@ -191,9 +214,12 @@ class Simulation:
             place, over = state.source, state.source_over
         else:
             walk = tree_map(lambda t: t.index_select(0, state.initial_condition), self.walk)
-            place, stop, over = locate(walk, now)
+            time = state.steps.double() * self.dt
+            place, stop, tour, over = locate(walk, time, config.after_walk == "loop")
             if config.emission == "per_stop":
-                emits = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
+                first = walk.emits.gather(-1, stop.unsqueeze(-1)).squeeze(-1)
+                draw = counter_rng.uniform(state.seed, state.episode, tour, stop)
+                emits = torch.where(tour == 0, first, draw < config.emission_probability)
         if config.emission == "per_step":
             draw = counter_rng.uniform(state.seed, state.episode, state.steps)
             emits = draw < config.emission_probability
@@ -214,10 +240,10 @@ class Simulation:
             steps=torch.zeros_like(number),
             origin=goal,
             goal=goal,
-            elapsed=zeros + self.config.motion.sensing_time,
+            elapsed=torch.full_like(goal, math.ceil(self.config.motion.sensing_time / self.dt) + 1),
             vertical=zeros,
             cruise=zeros,
-            used=zeros,
+            battery_before=zeros + 100,
             position=torch.cat([place, zeros.unsqueeze(-1)], -1),
             track=zeros,
             battery=zeros + 100,
@@ -233,3 +259,15 @@ class Simulation:
         for sensor in self.sensors.values():
             sensor.check(state, self)
         return self._sense(state)
+
+
+def _nearest_other(points: Tensor) -> Tensor:
+    """Distance from each landing point [L, 2] to the nearest other one [m], [L]; infinite for padded ones."""
+    distance, real = torch.full((len(points),), torch.inf), points.isfinite().all(-1)
+    places = np.asarray(shapely.points(points[real].double().numpy()))
+    nearest = shapely.STRtree(places).query_nearest(
+        places, exclusive=True, return_distance=True, all_matches=False
+    )
+    (index, _), found = (torch.as_tensor(each) for each in nearest)
+    distance[real.nonzero().squeeze(-1)[index]] = found.float()
+    return distance

@@ -26,13 +26,13 @@ class State(NamedTuple):
     goal: Tensor
     """Flat id of the landing point that the UAV stands on or is bound for, [B, N]."""
     elapsed: Tensor
-    """Time since the latest decision [s], [B, N]."""
+    """Simulation steps since the latest decision, [B, N]."""
     vertical: Tensor
     """Duration of takeoff, and of landing [s]; 0 if the UAV holds, [B, N]."""
     cruise: Tensor
     """Duration of the cruise [s]; 0 if the UAV holds, [B, N]."""
-    used: Tensor
-    """Battery used so far on this flight [%], [B, N]."""
+    battery_before: Tensor
+    """Battery level at the latest decision [%], [B, N]."""
     position: Tensor
     """Position of the UAV, east, north, up [m], [B, N, 3]."""
     track: Tensor

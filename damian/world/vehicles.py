@@ -11,7 +11,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry
-from damian.common.tensors import gather_rows, tree_map, tree_where
+from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.world.airspace import Airspace
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
 from damian.world.config import WorldConfig
@@ -21,8 +21,13 @@ from damian.world.regions.places import local_places
 from damian.world.regions.polygon import MAX_COORDINATE_M
 from damian.world.state import State
 
-TIME_EPS = 1e-4
-"""Tolerance of times [s]; far below any step, far above float32 error within an episode."""
+FLIGHT_LEVEL_M = 30.48
+"""Metres per flight level of a published region (one flight level is 100 feet)."""
+
+_FLIGHT_ERROR = 1e-6
+"""Largest relative error of the duration of a flight, which is computed in float32."""
+_ROUNDING = 1e-12
+"""Largest relative error of a number of steps, which is computed in double precision."""
 
 Model = TypeVar("Model", bound="MotionModel")
 
@@ -37,12 +42,16 @@ class MotionModel(ABC):
     """
 
     instant: bool
-    """Whether a UAV is at its target as soon as a step ends."""
+    """Whether a UAV is at its target as soon as a step ends; if not, each UAV needs a flight level of its
+    own, within those of the region."""
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         self.motion, self.battery, self.dt = config.motion, config.battery, dt
         self.points = airspace.points.flatten(0, 1)
-        self.levels = torch.tensor(flight_levels(config.motion, config.agents))
+        levels = flight_levels(config.motion, config.agents, shared=self.instant)
+        if not self.instant:
+            _check_levels(levels, airspace)
+        self.levels = torch.tensor(levels)
         self.vertical = self.shortest_time(self.levels)
         self.vertical_drain = vertical_drain(2 * self.vertical, config.battery)
         self.charge = float(charge_gain(torch.tensor(dt), config.battery))
@@ -83,8 +92,19 @@ class MotionModel(ABC):
         """State with the positions and batteries after a step of ``dt``."""
 
     @abstractmethod
-    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
-        """New messages of UAVs on the ground [B, N], and the messages ``before`` of UAVs in flight."""
+    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
+        """Which UAVs send a message in this step, and the latest message of each UAV.
+
+        A UAV that is not on the ground must not spot the source in its latest message.
+
+        Args:
+            state: after the step; ``state.sent`` are the latest messages before it.
+            on_ground: whether each UAV stands on its landing point, [B, N] bool.
+            messages: what each UAV would send now, [B, N].
+
+        Returns:
+            Flags [B, N], and messages [B, N].
+        """
 
     @abstractmethod
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
@@ -92,11 +112,13 @@ class MotionModel(ABC):
 
     def reach(self, state: State) -> Tensor:
         """Longest cruise of each UAV now [m], [B, N]; 0: it can only hold; negative: it may not choose."""
-        if self.battery.enabled:
-            left = cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
-        else:
-            left = torch.full_like(state.battery, MAX_COORDINATE_M)
-        return torch.where(self.ready(state), left, -1.0)
+        return torch.where(self.ready(state), self.battery_reach(state), -1.0)
+
+    def battery_reach(self, state: State) -> Tensor:
+        """Longest cruise that each battery allows [m], [B, N]; 0: it allows only holding."""
+        if not self.battery.enabled:
+            return torch.full_like(state.battery, MAX_COORDINATE_M)
+        return cruise_range(state.battery - self.vertical_drain, self.battery).clamp(min=0)
 
     def length(self, origin: Tensor, goal: Tensor) -> Tensor:
         """Distance between two landing points, given by flat ids [B, N], in metres [B, N]."""
@@ -108,10 +130,17 @@ class MotionModel(ABC):
         motion = self.motion
         return minimum_time(length, motion.degree, motion.max_speed, motion.max_acceleration)
 
-    def drain_or_charge(self, state: State, drain: Tensor, rests: Tensor) -> State:
-        """State after a step that drains batteries by ``drain`` [%] and charges UAVs at rest, each [B, N]."""
-        gain = self.charge * (rests & gather_rows(self.chargers, state.goal))
-        return state._replace(battery=(state.battery - drain + gain).clamp(0, 100))
+    def battery_after(self, level: Tensor, drain: Tensor, rested: Tensor, goal: Tensor) -> Tensor:
+        """Battery levels [%] after a flight and a rest, [B, N].
+
+        Args:
+            level: before the flight, [B, N] percent.
+            drain: of the flight, [B, N] percent.
+            rested: steps at rest since the flight, [B, N].
+            goal: flat id of the landing point of the rest, [B, N].
+        """
+        gain = self.charge * (rested * gather_rows(self.chargers, goal))
+        return (level - drain + gain).clamp(0, 100)
 
 
 def _not_a_model(found: Any) -> str | None:
@@ -157,14 +186,25 @@ def check_model(model: MotionModel, kind: str, state: State) -> None:
         _require_alike(f"{name}: ready", ready := model.ready(state), flag)
         _require_alike(f"{name}: on_ground", on_ground := model.on_ground(state), flag)
         _require_alike(f"{name}: reach", model.reach(state), state.battery)
+        _require_alike(f"{name}: battery_reach", model.battery_reach(state), state.battery)
         valid = flag.unsqueeze(-1).repeat(1, 1, 2)
         _require_alike(f"{name}: mask_busy", model.mask_busy(valid, ready.unsqueeze(-1), valid[0, 0]), valid)
         flying = model.take_off(state, goal, ready, ready & (goal != state.goal))
         _require_alike(f"{name}: take_off", flying, state)
         moved = model.move(flying)
         _require_alike(f"{name}: move", moved, state)
-        sent = model.latest_messages(on_ground, state.sent, state.sent)
-        _require_alike(f"{name}: latest_messages", sent, state.sent)
+        landed = model.on_ground(moved)
+        heard, here = (state.sent._replace(spotted=spotted) for spotted in (torch.ones_like(flag), landed))
+        key, found = (
+            f"{name}: latest_messages",
+            model.latest_messages(moved._replace(sent=heard), landed, here),
+        )
+        pair = isinstance(found, tuple) and len(found) == 2
+        checks.require(pair, key, f"a {type(found).__name__}", "is not a pair of flags and Messages")
+        _require_alike(key, found[0], flag)
+        _require_alike(key, found[1], state.sent)
+        problem = "still spots the source: let it send a message at its takeoff"
+        checks.require(not (found[1].spotted & ~landed).any(), key, "a UAV in flight", problem)
         if (stop := model.new_stop(moved, on_ground, None)) is not None:
             _require_alike(f"{name}: new_stop", stop, flag)
 
@@ -208,10 +248,11 @@ class InstantMotion(MotionModel):
             return state
         length = self.length(state.origin, state.goal)
         drain = flight_drain(self.vertical, length, self.battery) * (length > 0)
-        return self.drain_or_charge(state, drain, length == 0)
+        battery = self.battery_after(state.battery, drain, length == 0, state.goal)
+        return state._replace(battery=battery)
 
-    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
-        return messages
+    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
+        return on_ground, messages
 
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
         return action_valid
@@ -224,10 +265,10 @@ class PolynomialFlight(MotionModel):
     instant = False
 
     def ready(self, state: State) -> Tensor:
-        return state.elapsed >= self.duration(state) + self.motion.sensing_time - TIME_EPS
+        return state.elapsed >= self.steps(state, self.motion.sensing_time)
 
     def on_ground(self, state: State) -> Tensor:
-        return state.elapsed >= self.duration(state) - TIME_EPS
+        return state.elapsed >= self.steps(state)
 
     def mask_busy(self, valid: Tensor, ready: Tensor, hold: Tensor) -> Tensor:
         return torch.where(ready, valid, hold)
@@ -236,14 +277,15 @@ class PolynomialFlight(MotionModel):
         state = state._replace(origin=torch.where(ready, state.goal, state.origin), goal=goal)
         cruise = self.shortest_time(self.length(state.origin, state.goal))
         return state._replace(
-            elapsed=torch.where(ready, 0.0, state.elapsed),
+            elapsed=torch.where(ready, 0, state.elapsed),
             vertical=torch.where(ready, self.vertical * departs, state.vertical),
             cruise=torch.where(ready, cruise, state.cruise),
-            used=torch.where(ready, 0.0, state.used),
+            battery_before=torch.where(ready, state.battery, state.battery_before),
         )
 
     def move(self, state: State) -> State:
-        elapsed = state.elapsed + self.dt
+        state = state._replace(elapsed=state.elapsed + 1)
+        elapsed = state.elapsed.double() * self.dt
         position, cruised = fly(
             gather_rows(self.points, state.origin),
             gather_rows(self.points, state.goal),
@@ -253,25 +295,42 @@ class PolynomialFlight(MotionModel):
             state.cruise,
             self.motion.degree,
         )
-        state = state._replace(elapsed=elapsed, position=position)
+        state = state._replace(position=position)
         if not self.battery.enabled:
             return state
+        # From the latest decision on, not from step to step, because rounding errors would add up.
         used = used_so_far(elapsed, state.vertical, state.cruise, cruised, self.battery)
-        landed_before = elapsed - self.dt >= self.duration(state) - TIME_EPS
-        drained = self.drain_or_charge(state, used - state.used, landed_before)
-        return drained._replace(used=used)
+        rested = (state.elapsed - self.steps(state)).clamp(min=0)
+        battery = self.battery_after(state.battery_before, used.to(cruised.dtype), rested, state.goal)
+        return state._replace(battery=battery)
 
-    def latest_messages(self, on_ground: Tensor, messages: Messages, before: Messages) -> Messages:
-        return tree_where(on_ground, messages, before)
+    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
+        """A UAV sends messages while it is on the ground, and one from its takeoff point as it departs."""
+        sends = on_ground | (state.elapsed == 1)
+        start = gather_rows(self.points, state.origin)
+        position = torch.where(expand_mask(on_ground, start), messages.position, start)
+        return sends, tree_where(sends, messages._replace(position=position), state.sent)
 
     def new_stop(self, state: State, on_ground: Tensor, action_valid: Tensor | None) -> Tensor | None:
         """Each decision adds one landing point, however long the UAV then senses there."""
-        waited = (state.elapsed > self.dt + TIME_EPS) & state.message_sent
-        return on_ground & ~waited
+        return on_ground & (state.elapsed == self.steps(state).clamp(min=1))
+
+    def steps(self, state: State, sensing_time: float = 0.0) -> Tensor:
+        """Least number of steps after which the latest flight, and a time [s] behind it, are over, [B, N]."""
+        seconds = self.duration(state).double() * (1 - _FLIGHT_ERROR) + sensing_time
+        return (seconds * ((1 - _ROUNDING) / self.dt)).ceil().long()
 
     def duration(self, state: State) -> Tensor:
         """Duration of the latest flight [s], [B, N]; 0 if the UAV held."""
         return 2 * state.vertical + state.cruise
+
+
+def _check_levels(levels: list[float], airspace: Airspace) -> None:
+    """Require that each flight level lies within those of every region."""
+    key = "motion.min_level + i * motion.level_separation"
+    for low, high in (region.levels for region in airspace.regions if region.levels is not None):
+        for level in levels:
+            checks.in_range(key, level, low * FLIGHT_LEVEL_M, high * FLIGHT_LEVEL_M, "m")
 
 
 def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:

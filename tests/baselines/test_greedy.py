@@ -157,15 +157,16 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
     places, times = 400 * torch.rand(2, 2, 3, 2), 8.0 + torch.randint(2, (2, 3))
     detected = torch.minimum(torch.tensor([-1.0, 0.0, 5.0, 9.0])[torch.randint(4, (2, 3))], times)
     held = sent_messages(env.reset())._replace(time=times, position=places[0], spotted=detected == times)
-    held = held._replace(detected_time=detected, detected_position=places[1])
+    in_flight = torch.rand(2, 3) < 0.3
+    target = places[0] + 30 * in_flight.unsqueeze(-1)
+    held = held._replace(detected_time=detected, detected_position=places[1], target=target)
     ground = policy.points[[0, 0]]
     likely, recent = policy.believe(held, ground, torch.full((2, 1), 9.0))
     for world, spots in enumerate(held.spotted.tolist()):
         ages = [9 - time if time >= 0 else math.inf for time in detected[world].tolist()]
         confidence = TRUST * (1.0 if min(ages) == 0 else 0.7)
-        silent = [
-            p for p, t, spot in zip(places[0, world], times[world], spots, strict=True) if t == 9 and not spot
-        ]
+        uavs = zip(places[0, world], times[world], spots, in_flight[world], strict=True)
+        silent = [place for place, time, spot, flies in uavs if time == 9 and not spot and not flies]
         expected = []
         for place in ground[world].tolist():
             log = math.log(1 - confidence) if any(math.dist(p, place) <= radius for p in silent) else 0.0
@@ -313,3 +314,26 @@ def test_with_any_number_of_uavs_the_policy_is_clearly_better_than_the_random_on
             env.set_seed(5)
             scores.append(evaluate(env, policy, 50).true_return)
         assert scores[0] > 2 * scores[1]
+
+
+@pytest.mark.parametrize("actions", [FINE, CONTINUOUS], ids=["discrete", "continuous"])
+def test_a_uav_last_heard_of_at_its_takeoff_chooses_from_where_it_will_land(actions):
+    env = field(actions=actions)
+    td = detection(env, [200.0, 200.0])
+    held, points = sent_messages(td), env.uav_env.simulation.points
+    goal = int((points - torch.tensor([120.0, 300.0])).norm(dim=-1).argmin())
+    first = torch.tensor([True, False, False]).unsqueeze(-1)
+    flies = held._replace(target=torch.where(first, points[goal], held.target))
+    stands = flies._replace(
+        time=torch.where(first[:, 0], 0.0, held.time),  # so long ago that its silence does not count
+        position=torch.where(first, points[goal], held.position),
+        trail=torch.where(first, goal, held.trail),
+    )
+    assert flies.in_flight.tolist() == [[True, False, False]] * 2
+    assert not stands.in_flight.any()
+    chosen = [
+        greedy_policy(env)(td.clone().set(("agents", "message"), each.pack()))["agents", "action"]
+        for each in (held, flies, stands)
+    ]
+    assert torch.equal(chosen[1], chosen[2])
+    assert not torch.equal(chosen[0], chosen[1])

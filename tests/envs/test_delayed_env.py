@@ -73,7 +73,8 @@ def test_with_delays_of_0_all_transforms_output_what_the_environment_without_the
 @both_motions
 def test_the_server_node_ends_an_episode_with_the_walk_of_the_source(motion):
     episode = EpisodeConfig(max_steps=None, end_with_source=True)
-    source = SourceConfig(motion="dynamic", min_wait=0.5, max_wait=1.0, n_hotspots=1, local_distance=5.0)
+    waits, after = {"min_wait": 0.5, "max_wait": 1.0}, "stop"
+    source = SourceConfig(motion="dynamic", n_hotspots=1, local_distance=5.0, after_walk=after, **waits)
     scenario = everything(motion, source=source, episode=episode)
     check_equals_undelayed(all_transforms(scenario, 4), scenario, 60)
 

@@ -13,7 +13,9 @@ from helpers import (
     HERE,
     KEEPS_GOING,
     MOTIONS,
+    SQUARE,
     act,
+    both_kinds,
     both_motions,
     clock,
     everything,
@@ -27,11 +29,18 @@ from helpers import (
     walking,
 )
 
+from damian.common.errors import InputError
+from damian.envs.scenario import ScenarioConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
+from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
+
+FAR = [[390.0, 10.0]]
+"""A charging point where no UAV of these tests lands."""
 
 # Ends of episodes.
 
@@ -79,21 +88,77 @@ def test_the_time_limit_can_count_from_the_latest_detection():
     assert go(never_detected, HERE)["truncated"].item()
 
 
-def test_empty_batteries_terminate_without_success():
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.02, charging_points=[[390.0, 10.0]])
+@both_motions
+@pytest.mark.parametrize(
+    ("level", "resolution", "empty"),
+    [
+        (5.0, 5.0, False),
+        (4.9, 5.0, True),  # observed as 0
+        (4.9, 0.1, False),
+        (1e-3, 1e-4, True),  # too little for the shortest flight
+    ],
+)
+def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding(
+    motion, level, resolution, empty
+):
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.5, resolution=resolution, charging_points=FAR)
     episode = EpisodeConfig(max_steps=None, discharged_share=1.0)
     task = RewardConfig(penalty=2.0)
-    env = fresh(one_uav(battery=battery, episode=episode, reward=task))
-    env.state = env.state._replace(battery=torch.tensor([[1e-7]]))
-    assert not go(env, HERE)["done"].item()
-    env.state = env.state._replace(battery=torch.tensor([[0.0]]))
+    env = fresh(one_uav(battery=battery, motion=MOTIONS[motion], episode=episode, reward=task))
+    env.state = env.state._replace(battery=torch.tensor([[level]]))
     output = go(env, HERE)
-    assert (output["terminated"] & ~output["truncated"] & ~output["success"]).item()
-    assert output["agents", "reward"].item() == -2.0
+    assert sent_messages(output).empty.item() == empty
+    assert output["done"].item() == empty
+    assert output["agents", "reward"].item() == (-2.0 if empty else 0.0)
+    assert (output["terminated"] & ~output["truncated"] & ~output["success"]).item() == empty
+
+
+@both_motions
+@both_kinds
+def test_a_landed_uav_is_empty_exactly_where_no_action_leads_to_another_point(motion, kind):
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.02, resolution=1e-3, charging_points=FAR)
+    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0)
+    headings = [10.0 * n for n in range(36)]
+    actions = ActionConfig(kind=kind, distances=[0.0, 10.0, 20.0, 40.0, 60.0], headings=headings)
+    scenario = ScenarioConfig(
+        agents=1, region=region, battery=battery, motion=MOTIONS[motion], actions=actions, episode=KEEPS_GOING
+    )
+    table = actions.table()
+    env = fresh(scenario, num_worlds=len(table))
+    moves = torch.arange(len(table)) if kind == "discrete" else table / torch.tensor([60.0, math.tau])
+    generator, start = torch.Generator().manual_seed(0), env.state
+    seen = []
+    for level in torch.linspace(0.5, 40.0, 60).tolist():
+        goal = int(torch.randint(len(env.simulation.points), (), generator=generator))
+        points = torch.full_like(start.goal, goal)
+        state = start._replace(goal=points, battery=torch.full_like(start.battery, level))
+        expected = bool(env.simulation._empty(state, torch.ones_like(start.message_sent))[0, 0])
+        env.state = state
+        act(env, moves.unsqueeze(1))
+        assert (env.state.goal == points).all().item() == expected
+        seen.append(expected)
+    assert 5 < sum(seen) < 55
+
+
+def test_batteries_fail_in_the_energy_task_and_a_uav_in_flight_does_not_count_for_want_of_reach():
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.005, resolution=1e-3, charging_points=FAR)
+    episode = EpisodeConfig(max_steps=60, discharged_share=1.0)
+    for motion in ("instant", "polynomial"):
+        scenario = square(agents=2, battery=battery, motion=MOTIONS[motion], episode=episode)
+        env, generator = fresh(scenario, num_worlds=32), torch.Generator().manual_seed(0)
+        failed = torch.zeros(32, dtype=torch.bool)
+        for _ in range(60):
+            output = act(env, random_actions(env, generator))
+            empty = sent_messages(output).empty
+            assert not (empty & ~env.simulation.vehicles.on_ground(env.state)).any()
+            assert output["terminated"].squeeze(-1).equal(empty.all(-1))
+            failed |= output["terminated"].squeeze(-1)
+        assert failed.sum() > 8
 
 
 def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_configured():
-    source = walking(level_db=170.0, n_hotspots=1, min_stops=0, max_stops=0, min_wait=2.0, max_wait=2.0)
+    once = {"n_hotspots": 1, "min_stops": 0, "max_stops": 0, "min_wait": 2.0, "max_wait": 2.0}
+    source = walking(level_db=170.0, after_walk="stop", **once)
     for terminates in (True, False):
         episode = EpisodeConfig(max_steps=None, end_with_source=terminates)
         env = fresh(one_uav(source=source, episode=episode))
@@ -103,6 +168,28 @@ def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_co
         output = go(env, HERE)
         assert output["terminated"].item() == terminates
         assert not sent_messages(output).spotted.item()
+
+
+@pytest.mark.parametrize("emission", ["constant", "per_stop"])
+def test_a_source_that_begins_its_walk_anew_is_heard_for_the_whole_episode(emission):
+    source = walking(level_db=170.0, emission=emission, emission_probability=0.4, n_hotspots=2, max_stops=3)
+    env = fresh(one_uav(source=source, clock=clock("1m"), episode=KEEPS_GOING), num_worlds=64)
+    heard, rounds = [], 60.0 * 400 / env.simulation.walk.depart[:, -1]
+    assert rounds.min() > 5
+    for _ in range(400):
+        output = go(env, HERE)
+        heard.append(sent_messages(output).spotted)
+        assert not output["done"].any()
+    share = torch.stack(heard).float()
+    assert share[200:].mean().item() == pytest.approx(1.0 if emission == "constant" else 0.4, abs=0.03)
+    assert (emission == "constant") == share.all()
+
+
+def test_the_end_of_a_walk_that_never_comes_cannot_end_an_episode():
+    message = "episode.end_with_source: True needs source.motion=dynamic and source.after_walk=stop: "
+    for source in (SourceConfig(), SourceConfig(motion="dynamic")):
+        with pytest.raises(InputError, match=f"^{message}"):
+            square(source=source, episode=EpisodeConfig(end_with_source=True))
 
 
 def test_a_persistent_task_never_ends():
@@ -125,8 +212,6 @@ def test_success_gives_the_bonus_and_a_timeout_the_penalty(over_steps, bonus):
 
 
 # Batteries.
-
-FAR = [[390.0, 10.0]]
 
 
 def test_the_battery_drain_of_a_flight_does_not_depend_on_the_length_of_a_step():

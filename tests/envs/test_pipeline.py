@@ -1,18 +1,19 @@
 """``make_env``: the messages that the server holds, the action history, and clocks."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from delayed_envs import DELAYS, PAPER, after_steps, choices, delayed, every_delay
-from helpers import KEEPS_GOING, all_same, both_motions, everything, play, square
+from helpers import FLYING, KEEPS_GOING, all_same, both_motions, everything, play, square
 from torch import Tensor
 
 from damian.delays.config import DelayConfig
 from damian.delays.laws import law_of
 from damian.envs.clocks import ClockConfig
-from damian.envs.pipeline import hold_action, make_env
+from damian.envs.pipeline import action_codes, hold_action, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED
@@ -98,6 +99,28 @@ def test_the_action_history_holds_the_chosen_displacements_east_and_north():
         observation = outputs[2 * t + 1][OBSERVATION]
         assert observation.shape[-1] == undelayed.observation_spec[OBSERVATION].shape[-1] + 4
         torch.testing.assert_close(observation[..., -4:], expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("obs", [2, {"law": "uniform", "low": 0, "high": 5, "probability": 1.0}])
+def test_the_history_shows_a_flight_until_the_server_hears_of_its_end(obs):
+    delay = DelayConfig(obs=obs, history=3)
+    motion = replace(FLYING, sensing_time=4.0)
+    env = delayed(square(motion=motion, delay=delay, episode=KEEPS_GOING), 16)
+    codes, points = action_codes(env.scenario.actions), env.uav_env.simulation.points
+    td, known, unknown = env.reset(), 0, 0
+    latest, chosen_at = torch.zeros(2, 16, 3, dtype=torch.long)
+    for step, action in enumerate(choices(env, 60)):
+        latest = torch.where(td[READY], action, latest)
+        chosen_at = torch.where(td[READY], step, chosen_at)
+        td = env.step(td.set(ACTION, action))["next"]
+        state = env.uav_env.state
+        flew = state.goal != state.origin
+        held = Messages.unpack(td[RECEIVED])
+        heard = (held.position == points[state.goal]).all(-1) & (held.time > chosen_at)
+        shown = (td[OBSERVATION][..., -2:] == codes[latest]).all(-1)
+        assert (shown == ~heard)[flew].all()
+        known, unknown = known + int((flew & heard).sum()), unknown + int((flew & ~heard).sum())
+    assert min(known, unknown) > 100
 
 
 # Clocks.

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import MOTIONS, both_motions, everything, square
+from helpers import MOTIONS, both_motions, everything, square, walking
 from tensordict import TensorDictBase
 from torchrl.envs import RewardSum, StepCounter
 
@@ -24,6 +24,7 @@ from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig
 from damian.world.messages import Messages
+from damian.world.signal_source import SourceConfig
 
 HORIZON = 24
 BURSTS = {"law": "burst", "enter": 0.3, "leave": 0.3, "good": 0, "bad": 5, "bad_loss": 0.2}
@@ -40,6 +41,8 @@ def joint_spotting(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioC
     """Two of three UAVs must spot the source at the same time; it is near many of the landing points."""
     sections = {
         "motion": MOTIONS[motion],
+        # UAVs in flight hear nothing, so that a louder source is needed for as many successes.
+        "source": SourceConfig(level_db=135.0 if motion == "instant" else 140.0, position=[100.0, 100.0]),
         "delay": delay,
         "reward": RewardConfig(
             spotted=0.3, source_distance=0.2, bonus=2.0, bonus_over_steps=True, penalty=0.5
@@ -145,7 +148,8 @@ def test_false_late_and_missed_successes_differ_from_true_ones(motion):
 @both_motions
 def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion):
     ends = EpisodeConfig(max_steps=9, success_share=0.3, discharged_share=0.6, end_with_source=True)
-    for scenario in (joint_spotting(motion, DelayConfig()), everything(motion, episode=ends)):
+    stops = everything(motion, episode=ends, source=walking(emission="per_step", after_walk="stop"))
+    for scenario in (joint_spotting(motion, DelayConfig()), stops):
         flight, server = fly(scenario)
         row = evaluation(flight, server)
         assert (row.true_success_rate, row.true_steps, row.true_return) == (

@@ -217,9 +217,14 @@ def test_a_region_source_with_other_arguments_is_one_line():
         ({"mistake": "float flag"}, "ready: torch.float32 [8, 3] is not a tensor of torch.bool [8, 3]"),
         ({"mistake": "no UAVs"}, "on_ground: torch.bool [8] is not a tensor of torch.bool [8, 3]"),
         ({"mistake": "none"}, "take_off: a NoneType is not a State"),
+        ({"mistake": "no flags"}, "latest_messages: a Messages is not a pair of flags and Messages"),
+        (
+            {"mistake": "no takeoff"},
+            "latest_messages: a UAV in flight still spots the source: let it send a message at its takeoff",
+        ),
         (
             {"mistake": "double"},
-            "move: elapsed: torch.float64 [8, 3] is not a tensor of torch.float32 [8, 3]",
+            "move: elapsed: torch.float64 [8, 3] is not a tensor of torch.int64 [8, 3]",
         ),
         ({"mistake": "raise"}, "ValueError: Got unexpected field names: ['height']" + line("height=0")),
     ],

@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from damian import ContextSampler, Law, MessageContext, feature, reward_term, sensor
+from damian.common.tensors import tree_where
 from damian.server.features import FeatureCache
 from damian.server.reward_terms import Counters
 from damian.world.airspace import Airspace
 from damian.world.config import WorldConfig
+from damian.world.messages import Messages
 from damian.world.regions.config import RegionConfig
 from damian.world.regions.region import Region
 from damian.world.simulation import Simulation
@@ -166,6 +168,12 @@ class Flight(PolynomialFlight):
 
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> Any:
         return None if self.mistake == "none" else super().take_off(state, goal, ready, departs)
+
+    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> Any:
+        sends, sent = super().latest_messages(state, on_ground, messages)
+        if self.mistake == "no takeoff":
+            return on_ground, tree_where(on_ground, messages, state.sent)
+        return sent if self.mistake == "no flags" else (sends, sent)
 
     def move(self, state: State) -> State:
         moved = super().move(state)

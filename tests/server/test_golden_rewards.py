@@ -184,7 +184,7 @@ def test_recorded_episodes_give_the_recorded_rewards_and_ends(case, ends):
     records, config = recorded(case, EPISODES), usecase(case)
     messages, server, counters = server_inputs(case, records)
     never = torch.zeros(len(records), dtype=torch.bool)
-    ended = status(messages, counters.steps, server.now, never, 1.0, config.episode)
+    ended = status(messages, counters.steps, never, 1.0, config.episode)
     terms = reward(observe(messages, server, config.reward.terms), counters, config.reward)
     total = torch.stack([*terms.values()]).sum(0)
     total += final_reward(ended, counters, config.reward)[:, None]

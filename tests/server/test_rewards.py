@@ -116,9 +116,9 @@ def test_every_end_of_an_episode_equals_that_of_a_plain_loop(
         for uav in uavs:
             if uav.heard_at is not None:  # All detections happen at the end of a step.
                 uav.heard_at = now if uav.spots else float(rng.integers(round(now / dt) + 1)) * dt
-    messages, server = messages_of(worlds)
+    messages, _ = messages_of(worlds)
     over = torch.zeros(6, dtype=torch.bool)
-    ours = status(messages, torch.as_tensor(steps), server.now, over, dt, episode)
+    ours = status(messages, torch.as_tensor(steps), over, dt, episode)
     expected = [
         twin.end(uavs, int(n), now, dt, episode) for n, (now, uavs) in zip(steps, worlds, strict=True)
     ]
@@ -126,14 +126,14 @@ def test_every_end_of_an_episode_equals_that_of_a_plain_loop(
     assert not (ours.terminated & ours.truncated).any()
 
 
-def status_of(spots, battery=100.0, steps=5, over=False, **ends):
+def status_of(spots, empty=False, steps=5, over=False, **ends):
     """Success, terminated and truncated of one world in which the UAVs spot the source or not."""
     (_, uavs), *_ = random_worlds(0, len(spots), 0.0, 0.0)
     for uav, flag in zip(uavs, spots, strict=True):
-        uav.spots, uav.battery = flag, battery
-    messages, server = messages_of([(float(steps), uavs)])
+        uav.spots, uav.empty = flag, empty
+    messages, _ = messages_of([(float(steps), uavs)])
     config = EpisodeConfig(**ends)
-    ended = status(messages, torch.tensor([steps]), server.now, torch.tensor([over]), 1.0, config)
+    ended = status(messages, torch.tensor([steps]), torch.tensor([over]), 1.0, config)
     return tuple(flag.item() for flag in ended)
 
 
@@ -146,7 +146,7 @@ def test_success_at_the_last_step_terminates_and_does_not_truncate():
 
 def test_empty_batteries_or_the_end_of_the_sources_walk_terminate_without_success():
     ends = {"max_steps": 5, "discharged_share": 0.5}
-    assert status_of([False], battery=0.0, **ends) == (False, True, False)
+    assert status_of([False, False], empty=True, **ends) == (False, True, False)
     assert status_of([False], over=True, max_steps=5, end_with_source=True) == (False, True, False)
     assert status_of([False], over=True, max_steps=None) == (False, False, False)
 
@@ -191,7 +191,7 @@ def test_every_end_without_success_costs_the_penalty(terminated):
     [
         (
             lambda: RewardConfig(coverage=math.nan),
-            "reward.coverage: nan is not a finite weight",
+            "reward.coverage: nan is not a finite number",
         ),
         (
             lambda: RewardConfig(drift="rough"),
@@ -200,6 +200,14 @@ def test_every_end_without_success_costs_the_penalty(terminated):
         (
             lambda: RewardConfig(desired_spotting=1.5),
             "reward.desired_spotting: 1.5 is not between 0 and 1",
+        ),
+        (
+            lambda: RewardConfig(desired_distance=math.nan),
+            "reward.desired_distance: nan is not at least 0",
+        ),
+        (
+            lambda: RewardConfig(desired_distance_spotting=-3.0),
+            "reward.desired_distance_spotting: -3.0 is not at least 0",
         ),
         (
             lambda: EpisodeConfig(max_steps=0),

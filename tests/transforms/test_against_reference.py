@@ -184,11 +184,14 @@ def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_
             assert found[2 * t + 2, w, n].equal(torch.tensor(last_actions(recorded, steps, default)) / 6)
 
 
-@pytest.mark.parametrize("recorded_key", [None, "ready"])
-def test_with_an_age_key_the_history_contains_only_actions_chosen_since_the_observation(law, recorded_key):
+@pytest.mark.parametrize(("recorded_key", "reflected_after"), [(None, 1), ("ready", 1), ("ready", 2)])
+def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_does_not_reflect(
+    law, recorded_key, reflected_after
+):
     default, chosen = 2, choices()
     late = ObservationDelay(law, [OBSERVATION])
-    history = ActionHistory(3, ACTION, default=default, recorded_key=recorded_key, age_key="age")
+    when = {"recorded_key": recorded_key, "reflected_after": reflected_after}
+    history = ActionHistory(3, ACTION, default=default, age_key="age", **when)
     outputs = play(delayed(late, history), chosen)
     found = torch.stack([td["agents", "action_history"] for td in outputs])
     ages = column(outputs, "agents", "age")
@@ -199,7 +202,7 @@ def test_with_an_age_key_the_history_contains_only_actions_chosen_since_the_obse
             recorded += [(t, chosen[t][w, n].item())] * (recorded_key is None or ready[t][w][n])
             latest = last_actions(recorded, 3, (-STEPS, default))
             since = t + 1 - ages[2 * t + 1][w][n][0]  # when the observation was generated
-            expected = [action if at >= since else default for at, action in latest]
+            expected = [action if since - at < reflected_after else default for at, action in latest]
             assert found[2 * t + 1, w, n].equal(torch.tensor(expected) / 6)
             recorded = [] if done[t][w][0] else recorded
 

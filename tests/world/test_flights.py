@@ -135,21 +135,29 @@ def test_a_uav_is_ready_once_it_has_landed_and_sensed(sensing):
     outputs += [go(env, EAST) for _ in range(math.ceil(duration + sensing) - 1)]
     for seconds, td in enumerate(outputs, start=1):
         assert td["agents", "ready"].item() == (seconds >= duration + sensing)
-        assert td["agents", "message_sent"].item() == (seconds >= duration)
+        assert td["agents", "message_sent"].item() == (seconds == 1 or seconds >= duration)
     assert outputs[-1]["agents", "ready"].item()
 
 
-def test_a_uav_in_flight_sends_no_new_message():
+def test_a_uav_sends_a_message_at_its_takeoff_and_the_next_one_when_it_lands():
     env = fresh(one_uav(motion=FLYING))
-    before = env.reset()["agents", "message"].clone()
+    before = sent_messages(env.reset())
     output = go(env, EAST)
-    duration = flight(env)
+    assert output["agents", "message_sent"].item()
+    takeoff, duration = output["agents", "message"].clone(), flight(env)
+    message = sent_messages(output)
+    assert message.in_flight.item()
+    assert message.time.item() == 1.0
+    assert message.position.equal(before.position)
+    assert message.target[0, 0].equal(env.simulation.points[env.state.goal.item()])
+    assert message.trail.equal(before.trail)
     for _ in range(math.ceil(duration) - 1):
-        assert not output["agents", "message_sent"].item()
-        assert output["agents", "message"].equal(before)
+        assert output["agents", "message"].equal(takeoff)
         output = go(env, HERE)
+        assert output["agents", "message_sent"].item() == env.simulation.vehicles.on_ground(env.state).item()
     message = sent_messages(output)
     assert output["agents", "message_sent"].item()
+    assert not message.in_flight.item()
     assert message.time.item() == math.ceil(duration)
     assert message.position[0, 0].equal(env.simulation.points[env.state.goal.item()])
     assert message.position.equal(message.target)
@@ -263,8 +271,8 @@ def test_each_decision_adds_one_point_to_the_trail_however_long_the_uav_senses(s
     landings = 0
     for _ in range(60):
         due |= env.simulation.ready(env.state)
-        output = act(env, random_actions(env, generator))
-        for b, n in (due & output["agents", "message_sent"]).nonzero().tolist():
+        act(env, random_actions(env, generator))
+        for b, n in (due & env.simulation.vehicles.on_ground(env.state)).nonzero().tolist():
             expected[b][n] = [env.state.goal[b, n].item(), *expected[b][n][:-1]]
             due[b, n] = False
             landings += 1

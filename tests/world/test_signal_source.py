@@ -10,15 +10,24 @@ import shapely
 import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
+from walks import (
+    DYNAMIC,
+    SCENARIO,
+    USE_CASE,
+    dynamic_walks,
+    in_double,
+    leg_lengths,
+    n_stops,
+    twin_covered,
+    twin_duration,
+    twin_position,
+)
 
 from damian.common.errors import InputError
 from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, leg_duration, locate
 
-DATA = Path(__file__).parents[1] / "data"
-SCENARIO = json.loads((DATA / "usecase1.json").read_text())["scenario"]
-GOLDEN = json.loads((DATA / "motion_energy_coverage.json").read_text())
+GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
 
-USE_CASE = shapely.Polygon(SCENARIO["polygon_vertices_ring"])
 HOLE = shapely.Polygon(
     [(-100, -100), (100, -100), (100, 100), (-100, 100)],
     [[(-60, -60), (60, -60), (60, 60), (-60, 60)]],
@@ -35,56 +44,6 @@ POLYGONS = {
     "turned sliver": TURNED_SLIVER,
     "two parts": TWO_PARTS,
 }
-DYNAMIC = SourceConfig(motion="dynamic")
-
-
-def dynamic_walks(polygon=USE_CASE, n=8, seed=0, **settings_):
-    config = SourceConfig(motion="dynamic", **settings_)
-    return draw_walks(polygon, config, n, np.random.default_rng(seed))
-
-
-def in_double(walk):
-    return Walk(*(x if x.dtype == torch.bool else x.double() for x in walk))
-
-
-def n_stops(walk):
-    return walk.arrive.isfinite().sum(1)
-
-
-def leg_lengths(walk):
-    """Lengths of all legs between real stops [m]."""
-    return walk.stop.diff(dim=1).norm(dim=-1)[walk.arrive[:, 1:].isfinite()]
-
-
-def twin_duration(length, speed, acceleration):
-    """Duration of a leg: two ramps and a constant speed between them, or two ramps that meet."""
-    if length == 0:
-        return 0.0
-    ramp = speed**2 / (2 * acceleration)
-    if 2 * ramp >= length:
-        return 2 * math.sqrt(length / acceleration)
-    return 2 * speed / acceleration + (length - 2 * ramp) / speed
-
-
-def twin_covered(length, speed, acceleration, elapsed, n=4000):
-    """Integrate the speed, the least of rising, largest and falling speed, by the midpoint rule."""
-    duration = twin_duration(length, speed, acceleration)
-    end = min(max(elapsed, 0.0), duration)
-    t = (np.arange(n) + 0.5) * end / n
-    profile = np.minimum(np.minimum(acceleration * t, acceleration * (duration - t)), speed)
-    return profile.sum() * end / n
-
-
-def twin_position(walk, w, time):
-    """Position [m] and latest stop of walk w at a time, by a search over its stops."""
-    stop, arrive, depart, speed, acceleration = (x[w].tolist() for x in walk[:5])
-    n = sum(math.isfinite(a) for a in arrive)
-    k = max(i for i in range(n) if arrive[i] <= time)
-    if k == n - 1 or time <= depart[k]:
-        return stop[k], k
-    length = math.dist(stop[k], stop[k + 1])
-    share = twin_covered(length, speed[k], acceleration[k], time - depart[k]) / length
-    return [a + share * (b - a) for a, b in zip(stop[k], stop[k + 1], strict=True)], k
 
 
 def test_the_footprint_radius_equals_the_recorded_one():
@@ -228,14 +187,22 @@ def test_waits_and_legs_alternate_without_gaps():
             assert arrive[k + 1] - depart[k] == pytest.approx(leg, abs=1e-2)
 
 
-def test_padded_stops_repeat_the_last_one_and_are_never_reached():
-    walk = dynamic_walks(n=20)
+@pytest.mark.parametrize("loops", [False, True])
+def test_padded_stops_lie_where_the_walk_ends_and_are_never_reached(loops):
+    walk = dynamic_walks(n=20, after_walk="loop" if loops else "stop")
     assert len(n_stops(walk).unique()) > 1
-    assert n_stops(walk).max() == walk.arrive.shape[1]
+    assert n_stops(walk).max() == walk.arrive.shape[1] - loops
     for w, n in enumerate(n_stops(walk).tolist()):
+        last, leg = n - 1, 0.0
+        if loops:
+            length = math.dist(walk.stop[w, last].tolist(), walk.stop[w, 0].tolist())
+            leg = twin_duration(length, DYNAMIC.speed, DYNAMIC.acceleration)
+            assert walk.speed[w, last] == DYNAMIC.speed
+            assert walk.acceleration[w, last] == DYNAMIC.acceleration
+        end = walk.depart[w, last].item() + leg
         assert walk.arrive[w, n:].isinf().all()
-        assert (walk.depart[w, n:] == walk.depart[w, n - 1]).all()
-        assert (walk.stop[w, n:] == walk.stop[w, n - 1]).all()
+        assert walk.depart[w, n:].tolist() == pytest.approx([end] * len(walk.depart[w, n:]), abs=1e-3)
+        assert (walk.stop[w, n:] == walk.stop[w, 0 if loops else last]).all()
 
 
 @given(
@@ -348,11 +315,13 @@ def test_the_same_seed_draws_the_same_walks_in_float32():
 
 
 @pytest.mark.parametrize("n_hotspots", [1, 4])
-def test_locate_compiles_to_one_graph(n_hotspots):
-    walk = dynamic_walks(n_hotspots=n_hotspots, min_stops=1, max_stops=n_hotspots)
+@pytest.mark.parametrize("loops", [False, True])
+def test_locate_compiles_to_one_graph(n_hotspots, loops):
+    after = "loop" if loops else "stop"
+    walk = dynamic_walks(n_hotspots=n_hotspots, min_stops=1, max_stops=n_hotspots, after_walk=after)
     compiled = torch.compile(locate, fullgraph=True, backend="eager")
     time = torch.linspace(0, 2000, 8)
-    for one, other in zip(compiled(walk, time), locate(walk, time), strict=True):
+    for one, other in zip(compiled(walk, time, loops), locate(walk, time, loops), strict=True):
         torch.testing.assert_close(one, other)
 
 
@@ -381,6 +350,11 @@ def test_locate_compiles_to_one_graph(n_hotspots):
         (
             {"position": [1.0, math.nan]},
             "source.position: [1.0, nan] is not [x, y] in metres or {lat: ..., lon: ...} in degrees",
+        ),
+        ({"after_walk": "turn"}, "source.after_walk: turn is not one of loop, stop"),
+        (
+            {"after_walk": "stop"},
+            "source.after_walk: stop needs source.motion=dynamic: a static source does not walk",
         ),
         ({"n_hotspots": 0}, "source.n_hotspots: 0 is not between 1 and 1000"),
         ({"min_stops": 0}, "source.min_stops: 0 is not at least 1"),

@@ -1,0 +1,64 @@
+"""What a dynamic source does after its walk: it begins it anew, for any number of rounds."""
+
+from fractions import Fraction
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from walks import DYNAMIC, dynamic_walks, in_double, n_stops, twin_position
+
+from damian.world.signal_source import Walk, locate
+
+LOOP = {"after_walk": "loop"}
+
+
+def test_a_walk_that_begins_anew_is_the_same_until_it_ends():
+    once, anew = dynamic_walks(n=20, emission="per_stop"), dynamic_walks(n=20, emission="per_stop", **LOOP)
+    for w, n in enumerate(n_stops(once).tolist()):
+        for name in ("stop", "arrive", "depart", "emits"):
+            assert getattr(once, name)[w, :n].equal(getattr(anew, name)[w, :n]), name
+        assert once.speed[w, : n - 1].equal(anew.speed[w, : n - 1])
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    steps=st.integers(0, 10**9),
+    dt=st.sampled_from([0.1, 1.0, 3.0, 60.0, 1 / 3]),
+    n_hotspots=st.integers(1, 3),
+)
+def test_after_any_number_of_rounds_the_source_is_where_exact_arithmetic_says(seed, steps, dt, n_hotspots):
+    walk = dynamic_walks(
+        n=1, seed=seed, n_hotspots=n_hotspots, min_stops=0, max_stops=2, min_wait=0.5, max_wait=5.0, **LOOP
+    )
+    located = locate(walk, torch.tensor([steps], dtype=torch.float64) * dt, loops=True)
+    time = Fraction(steps * dt)  # as a float64 has it
+    end = Fraction(walk.depart[0, -1].item())
+    tour, place, stop = int(time // end), *twin_position(returning(walk), 0, float(time % end))
+    assert located.tour.item() == tour
+    assert located.stop.item() == stop
+    assert located.position[0].tolist() == pytest.approx(place, abs=2e-2)
+    assert not located.finished.any()
+
+
+def returning(walk):
+    """A walk for the twin, which reaches its first stop a second time."""
+    n = int(n_stops(walk)[0])
+    arrive = torch.cat([walk.arrive[:, :n], walk.depart[:, n : n + 1]], 1)
+    return Walk(*(field[:, : n + 1] for field in walk))._replace(arrive=arrive)
+
+
+def test_a_source_returns_to_its_first_stop_without_a_jump():
+    walk = in_double(dynamic_walks(n=6, n_hotspots=2, min_wait=0.0, max_wait=1.0, **LOOP))
+    end = walk.depart[:, -1]
+    for tour in (1, 2, 1000):
+        places = [locate(walk, tour * end + offset, loops=True).position for offset in (-1e-3, 0.0, 1e-3)]
+        assert (places[1] - walk.stop[:, 0]).norm(dim=-1).max() < 1e-6
+        assert (places[0] - places[2]).norm(dim=-1).max() < 2e-3 * DYNAMIC.speed
+
+
+def test_a_walk_of_one_stop_that_begins_anew_stays_there():
+    walk = dynamic_walks(n_hotspots=1, min_stops=0, max_stops=0, min_wait=0.0, max_wait=0.0, **LOOP)
+    located = locate(walk, torch.full((8,), 1e6, dtype=torch.float64), loops=True)
+    assert located.position.equal(walk.stop[:, 0])
+    assert not located.finished.any()

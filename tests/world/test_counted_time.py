@@ -1,0 +1,142 @@
+"""Times are counted in steps: decisions, flights, charging and limits, against exact arithmetic."""
+
+import math
+from fractions import Fraction
+
+import pytest
+import torch
+from helpers import HERE, KEEPS_GOING, act, clock, fresh, go, one_uav, random_actions, square
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from damian.envs.uav_env import UavEnv
+from damian.server.termination import EpisodeConfig
+from damian.world.battery import BatteryConfig
+from damian.world.motion import MotionConfig
+from damian.world.signal_source import SourceConfig
+from damian.world.state import State
+
+periods = st.sampled_from(["0.1", "0.3", "0.7", "1", "2.5", "0.025", "60"])
+
+
+def one_state(env: UavEnv, **changed) -> State:
+    """The state of the only UAV of an environment with changed fields."""
+    state = env.state
+    return state._replace(
+        **{name: torch.full_like(getattr(state, name), value) for name, value in changed.items()}
+    )
+
+
+def first_step(env: UavEnv, holds, near: int, **changed) -> int:
+    """The first number of steps since the latest decision at which a condition on the state holds."""
+    steps = range(max(near - 3, 0), near + 4)
+    flags = [bool(holds(one_state(env, elapsed=n, **changed)).item()) for n in steps]
+    assert flags == sorted(flags)
+    assert True in flags
+    return steps[flags.index(True)]
+
+
+@given(period=periods, tenths=st.integers(0, 10**6))
+@settings(max_examples=settings.default.max_examples // 2)
+def test_a_uav_that_holds_is_ready_after_exactly_its_sensing_time(period, tenths):
+    motion = MotionConfig("polynomial", sensing_time=tenths / 10)
+    env = fresh(one_uav(motion=motion, clock=clock(f"{period}s")))
+    expected = math.ceil(Fraction(tenths, 10) / Fraction(period))
+    assert first_step(env, env.simulation.ready, expected, vertical=0.0, cruise=0.0) == expected
+
+
+@given(
+    period=periods,
+    vertical=st.floats(0.125, 1024.0, width=32),
+    cruise=st.floats(0.0, 2.0**17, width=32),
+    tenths=st.integers(0, 10**4),
+)
+@settings(max_examples=settings.default.max_examples // 2)
+def test_a_flight_ends_after_exactly_its_duration_but_for_its_float_error(period, vertical, cruise, tenths):
+    motion = MotionConfig("polynomial", sensing_time=tenths / 10)
+    env = fresh(one_uav(motion=motion, clock=clock(f"{period}s")))
+    duration = 2 * Fraction(vertical) + Fraction(cruise)
+    models = ((env.simulation.vehicles.on_ground, 0), (env.simulation.ready, Fraction(tenths, 10)))
+    for holds, sensing in models:
+        least, most = (
+            math.ceil((duration * (1 - error) + sensing) / Fraction(period))
+            for error in (Fraction(2, 10**6), Fraction(0))
+        )
+        if most - least <= 1:  # so many steps that the float error of the duration is more than one
+            assert least <= first_step(env, holds, most, vertical=vertical, cruise=cruise) <= most
+
+
+def test_a_thousand_steps_of_a_tenth_of_a_second_are_100_seconds():
+    env = fresh(one_uav(motion=MotionConfig("polynomial", sensing_time=100.0), clock=clock("0.1s")))
+    go(env, HERE)
+    state, ready = env.state, []
+    for _ in range(999):
+        ready.append(env.simulation.ready(state).item())
+        state = env.simulation.vehicles.move(state)
+    assert not any(ready)
+    assert env.simulation.ready(state).item()
+
+
+def test_flights_land_in_the_step_that_contains_the_end_of_their_duration():
+    motion = MotionConfig("polynomial", max_speed=20.0, max_acceleration=10.0)
+    env = fresh(square(motion=motion, clock=clock("0.1s"), episode=KEEPS_GOING), num_worlds=8)
+    generator, landings, begun = torch.Generator().manual_seed(0), 0, {}
+    for step in range(1, 200):
+        ready = env.simulation.ready(env.state)
+        act(env, random_actions(env, generator))
+        for b, n in ready.nonzero().tolist():
+            seconds = 2 * env.state.vertical[b, n].double() + env.state.cruise[b, n].double()
+            begun[b, n] = step - 1, seconds.item()
+        landed = env.simulation.vehicles.on_ground(env.state)
+        for (b, n), (start, seconds) in begun.items():
+            assert landed[b, n].item() == ((step - start) * 0.1 >= seconds * (1 - 1e-6))
+        landings += int(landed.sum())
+    assert landings > 100
+
+
+def test_the_position_on_a_long_flight_is_as_exact_as_on_a_short_one():
+    env = fresh(one_uav(motion=MotionConfig("polynomial", max_speed=0.001), clock=clock("0.1s")))
+    state, simulation = one_state(env, goal=1, vertical=1.0, cruise=1e6, elapsed=0), env.simulation
+    origin, goal = (simulation.points[point.item()].double() for point in (state.origin, state.goal))
+    for steps in (10**6, 5 * 10**6 + 1, 9_999_999):
+        tau = (steps * 0.1 - 1.0) / 1e6
+        share = 10 * tau**3 - 15 * tau**4 + 6 * tau**5
+        position = simulation.vehicles.move(state._replace(elapsed=state.elapsed + steps - 1)).position
+        expected = (origin + share * (goal - origin)).tolist()
+        assert position[0, 0, :2].tolist() == pytest.approx(expected, rel=1e-6)
+
+
+def test_charging_for_many_short_steps_gains_as_much_as_for_few_long_ones():
+    # A step gains so little that a sum over the steps in float32 would not change.
+    motion = MotionConfig("polynomial", sensing_time=1e5)
+    battery = BatteryConfig(enabled=True)
+    env = fresh(one_uav(motion=motion, battery=battery, clock=clock("0.0001s")))
+    state = one_state(env, battery=50.0, battery_before=50.0, vertical=0.0, cruise=0.0, elapsed=0)
+    levels = []
+    for _ in range(3000):
+        state = env.simulation.vehicles.move(state)
+        levels.append(state.battery.item())
+    gain = 100 * 0.3 / (3600 * battery.capacity_kwh / battery.charging_power_kw)
+    assert levels[-1] == pytest.approx(50 + gain, abs=1e-5)
+    assert levels == sorted(levels)
+
+
+@given(
+    period=st.sampled_from([0.1, 0.3, 0.7, 1.0, 60.0]),
+    detected=st.integers(0, 10**6),
+    limit=st.integers(1, 100),
+)
+@settings(max_examples=settings.default.max_examples // 4)
+def test_a_limit_since_the_latest_detection_is_reached_after_exactly_that_many_steps(period, detected, limit):
+    episode = EpisodeConfig(max_steps=limit, since_detection=True)
+    source = SourceConfig(level_db=180.0)
+    env = fresh(one_uav(episode=episode, source=source, clock=clock(f"{period}s")))
+    state = one_state(env, steps=detected)
+    state = env.simulation.step(state, torch.tensor([[[0.0, 0.0]]]))  # hears the source
+    steps = state.steps + torch.arange(-1, limit + 2)
+    messages = type(state.sent)(*(each.expand(len(steps), *each.shape[1:]) for each in state.sent))
+    assert messages.spotted.all()
+    over = torch.zeros_like(steps, dtype=torch.bool)
+    features = env.server.features(messages, steps)
+    ended = env.server.reward_and_status(features, messages, steps, over).status
+    assert ended.truncated.tolist() == (torch.arange(-1, limit + 2) >= limit).tolist()

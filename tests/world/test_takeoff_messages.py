@@ -1,0 +1,190 @@
+"""Messages of UAVs that take off, fly and land, against a slow reference (twin), and what flights earn."""
+
+import math
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from helpers import FLYING, KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from damian.envs.clocks import ClockConfig
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import UavEnv
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
+from damian.server.termination import EpisodeConfig
+from damian.world.motion import MotionConfig
+from damian.world.signal_source import SourceConfig
+
+SPOTTED = ("agents", "reward_terms", "spotted")
+
+
+def flying(**changed) -> ScenarioConfig:
+    """A scenario with flights and a loud source, in which UAVs are paid only for spotting it."""
+    sections = {
+        "region": REGIONS["fixed"],
+        "motion": FLYING,
+        "source": walking(level_db=136.0),
+        "reward": RewardConfig(spotted=1.0, spotting_agents=0.5),
+        "observation": ObservationConfig(global_features=["spotting_agents"]),
+        "episode": EpisodeConfig(max_steps=None, success_share=0.5),
+    }
+    return ScenarioConfig(**(sections | changed))
+
+
+@dataclass
+class FlyingUav:
+    """What one UAV sends, one step at a time: metres, seconds."""
+
+    level: float
+    place: tuple
+    motions: int = 0
+    heard_at: float = -1.0
+    heard_from: tuple = (0.0, 0.0)
+    duration: float = 0.0
+    elapsed: int = 10**6
+    start: tuple = ()
+    message: dict = field(default_factory=dict)
+
+    def choose(self, target: tuple, motion: MotionConfig) -> None:
+        """Begin to fly to a landing point, or to hold."""
+        self.start, self.place, self.elapsed, self.duration = self.place, target, 0, 0.0
+        self.motions += 1
+        if self.start != target:
+            phases = self.level, math.dist(self.start, target), self.level
+            self.duration = sum(shortest_time(length, motion) for length in phases)
+
+    def listen(self, now: float, dt: float, source: tuple, radius: float) -> bool:
+        """Pass a step, and send a message on the ground or as the flight begins; returns if one is sent."""
+        self.elapsed += 1
+        landed = self.elapsed * dt >= self.duration
+        if not landed and self.elapsed > 1:
+            return False
+        spotted = landed and math.dist(self.place, source) <= radius
+        if spotted:
+            self.heard_at, self.heard_from = now, self.place
+        self.message = {
+            "time": now,
+            "position": self.place if landed else self.start,
+            "target": self.place,
+            "spotted": spotted,
+            "motions": self.motions,
+            "detected_time": self.heard_at,
+            "detected_position": self.heard_from,
+        }
+        self.motions = 0 if spotted else self.motions
+        return True
+
+
+def shortest_time(length: float, motion: MotionConfig) -> float:
+    """Shortest duration of a phase of degree 5."""
+    hardest = 10 * math.sqrt(3) / 3
+    return max(15 / 8 * length / motion.max_speed, math.sqrt(hardest * length / motion.max_acceleration))
+
+
+def twins(env: UavEnv) -> list[list[FlyingUav]]:
+    """The UAVs of all worlds as they begin an episode."""
+    levels, places = env.simulation.vehicles.levels.tolist(), env.state.position[..., :2].tolist()
+    worlds = [[FlyingUav(*uav) for uav in zip(levels, map(tuple, row), strict=True)] for row in places]
+    for world, source in zip(worlds, env.state.source.tolist(), strict=True):
+        for uav in world:
+            uav.listen(0.0, env.simulation.dt, source, env.simulation.radius)
+    return worlds
+
+
+@pytest.mark.parametrize("sensing_time", [0.0, 2.5])
+def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
+    motion = MotionConfig("polynomial", max_speed=20.0, max_acceleration=10.0, sensing_time=sensing_time)
+    env = fresh(flying(motion=motion, episode=KEEPS_GOING), num_worlds=6)
+    worlds, generator = twins(env), torch.Generator().manual_seed(0)
+    begun = spotting = 0
+    for step in range(1, 41):
+        ready = env.simulation.ready(env.state).tolist()
+        output = act(env, random_actions(env, generator))
+        goals = env.simulation.points[env.state.goal].tolist()
+        sent, told = sent_messages(output), output["agents", "message_sent"].tolist()
+        for b, world in enumerate(worlds):
+            for n, uav in enumerate(world):
+                if ready[b][n]:
+                    uav.choose(tuple(goals[b][n]), motion)
+                assert (
+                    uav.listen(float(step), 1.0, env.state.source[b].tolist(), env.simulation.radius)
+                    == (told[b][n])
+                )
+                for name, value in uav.message.items():
+                    assert getattr(sent, name)[b, n].tolist() == pytest.approx(value, abs=1e-4), name
+                begun += uav.message["position"] != uav.message["target"]
+            spots = [uav.message["spotted"] for uav in world]
+            shared = 0.5 * sum(spots) / len(world)
+            own = [uav.message["spotted"] / max(uav.message["motions"], 1) for uav in world]
+            reward = output["agents", "reward"][b, :, 0].tolist()
+            assert reward == pytest.approx([each + shared for each in own])
+            spotting += sum(spots)
+    assert begun > 100
+    assert spotting > 10
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    agents=st.integers(1, 4),
+    degree=st.sampled_from([3, 5, 7]),
+    speed=st.floats(2.0, 40.0),
+    sensing_time=st.sampled_from([0.0, 0.3, 7.0]),
+    period=st.sampled_from(["0.5s", "1s", "2s", "10s"]),
+    emission=st.sampled_from(["constant", "per_step", "per_stop"]),
+)
+@settings(max_examples=settings.default.max_examples // 20)
+def test_a_uav_in_flight_neither_spots_nor_is_paid_nor_counts(
+    *, seed, agents, degree, speed, sensing_time, period, emission
+):
+    motion = MotionConfig("polynomial", degree, speed, 5.0, sensing_time)
+    source = walking(level_db=145.0, emission=emission)
+    scenario = flying(agents=agents, motion=motion, source=source, clock=ClockConfig(period))
+    env = fresh(scenario, 4, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(15):
+        before = env.state
+        output = act(env, random_actions(env, generator))
+        flies = ~env.simulation.vehicles.on_ground(env.state)
+        spotted = sent_messages(output).spotted
+        assert not spotted[flies].any()
+        assert (output[SPOTTED][flies] == 0).all()
+        paid = output[SPOTTED] + 0.5 * spotted.float().mean(-1, keepdim=True)
+        torch.testing.assert_close(output["agents", "reward"][..., 0], paid)
+        enough = (spotted & ~flies).sum(-1, keepdim=True) >= max(agents / 2, 1)
+        assert output["success"].equal(enough)
+        chose = env.simulation.ready(before)
+        assert (env.state.motions == before.motions + chose)[flies].all()
+
+
+def test_a_flight_of_less_than_a_step_needs_no_message_at_its_takeoff():
+    motion = MotionConfig("polynomial", max_speed=1000.0, max_acceleration=1000.0)
+    env = fresh(flying(motion=motion, clock=ClockConfig("5s")), 8)
+    generator, moved = torch.Generator().manual_seed(0), 0
+    for _ in range(10):
+        before = env.state.goal
+        output = act(env, random_actions(env, generator))
+        assert output["agents", "message_sent"].all()
+        assert not sent_messages(output).in_flight.any()
+        moved += int((env.state.goal != before).sum())
+    assert moved > 30
+
+
+def test_a_uav_that_leaves_the_source_stops_spotting_it_at_once():
+    source = SourceConfig(level_db=130.0, position=[100.0, 100.0])
+    region = REGIONS["fixed"]
+    scenario = flying(agents=1, source=source, region=region, episode=KEEPS_GOING)
+    env = fresh(scenario, 64)
+    generator, left = torch.Generator().manual_seed(0), 0
+    for _ in range(30):
+        before = env.state
+        output = act(env, random_actions(env, generator))
+        message = sent_messages(output)
+        leaves = before.sent.spotted & message.in_flight & (message.time > before.sent.time)
+        assert not message.spotted[leaves].any()
+        assert message.detected_time[leaves].equal(before.sent.detected_time[leaves])
+        assert message.detected_position[leaves].equal(before.sent.position[leaves])
+        left += int(leaves.sum())
+    assert left > 2
