@@ -54,6 +54,7 @@ from damian.learners.base import Learner, check_learner, check_numbers
 from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage
+from damian.replay.corrections import corrections_of
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.server.server import Server
@@ -102,7 +103,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv) -> Learner:
     setup, name = config.learning_setup, config.learner.name
     with own_code(name):
         size = config.learner.buffer_size(setup)
-    buffer = None if size is None else make_buffer(config, env.server, size)
+    buffer = None if size is None else make_buffer(config, env, size)
     with own_code(name):
         learner = config.learner.make(env, setup, buffer)
         check_learner(learner, name)
@@ -114,18 +115,26 @@ def own_code(learner: str) -> AbstractContextManager[None]:
     return naming_errors(learner) if ":" in learner else nullcontext()
 
 
-def make_buffer(config: TrainConfig, server: Server, size: int) -> ReplayBuffer:
-    """A replay buffer of ``size`` environment steps; with ``backupdate``, late messages correct them."""
+def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer:
+    """A replay buffer of ``size`` environment steps; with ``backupdate``, what arrives late corrects them."""
     if not config.backupdates:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
-    setup = config.learning_setup
+    setup, actor = config.learning_setup, config.recompute_actor
     least = (setup.longest_period + 2 * setup.longest_delay) * setup.worlds
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
     checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
-    recompute = server_recompute(server, actor=config.recompute_actor)
-    hindsight = keys.HINDSIGHT if "hindsight" in config.learner.reads else None
-    options = {"hindsight_key": hindsight, "device": config.device}
-    storage = BackupdateStorage(size, recompute, config.longest_delay, **options)
+    recompute = server_recompute(env.server, actor=actor) if has_message_delay(config) else None
+    observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor] if recompute else []
+    corrections = corrections_of(env.transform, [keys.REWARD, *observed])
+    size += sum(correction.lookback for correction in corrections) * setup.worlds
+    storage = BackupdateStorage(
+        size,
+        recompute,
+        config.longest_wait,
+        corrections=corrections,
+        hindsight_key=keys.HINDSIGHT if "hindsight" in config.learner.reads else None,
+        device=config.device,
+    )
     return ReplayBuffer(storage=storage)
 
 
