@@ -40,6 +40,10 @@ AGE = (AGENTS, "age")
 """Age of information: steps since the message that the server holds was generated, [B, N, 1]."""
 DELAY = (AGENTS, "delay")
 """Delay of the message sent in this step [steps], -1 if it never arrives, [B, N, 1]; never for an actor."""
+REWARD_DELAY = (AGENTS, "reward_delay")
+"""Delay of the reward earned in this step [steps], [B, N, 1]; never for an actor."""
+EARNED_REWARD = (AGENTS, "earned_reward")
+"""The reward earned in this step, whenever it is paid, [B, N, 1]; never for an actor."""
 POSITION = (AGENTS, "position")
 """True position of each UAV at this instant, east and north [m], [B, N, 2]; for delay laws, never for an
 actor."""
@@ -75,7 +79,8 @@ STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")
 ADVANTAGE = (AGENTS, "advantage")
 """Advantage of the action."""
 BACKUPDATED = (AGENTS, "backupdated")
-"""Did back-updating replace the message that the server held at this step, [T, B, N, 1] bool."""
+"""Did back-updating replace the message that the server held at this step, [T, B, N, 1] bool; if only rewards
+are late: did it credit the step with a late reward."""
 HINDSIGHT = (AGENTS, "hindsight")
 """Under ``"next"``, if a back-updating storage gets this key: the newest message sent by that step that has
 arrived by now, packed, [T, B, N, M]."""

@@ -45,9 +45,9 @@ from damian.learners.base import Learner, check_learner, check_numbers
 from damian.learners.finite import divergence
 from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage
+from damian.replay.corrections import corrections_of
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
-from damian.server.server import Server
 
 from .shared.collecting import make_collector, ticks
 from .shared.known_settings import CONF
@@ -74,11 +74,11 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     return env
 
 
-def replay_buffer(config: TrainConfig, server: Server) -> ReplayBuffer | None:
+def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     """The replay buffer (back-updating or not) of the learner, if it needs one."""
     with own_code(config.learner.name):
         size = config.learner.buffer_size(config.learning_setup)
-    return None if size is None else make_buffer(config, server, size)
+    return None if size is None else make_buffer(config, env, size)
 
 
 def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
@@ -95,18 +95,26 @@ def own_code(learner: str) -> AbstractContextManager[None]:
     return naming_errors(learner) if ":" in learner else nullcontext()
 
 
-def make_buffer(config: TrainConfig, server: Server, size: int) -> ReplayBuffer:
-    """A replay buffer of ``size`` environment steps; with ``backupdate``, late messages correct them."""
+def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer:
+    """A replay buffer of ``size`` environment steps; with ``backupdate``, what arrives late corrects them."""
     if not config.backupdates:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
-    setup = config.learning_setup
+    setup, actor = config.learning_setup, config.recompute_actor
     least = (setup.longest_period + 2 * setup.longest_delay) * setup.worlds
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
     checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
-    recompute = server_recompute(server, actor=config.recompute_actor)
-    hindsight = keys.HINDSIGHT if "hindsight" in config.learner.reads else None
-    options = {"hindsight_key": hindsight, "device": config.device}
-    storage = BackupdateStorage(size, recompute, config.longest_delay, **options)
+    recompute = server_recompute(env.server, actor=actor) if has_message_delay(config) else None
+    observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor] if recompute else []
+    corrections = corrections_of(env.transform, [keys.REWARD, *observed])
+    size += sum(correction.lookback for correction in corrections) * setup.worlds
+    storage = BackupdateStorage(
+        size,
+        recompute,
+        config.longest_wait,
+        corrections=corrections,
+        hindsight_key=keys.HINDSIGHT if "hindsight" in config.learner.reads else None,
+        device=config.device,
+    )
     return ReplayBuffer(storage=storage)
 
 
@@ -119,7 +127,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     """
     config.check_learning()
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    buffer = replay_buffer(config, env.server)
+    buffer = replay_buffer(config, env)
     learner = make_learner(config, env, buffer)
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     state = TrainingState(folder, learner.components(), collector, clock, buffer)

@@ -36,7 +36,9 @@ def observation_delay(kind: Kind, law: Any, **options: Any) -> StatefulTransform
 TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
     "ObservationDelay": observation_delay,
     "ActionDelay": lambda kind, law, **options: ActionDelay(law, kind.action, **options),
-    "RewardDelay": lambda kind, law, **options: RewardDelay(law, kind.reward, **options),
+    "RewardDelay": lambda kind, law, **options: RewardDelay(
+        law, kind.reward, delay_key="reward_delay", earned_key="earned_reward", **options
+    ),
     "CumulativeReward": lambda kind, law, **options: CumulativeReward(3, 0.5, kind.reward, **options),
     "ActionHistory": lambda kind, law, **options: ActionHistory(3, kind.action, **options),
     "SampleAndHold": lambda kind, law, **options: (

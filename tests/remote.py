@@ -1,4 +1,5 @@
-"""An environment without UAVs, whose receiver gets messages late, at the root or in a group of agents."""
+"""An environment without UAVs, whose receiver gets messages late, at the root or in a group of agents; and a
+slow twin of back-updating."""
 
 from collections.abc import Callable
 from typing import Any
@@ -133,3 +134,52 @@ def stored(storage: BackupdateStorage, steps: TensorDictBase, parts: int = 1) ->
     for part in steps.split(steps.shape[1] // parts, 1):
         buffer.extend(part)
     return storage[storage.latest()]
+
+
+class Twin:
+    """What a receiver knows of the stored steps [T, B] of one world after the last of them, step by step."""
+
+    def __init__(self, steps: TensorDictBase, world: int, group: tuple[str, ...]) -> None:
+        self.steps, self.group, self.T = steps[:, world], group, len(steps)
+        self.senders = [(i,) for i in range(AGENTS)] if group else [()]
+        self.start = [t - int(self.steps["step_count"][t]) for t in range(self.T)]
+        self.newest = [[self._newest(t, row) for row in self.senders] for t in range(self.T)]
+        self.terminated, self.truncated, self.valid, over = [], [], [], False
+        for t in range(self.T):
+            over = over and t != self.start[t]
+            self.valid.append(not over)
+            elapsed = t - self.start[t] + 1
+            terminated = any(self.message(t, row)[1] < 0.1 for row in self.senders)
+            reset = bool(self.steps["next", "done"][t])
+            self.terminated.append(terminated)
+            self.truncated.append((elapsed >= LIMIT or reset) and not terminated)
+            over = over or terminated or elapsed >= LIMIT or reset
+
+    def _newest(self, t: int, row: tuple[int, ...]) -> int:
+        """The step after which the newest message was sent; the step before the episode, if at its reset."""
+        delay = self.steps[next_key(key(self.group, "delay"))]
+        arrived = [g for g in range(self.start[t], t + 1) if 0 <= delay[(g, *row)] <= self.T - 1 - g]
+        return max(arrived, default=self.start[t] - 1)
+
+    def message(self, t: int, row: tuple[int, ...]) -> list[float]:
+        g, name = self.newest[t][self.senders.index(row)], key(self.group, "message")
+        at_reset = g < self.start[t]
+        return (
+            self.steps[name][(g + 1, *row)] if at_reset else self.steps[next_key(name)][(g, *row)]
+        ).tolist()
+
+    def observation(self, t: int, row: tuple[int, ...]) -> list[float]:
+        number, draw = self.message(t, row)
+        return [3 * number, 3 * draw, number]
+
+    def observation_before(self, t: int, row: tuple[int, ...]) -> list[float]:
+        if t == self.start[t]:
+            return self.steps[key(self.group, "observation")][(t, *row)].tolist()
+        return self.observation(t - 1, row)
+
+    def reward(self, t: int, row: tuple[int, ...]) -> float:
+        return self.message(t, row)[1] + t - self.start[t] + 1
+
+    def replaced(self, t: int, row: tuple[int, ...]) -> bool:
+        age = int(self.steps[next_key(key(self.group, "age"))][(t, *row)])
+        return self.newest[t][self.senders.index(row)] > t - age

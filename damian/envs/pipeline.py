@@ -48,8 +48,9 @@ def make_env(
         seed: of the worlds and of the delays.
         device: of all tensors.
         extras: as in ``UavEnv``; if messages are delayed, ``message`` also outputs ``received`` (the messages
-            that the server holds), their ``age`` [steps], and the ``delay`` [steps] of the messages sent, all
-            under ``"agents"``.
+            that the server holds), their ``age`` [steps], and the ``delay`` [steps] of the messages sent, and
+            if rewards are delayed, ``reward_delay`` [steps] and, without a message delay, ``earned_reward``,
+            all under ``"agents"``.
 
     Raises:
         InputError: the scenario asks for something impossible, or combines ``clock.skip`` with ``message``.
@@ -86,7 +87,7 @@ def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         *action_transforms(scenario),
         *(server_transforms(scenario, server, extras) if has_message_delay(scenario) else []),
         *(link_transforms(scenario, server, extras) if scenario.links.kind == "matrix" else []),
-        *reward_transforms(scenario),
+        *reward_transforms(scenario, extras),
         *observation_transforms(scenario),
         *skip_transforms(scenario, extras),
     ]
@@ -154,13 +155,23 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
     return [channel, OnboardNode(server, dropped_keys=dropped)]
 
 
-def reward_transforms(scenario: ScenarioConfig) -> list[Transform]:
+def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
     """The reward delay, and the discounted sum of the latest rewards (paper, section 3.5, eq. 4)."""
-    delay, dt = scenario.delay, scenario.clock.dt
+    delay, dt, reported = scenario.delay, scenario.clock.dt, "message" in extras
     transforms: list[Transform] = []
     if has_delay(delay.rew, dt):
         law = law_of(delay.rew, "delay.rew")
-        transforms.append(RewardDelay(law, keys.REWARD, dt=dt, context_keys=CONTEXT_KEYS))
+        # With a message delay the server computes in hindsight what was earned.
+        earned_key = keys.EARNED_REWARD if reported and not has_message_delay(scenario) else None
+        late = RewardDelay(
+            law,
+            keys.REWARD,
+            dt=dt,
+            context_keys=CONTEXT_KEYS,
+            delay_key=keys.REWARD_DELAY if reported else None,
+            earned_key=earned_key,
+        )
+        transforms.append(late)
     if delay.reward_window > 1:
         transforms.append(CumulativeReward(delay.reward_window, delay.reward_discount, keys.REWARD))
     return transforms

@@ -58,11 +58,11 @@ class LearningSetup(NamedTuple):
     longest_period: int
     """Largest number of steps per world between two updates."""
     longest_delay: int = 0
-    """Longest delay of a message [steps]."""
+    """Longest delay of a message, or with back-updating of a reward, if that is longer [steps]."""
     backupdate: bool = False
     """Whether the replay buffer corrects stored steps as late messages arrive (paper, section 3.4)."""
     settle: bool = False
-    """Whether to learn from a step only when none of its messages can be in transit any more."""
+    """Whether to learn from a step only when neither its messages nor its reward can be in transit."""
     recompute_actor: bool = False
     """Whether late messages also replace the actor's observations (the original authors' variant)."""
     critic_key: NestedKey = keys.GLOBAL_OBSERVATION

@@ -1,5 +1,6 @@
 """A replay-buffer storage that corrects stored steps as late messages arrive (paper, section 3.4)."""
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -12,16 +13,20 @@ from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.keys import next_key
+from damian.replay.corrections import Correction, CreditLateRewards
 from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
 from damian.replay.step_keys import (
     ENDS,
     Recompute,
     StepKeys,
-    check_recompute,
+    check_entries,
+    check_messages,
+    check_returned,
     check_steps,
     example_steps,
 )
 from damian.replay.time_storage import TimeStorage
+from damian.transforms.entries import Entries
 
 
 class BackupdateStorage(TimeStorage):
@@ -29,23 +34,28 @@ class BackupdateStorage(TimeStorage):
 
     Whenever steps are written, the storage recomputes them, and the earlier steps that a late message may
     still concern, from all messages that have arrived by the last step. The entries that ``recompute``
-    returns replace the stored ones. Where the steps have such an entry before the step too, as observations
-    are, it becomes that after the previous step of the same episode; ``done``, ``terminated`` and
-    ``truncated`` before a step stay. All other entries stay, such as the actor's action and log-probability.
+    returns replace the stored ones, once ``corrections`` have changed them as the transforms after the
+    receiver did. Where the steps have such an entry before the step too, as observations are, it becomes that
+    after the previous step of the same episode; ``done``, ``terminated`` and ``truncated`` before a step
+    stay. All other entries stay, such as the actor's action and log-probability.
 
     The storage adds: ``valid`` [T, B, 1], false where the episode had ended already, as the receiver knows
     now; ``reset_after`` [T, B, 1], true where the environment was reset (such a step is truncated if the task
     had not ended after all); ``backupdated`` beside ``delay_key``, [T, B, 1] or [T, B, N, 1], true where a
-    late message replaced the one that the receiver held; and the messages of ``hindsight_key``.
+    late message replaced the one that the receiver held (without messages: where a late reward has been
+    paid); and the messages of ``hindsight_key``.
 
     The entries of messages are at the root (one sender in each world: [T, B, M], delay and age [T, B, 1]) or
     in a group of N agents ([T, B, N, M], delay and age [T, B, N, 1]). ``ObservationDelay`` writes all but the
     message.
 
     Args:
-        max_size: T times B; T must be at least the steps of a batch plus twice ``longest``.
-        recompute: computes the entries that depend on messages (for UAVs ``server_recompute``).
-        longest: longest delay of a message [steps].
+        max_size: T times B; T must be at least the steps of a batch plus twice ``longest`` plus ``lookback``.
+        recompute: computes the entries that depend on messages (for UAVs ``server_recompute``). None if only
+            rewards are late: the ``corrections`` then credit them, and no entry of messages is needed.
+        longest: longest delay of a message or of a reward [steps].
+        corrections: for what transforms after the receiver do to these entries, in their order: late rewards,
+            sums of rewards, slow clocks (``corrections_of``).
         env: environment of the steps, with its transforms: its specs and what ``recompute`` returns for two
             steps of zeros are checked at once. If not given, the first steps that are written are checked.
         message_key: the message sent in each step; its entry, and the next three, are under ``"next"``.
@@ -58,16 +68,17 @@ class BackupdateStorage(TimeStorage):
         options: of ``LazyTensorStorage``.
 
     Raises:
-        InputError: with ``env``: its steps lack an entry, or ``recompute`` returns something else than it
-            should.
+        InputError: there is nothing to correct; or with ``env``: its steps lack an entry, or ``recompute``
+            returns something else than it should.
     """
 
     def __init__(
         self,
         max_size: int,
-        recompute: Recompute,
+        recompute: Recompute | None,
         longest: int,
         *,
+        corrections: Sequence[Correction] = (),
         env: EnvBase | None = None,
         message_key: NestedKey = keys.MESSAGE,
         received_key: NestedKey = keys.RECEIVED,
@@ -79,7 +90,13 @@ class BackupdateStorage(TimeStorage):
     ) -> None:
         checks.whole("longest", longest, 0, unit="steps")
         super().__init__(max_size, **options)
-        self.recompute, self.longest = recompute, longest
+        self.recompute, self.longest, self.corrections = recompute, longest, list(corrections)
+        self._late_rewards = [found for found in corrections if isinstance(found, CreditLateRewards)]
+        if recompute is None:
+            should = "needs corrections that credit late rewards, and goes without hindsight_key"
+            good = bool(self._late_rewards) and hindsight_key is None
+            checks.require(good, "recompute", None, should)
+            delay_key = self._late_rewards[0].delay_key
         self.step_keys = StepKeys(
             unravel_key(message_key),
             unravel_key(received_key),
@@ -92,6 +109,11 @@ class BackupdateStorage(TimeStorage):
         if env is not None:
             self._check_once(example_steps(env))
 
+    @property
+    def lookback(self) -> int:
+        """Number of earlier steps that the corrections of a step read."""
+        return sum(correction.lookback for correction in self.corrections)
+
     def set(  # type: ignore[override]
         self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True
     ) -> None:
@@ -99,7 +121,7 @@ class BackupdateStorage(TimeStorage):
 
         Raises:
             InputError: an entry is missing or misshapen, the storage is too small for the batch, or a message
-                is later than ``longest``.
+                or a reward is later than ``longest``.
         """
         if data.dim() != 2:
             raise InputError(f"steps: a batch of shape {list(data.shape)} is not [T, B]")
@@ -112,13 +134,20 @@ class BackupdateStorage(TimeStorage):
         """Check the entries of a few steps, and what ``recompute`` returns for them, if not done before."""
         if self._checked:
             return
-        steps = steps if self.device == "auto" else steps.to(self.device)
+        steps, entries = steps if self.device == "auto" else steps.to(self.device), {}
         check_steps(steps, self.step_keys)
-        check_recompute(self.recompute, self._with_added_entries(steps), self.step_keys)
+        for late in self._late_rewards:
+            late.delay(steps)  # raises an error if there is none
+        if self.recompute is not None:
+            check_messages(steps, self.step_keys)
+            held = steps[next_key(self.step_keys.received)]
+            entries = self.recompute(self._with_added_entries(steps), held)
+            check_returned(entries, steps, self.step_keys)
+        check_entries(self._correct(entries, self._with_added_entries(steps)), steps)
         self._checked, self._n_worlds = True, steps.shape[1]
 
     def _check_times(self, data: TensorDictBase) -> None:
-        needs, n_worlds = len(data) + 2 * self.longest, data.shape[1]
+        needs, n_worlds = len(data) + 2 * self.longest + self.lookback, data.shape[1]
         if n_worlds != self._n_worlds:
             raise InputError(
                 f"steps: a batch of shape {list(data.shape)} is not one of {self._n_worlds} worlds: give "
@@ -129,9 +158,11 @@ class BackupdateStorage(TimeStorage):
                 f"max_size: {self.max_size} is too little for batches of {len(data)} steps and delays of "
                 f"up to {self.longest} steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}"
             )
-        longest = int(data[next_key(self.step_keys.delay)].max())
-        if longest > self.longest:
-            raise InputError(f"longest: a message takes {longest} steps, more than {self.longest} steps")
+        delays = [] if self.recompute is None else [("message", self.step_keys.delay)]
+        for name, key in [*delays, *(("reward", late.delay_key) for late in self._late_rewards)]:
+            longest = int(data[next_key(key)].max())
+            if longest > self.longest:
+                raise InputError(f"longest: a {name} takes {longest} steps, more than {self.longest} steps")
 
     def _with_added_entries(self, data: TensorDictBase) -> TensorDictBase:
         """Copy of steps [T, B], with the entries that the storage adds, before any back-updating."""
@@ -154,9 +185,10 @@ class BackupdateStorage(TimeStorage):
             message: packed messages, [K, M].
 
         Raises:
-            InputError: a message is older than the longest delay, or than the stored steps, or ``agent`` is
-                missing.
+            InputError: a message is older than the longest delay, or than the stored steps, ``agent`` is
+                missing, or the storage has no messages.
         """
+        checks.require(self.recompute is not None, "recompute", None, "recomputes nothing from messages")
         oldest, newest = int(steps_ago.max()), int(steps_ago.min())
         reach = min(self.longest, cast(int, self._len_along_dim0) - 1)
         if newest < 0 or oldest > reach:
@@ -173,9 +205,9 @@ class BackupdateStorage(TimeStorage):
         self.backupdate(oldest + 1)
 
     def backupdate(self, n_steps: int) -> None:
-        """Correct the latest ``n_steps`` steps with all messages that have arrived by the last step."""
+        """Correct the latest ``n_steps`` steps with all that has arrived by the last step."""
         # Earlier steps too, whose messages may be the newest ones of the steps to correct.
-        index = self.latest(n_steps + self.longest)
+        index = self.latest(n_steps + self.longest + self.lookback)
         recomputed = self.recomputed(self._storage[index])
         rows = index[-n_steps:]
         for key, value in recomputed.items():
@@ -184,15 +216,9 @@ class BackupdateStorage(TimeStorage):
 
     def recomputed(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
         """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step."""
-        names, begins = self.step_keys, steps[self.step_keys.step_count].squeeze(-1) == 0
-        log = MessageLog(
-            sent=steps[next_key(names.message)],
-            delay=steps[next_key(names.delay)].squeeze(-1),
-            held=steps[next_key(names.received)],
-            age=steps[next_key(names.age)].squeeze(-1).long(),
-        )
-        latest = latest_arrived(log)
-        after = {unravel_key(key): value for key, value in self.recompute(steps, latest).items()}
+        begins = steps[self.step_keys.step_count].squeeze(-1) == 0
+        entries, added = self._recompute_latest(steps)
+        after = self._correct(entries, steps)
         done, terminated, truncated = ENDS
         reset = steps[keys.RESET_AFTER]
         if done in after:
@@ -201,13 +227,34 @@ class BackupdateStorage(TimeStorage):
         already_ended = ~steps[keys.VALID][0].squeeze(-1) & ~begins[0]
         ended = after[done] if done in after else steps[done]
         over = ended_before(ended.squeeze(-1), begins, already_ended)
-        added: dict[NestedKey, Tensor] = {
-            names.backupdated: (latest != log.held).any(-1, keepdim=True),
-            keys.VALID: ~over.unsqueeze(-1),
-        }
+        return {**after, **_before(steps, after, begins), **added, keys.VALID: ~over.unsqueeze(-1)}
+
+    def _recompute_latest(self, steps: TensorDictBase) -> tuple[Entries, Entries]:
+        """What ``recompute`` returns for all that has arrived, and ``backupdated`` and ``hindsight_key``."""
+        names = self.step_keys
+        delay = steps[next_key(names.delay)]
+        if self.recompute is None:
+            paid = self._late_rewards[0].paid(steps, steps[names.step_count].squeeze(-1))
+            return {}, {names.backupdated: paid & (delay > 0)}
+        log = MessageLog(
+            sent=steps[next_key(names.message)],
+            delay=delay.squeeze(-1),
+            held=steps[next_key(names.received)],
+            age=steps[next_key(names.age)].squeeze(-1).long(),
+        )
+        latest = latest_arrived(log)
+        added: Entries = {names.backupdated: (latest != log.held).any(-1, keepdim=True)}
         if names.hindsight is not None:
             added[next_key(names.hindsight)] = latest
-        return {**after, **_before(steps, after, begins), **added}
+        return self.recompute(steps, latest), added
+
+    def _correct(self, entries: Entries, steps: TensorDictBase) -> Entries:
+        """Apply the corrections to what ``recompute`` returned for steps [T, B]."""
+        entries = {unravel_key(key): value for key, value in entries.items()}
+        count = steps[self.step_keys.step_count].squeeze(-1)
+        for correction in self.corrections:
+            entries = correction(entries, steps, count)
+        return entries
 
 
 def _before(steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor) -> dict[NestedKey, Tensor]:

@@ -44,6 +44,23 @@ def latest_arrived(log: MessageLog, now: int | None = None) -> Tensor:
     return torch.where(came_late.unsqueeze(-1), _at(log.sent, newest.clamp(min=0)), _at(log.held, held_at))
 
 
+def paid_by_now(delay: Tensor, begins: Tensor, reset_after: Tensor) -> Tensor:
+    """Whether the reward earned at each step has been paid by the last step (``RewardDelay``), [T, *] bool.
+
+    The last step before a reset pays what is still in transit, if the environment was done there.
+
+    Args:
+        delay: delay of the reward earned at each step [steps], [T, *].
+        begins: whether this step is the first after a reset, [T, *].
+        reset_after: whether the environment was done with this step, [T, *].
+    """
+    steps = _steps(delay)
+    later_begins = torch.where(begins, steps, len(steps))[1:]
+    none_later = torch.full_like(steps[:1], len(steps))
+    last = torch.cat([later_begins, none_later]).flip(0).cummin(0).values.flip(0) - 1
+    return (steps + delay <= last) | reset_after.expand_as(steps).gather(0, last)
+
+
 def episode_starts(begins: Tensor) -> Tensor:
     """Index of the first step of each step's episode, [T, *]; 0 if the episode began before these steps."""
     return torch.where(begins, _steps(begins), 0).cummax(0).values

@@ -1,6 +1,5 @@
 """Recomputes stored steps of UAVs with the server node, for ``BackupdateStorage``."""
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
@@ -16,8 +15,8 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
     Args:
         server: server node of the environment.
         reward_terms: recompute ``reward_terms`` too.
-        actor: recompute the actors' observations too. Only their first features change, which come from the
-            server; an actor's own memory behind them, such as its past actions, stays.
+        actor: recompute the actors' observations too, without what ``ActionHistory`` appends to them
+            (``corrections_of`` keeps that).
 
     Returns:
         The function, for ``BackupdateStorage(recompute=...)``.
@@ -33,12 +32,10 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
             **outputs.status.entries(),
         }
         if actor:
-            sent, stored = steps[next_key(keys.MESSAGE)], steps[next_key(keys.OBSERVATION)]
-            own = server.observation.own
-            features = (
+            sent, own = steps[next_key(keys.MESSAGE)], server.observation.own
+            entries[keys.OBSERVATION] = (
                 server.observe_with_timely_messages(messages, sent, elapsed) if own else outputs.observation
             )
-            entries[keys.OBSERVATION] = torch.cat([features, stored[..., features.shape[-1] :]], -1)
         if reward_terms:
             entries |= {(*keys.REWARD_TERMS, name): term for name, term in outputs.terms.items()}
         return {next_key(key): value for key, value in entries.items()}

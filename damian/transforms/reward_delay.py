@@ -24,6 +24,7 @@ from damian.transforms.entries import (
     flag_keys,
     from_rows,
     require_keys,
+    sibling_key,
     spec_rows,
 )
 from damian.transforms.order import KeyUsage
@@ -109,10 +110,17 @@ class RewardDelay(RewardTransform):
         reward_key: key of the reward.
         dt: length of a step [s], for delays given as times.
         context_keys: key of each entry that the law may read, by the name that the law gives it
-            (``ContextSampler``). A bare name means an entry in the same TensorDict as the reward.
+            (``ContextSampler``).
+        delay_key: key for the delay of the reward earned in this step [steps], [..., 1] long; None to leave
+            it out. An actor must not observe it; back-updating needs it.
+        earned_key: key for the reward earned in this step, whenever it is received; None to leave it out. An
+            actor must not observe it; back-updating needs it if no messages tell of the reward.
         seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
             global generator at the first reset.
         gradients: let gradients flow through the received rewards (``StatefulTransform``).
+
+    A bare name for one of these keys means an entry in the same TensorDict as the reward. After a reset, what
+    ``delay_key`` and ``earned_key`` name is 0.
 
     Raises:
         InputError: the delay is not valid, or its law loses rewards or reads what has no key.
@@ -129,10 +137,15 @@ class RewardDelay(RewardTransform):
         *,
         dt: float = 1.0,
         context_keys: Mapping[str, NestedKey] | None = None,
+        delay_key: NestedKey | None = None,
+        earned_key: NestedKey | None = None,
         seed: int | None = None,
         gradients: bool = False,
     ) -> None:
         super().__init__(reward_key, seed, gradients)
+        self.delay_key, self.earned_key = (
+            sibling_key(self.reward_key, key) for key in (delay_key, earned_key)
+        )
         law = law_of(delay)
         self.sampler = sampler_of(law, dt)
         self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
@@ -157,7 +170,10 @@ class RewardDelay(RewardTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        return super().key_usage._replace(reads=list(self.contexts.keys.values()), pays_at_end=True)
+        created = [key for key in (self.delay_key, self.earned_key) if key is not None]
+        return super().key_usage._replace(
+            reads=list(self.contexts.keys.values()), creates=created, pays_at_end=True
+        )
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         memory = super().init_memory(tensordict)
@@ -173,7 +189,10 @@ class RewardDelay(RewardTransform):
         memory = memory | {"channel": self.sampler.begin_episode(memory["channel"], mask)}
         if self.sampler.sees_context:
             memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
-        return super().on_reset(memory, entries, mask)
+        memory, _ = super().on_reset(memory, entries, mask)
+        if self.delay_key is None and self.earned_key is None:
+            return memory, {}
+        return memory, self._report(torch.zeros_like(memory["clock"]), torch.zeros_like(memory["past"][0]))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         clock, in_transit = memory["clock"] + 1, memory["past"]
@@ -196,7 +215,26 @@ class RewardDelay(RewardTransform):
             received = torch.where(ended, received + rest, received)
             in_transit = in_transit.masked_fill(ended, 0)
         memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "past": in_transit}
-        return memory, {self.reward_key: from_rows(received, self.rows)}
+        return memory, {self.reward_key: from_rows(received, self.rows)} | self._report(delay, reward)
+
+    def _report(self, delay: Tensor, earned: Tensor) -> Entries:
+        """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards [M, ...]."""
+        entries: Entries = {}
+        if self.delay_key is not None:
+            entries[self.delay_key] = from_rows(delay.unsqueeze(-1).clone(), self.rows)
+        if self.earned_key is not None:
+            entries[self.earned_key] = from_rows(earned.clone(), self.rows)
+        return entries
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        rewards, device = self.env.full_reward_spec, observation_spec.device
+        if self.delay_key:
+            shape = torch.Size((*spec_rows(rewards, self.reward_key), 1))
+            observation_spec[self.delay_key] = Unbounded(shape, dtype=torch.long, device=device)
+        if self.earned_key:
+            earned = rewards[self.reward_key]
+            observation_spec[self.earned_key] = Unbounded(earned.shape, dtype=earned.dtype, device=device)
+        return observation_spec
 
 
 class CumulativeReward(RewardTransform):
@@ -227,15 +265,27 @@ class CumulativeReward(RewardTransform):
         checks.in_range("gamma", gamma, 0.0, 1.0)
         super().__init__(reward_key, gradients=gradients)
         self.n_past = steps
-        self.weights = [gamma**age for age in range(steps)]
+        self.gamma = gamma
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         reward = as_rows(entries[self.reward_key], self.rows)
         past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
-        dtype = self.sum_dtype(reward.dtype)
-        weights = torch.tensor(self.weights, dtype=dtype, device=reward.device)
-        total = (weights.view(-1, *[1] * reward.dim()) * past).sum(0, dtype=dtype)
+        total = discounted_sum(past, self.gamma, self.sum_dtype(reward.dtype))
         return memory | {"past": past}, {self.reward_key: from_rows(total, self.rows)}
 
     def sum_dtype(self, dtype: torch.dtype) -> torch.dtype:
         return dtype if dtype.is_floating_point or self.n_past == 1 else torch.float32
+
+
+def discounted_sum(past: Tensor, gamma: float, dtype: torch.dtype) -> Tensor:
+    """The discounted sum of the latest rewards (paper, eq. 4).
+
+    Args:
+        past: the latest K rewards, the newest first, [K, ...].
+        gamma: discount per step.
+        dtype: type of the sum.
+    """
+    weights = torch.tensor([gamma**age for age in range(len(past))], dtype=dtype, device=past.device)
+    # In double precision, so that the order of the sum, which depends on the batch, does not matter.
+    precise = torch.float64 if dtype.is_floating_point else dtype
+    return (weights.view(-1, *[1] * (past.dim() - 1)) * past).sum(0, dtype=precise).to(dtype)

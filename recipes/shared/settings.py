@@ -10,6 +10,7 @@ from omegaconf import MISSING, OmegaConf
 
 from damian import keys
 from damian.common import checks
+from damian.delays.laws import law_of
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
 from damian.evaluation.loggers import check_loggers
@@ -65,9 +66,11 @@ class TrainConfig(ScenarioConfig):
     """Updates between two checkpoints: what a killed run loses at most."""
     backupdate: bool = False
     """Back-updating (paper, section 3.4): late messages correct stored steps before the learner uses them.
-    They correct the critic's observations, rewards and ends of episodes, but not the actor's observations."""
+    They correct the critic's observations, rewards and ends of episodes, but not the actor's observations. A
+    late reward (``delay.rew``) counts for the step that earned it, as soon as it has been paid."""
     settle: bool = False
-    """With ``backupdate``: learn from a step only when none of its messages can be in transit any more."""
+    """With ``backupdate``: learn from a step only when neither its messages nor its reward can be in transit
+    any more."""
     recompute_actor: bool = False
     """With ``backupdate``, the original authors' variant: late messages correct the actor's observations too,
     and the log-probabilities of its actions follow from these."""
@@ -117,16 +120,8 @@ class TrainConfig(ScenarioConfig):
         checks.require(not useless, "delay.hold", "max", "means nothing without delayed messages (delay.obs)")
 
     def _check_backupdate(self) -> None:
-        """Back-updating recomputes the reward of every single step, undelayed, from the server's messages."""
-        incompatible = {
-            "delay.reward_window": (self.delay.reward_window, self.delay.reward_window > 1),
-            "delay.rew": (self.delay.rew, has_delay(self.delay.rew, self.clock.dt)),
-            "clock.server": (self.clock.server, self.clock.steps("server") > 1),
-        }
-        for key, (value, given) in incompatible.items():
-            should = "does not go with backupdate=true, which would undo it; leave out one of them"
-            checks.require(not (self.backupdate and given), key, value, should)
-        hindsight = "hindsight" in self.learner.reads and not self.backupdates
+        """Check what goes with back-updating only, and what it needs."""
+        hindsight = "hindsight" in self.learner.reads and not (self.backupdate and has_message_delay(self))
         should = "reads hindsight, which needs aware=backupdate and a message delay (delay.obs)"
         checks.require(not hindsight, "learner", self.learner.name, should)
         onboard = self.recompute_actor and self.links.kind != "server"
@@ -150,6 +145,12 @@ class TrainConfig(ScenarioConfig):
         return self.delay.uplink.sampler(self.clock.dt).longest
 
     @property
+    def longest_wait(self) -> int:
+        """Longest time until all that corrects a step has arrived: its messages, and its reward [steps]."""
+        late_reward = law_of(self.delay.rew, "delay.rew").sampler(self.clock.dt).longest
+        return max(self.longest_delay, late_reward) if self.backupdates else self.longest_delay
+
+    @property
     def update_steps(self) -> int:
         """Steps of every world before the first update: the system clock's period, or ``learner.steps``."""
         return self.clock.steps("system") if self.clock.system else self.learner.steps
@@ -163,7 +164,7 @@ class TrainConfig(ScenarioConfig):
             worlds=self.worlds,
             shortest_period=clock.shortest,
             longest_period=clock.longest,
-            longest_delay=self.longest_delay,
+            longest_delay=self.longest_wait,
             backupdate=self.backupdates,
             settle=self.settle,
             recompute_actor=self.recompute_actor,
@@ -174,8 +175,8 @@ class TrainConfig(ScenarioConfig):
 
     @property
     def backupdates(self) -> bool:
-        """Is back-updating switched on, and can any message be late or lost?"""
-        return self.backupdate and has_message_delay(self)
+        """Is back-updating switched on, and can any message or reward be late or lost?"""
+        return self.backupdate and (has_message_delay(self) or has_delay(self.delay.rew, self.clock.dt))
 
     @property
     def eval_scenario(self) -> ScenarioConfig:

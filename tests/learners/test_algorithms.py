@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 
 import pytest
+import torch
 from helpers import everything
 
 from damian.delays.config import DelayConfig
@@ -14,7 +15,7 @@ from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.recipes.shared.settings import LoggerConfig, TrainConfig
-from damian.recipes.train import learning_env, make_learner, train
+from damian.recipes.train import learning_env, make_learner, replay_buffer, train
 from damian.replay.backupdate import BackupdateStorage
 
 AWARE = {
@@ -79,7 +80,7 @@ def build_learner(name: str, aware: str = "backupdate", **changed) -> tuple[Mapp
     """A learner and its environment, in which messages are up to 3 steps late."""
     settings = replace(config(name, "none", "discrete", "instant", aware), **changed)
     env = learning_env(settings)
-    return make_learner(settings, env), env
+    return make_learner(settings, env, replay_buffer(settings, env)), env
 
 
 @both_learners
@@ -105,6 +106,23 @@ def test_a_replay_buffer_has_room_for_the_longest_batch_and_twice_the_longest_de
     learner, env = build_learner(name, clock=clock, learner=config)
     assert learner.buffer.storage.max_size == 4 * (24 + 2 * 3)
     learner.learn(env.rollout(24, learner.actor, break_when_any_done=False))
+
+
+@both_learners
+@pytest.mark.parametrize("obs", [0, 3])
+def test_a_learner_also_waits_for_late_rewards_and_its_replay_buffer_has_room_for_the_corrections(name, obs):
+    delay, clock = DelayConfig(obs=obs, rew=7, reward_window=4), ClockConfig(server="2s")
+    learner, env = build_learner(name, settle=True, delay=delay, clock=clock)
+    storage, setup = learner.buffer.storage, learner.setup
+    assert (setup.settle_steps, storage.longest, storage.recompute is None) == (7, 7, obs == 0)
+    assert storage.lookback == 3 + (1 if obs else 0)  # without late messages no observation is corrected
+    assert storage.max_size == (env.batch_size[0] * storage.lookback) + (400 if name == "sac" else 4 * 26)
+    torch.manual_seed(0)
+    learner.learn(env.rollout(12, learner.actor, break_when_any_done=False))
+    losses = learner.learn(env.rollout(12, learner.actor, break_when_any_done=False))
+    assert all(map(math.isfinite, losses.values()))
+    naive, _ = build_learner(name, "history", delay=delay, clock=clock)
+    assert naive.setup.longest_delay == obs
 
 
 @pytest.mark.parametrize("recompute", [False, True])

@@ -12,6 +12,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from damian import keys
 from damian.baselines.random import random_policy
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
@@ -20,6 +21,7 @@ from damian.envs.uav_env import UavEnv
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages, mappo_loss, minibatch_losses
 from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.replay.backupdate import BackupdateStorage
+from damian.replay.corrections import corrections_of
 from damian.replay.recompute import server_recompute
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
@@ -241,7 +243,10 @@ def collect_delayed(kind: str, recompute_actor: bool) -> tuple[Mappo, TensorDict
     env = make_env(scenario, 4, seed=1, extras=["message"])
     env.append_transform(StepCounter())
     recompute = server_recompute(env.server, actor=recompute_actor)
-    buffer = TensorDictReplayBuffer(storage=BackupdateStorage(40 * 4, recompute, longest=5))
+    observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * recompute_actor]
+    corrections = corrections_of(env.transform, observed)
+    storage = BackupdateStorage(40 * 4, recompute, longest=5, corrections=corrections)
+    buffer = TensorDictReplayBuffer(storage=storage)
     torch.manual_seed(2)
     config = MappoConfig(minibatches=1, epochs=1)
     learner = Mappo(env, config, learning(SMALL, recompute_actor=recompute_actor), buffer)

@@ -38,7 +38,7 @@ VALID = {
             "features": [{"type": "Feature", "properties": {"name": "park"}, "geometry": POLYGON}],
         }
     ),
-    "own/scenario/mine.yaml": "# @package _global_\nagents: 2\nreward: {spotted: 0.5}\nregion: {lattice_step: 100}\n",
+    "own/scenario/mine.yaml": "# @package _global_\nagents: 2\nreward:\n  spotted: 0.5\nworlds: 2\n",
     "run/config.yaml": OmegaConf.to_yaml(OmegaConf.structured(RUN)),
     "seed0_naive.json": json.dumps(
         {

@@ -199,7 +199,7 @@ def settings(**changed: Any) -> TrainConfig:
 
 def learner_of(config: TrainConfig) -> tuple[Mappo | Sac, DelayedEnv]:
     env = learning_env(config)
-    return make_learner(config, env, replay_buffer(config, env.server)), env
+    return make_learner(config, env, replay_buffer(config, env)), env
 
 
 @both_kinds

@@ -50,9 +50,6 @@ from damian.recipes.shared.stored_runs import save_config
         (["+delay.foo=3"], "delay.foo: no such key"),
         (["delay.obs=-3"], "delay.obs: -3 is neither whole steps such as 3 nor a time such as 3s"),
         (["delay.act=3.5"], "delay.act: 3.5 is neither whole steps"),
-        (["backupdate=true", "delay.reward_window=3"], "delay.reward_window: 3 does not go with"),
-        (["backupdate=true", "delay.rew=3"], "delay.rew: 3 does not go with"),
-        (["backupdate=true", "clock.server=4s"], "clock.server: 4s does not go with"),
         (
             ["delay=paper", "delay.obs.enter=0.1"],
             "to write another law, choose delay=none first",

@@ -51,6 +51,8 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
         ["delay=burst", "aware=backupdate", "scenario=mixed", "delay.order=arrival"],
         ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
         ["aware=backupdate"],
+        ["delay=paper", "aware=backupdate", "clock.server=2s", "delay.rew=3", "delay.reward_window=3"],
+        ["learner=sac", "delay.rew=3", "aware=backupdate", "settle=true", "clock.server=2s"],
     ],
 )
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):

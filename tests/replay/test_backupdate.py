@@ -17,6 +17,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
 from damian.replay.backupdate import BackupdateStorage
+from damian.replay.corrections import corrections_of
 from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
 from damian.replay.recompute import server_recompute
 from damian.server.features import ObservationConfig
@@ -124,9 +125,11 @@ def rollout(scenario: ScenarioConfig, n_steps: int, n_worlds: int = 4) -> Tensor
 def buffer(
     scenario: ScenarioConfig, capacity: int, n_worlds: int = 4, actor: bool = False, **options
 ) -> TensorDictReplayBuffer:
-    env = make_env(scenario, n_worlds)
-    recompute = server_recompute(env.base_env.server, reward_terms=True, actor=actor)
-    storage = BackupdateStorage(capacity * n_worlds, recompute, LONGEST)
+    env = make_env(scenario, n_worlds, extras=EXTRAS)
+    recompute = server_recompute(env.server, reward_terms=True, actor=actor)
+    observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor]
+    corrections = corrections_of(env.transform, [keys.REWARD, *observed])
+    storage = BackupdateStorage(capacity * n_worlds, recompute, LONGEST, corrections=corrections)
     return TensorDictReplayBuffer(storage=storage, batch_size=8, **options)
 
 
@@ -190,7 +193,7 @@ def test_an_actors_observation_can_be_back_updated_but_its_action_history_stays(
     scenario.observation.ctde = ctde
     undelayed = rollout(replace(scenario, delay=DelayConfig(history=2)), 39)
     delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, history=2)), 39)
-    replay = buffer(scenario, 64, actor=True)
+    replay = buffer(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, history=2)), 64, actor=True)
     for part in delayed.split(13, 1):
         replay.extend(part)
     corrected, expected, original = (

@@ -107,14 +107,19 @@ def rewards_of(outputs: Sequence[TensorDictBase]) -> tuple[list, list]:
 
 
 def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law):
-    transform = RewardDelay(law, REWARD)
+    transform = RewardDelay(law, REWARD, delay_key="reward_delay", earned_key="earned")
     earned, done = rewards_of(play(Counting(WORLDS, N_AGENTS), choices()))
-    received, _ = rewards_of(play(delayed(transform), choices()))
+    outputs = play(delayed(transform), choices())
+    received, _ = rewards_of(outputs)
+    reported, known = (after(outputs, "agents", name) for name in ("reward_delay", "earned"))
+    assert known == earned
+    assert received == rewards_of(play(delayed(RewardDelay(law, REWARD)), choices()))[0]
     table = drawn(transform.sampler, transform.memory["streams"], STEPS).tolist()
     for row, (w, n) in enumerate(ROWS):
         purse, in_transit = Purse(), 0.0
         for t in range(STEPS):
             reward, ended = earned[t][w][n][0], done[t][w][0]
+            assert reported[t][w][n] == [table[t][row]]
             assert received[t][w][n][0] == purse.step(t, reward, table[t][row], ended)
             in_transit += reward - received[t][w][n][0]
             assert not ended or in_transit == 0

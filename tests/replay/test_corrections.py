@@ -1,0 +1,306 @@
+"""Back-updating with late rewards, sums of rewards and slow clocks, against a loop over a world's steps."""
+
+import random
+from typing import NamedTuple
+
+import pytest
+import torch
+from remote import LONGEST, WORLDS, Receiver, Remote, Twin, both_layouts, key, make_storage, rollout, stored
+from tensordict import NestedKey, TensorDictBase
+from torchrl.data import ReplayBuffer
+from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
+
+from damian.common.errors import InputError
+from damian.delays.laws import Uniform
+from damian.keys import next_key
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.corrections import CreditLateRewards, SumLatestRewards, corrections_of
+from damian.transforms import (
+    ActionDelay,
+    CumulativeReward,
+    ObservationDelay,
+    RewardDelay,
+    SampleAndHold,
+    delay_trajectories,
+)
+
+
+class Case(NamedTuple):
+    """How late rewards are, how many are summed, and how slow the receiver's clock is."""
+
+    latest: int | None = None
+    window: int = 1
+    period: int = 1
+    loss: float = 0.0
+    order: str = "generation"
+
+
+GAMMA = 0.7
+
+
+def make_late(group: tuple[str, ...], case: Case) -> TransformedEnv:
+    """The remote environment with late messages and what a case says."""
+    message, received, reward = (key(group, name) for name in ("message", "received", "reward"))
+    delay = ObservationDelay(
+        Uniform(0, LONGEST),
+        [message],
+        [received],
+        loss=case.loss,
+        order=case.order,
+        delay_key="delay",
+        seed=3,
+    )
+    transforms = [delay, StepCounter(), Receiver(group)]
+    if case.latest is not None:
+        transforms.append(RewardDelay(Uniform(0, case.latest), reward, delay_key="reward_delay", seed=4))
+    transforms.append(CumulativeReward(case.window, GAMMA, reward))
+    transforms.append(SampleAndHold(case.period, [key(group, "observation")]))
+    return TransformedEnv(Remote(group), Compose(*transforms))
+
+
+class LateTwin(Twin):
+    """The twin of ``remote``, with late rewards, sums of rewards and a slow clock."""
+
+    def __init__(self, steps: TensorDictBase, world: int, group: tuple[str, ...], case: Case) -> None:
+        super().__init__(steps, world, group)
+        self.case = case
+
+    def paid(self, t: int, row: tuple[int, ...]) -> bool:
+        """Has the reward that step t earned been received by the last step."""
+        if self.case.latest is None:
+            return True
+        delay = int(self.steps[next_key(key(self.group, "reward_delay"))][(t, *row)])
+        for later in range(t, self.T):
+            if self.start[later] != self.start[t]:
+                return False
+            if later - t >= delay or self.steps["next", "done"][later]:
+                return True
+        return False
+
+    def summed(self, t: int, row: tuple[int, ...]) -> float:
+        """The reward after the step: eq. 4 of the rewards that have been received."""
+        latest = range(max(self.start[t], t - self.case.window + 1), t + 1)
+        return sum(GAMMA ** (t - g) * self.reward(g, row) for g in latest if self.paid(g, row))
+
+    def held(self, t: int, row: tuple[int, ...]) -> list[float]:
+        """The observation after the step: that of the latest tick, or of the reset."""
+        tick = t - (t - self.start[t] + 1) % self.case.period
+        if tick < self.start[t]:
+            return self.steps[key(self.group, "observation")][(self.start[t], *row)].tolist()
+        return self.observation(tick, row)
+
+    def held_before(self, t: int, row: tuple[int, ...]) -> list[float]:
+        if t == self.start[t]:
+            return self.steps[key(self.group, "observation")][(t, *row)].tolist()
+        return self.held(t - 1, row)
+
+
+def random_case(rng: random.Random) -> Case:
+    latest, window, period = rng.choice([None, 0, 2, LONGEST]), rng.randint(1, 4), rng.randint(1, 5)
+    return Case(latest, window, period, rng.choice([0.0, 0.4]), rng.choice(["generation", "arrival"]))
+
+
+def storage_of(env: TransformedEnv, group: tuple[str, ...], n_steps: int) -> BackupdateStorage:
+    """A storage of ``n_steps`` steps, with the corrections that follow from the environment."""
+    recomputed = [key(group, name) for name in ("observation", "reward")]
+    corrections = corrections_of(env.transform, recomputed)
+    storage = make_storage(group, corrections=corrections, env=env)
+    storage.max_size = n_steps * WORLDS
+    return storage
+
+
+@both_layouts
+@pytest.mark.parametrize("seed", range(4))
+def test_stored_steps_become_what_a_slow_twin_says(group, seed):
+    rng = random.Random(seed)
+    for _ in range(3):
+        case, part = random_case(rng), rng.choice([4, 10, 20])
+        env = make_late(group, case)
+        collected = rollout(env, 40)
+        capacity = part + 2 * LONGEST + case.window - 1 + case.period - 1  # the least, so that the ring wraps
+        after = stored(storage_of(env, group, min(capacity, 40)), collected, 40 // part)
+        steps, n_older = collected.transpose(0, 1), 40 - len(after)
+        for world in range(WORLDS):
+            twin = LateTwin(steps, world, group, case)
+            for t in range(n_older, 40):
+                for row in twin.senders:
+                    check_step(after, (t - n_older, world, *row), twin, t, row)
+    assert n_older >= 0
+
+
+def check_step(after: TensorDictBase, at: tuple[int, ...], twin: LateTwin, t: int, row: tuple) -> None:
+    """Compare what is stored of a step with the twin."""
+    observation, reward = key(twin.group, "observation"), key(twin.group, "reward")
+    assert after[next_key(reward)][at].item() == pytest.approx(twin.summed(t, row)), (twin.case, t)
+    assert after[next_key(observation)][at].tolist() == pytest.approx(twin.held(t, row)), (twin.case, t)
+    assert after[observation][at].tolist() == pytest.approx(twin.held_before(t, row)), (twin.case, t)
+
+
+def test_writing_in_small_batches_around_the_ring_gives_the_same_as_writing_at_once():
+    for case in (
+        Case(3, 4, 5, 0.7),
+        Case(None, 6, 1, 0.7),
+        Case(None, 1, 6, 0.5),
+        Case(0, 2, 2, 0.7, "arrival"),
+    ):
+        env = make_late((), case)
+        collected = rollout(env, 60)
+        least = 2 + 2 * LONGEST + case.window - 1 + case.period - 1
+        whole, ring = (
+            stored(storage_of(env, (), 200), collected),
+            stored(storage_of(env, (), least), collected, 30),
+        )
+        n_older = 60 - least
+        assert all(whole[name][n_older:].equal(ring[name]) for name in ring.keys(True, True)), case
+
+
+@both_layouts
+def test_without_late_rewards_sums_and_slow_clocks_nothing_is_corrected(group):
+    env = make_late(group, Case(None, 1, 1))
+    assert corrections_of(env.transform, [key(group, "observation"), key(group, "reward")]) == []
+    collected = rollout(env, 40)
+    corrections = [CreditLateRewards(key(group, "reward"), key(group, "reward_delay"))]
+    collected["next", *group, "reward_delay"] = torch.zeros_like(collected["next", *group, "delay"])
+    plain, credited = (
+        stored(make_storage(group, corrections=chosen), collected, 4) for chosen in ([], corrections)
+    )
+    assert all(plain[name].equal(credited[name]) for name in plain.keys(True, True))
+
+
+@both_layouts
+def test_neither_messages_nor_rewards_that_arrive_later_are_used(group):
+    case = Case(4, 3, 2)
+    env = make_late(group, case)
+    collected = rollout(env, 30)
+    spoilt = collected.clone()
+    now = torch.arange(30).view(1, 30, *[1] * (len(group) + 1))
+    message, delay = (next_key(key(group, name)) for name in ("message", "delay"))
+    late = now + collected[delay] > 29
+    spoilt[message] = torch.where(late, torch.nan, collected[message])
+    spoilt[delay] = torch.where(late, LONGEST, collected[delay])
+    reward, reward_delay = (next_key(key(group, name)) for name in ("reward", "reward_delay"))
+    unpaid = now + collected[reward_delay] > 29
+    unpaid &= ~collected["next", "done"].flip(1).cummax(1).values.flip(1).view(
+        WORLDS, 30, *[1] * (unpaid.dim() - 2)
+    )
+    spoilt[reward_delay] = torch.where(unpaid, 4, collected[reward_delay])
+    spoilt[reward] = torch.full_like(spoilt[reward], torch.nan)  # the sums that were paid tell nothing
+    assert late.any()
+    assert unpaid.any()
+    one, other = (stored(storage_of(env, group, 60), steps, 3) for steps in (collected, spoilt))
+    names = (reward, next_key(key(group, "observation")), ("next", "done"), "valid")
+    assert all(one[name].equal(other[name]) for name in names)
+
+
+def late_cartpole(*transforms: object) -> TransformedEnv:
+    late = RewardDelay(Uniform(0, 4), delay_key="reward_delay", earned_key="earned", seed=0)
+    env = TransformedEnv(GymEnv("CartPole-v1"), Compose(StepCounter(), late, *transforms))
+    env.set_seed(0)
+    return env
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_late_rewards_alone_are_credited_in_any_environment(window):
+    env = late_cartpole(CumulativeReward(window, GAMMA))
+    steps = env.rollout(70, break_when_any_done=False)
+    corrections = corrections_of(env.transform, ["reward"])
+    storage = BackupdateStorage(200, None, 4, corrections=corrections, env=env)
+    buffer = ReplayBuffer(storage=storage)
+    for part in steps.split(10):
+        buffer.extend(part.unsqueeze(0))
+    after = storage[storage.latest()].squeeze(1)
+    count, done = (steps[name].flatten().tolist() for name in ("step_count", ("next", "done")))
+    delay = steps["next", "reward_delay"].flatten().tolist()
+    for t in range(70):
+        latest = range(t - min(count[t], window - 1), t + 1)
+        paid = [g for g in latest if g + delay[g] <= 69 or any(done[g:])]
+        expected = sum(GAMMA ** (t - g) for g in paid)
+        assert after["next", "reward"][t].item() == pytest.approx(expected)
+    assert not steps["next", "reward"].equal(after["next", "reward"])
+    paid_late = [g for g in range(70) if delay[g] > 0 and (g + delay[g] <= 69 or any(done[g:]))]
+    assert after["backupdated"].flatten().nonzero().flatten().tolist() == paid_late
+    assert after["next", "done"].equal(steps["next", "done"])
+    assert after["valid"].all()
+    with pytest.raises(InputError, match="recompute: None recomputes nothing from messages"):
+        storage.receive(torch.tensor([0]), None, torch.tensor([0]), torch.zeros(1, 1))
+
+
+def test_rewards_in_transit_at_a_reset_that_ends_no_episode_are_not_credited():
+    env = late_cartpole()
+    steps = torch.cat([env.rollout(6), env.rollout(6)])
+    assert not steps["next", "done"].any()
+    storage = BackupdateStorage(100, None, 4, corrections=corrections_of(env.transform, ["reward"]))
+    ReplayBuffer(storage=storage).extend(steps.unsqueeze(0))
+    left = 5 - torch.arange(12) % 6
+    expected = steps["next", "reward_delay"].flatten() <= left
+    assert storage[storage.latest()]["next", "reward"].flatten().bool().equal(expected)
+    assert not expected.all()
+
+
+def test_the_sum_is_that_of_the_transform():
+    torch.manual_seed(0)
+    env = make_late(("agents",), Case())
+    collected = rollout(env, 40)
+    played = delay_trajectories(
+        collected, CumulativeReward(3, GAMMA, ("agents", "reward")), action_spec=env.full_action_spec
+    )
+    steps = collected.transpose(0, 1)
+    correction, reward = SumLatestRewards(("agents", "reward"), 3, GAMMA), ("next", "agents", "reward")
+    summed = correction({reward: steps[reward]}, steps, steps["step_count"].squeeze(-1))
+    assert summed[reward].equal(played[reward].transpose(0, 1))
+
+
+def test_a_reward_later_than_longest_and_a_ring_without_the_earlier_steps_are_refused():
+    env = make_late((), Case(LONGEST + 1, 3))
+    collected = rollout(env, 40)
+    assert collected["next", "reward_delay"].max() == LONGEST + 1
+    with pytest.raises(InputError, match=f"longest: a reward takes {LONGEST + 1} steps, more than {LONGEST}"):
+        stored(storage_of(env, (), 60), collected)
+    with pytest.raises(InputError, match="max_size: 153 is too little for batches of 40 steps"):
+        stored(storage_of(env, (), 51), collected)
+
+
+NO_DELAYS = "RewardDelay: back-updating needs each delay: give it delay_key='reward_delay'"
+
+
+@pytest.mark.parametrize(
+    ("transform", "message"),
+    [
+        (RewardDelay(2), NO_DELAYS),
+        (SampleAndHold(3, ["observation"], stagger=True), "SampleAndHold: stagger: True has ticks that no"),
+    ],
+)
+def test_transforms_that_do_not_tell_what_a_correction_needs_are_refused(transform, message):
+    with pytest.raises(InputError, match=message):
+        corrections_of(Compose(ActionDelay(2), transform), ["reward", "observation"])
+    assert corrections_of(transform, ["other"]) == []
+
+
+@pytest.mark.parametrize(
+    ("corrections", "options", "message"),
+    [
+        ([], {}, "recompute: None needs corrections that credit late rewards"),
+        (
+            [CreditLateRewards("reward", "late")],
+            {},
+            "delay_key: the steps have no late after them: RewardDelay",
+        ),
+        ([CreditLateRewards("reward", "reward_delay")], {}, "earned_key: the steps have no None after them"),
+        ([CreditLateRewards("reward", "reward_delay")], {"hindsight_key": "h"}, "goes without hindsight_key"),
+    ],
+)
+def test_a_storage_refuses_corrections_that_cannot_work(corrections, options, message):
+    with pytest.raises(InputError, match=message):
+        BackupdateStorage(100, None, 4, corrections=corrections, env=late_cartpole(), **options)
+
+
+def test_an_entry_that_a_correction_needs_must_be_recomputed():
+    def recompute(steps: TensorDictBase, messages: torch.Tensor) -> dict[NestedKey, torch.Tensor]:
+        return {("next", "observation"): steps["next", "observation"]}
+
+    with pytest.raises(
+        InputError, match=r"recompute: it returns no \('next', 'reward'\), which a correction"
+    ):
+        make_storage(
+            (), recompute, corrections=[SumLatestRewards("reward", 2, 1.0)], env=make_late((), Case())
+        )

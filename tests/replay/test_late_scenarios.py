@@ -1,0 +1,135 @@
+"""UAVs whose rewards are late too, or summed, or whose server has a slow clock: hindsight equals no delay."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from helpers import everything, random_actions
+from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
+from torchrl.envs import StepCounter
+
+from damian import keys
+from damian.delays.config import DelayConfig, LinkConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import has_message_delay, make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.keys import next_key
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.corrections import corrections_of
+from damian.replay.recompute import server_recompute
+from damian.server.features import ObservationConfig
+from damian.server.termination import EpisodeConfig
+
+STEPS, WORLDS, LONGEST = 40, 4, 5
+LATE = {"law": "uniform", "low": 0, "high": LONGEST}
+SUMMED = {"reward_window": 3, "reward_discount": 0.7}
+ENDS = ["success", "done", "terminated", "truncated"]
+
+
+def training_env(scenario: ScenarioConfig) -> DelayedEnv:
+    env = make_env(scenario, WORLDS, extras={"message"})
+    env.append_transform(StepCounter())
+    return env
+
+
+def fly(env: DelayedEnv) -> TensorDictBase:
+    """Steps [T, B] with random actions, the same at each call."""
+    generator, steps, td = torch.Generator().manual_seed(5), [], env.reset()
+    for _ in range(STEPS):
+        action = random_actions(env.base_env, generator)
+        after, td = env.step_and_maybe_reset(td.set(keys.ACTION, action))
+        steps.append(after.clone())
+    return torch.stack(steps)
+
+
+def backupdated(scenario: ScenarioConfig, actor: bool) -> tuple[TensorDictBase, TensorDictBase]:
+    """Such steps as collected, and as corrected by all that has arrived after the last one, [T, B]."""
+    env = training_env(scenario)
+    recompute = server_recompute(env.server, actor=actor) if has_message_delay(scenario) else None
+    observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor] if recompute else []
+    corrections = corrections_of(env.transform, [keys.REWARD, *observed])
+    storage = BackupdateStorage(
+        2 * STEPS * WORLDS, recompute, LONGEST, corrections=corrections, env=env, device="cpu"
+    )
+    buffer, late = ReplayBuffer(storage=storage), fly(env)
+    for steps in late.split(8):
+        buffer.extend(steps.transpose(0, 1))
+    return late, storage[storage.latest()]
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "late messages, summed rewards": {"delay": DelayConfig(obs=LATE, **SUMMED)},
+    "late messages, slow server": {"delay": DelayConfig(obs=LATE), "clock": ClockConfig(server="3s")},
+    "late messages and rewards": {"delay": DelayConfig(obs=LATE, rew=LATE)},
+    "late and summed rewards": {"delay": DelayConfig(rew=LATE, **SUMMED)},
+    "late rewards, slow server": {"delay": DelayConfig(rew=3), "clock": ClockConfig(server="2s")},
+    "order of arrival": {
+        "delay": DelayConfig(obs=LATE, rew=3, order="arrival", **SUMMED),
+        "clock": ClockConfig(server="4s"),
+    },
+    "slow agents, history": {
+        "delay": DelayConfig(obs=LATE, rew=LATE, history=2, **SUMMED),
+        "clock": ClockConfig(server="2s", agents="4s"),
+    },
+    "links": {
+        "delay": DelayConfig(obs=LATE, rew=LATE),
+        "clock": ClockConfig(server="2s"),
+        "links": LinkConfig("matrix", delay=1),
+    },
+}
+FLYING = {"late messages, slow server", "late and summed rewards", "slow agents, history"}
+"""Cases with real flights; in the others UAVs move at once."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(name):
+    case, motion = CASES[name], "polynomial" if name in FLYING else "instant"
+    scenario = everything(motion, episode=EpisodeConfig(max_steps=9), **case)
+    on_time = replace(scenario, delay=replace(scenario.delay, obs=0, rew=0, order="generation"))
+    actor = scenario.links.kind == "server" and has_message_delay(scenario)
+    rollouts = (*backupdated(scenario, actor), fly(training_env(on_time)))
+    late, found, true = (steps[: STEPS - LONGEST] for steps in rollouts)
+    after = [keys.REWARD, keys.GLOBAL_OBSERVATION, *ENDS]
+    corrected = [next_key(key) for key in after] + [keys.GLOBAL_OBSERVATION]
+    for key in corrected:
+        assert found[key].equal(true[key]), key
+    assert not late[next_key(keys.REWARD)].equal(true[next_key(keys.REWARD)])
+    if actor:
+        n_features = true[keys.OBSERVATION].shape[-1] - 2 * scenario.delay.history
+        for key in (keys.OBSERVATION, next_key(keys.OBSERVATION)):
+            assert found[key][..., :n_features].equal(true[key][..., :n_features]), key
+            assert found[key][..., n_features:].equal(late[key][..., n_features:]), key
+            assert not late[key][..., :n_features].equal(true[key][..., :n_features])
+
+
+def test_without_recompute_actor_an_actors_observations_stay():
+    scenario = everything(delay=DelayConfig(obs=LATE, rew=3, **SUMMED), clock=ClockConfig(server="2s"))
+    late, found = backupdated(scenario, False)
+    changed = {key for key in late.keys(True, True) if not found[key].equal(late[key])}
+    assert keys.GLOBAL_OBSERVATION in changed
+    assert not changed & {keys.OBSERVATION, next_key(keys.OBSERVATION), keys.ACTION}
+
+
+def test_a_reward_counts_only_once_it_has_been_paid():
+    scenario = everything(episode=EpisodeConfig(max_steps=None), delay=DelayConfig(obs=1, rew=3))
+    _, found = backupdated(scenario, False)
+    reward = found[next_key(keys.REWARD)]
+    assert reward[: STEPS - 3].ne(0).all()
+    assert reward[STEPS - 3 :].eq(0).all()
+
+
+def test_own_messages_and_slow_agents_go_with_hindsight():
+    observation = ObservationConfig(local_features=["spotted", "battery"], own=True)
+    scenario = everything(
+        episode=EpisodeConfig(max_steps=9),
+        observation=observation,
+        delay=DelayConfig(obs=LATE, rew=2),
+        clock=ClockConfig(agents="3s"),
+    )
+    on_time = replace(scenario, delay=DelayConfig())
+    (_, found), true = backupdated(scenario, True), fly(training_env(on_time))
+    for key in (keys.OBSERVATION, next_key(keys.REWARD), next_key(keys.GLOBAL_OBSERVATION)):
+        assert found[key][: STEPS - LONGEST].equal(true[key][: STEPS - LONGEST]), key
