@@ -83,7 +83,7 @@ def scenarios() -> Scenarios:
     paper = cast(TrainConfig, OmegaConf.to_object(composed))
     full = replace(
         paper,
-        region=replace(paper.region, start_positions=None, initial_conditions=1024),
+        region=replace(paper.region, start_positions=None, start_together=False, initial_conditions=1024),
         motion=MotionConfig(kind="polynomial"),
         battery=BatteryConfig(enabled=True),
         actions=replace(paper.actions, mask=True),
@@ -99,7 +99,7 @@ def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:
     return replace(
         scenario,
         agents=agents,
-        region=replace(scenario.region, start_positions=None, initial_conditions=1024),
+        region=replace(scenario.region, start_positions=None, start_together=False, initial_conditions=1024),
         motion=replace(scenario.motion, max_level=30.0),  # room for 50 flight levels
     )
 

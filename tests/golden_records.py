@@ -17,6 +17,24 @@ EPISODES = "episodes_usecase_settings"
 PERSISTENT = "persistent_all_obs_weights_1"
 CUMULATIVE = "cumulative_reward_size3_usecase_weights"
 
+FEATURES = {
+    "source distance": "source_distance",
+    "source bearing": "source_bearing",
+    "source drift": "source_drift",
+    "source time": "source_time",
+    "AVG agent-all distance": "mean_distance",
+    "AVG agent-not_spotting_agents distance": "mean_distance_not_spotting",
+    "AVG spotting_agents-source distance": "mean_distance_spotting",
+    "current N spotting agents": "spotting_agents",
+    "current agent spotted the source": "spotted",
+    "agents distances": "agent_distances",
+    "single-agent coverage area": "coverage",
+}
+"""Feature names of the original implementation, and of this project."""
+
+TOLERANCE = 1e-4
+"""Largest difference between a feature or a reward and the recorded one."""
+
 
 class Transition(NamedTuple):
     """One recorded transition."""
@@ -136,3 +154,19 @@ def server_inputs(case: int, records: list[Transition]) -> tuple[Messages, Serve
         points=torch.zeros(1, 2),
     )
     return messages, server, Counters(number, motions)
+
+
+def converted(name: str, value: float, detected: bool) -> float:
+    """A feature of the original in this project's convention: bearings clockwise from north."""
+    if not detected or name not in ("source_bearing", "source_drift"):
+        return value
+    # A drift is the bearing relative to the track, which is 0 here, plus half a turn.
+    return (0.25 - value) % 1.0 if name == "source_bearing" else (1.25 - value) % 1.0
+
+
+def close(name: str, one: float, other: float) -> bool:
+    """Whether two values of a feature are equal within the tolerance; angles wrap around."""
+    difference = abs(one - other)
+    if name in ("source_bearing", "source_drift"):
+        difference = min(difference, 1 - difference)
+    return difference < TOLERANCE

@@ -13,9 +13,13 @@ import pytest
 import torch
 from golden_records import (
     EPISODES,
+    FEATURES,
     PERSISTENT,
+    TOLERANCE,
     Transition,
+    close,
     column,
+    converted,
     detection_step,
     ready_env,
     recorded,
@@ -27,39 +31,6 @@ from helpers import GOLDEN, act, usecase
 from damian.server.features import observe
 from damian.server.rewards import RewardConfig, final_reward, reward
 from damian.server.termination import status
-
-FEATURES = {
-    "source distance": "source_distance",
-    "source bearing": "source_bearing",
-    "source drift": "source_drift",
-    "source time": "source_time",
-    "AVG agent-all distance": "mean_distance",
-    "AVG agent-not_spotting_agents distance": "mean_distance_not_spotting",
-    "AVG spotting_agents-source distance": "mean_distance_spotting",
-    "current N spotting agents": "spotting_agents",
-    "current agent spotted the source": "spotted",
-    "agents distances": "agent_distances",
-    "single-agent coverage area": "coverage",
-}
-"""Feature names of the original implementation, and of this project."""
-
-TOLERANCE = 1e-4
-
-
-def converted(name: str, value: float, detected: bool) -> float:
-    """A feature of the original in this project's convention: bearings clockwise from north."""
-    if not detected or name not in ("source_bearing", "source_drift"):
-        return value
-    # A drift is the bearing relative to the track, which is 0 here, plus half a turn.
-    return (0.25 - value) % 1.0 if name == "source_bearing" else (1.25 - value) % 1.0
-
-
-def close(name: str, one: float, other: float) -> bool:
-    """Whether two values of a feature are equal within the tolerance; angles wrap around."""
-    difference = abs(one - other)
-    if name in ("source_bearing", "source_drift"):
-        difference = min(difference, 1 - difference)
-    return difference < TOLERANCE
 
 
 def reason_for_other_feature(name: str, transition: Transition, uav: int, value: float) -> str | None:
