@@ -42,10 +42,6 @@ class WorldConfig:
             f"{len(starts or [])} places",
             f"are not one for each of the {self.agents} UAVs (agents)",
         )
-        n_places = len({tuple(start) for start in starts or ()})
-        should = "are equal for some UAVs only: give each UAV its own place, or all of them the same"
-        together = starts is None or n_places in (1, self.agents)
-        checks.require(together, "region.start_positions", starts, should)
 
     def airspace(self, rng: np.random.Generator) -> Airspace:
         """Build the regions and their landing points.

@@ -120,7 +120,7 @@ def test_an_update_learns_from_whole_sequences():
 def test_two_minibatches_split_the_worlds_in_halves():
     env = delayed_env()
     learner = Mappo(
-        env, MappoConfig(epochs=1, minibatches=2, lr=1e-12, normalize_advantage=False), learning(GRU)
+        env, MappoConfig(epochs=1, minibatches=2, lr=1e-9, normalize_advantage=False), learning(GRU)
     )
     (batch,) = batches(env, learner.actor, 14, 1)
     losses = learner.learn(batch)

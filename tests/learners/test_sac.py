@@ -234,7 +234,7 @@ def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_by_tau_t
 
 
 def test_an_update_clears_the_gradients_of_the_previous_one():
-    learner = recording_learner(lr=1e-12, alpha_lr=1e-12)
+    learner = recording_learner(lr=1e-9, alpha_lr=1e-9)
     first = [weight.grad.clone() for weight in learner.loss.parameters()]
     learner.update(learner.drawn[0])
     for weight, gradient in zip(learner.loss.parameters(), first, strict=True):

@@ -191,7 +191,7 @@ def test_every_end_without_success_costs_the_penalty(terminated):
     [
         (
             lambda: RewardConfig(coverage=math.nan),
-            "reward.coverage: nan is not a finite number",
+            "reward.coverage: nan is not a finite weight",
         ),
         (
             lambda: RewardConfig(drift="rough"),
@@ -203,11 +203,11 @@ def test_every_end_without_success_costs_the_penalty(terminated):
         ),
         (
             lambda: RewardConfig(desired_distance=math.nan),
-            "reward.desired_distance: nan is not at least 0",
+            "reward.desired_distance: nan is not between 0 and 2",
         ),
         (
             lambda: RewardConfig(desired_distance_spotting=-3.0),
-            "reward.desired_distance_spotting: -3.0 is not at least 0",
+            "reward.desired_distance_spotting: -3.0 is not between 0 and 2",
         ),
         (
             lambda: EpisodeConfig(max_steps=0),
