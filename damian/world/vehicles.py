@@ -195,10 +195,8 @@ def check_model(model: MotionModel, kind: str, state: State) -> None:
         _require_alike(f"{name}: move", moved, state)
         landed = model.on_ground(moved)
         heard, here = (state.sent._replace(spotted=spotted) for spotted in (torch.ones_like(flag), landed))
-        key, found = (
-            f"{name}: latest_messages",
-            model.latest_messages(moved._replace(sent=heard), landed, here),
-        )
+        key = f"{name}: latest_messages"
+        found = model.latest_messages(moved._replace(sent=heard), landed, here)
         pair = isinstance(found, tuple) and len(found) == 2
         checks.require(pair, key, f"a {type(found).__name__}", "is not a pair of flags and Messages")
         _require_alike(key, found[0], flag)
