@@ -164,6 +164,8 @@ def restore(components: Mapping[str, Any], stored: Mapping[str, Any], path: Path
         except RunError:
             raise
         except Exception as error:  # a component of one's own can raise anything
+            if isinstance(error, InputError) and str(error).startswith(f"{key}: "):
+                raise  # a file that belongs to the checkpoint
             problem = f"its {name} does not fit this run: {_detail(error)}"
             raise InputError(f"{key}: {path}: {problem}") from (error if _is_foreign(error) else None)
 

@@ -48,7 +48,7 @@ def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case, monke
     whole = run(*words, folder="whole")
     with killed_after(2):
         run(*words, folder="other")
-    with killed_after(5):
+    with killed_after(7):
         run("resume=other", folder="unused")
     other = run("resume=other", folder="unused").with_name("other")
     check_equal(whole, other)
