@@ -38,21 +38,22 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
     Raises:
         InputError: no checkpoint is given, or its actor has other observations, actions or layers.
     """
-    require_checkpoint(config)
+    folder = checkpoint_of(config)
     env = make_eval_env(config)
     actor = config.learner.make_actor(env, config.model)
-    load(Checkpoint(actor=actor), Path(config.checkpoint), "checkpoint")
+    load(Checkpoint(actor=actor), folder, "checkpoint")
     return env, actor
 
 
-def require_checkpoint(config: TrainConfig) -> None:
-    """Require the name of a run folder.
+def checkpoint_of(config: TrainConfig) -> Path:
+    """The run folder with the policy to fly.
 
     Raises:
         InputError: no checkpoint is given.
     """
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
+    return Path(config.checkpoint)
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

@@ -194,10 +194,10 @@ def read_result(file: Path) -> dict[str, Any]:
             saved = json.loads(read_text(file))
         except (ValueError, RecursionError) as error:
             raise InputError(f"is not the result of a run ({type(error).__name__}); delete it") from None
-        returns = saved.get("returns") if isinstance(saved, dict) else None
-        whole = isinstance(returns, dict) and {*Run._fields} <= {*saved}
-        numbers = whole and all(isinstance(number, int | float) for number in returns.values())
-        checks.require(numbers, "it", show(saved), "is not the result of a run; delete it")
+        whole = isinstance(saved, dict) and {*Run._fields, "returns"} <= {*saved}
+        returns = list(saved["returns"].values()) if whole and isinstance(saved["returns"], dict) else [None]
+        good = all(isinstance(number, int | float) for number in returns)
+        checks.require(good, "it", show(saved), "is not the result of a run; delete it")
         return saved
 
 
