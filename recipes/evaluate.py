@@ -39,15 +39,15 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
     Raises:
         InputError: no checkpoint is given, or its actor has other observations, actions or layers.
     """
-    written = required_checkpoint(config)
+    written = checkpoint_of(config)
     env = make_eval_env(config)
     actor = config.learner.make_actor(env, config.model)
     load_networks(written, "checkpoint", {"actor": actor})
     return env, actor
 
 
-def required_checkpoint(config: TrainConfig) -> Path:
-    """The run folder, or checkpoint file, that the settings name.
+def checkpoint_of(config: TrainConfig) -> Path:
+    """The run folder, or checkpoint file, with the policy to fly.
 
     Raises:
         InputError: no checkpoint is given.

@@ -28,7 +28,7 @@ from damian.evaluation.run_folder import save_results
 from damian.server.server import Server
 from damian.world.messages import Messages
 
-from .evaluate import required_checkpoint, stored
+from .evaluate import checkpoint_of, stored
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
 from .shared.settings import TrainConfig
@@ -41,7 +41,7 @@ PLACE = ("position", "target", "track", "trail")
 
 def foresee(config: TrainConfig, folder: Path) -> None:
     """Evaluate the policy with ever more messages known on time, and fill the run folder."""
-    required_checkpoint(config)
+    checkpoint_of(config)  # before the delays, because without it nothing can be compared
     if not has_message_delay(config):
         raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
     should = "is not supported: the rows replace what the server broadcasts; choose links=server"

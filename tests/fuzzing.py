@@ -93,6 +93,9 @@ def quoted(text: str) -> str:
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
+WORDS += ["[" * 3000, "[" * 500 + "]" * 500, "{a: " * 500 + "1" + "}" * 500]
+
+
 @functools.cache
 def scalars() -> st.SearchStrategy[str]:
     """Numbers, times, words and text of every kind."""
@@ -257,7 +260,9 @@ def check_line(line: str, given: list[str], program: str = "train") -> None:
     typed = {each.partition("=")[0].lstrip("+~") for each in given}
     typed |= {text_files.one_line(key) for key in typed}
     typed |= {key.partition(".")[0] for key in typed} | {repr(each) for each in given}
-    meant = {*known, *default_options("train"), *_groups(), *typed, "--", "the words"} - {""}
+    meant = {*known, *default_options("train"), *_groups(), *typed, "nested too deeply", "lattice step"} - {
+        ""
+    }
     files = tuple(each.partition("=")[2] for each in given if each.partition("=")[2])
     assert any(name in line for name in meant) or line.startswith(files), line
 

@@ -5,7 +5,8 @@ import sys
 
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
-from yaml import MarkedYAMLError
+from yaml import MarkedYAMLError, YAMLError
+from yaml.reader import ReaderError
 
 from damian.common import text_files
 from damian.common.errors import InputError
@@ -14,7 +15,15 @@ from .command_line import NO_NAMES, own_folder
 from .known_settings import default_options, groups
 from .misspelt import RENAMED, no_such_key, no_such_option
 
-COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, MarkedYAMLError, ValueError, TypeError, OSError)
+COMPOSITION_ERRORS = (
+    HydraException,
+    OmegaConfBaseException,
+    YAMLError,
+    ValueError,
+    TypeError,
+    OSError,
+    RecursionError,
+)
 """What Hydra raises for overrides and files that it cannot compose."""
 QUOTES = {
     r"mismatched input '='|no viable alternative at input '\[\w+='": (
@@ -57,6 +66,11 @@ def _cause(error: BaseException, program: str) -> str:
         error = error.__cause__
     if isinstance(error, MarkedYAMLError) and (mark := error.problem_mark):
         return f"{mark.name}, line {mark.line + 1}, column {mark.column + 1}: {error.problem}"
+    if isinstance(error, ReaderError):
+        return f"{error.name}, character {error.position + 1}: {error.reason}"
+    if isinstance(error, RecursionError):
+        longest = max(sys.argv[1:], key=len, default="")
+        return f"{text_files.show(longest)}: a word or a file of the settings is nested too deeply"
     text, _, _ = _INSTANCE.sub(r"\1: ", str(error)).partition("Config search path")
     found = _about_words(text, program) or _about_key(text, error, outer, program)
     return found or _unreadable(error) or _plain(text, error)
@@ -120,7 +134,7 @@ def _plain(text: str, error: BaseException) -> str:
 
 def foreign_cause(error: BaseException) -> BaseException | None:
     """The exception of other code, such as a component of the user's own, that an error stands for."""
-    known = (HydraException, OmegaConfBaseException, MarkedYAMLError, InputError)
+    known = (HydraException, OmegaConfBaseException, YAMLError, RecursionError, InputError)
     if _INSTANCE.match(str(error)):
         cause = error.__context__  # OmegaConf hides it
     elif isinstance(error, InputError):
@@ -147,7 +161,7 @@ def _unknown(key: str, text: str, error: BaseException, program: str) -> str:
 def _gives_group_no_name(override: str) -> bool:
     """Does an override set a group to no word, which Hydra refuses without naming the group?"""
     group, equals, value = override.lstrip("+").partition("=")
-    is_name = re.fullmatch(r"[^\W\d][\w/-]*", value) and value.lower() not in NO_NAMES
+    is_name = re.fullmatch(r"[^\W\d][\w/.:-]*", value) and value.lower() not in NO_NAMES
     return bool(equals) and not is_name and (group in RENAMED or group in groups())
 
 
