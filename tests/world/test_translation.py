@@ -77,7 +77,7 @@ OFFSET = st.floats(-1e7, 1e7)
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
-@settings(max_examples=3)
+@settings(max_examples=1)
 @given(vertices=st.sampled_from([SQUARE, RAGGED]), east=OFFSET, north=OFFSET)
 @example(vertices=SQUARE, east=1000.0, north=1000.0)
 @example(vertices=RAGGED, east=1e7, north=-1e7)
@@ -88,6 +88,15 @@ def test_moving_the_region_and_all_places_changes_no_bit_of_a_rollout(kind, vert
         assert ours.goal.equal(expected.goal)
     assert all(a.equal(b) for a, b in zip(leaves(ours), leaves(expected), strict=True))
     assert len({*ours.goal.flatten().tolist()}) > 3
+
+
+@given(seed=st.integers(0, 2**32 - 1), east=OFFSET, north=OFFSET)
+def test_a_centred_region_does_not_depend_on_where_it_was(seed, east, north):
+    corners = np.random.default_rng(seed).uniform(-300, 300, (7, 2)).round(3)
+    here = centred(Region(shapely.MultiPoint(corners).convex_hull, "here"))
+    there = centred(Region(shapely.MultiPoint(np.add(corners, [east, north])).convex_hull, "there"))
+    corners, moved = ({*map(tuple, shapely.get_coordinates(r.polygon))} for r in (here, there))
+    assert corners == moved
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (-3.5e6, 1e7)])
