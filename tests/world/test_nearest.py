@@ -55,16 +55,15 @@ def test_of_points_at_one_distance_in_any_direction_the_lowest_id_is_nearest(dis
     assert ours.tolist() == [list(range(359))]
 
 
-def test_targets_searched_in_many_parts_are_found_alike(monkeypatch):
+@pytest.mark.parametrize("slots", [2**18, 1000])
+def test_many_targets_find_what_a_comparison_with_every_point_finds(monkeypatch, slots):
+    monkeypatch.setattr(nearest, "_SLOTS", slots)
     rng = np.random.default_rng(0)
-    points = rng.uniform(0, 1000, (300, 2))
-    target = torch.as_tensor(rng.uniform(0, 1000, (200, 2)))
-    region = torch.zeros(200, dtype=torch.long)
+    points, target = rng.uniform(0, 1000, (300, 2)), rng.uniform(0, 1000, (3000, 2))
     grid = build_grid([points], [1e6], 5)
-    expected = grid.nearest(region, target, 5)
-    monkeypatch.setattr(nearest, "_SLOTS", 100)
-    assert grid.nearest(region, target, 5).equal(expected)
-    assert expected[:20].tolist() == [nearest_by_loop(points.tolist(), t, 5) for t in target[:20].tolist()]
+    ours = grid.nearest(torch.zeros(3000, dtype=torch.long), torch.as_tensor(target), 12)
+    distance = np.floor(100 * np.linalg.norm(points - target[:, None], axis=-1) + 0.500001)
+    np.testing.assert_array_equal(ours, np.argsort(distance, axis=1, kind="stable")[:, :12])
 
 
 def test_no_targets_have_no_points():

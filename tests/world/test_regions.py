@@ -13,7 +13,7 @@ import damian
 from damian.common.errors import InputError
 from damian.common.text_files import MAX_BYTES
 from damian.world.regions.fir import read_fir
-from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon
+from damian.world.regions.geodesy import EARTH_RADIUS_M, area_centroid, to_latlon
 from damian.world.regions.geojson import read_geojson
 from damian.world.regions.polygon import landing_lattice
 from damian.world.regions.region import Region
@@ -59,6 +59,18 @@ def test_rows_of_a_table_are_ordered_by_sequence_number():
 def test_the_origin_of_local_metres_is_the_centroid():
     for region in (read_fir(FIR, "North Bay"), read_geojson(ZONES, where="name:ell")):
         assert region.polygon.centroid.coords[0] == pytest.approx((0, 0), abs=1.0)
+
+
+def test_the_origin_of_a_large_region_is_its_centroid_on_the_sphere(tmp_path):
+    shell, hole = (
+        [[0, 60], [10, 60], [10, 61], [0, 61], [0, 60]],
+        [[1, 60.4], [3, 60.4], [2, 60.6], [1, 60.4]],
+    )
+    file = tmp_path / "cell.geojson"
+    for rings in ([shell], [shell[::-1]], [shell, hole]):
+        file.write_text(json.dumps(_polygon(*rings)))
+        area = [np.array(ring, float) for ring in (shell, hole[::-1])[: len(rings)]]
+        assert read_geojson(file).origin == pytest.approx(area_centroid(area), abs=1e-9)
 
 
 def test_a_region_across_the_antimeridian_is_one_small_polygon():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from hypothesis import example, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from shapely.affinity import translate
 
@@ -76,18 +76,41 @@ def leaves(state):
 OFFSET = st.floats(-1e7, 1e7)
 
 
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-@settings(max_examples=3)
-@given(vertices=st.sampled_from([SQUARE, RAGGED]), east=OFFSET, north=OFFSET)
-@example(vertices=SQUARE, east=1000.0, north=1000.0)
-@example(vertices=RAGGED, east=1e7, north=-1e7)
-def test_moving_the_region_and_all_places_changes_no_bit_of_a_rollout(kind, vertices, east, north):
-    moved = rollout(simulation(vertices, (east, north), kind), kind, 200)
+def check_moved(vertices, offset, kind):
+    """Assert that moving the region and all places changes no bit of a rollout."""
     before = unmoved(tuple(map(tuple, vertices)), kind)
-    for ours, expected in zip(moved, before, strict=True):
+    for ours, expected in zip(rollout(simulation(vertices, offset, kind), kind, 200), before, strict=True):
         assert ours.goal.equal(expected.goal)
     assert all(a.equal(b) for a, b in zip(leaves(ours), leaves(expected), strict=True))
     assert len({*ours.goal.flatten().tolist()}) > 3
+
+
+@pytest.mark.parametrize(
+    ("vertices", "offset", "kind"),
+    [
+        (SQUARE, (1000.0, 1000.0), "discrete"),
+        (RAGGED, (1e7, -1e7), "discrete"),
+        (RAGGED, (-9_876_543.21, 0.1), "continuous"),
+    ],
+)
+def test_moving_the_region_and_all_places_changes_no_bit_of_a_rollout(vertices, offset, kind):
+    check_moved(vertices, offset, kind)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@given(vertices=st.sampled_from([SQUARE, RAGGED]), east=OFFSET, north=OFFSET)
+def test_moving_by_any_offset_changes_no_bit_of_a_rollout(kind, vertices, east, north):
+    check_moved(vertices, (east, north), kind)
+
+
+@given(seed=st.integers(0, 2**32 - 1), east=OFFSET, north=OFFSET)
+def test_a_centred_region_does_not_depend_on_where_it_was(seed, east, north):
+    corners = np.random.default_rng(seed).uniform(-300, 300, (7, 2)).round(3)
+    here = centred(Region(shapely.MultiPoint(corners).convex_hull, "here"))
+    there = centred(Region(shapely.MultiPoint(np.add(corners, [east, north])).convex_hull, "there"))
+    corners, moved = ({*map(tuple, shapely.get_coordinates(r.polygon))} for r in (here, there))
+    assert corners == moved
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (-3.5e6, 1e7)])
