@@ -32,7 +32,7 @@ from .shared.collecting import make_collector, ticks
 from .shared.known_settings import CONF
 from .shared.launch import checked
 from .shared.settings import TrainConfig
-from .train import learning_env, make_learner, replay_buffer
+from .train import learning_env, make_learner
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
@@ -94,7 +94,7 @@ def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
 def damian(config: TrainConfig) -> Iterator[Seconds]:
     """Train as ``damian train`` does; yields the times of each iteration."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    learner = cast(Mappo, make_learner(config, env, replay_buffer(config, env.server)))
+    learner = cast(Mappo, make_learner(config, env))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     batches = ticks(collector, clock)
     while True:

@@ -81,9 +81,10 @@ def replay_buffer(config: TrainConfig, server: Server) -> ReplayBuffer | None:
     return None if size is None else make_buffer(config, server, size)
 
 
-def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
-    """The learner, with the replay buffer that it needs."""
+def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None = None) -> Learner:
+    """The learner, with a replay buffer, which is made if it is not given and the learner needs one."""
     name = config.learner.name
+    buffer = replay_buffer(config, env.server) if buffer is None else buffer
     with own_code(name):
         learner = config.learner.make(env, config.learning_setup, buffer)
         check_learner(learner, name)

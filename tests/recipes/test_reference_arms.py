@@ -40,7 +40,7 @@ from damian.learners.networks import ModelConfig, make_critic
 from damian.learners.sac import Sac, SacConfig
 from damian.recipes.shared.launch import launch
 from damian.recipes.shared.settings import TrainConfig
-from damian.recipes.train import learning_env, main, make_learner, replay_buffer
+from damian.recipes.train import learning_env, main, make_learner
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 
@@ -199,7 +199,7 @@ def settings(**changed: Any) -> TrainConfig:
 
 def learner_of(config: TrainConfig) -> tuple[Mappo | Sac, DelayedEnv]:
     env = learning_env(config)
-    return make_learner(config, env, replay_buffer(config, env.server)), env
+    return make_learner(config, env), env
 
 
 @both_kinds
