@@ -70,6 +70,9 @@ STOPPED = (0, 130, 143, -signal.SIGTERM, -signal.SIGKILL)
 """Exit codes of a run that has ended, or that a signal has stopped before, in or after its training."""
 
 
+STOPS, STOPS_PER_RUN = 20, 5
+
+
 def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int]) -> int:
     """Start and resume a run until it is finished; returns how often it was stopped.
 
@@ -78,15 +81,24 @@ def run_through(words: list[str], folder: str, stop: Callable[[list[str]], int])
         folder: the run folder.
         stop: starts the recipe with words, and may stop it; returns the exit code.
     """
-    for stops in range(500):
+    for stops in range(STOPS_PER_RUN + 1):
         begun = Path(folder, "config.yaml").exists()
-        code = stop(
-            [f"resume={folder}", "hydra.run.dir=unused"] if begun else [*words, f"hydra.run.dir={folder}"]
-        )
+        again = [f"resume={folder}", "hydra.run.dir=unused"] if begun else [*words, f"hydra.run.dir={folder}"]
+        code = stop(again) if stops < STOPS_PER_RUN else ended(forked(again))
         assert code in STOPPED, Path("output.txt").read_text()[-2000:]
         if code == 0:
             return stops
-    raise AssertionError("the run makes no progress")
+    raise AssertionError("a run that nothing stops does not end")
+
+
+def check_stopped_runs(words: list[str], whole: Path, stop: Callable[[list[str]], int]) -> str:
+    """Stop runs until enough were stopped, and compare each with one that never was; returns how many."""
+    stops, runs = 0, 0
+    while stops < STOPS:
+        stops += run_through(words, f"run_{runs}", stop)
+        check_equal(whole, whole.with_name(f"run_{runs}"))
+        runs += 1
+    return f"{stops} stops in {runs} runs"
 
 
 @pytest.mark.slow
@@ -97,7 +109,7 @@ def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, numb
     words, moments = [*SMALL, *LEARNERS[learner]], random.Random(f"{learner} {number}")
     begin = time.monotonic()
     whole = run(*words, folder="whole")
-    longest, stops = time.monotonic() - begin, 0
+    longest = time.monotonic() - begin
 
     def stop(words: list[str]) -> int:
         child = forked(words)
@@ -105,12 +117,7 @@ def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, numb
         os.kill(child, number)
         return ended(child)
 
-    for trial in itertools.count():
-        if stops >= 20:
-            break
-        stops += run_through(words, f"run_{trial}", stop)
-        check_equal(whole, whole.with_name(f"run_{trial}"))
-    print(f"{learner}, {number.name}: {stops} stops in {trial} runs of {longest:.1f} s")
+    print(f"{learner}, {number.name}: {check_stopped_runs(words, whole, stop)} of {longest:.1f} s")
 
 
 @pytest.mark.slow
@@ -118,17 +125,12 @@ def test_a_run_stopped_at_twenty_random_moments_loses_nothing(run, learner, numb
 def test_a_run_killed_in_the_middle_of_writing_loses_nothing(run, learner, monkeypatch):
     monkeypatch.setattr(replay_memory, "SEGMENT_BYTES", 1000)
     words, moments = [*SMALL, *LEARNERS[learner]], random.Random(learner)
-    whole, stops = run(*words, folder="whole"), 0
 
     def stop(words: list[str]) -> int:
-        return ended(forked(words, lambda: kill_at_write(moments.randrange(60))))
+        return ended(forked(words, lambda: kill_at_write(moments.randrange(40))))
 
-    for trial in itertools.count():
-        if stops >= 20:
-            break
-        stops += run_through(words, f"run_{trial}", stop)
-        check_equal(whole, whole.with_name(f"run_{trial}"))
-    print(f"{learner}: {stops} kills in the middle of writing in {trial} runs")
+    whole = run(*words, folder="whole")
+    print(f"{learner}: {check_stopped_runs(words, whole, stop)} in the middle of writing")
 
 
 def kill_at_write(number: int) -> None:
