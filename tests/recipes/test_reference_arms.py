@@ -145,7 +145,8 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
     )
     for td in outputs:
         uavs = td["state"][:, :9].unflatten(-1, (3, 3))[..., :2]
-        to_source = (torch.tensor(position) - uavs) / (200 * math.sqrt(2))
+        from_centre = torch.tensor(position) - 100.0  # the middle of the square
+        to_source = (from_centre - uavs) / (200 * math.sqrt(2))
         torch.testing.assert_close(td[PRIVILEGED][..., -2:], to_source, atol=1e-6, rtol=0)
 
 
