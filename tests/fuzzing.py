@@ -270,12 +270,12 @@ def check_line(line: str, given: list[str], program: str = "train") -> None:
 @contextmanager
 def small_limits() -> Iterator[None]:
     """Refuse as too large what would take seconds to build, instead of what takes minutes."""
-    before = landing.MAX_PAIRS, polygon.MAX_CANDIDATES
-    landing.MAX_PAIRS, polygon.MAX_CANDIDATES = 3_000_000, 20_000
+    before = landing.MAX_TABLE_BYTES, polygon.MAX_CANDIDATES
+    landing.MAX_TABLE_BYTES, polygon.MAX_CANDIDATES = 10_000_000, 20_000
     try:
         yield
     finally:
-        landing.MAX_PAIRS, polygon.MAX_CANDIDATES = before
+        landing.MAX_TABLE_BYTES, polygon.MAX_CANDIDATES = before
 
 
 def is_affordable(config: TrainConfig) -> bool:
