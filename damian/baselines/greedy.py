@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from damian import keys
+from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
@@ -29,6 +30,8 @@ _FLIGHT_COST = 1e-6
 """Cost of a flight [weight per metre]: it only decides between equally good places, for the nearest."""
 _LEAST_GAIN = 1e-3
 """If no choice gains more weight than this, all weight lies out of reach."""
+MAX_PAIRS = 400_000_000
+"""Most pairs of landing points: the script weighs each of them against every other one of its region."""
 
 
 def greedy_policy(env: DelayedEnv) -> TensorDictModule:
@@ -36,7 +39,13 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
 
     It is stateless and deterministic: equal messages give equal actions. It writes ``("agents", "action")``
     [B, N], or [B, N, 2] if actions are continuous. The environment must have ``message`` among its extras.
+
+    Raises:
+        InputError: there are more than ``MAX_PAIRS`` pairs of landing points.
     """
+    n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
+    shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
+    checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
     arguments = {"message": message, "age": keys.AGE, "mask": keys.ACTION_MASK}

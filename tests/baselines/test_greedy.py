@@ -12,6 +12,7 @@ from torch import Tensor
 
 from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.baselines.random import random_policy
+from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -337,3 +338,13 @@ def test_a_uav_last_heard_of_at_its_takeoff_chooses_from_where_it_will_land(acti
     ]
     assert torch.equal(chosen[1], chosen[2])
     assert not torch.equal(chosen[0], chosen[1])
+
+
+def test_a_region_with_too_many_landing_points_is_refused_in_one_line():
+    region = RegionConfig(kind="vertices", vertices=[[0, 0], [4000, 0], [4000, 4000], [0, 4000]])
+    env = make_env(ScenarioConfig(agents=1, region=region), extras=["message"])
+    n_points = int(env.uav_env.simulation.airspace.n_points[0])
+    with pytest.raises(InputError) as error:
+        greedy_policy(env)
+    line = f"region.lattice_step: {n_points} landing points are too many for the scripted policy"
+    assert str(error.value) == f"{line}: take a larger step"
