@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from damian.evaluation.checkpoint import read_checkpoint
 from damian.evaluation.metrics_log import MetricsLog
@@ -65,6 +67,7 @@ def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
         os.dup2(output, 2)
         sys.stdout = os.fdopen(1, "w", buffering=1)
         sys.stderr = os.fdopen(2, "w", buffering=1)
+        tqdm.set_lock(threading.RLock())  # its own one is shared, and a killed child would keep it
         sys.argv = ["train.py", *words]
         prepare()
         launch(main)
