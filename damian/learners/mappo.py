@@ -11,7 +11,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.multiagent import MAPPOLoss
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
 from damian.common import checks
@@ -199,7 +199,7 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     durations = next_step.get(keys.DURATION, torch.ones_like(ends[0], dtype=torch.long))
     gamma, done, terminated = (x.unsqueeze(-2).expand_as(value) for x in (config.gamma**durations, *ends))
     lmbda = torch.where(next_agents["ready"].unsqueeze(-1), config.lmbda, 1.0)
-    advantage, batch[keys.VALUE_TARGET] = vec_generalized_advantage_estimate(
+    advantage, batch[keys.VALUE_TARGET] = generalized_advantage_estimate(
         gamma, lmbda, value, next_agents["state_value"], next_agents["reward"], done, terminated, time_dim=-3
     )
     ready = batch[keys.READY].unsqueeze(-1)

@@ -67,7 +67,10 @@ from damian.recipes.shared.stored_runs import save_config
         (["clock.server=soon"], "clock.server: soon is not a time"),
         (["agents=600", "motion.max_level=900"], "agents: 600 UAVs need as many landing points"),
         (["agents=60"], "leaves room for 39 flight levels"),
-        (["motion.min_level=1900", "motion.max_level=2000"], "is not between 0 and 1828.8 m"),
+        (
+            ["motion=polynomial", "motion.min_level=1900", "motion.max_level=2000"],
+            "is not between 0 and 1828.8 m",
+        ),
         (["region.id=Nope"], "Nope"),
         (["region=fir"], "region.path: it is missing"),
         (["region=geojson", "region.path=nowhere.json"], "nowhere.json"),
@@ -103,8 +106,8 @@ from damian.recipes.shared.stored_runs import save_config
         (["episode.discharged_share=0.5"], "episode.discharged_share: 0.5 needs battery.enabled"),
         (["episode.end_with_source=true"], "episode.end_with_source: True needs source.motion"),
         (
-            ["region=vertices", "region.vertices=[[0,0],[5000,0],[5000,5000],[0,5000]]"],
-            "are too many to rank for every action: raise region.lattice_step",
+            ["region=vertices", "region.vertices=[[0,0],[5e4,0],[5e4,4e4],[0,4e4]]"],
+            "more than 4 GB: raise region.lattice_step",
         ),
         (["-m", "seed=-1,0", "hydra.sweep.dir=sweep"], "seed: -1 is not between"),
         (["-m", "resume=nowhere", "frames=1,2", "hydra.sweep.dir=sweep"], "leave out -m"),
