@@ -73,7 +73,7 @@ def _cause(error: BaseException, program: str) -> str:
         return f"{text_files.show(longest)}: a word or a file of the settings is nested too deeply"
     text, _, _ = _INSTANCE.sub(r"\1: ", str(error)).partition("Config search path")
     found = _about_words(text, program) or _about_key(text, error, outer, program)
-    return found or _unreadable(error) or _plain(text, error)
+    return found or _unreadable(error) or _plain(text, error, outer)
 
 
 def _unreadable(error: BaseException) -> str | None:
@@ -106,7 +106,7 @@ def _about_unnamed(text: str) -> str | None:
         keys = (word.partition("=")[0].lstrip("+~") for word in sys.argv[1:])
         key = next((key for key in keys if key.endswith(f".{index[1]}")), index[1])
         return f"{key}: no such key: it is below a list, whose entries are counted from 0"
-    no_name = r"Config group override must be a string|type '\w+' is not iterable|can only concatenate"
+    no_name = r"override (deletion value )?must be a string|type '\w+' is not iterable|can only concatenate"
     if re.search(no_name, text):
         return next(map(_not_an_option, filter(_gives_group_no_name, sys.argv[1:])), None)
     return None
@@ -123,12 +123,15 @@ def _about_key(text: str, error: BaseException, outer: str, program: str) -> str
     return None
 
 
-def _plain(text: str, error: BaseException) -> str:
+def _plain(text: str, error: BaseException, outer: str) -> str:
     """A message with its key in front, and without OmegaConf's and Hydra's lines of types and hints."""
     key, tails = _KEY.search(text), ("full_key", "reference_type", "object_type", "Set the env", "See https")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     first, *more = [line for line in lines if not line.startswith(tails)] or [type(error).__name__]
     message = " ".join([first, ", ".join(more).replace(":,", ":")]).strip()
+    given = re.search(r"Error merging override [+~]*([\w.]+)=", outer)
+    if key and given and f".{key[1]}." in f".{given[1]}.":
+        return f"{given[1]}: {message}"  # OmegaConf names only the last part of a key in a mapping
     return f"{key[1]}: {message}" if key else message
 
 
@@ -160,11 +163,11 @@ def _unknown(key: str, text: str, error: BaseException, program: str) -> str:
 
 def _gives_group_no_name(override: str) -> bool:
     """Does an override set a group to no word, which Hydra refuses without naming the group?"""
-    group, equals, value = override.lstrip("+").partition("=")
+    group, equals, value = override.lstrip("+~").partition("=")
     is_name = re.fullmatch(r"[^\W\d][\w/.:-]*", value) and value.lower() not in NO_NAMES
     return bool(equals) and not is_name and (group in RENAMED or group in groups())
 
 
 def _not_an_option(override: str) -> str:
-    group, _, option = override.lstrip("+").partition("=")
+    group, _, option = override.lstrip("+~").partition("=")
     return no_such_option(group, option)

@@ -68,6 +68,7 @@ REFUSED = [
     ("=3", "is not of the form KEY=VALUE"),
     ("hydra.run.dir=", "hydra.run.dir: it is empty"),
     ("hydra.sweep.dir=''", "hydra.sweep.dir: it is empty"),
+    ("~region=nan", "region: nan is not one of fir, geojson, llanbedr"),
     ("motion=[3]", "motion: [3] is not one of instant, polynomial"),
     ("agents=" + "9" * 5000, "agents: it has more than 4300 digits"),
     ("actions.distances.x=1", "actions.distances.x: no such key"),
