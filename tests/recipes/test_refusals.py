@@ -66,7 +66,7 @@ from damian.recipes.shared.stored_runs import save_config
         (["clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
         (["clock.server=soon"], "clock.server: soon is not a time"),
         (["agents=600", "motion.max_level=900"], "agents: 600 UAVs need as many landing points"),
-        (["agents=60"], "leaves room for 39 flight levels"),
+        (["agents=60", "motion=polynomial"], "leaves room for 39 flight levels"),
         (
             ["motion=polynomial", "motion.min_level=1900", "motion.max_level=2000"],
             "is not between 0 and 1828.8 m",
