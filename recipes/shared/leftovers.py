@@ -44,7 +44,8 @@ def drop_empty(folder: Path) -> None:
     folder.rmdir()
     parent = folder.parent
     drop_sweep(parent)
-    while is_folder(parent) and parent.absolute() not in _older and not any(parent.iterdir()):
+    # Without a command line nothing tells which of the folders above were there before.
+    while _older and is_folder(parent) and parent.absolute() not in _older and not any(parent.iterdir()):
         parent.rmdir()
         parent = parent.parent
 

@@ -24,6 +24,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
+from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
@@ -340,6 +341,5 @@ def test_existing_environments_run_in_worker_processes():
 def test_a_state_dict_for_another_number_of_worlds_is_refused():
     env, other = (delayed(square(delay=DelayConfig(act=2)), n) for n in (2, 5))
     env.reset()
-    other.load_state_dict(env.state_dict())
-    with pytest.raises(RuntimeError, match=r"rows of shape \(2, 3\), but the environment has \(5, 3\)"):
-        other.reset()
+    with pytest.raises(InputError, match=r"\[2, \d+\] is not \[5, \d+\]: load it into as many worlds"):
+        other.load_state_dict(env.state_dict())

@@ -40,6 +40,7 @@ from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 FAR = [[390.0, 10.0]]
+CORNER = [[190.0, 10.0]]
 """A charging point where no UAV of these tests lands."""
 
 # Ends of episodes.
@@ -116,7 +117,7 @@ def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding
 @both_motions
 @both_kinds
 def test_a_landed_uav_is_empty_exactly_where_no_action_leads_to_another_point(motion, kind):
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.02, resolution=1e-3, charging_points=FAR)
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.02, resolution=1e-3, charging_points=CORNER)
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0)
     headings = [10.0 * n for n in range(36)]
     actions = ActionConfig(kind=kind, distances=[0.0, 10.0, 20.0, 40.0, 60.0], headings=headings)
@@ -141,7 +142,7 @@ def test_a_landed_uav_is_empty_exactly_where_no_action_leads_to_another_point(mo
 
 
 def test_batteries_fail_in_the_energy_task_and_a_uav_in_flight_does_not_count_for_want_of_reach():
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.005, resolution=1e-3, charging_points=FAR)
+    battery = BatteryConfig(enabled=True, capacity_kwh=0.005, resolution=1e-3, charging_points=CORNER)
     episode = EpisodeConfig(max_steps=60, discharged_share=1.0)
     for motion in ("instant", "polynomial"):
         scenario = square(agents=2, battery=battery, motion=MOTIONS[motion], episode=episode)
@@ -157,8 +158,8 @@ def test_batteries_fail_in_the_energy_task_and_a_uav_in_flight_does_not_count_fo
 
 
 def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_configured():
-    once = {"n_hotspots": 1, "min_stops": 0, "max_stops": 0, "min_wait": 2.0, "max_wait": 2.0}
-    source = walking(level_db=170.0, after_walk="stop", **once)
+    once = {"n_hotspots": 1, "min_stops": 1, "max_stops": 1, "min_wait": 0.9, "max_wait": 0.9}
+    source = walking(level_db=170.0, after_walk="stop", local_distance=1e-3, **once)
     for terminates in (True, False):
         episode = EpisodeConfig(max_steps=None, end_with_source=terminates)
         env = fresh(one_uav(source=source, episode=episode))

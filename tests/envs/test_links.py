@@ -126,6 +126,7 @@ def test_out_of_range_a_uav_knows_only_the_first_message():
 
 
 @pytest.mark.parametrize("links", [LINKS["updown"], LINKS["range"]])
+@pytest.mark.slow
 def test_a_compiled_step_does_the_same(links):
     scenario = everything(delay=DelayConfig(obs=LATE), links=LinkConfig(**links))
     eager, graph = (make_env(scenario, 2, seed=1) for _ in range(2))

@@ -89,6 +89,7 @@ def test_a_reward_term_reads_features_of_any_width_and_range(motion):
         assert output["agents", "reward"].squeeze(-1).equal(felt.sum(-1) + widest)
 
 
+@pytest.mark.slow
 def test_a_compiled_environment_with_sensors_does_the_same():
     observation = ObservationConfig(["spotted", *LOCAL], GLOBAL)
     scenario = square(motion=FLYING, sensors=SENSORS, observation=observation, delay=DelayConfig(obs=2))

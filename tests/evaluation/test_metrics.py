@@ -130,6 +130,7 @@ def test_an_evaluation_equals_counting_step_by_step(motion, delay):
 
 
 @both_motions
+@pytest.mark.slow
 def test_false_late_and_missed_successes_differ_from_true_ones(motion):
     flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.2)), 256)
     expected, rows = by_hand(flight, server, needed=2)

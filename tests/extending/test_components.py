@@ -132,6 +132,7 @@ def test_a_mistake_in_a_sensor_or_in_what_a_feature_declares_is_one_clear_line(
 
 
 @pytest.mark.parametrize("compiles", [False, True])
+@pytest.mark.slow
 def test_extensions_do_the_same_compiled_and_back_updated_steps_know_them(folder, compiles):
     scenario = everything(
         observation=ObservationConfig(["spotted", "features:heading"], ["features:spread", "source_time"]),

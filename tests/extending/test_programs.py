@@ -141,6 +141,7 @@ def test_a_learner_gets_what_it_reads_and_what_was_held_before_and_after_back_up
     assert 0.5 < float(metrics["changed"]) == float(metrics["marked"]) < 1
 
 
+@pytest.mark.slow
 def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
     (folder / "conf" / "experiment").mkdir()
     (folder / "conf" / "experiment" / "mine.yaml").write_text(

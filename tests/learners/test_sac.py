@@ -259,6 +259,7 @@ def test_a_checkpoint_restores_the_networks_but_not_the_discount():
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.slow
 def test_sac_learns_which_actions_are_rewarded(kind):
     """Actions to the east are rewarded at once and gamma is 0: a bandit without context."""
     env = UavEnv(everything(kind=kind, actions=ActionConfig(kind=kind, mask=False)), 16)

@@ -150,7 +150,7 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
         (["+delay.foo=3"], "delay.foo: no such key"),
         (["delay.obs=soon"], "delay.obs: soon is neither whole steps"),
         (["delay=sometimes"], "delay: sometimes is not one of burst, distance, lag, none, paper"),
-        (["resume=runs/last"], "resume: the random policy is not trained, so there is no run to resume"),
+        (["resume=runs/last"], "resume: the random policy flies, which is not trained"),
         (["region.id=Nope"], "Nope"),
     ],
 )

@@ -45,6 +45,7 @@ def test_without_vmas_there_are_no_ratios():
     assert rows({"ours": Seconds(0.3, 0.1, 0.6)}, frames=8000)[0][-1] == "-"
 
 
+@pytest.mark.slow
 def test_every_arm_trains_and_has_a_row():
     vmas = importlib.util.find_spec("vmas")
     table = training(worlds=2, steps=8, repeats=1)

@@ -140,7 +140,7 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
         ([listed("delay.loss=0.1", "source.position=[1,2,3]")], "source.position: [1, 2, 3] is not"),
         (["overrides=[seed=3]"], "a value with = in it needs quotes"),
         ([listed("seed=3")], "overrides: seed=3 cannot be the same for every run"),
-        (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not one of"),
+        (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
         (["arms=[undelayed,awake]"], "arms: awake is not one of undelayed, unaware, deployed, history"),
         (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
         (["seedz=3"], "seedz: no such key; did you mean seeds?"),

@@ -164,7 +164,7 @@ def test_the_same_seed_gives_the_same_results_and_another_one_others(fly):
         (["observation.age=true"], "observation.age: the policy was trained with False"),
         (["agent=3"], "agent: no such key; did you mean agents?"),
         (["delay.obs=-3"], "delay.obs: -3 is neither whole steps such as 3 nor a time"),
-        (["agents=60"], "leaves room for 39 flight levels"),
+        (["agents=60", "motion=polynomial"], "leaves room for 39 flight levels"),
         (["resume=nowhere"], "a resumed run keeps its configuration"),
     ],
 )

@@ -138,10 +138,19 @@ def test_a_folder_that_cannot_be_made_is_one_line(run, capsys, tmp_path, folder)
 # Learners that diverge.
 
 
-def test_a_learning_rate_of_a_million_stops_the_run(run, capsys):
-    line = stopped_with_learner(run, capsys, "learner.lr=1e6")
+def test_weights_beyond_all_use_stop_the_run(run, capsys, monkeypatch):
+    learn = Mappo.learn
+
+    def explode(learner: Mappo, batch) -> dict[str, float]:
+        numbers = learn(learner, batch)
+        for weights in learner.actor.parameters():
+            weights.data.fill_(1e6)
+        return numbers
+
+    monkeypatch.setattr(Mappo, "learn", explode)
+    line = stopped_with_learner(run, capsys, "learner.lr=0.001")
     assert line.startswith("error: update 1: actor: ")
-    assert "beyond 100000: the learner has diverged; choose a smaller learner.lr than 1e+06" in line
+    assert "beyond 100000: the learner has diverged; choose a smaller learner.lr than 0.001" in line
     assert line.endswith("bad/checkpoint.pt is of update 0 and intact")
     assert read_checkpoint(Path("bad/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 0
 
@@ -215,7 +224,7 @@ def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, me
 @pytest.mark.parametrize("key", ["resume", "checkpoint"])
 def test_a_name_that_no_folder_can_have_is_refused_in_one_line(run, capsys, tmp_path, key):
     line = stopped_with(run, capsys, 2, f"{key}={'x' * 5000}")
-    assert line.startswith(f"error: {key}: xxx")
+    assert line.startswith(f"error: {key}: 'xxx")
     assert len(line) < 400
     assert [*tmp_path.iterdir()] == []
 

@@ -64,11 +64,11 @@ def test_finished_arms_are_kept_and_a_missing_one_is_reproduced_by_another_proce
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--steps", "1000"], "--steps: 1000 is not above 1000"),
+        (["--steps", "1000"], "--steps: 1000 is not between 1001 and 1e+08"),
         (["--delay", "0"], "--delay: 0 steps is not between 1 and 200 steps"),
         (["--seeds", "0,x"], "--seeds: 0,x is not a list of different whole numbers"),
         (["--seeds", "1,01"], "--seeds: 1,01 is not a list of different whole numbers"),
-        (["--jobs", "0"], "--jobs: 0 is not at least 1"),
+        (["--jobs", "0"], "--jobs: 0 is not between 1 and 1024"),
         (["--episodes", "many"], "argument --episodes: invalid int value: 'many'"),
         (["--lag", "6"], "unrecognized arguments: --lag 6"),
     ],

@@ -162,6 +162,7 @@ def test_privileged_observations_change_no_other_output(delay):
     assert all_same([td.exclude(PRIVILEGED) for td in with_it], without)
 
 
+@pytest.mark.slow
 def test_held_messages_and_privileged_observations_compile():
     scenario = square(delay=DelayConfig(obs=BURST, hold="max"))
     env = make_env(scenario, 4, extras=["message", "privileged"]).compile(backend="eager")

@@ -7,6 +7,7 @@ from helpers import check_refused
 
 from damian.common.errors import InputError
 from damian.recipes.shared.launch import perform
+from damian.recipes.shared.leftovers import remember_folders
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.shared.stored_runs import save_config
 
@@ -133,7 +134,9 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(run, capsys, tm
 
 
 @pytest.mark.parametrize("kept", [None, "checkpoint.pt", "metrics.csv", "notes.txt"])
-def test_a_run_that_is_refused_before_its_first_step_leaves_no_folder(tmp_path, kept):
+def test_a_run_that_is_refused_before_its_first_step_leaves_no_folder(tmp_path, monkeypatch, kept):
+    monkeypatch.chdir(tmp_path)
+    remember_folders([])
     folder = tmp_path / "runs" / "sweep" / "seed=0"
     folder.mkdir(parents=True)
     (folder.parent / "multirun.yaml").touch()

@@ -101,8 +101,8 @@ def test_a_resumed_run_continues_with_the_period_of_its_triggered_clock(run):
 
 def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
     first = run(*TINY, "agents=2", folder="first")
-    still = run(f"checkpoint={first}", "learner.lr=1e-30", "seed=1", folder="still")
-    fresh = run(*TINY, "agents=2", "learner.lr=1e-30", "seed=1", folder="fresh")
+    still = run(f"checkpoint={first}", "learner.lr=1e-9", "seed=1", folder="still")
+    fresh = run(*TINY, "agents=2", "learner.lr=1e-9", "seed=1", folder="fresh")
     trained, kept, other = (weights(folder, "actor", "critic") for folder in (first, still, fresh))
     assert {name.partition(".")[0] for name in trained} == {"actor", "critic"}
     assert all(kept[name].equal(trained[name]) for name in trained)
@@ -113,7 +113,7 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
 
 def test_one_learner_starts_from_the_policy_of_the_other(run):
     first = run(*TINY, folder="first")
-    second = run(*TINY, f"checkpoint={first}", *SAC, "learner.lr=1e-30", folder="second")
+    second = run(*TINY, f"checkpoint={first}", *SAC, "learner.lr=1e-9", folder="second")
     one, other = (weights(folder, "actor") for folder in (first, second))
     assert all(other[name].equal(one[name]) for name in one)
 

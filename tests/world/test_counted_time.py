@@ -36,7 +36,7 @@ def first_step(env: UavEnv, holds, near: int, **changed) -> int:
     return steps[flags.index(True)]
 
 
-@given(period=periods, tenths=st.integers(0, 10**8))
+@given(period=periods, tenths=st.integers(0, 10**7))
 @settings(max_examples=settings.default.max_examples // 2)
 def test_a_uav_that_holds_is_ready_after_exactly_its_sensing_time(period, tenths):
     motion = MotionConfig("polynomial", sensing_time=tenths / 10)
