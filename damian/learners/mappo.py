@@ -198,7 +198,8 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     # Only with ``clock.skip`` do steps have durations other than 1.
     durations = next_step.get(keys.DURATION, torch.ones_like(ends[0], dtype=torch.long))
     gamma, done, terminated = (x.unsqueeze(-2).expand_as(value) for x in (config.gamma**durations, *ends))
-    lmbda = torch.where(next_agents["ready"].unsqueeze(-1), config.lmbda, 1.0)
+    # TorchRL says float, but broadcasts tensors.
+    lmbda: Any = torch.where(next_agents["ready"].unsqueeze(-1), config.lmbda, 1.0)
     advantage, batch[keys.VALUE_TARGET] = generalized_advantage_estimate(
         gamma, lmbda, value, next_agents["state_value"], next_agents["reward"], done, terminated, time_dim=-3
     )

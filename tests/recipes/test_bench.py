@@ -3,6 +3,8 @@
 import importlib.util
 from dataclasses import replace
 
+import pytest
+
 from damian.envs.pipeline import has_message_delay
 from damian.recipes.bench import QUICK, delayed, scenarios, step_times
 from damian.recipes.bench_training import (
