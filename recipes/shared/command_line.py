@@ -75,7 +75,7 @@ def prepared(words: Sequence[str]) -> list[str]:
     """
     options = vars(parsed(words))
     for word in options["overrides"]:
-        if not word.lstrip("+~").partition("=")[0].strip():
+        if not word.lstrip("+~").partition("=")[0].partition("@")[0].strip():
             raise InputError(f"{word!r}: this word is not of the form KEY=VALUE")
         if "\0" in word:
             raise InputError(f"{word!r}: a NUL byte is not text")

@@ -53,7 +53,10 @@ KINDS, MOTIONS = ("discrete", "continuous"), ("instant", "polynomial")
 
 @pytest.mark.parametrize("aware", AWARE)
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("learner", "rnn"), [("mappo", "none"), ("sac", "none"), ("mappo", "gru")])
+@pytest.mark.parametrize(
+    ("learner", "rnn"),
+    [("mappo", "none"), ("sac", "none"), pytest.param("mappo", "gru", marks=pytest.mark.slow)],
+)
 def test_every_learner_trains_with_every_kind_of_action_and_awareness_and_is_evaluated(
     tmp_path, learner, rnn, kind, aware
 ):

@@ -294,6 +294,7 @@ def run(tmp_path, monkeypatch):
         ["motion=polynomial", "delay=paper", "aware=both", "settle=true"],
     ],
 )
+@pytest.mark.slow
 def test_the_recipe_trains_recurrent_actors(run, overrides):
     folder = run(train, "model=gru", *TINY, *overrides)
     assert len((folder / "metrics.csv").read_text().splitlines()) == 3

@@ -203,7 +203,7 @@ def test_what_is_no_file_is_named(file, kind, tmp_path, monkeypatch):
     assert line is not None
 
 
-@examples(20, 1000)
+@examples(12, 1000)
 @given(st.sampled_from([*READERS]).flatmap(lambda file: st.tuples(st.just(file), contents(file))))
 def test_files_of_any_content_are_refused_in_one_line_or_read(case):
     file, content = case

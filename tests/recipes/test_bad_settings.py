@@ -66,6 +66,7 @@ REFUSED = [
     ("agents=1000000", "agents: 1000000 is not between 1 and 1000"),
     ("model.hidden=[" + ",".join("8" * 100) + "]", "model.hidden (number of layers): 100"),
     ("=3", "is not of the form KEY=VALUE"),
+    ("@agents=-1", "is not of the form KEY=VALUE"),
     ("hydra.run.dir=", "hydra.run.dir: it is empty"),
     ("hydra.sweep.dir=''", "hydra.sweep.dir: it is empty"),
     ("~region=nan", "region: nan is not one of fir, geojson, llanbedr"),
@@ -98,7 +99,7 @@ def test_a_batch_has_a_limit():
     assert line.startswith("worlds: 1000000000000 environment steps between two updates is not between 1 and")
 
 
-@examples(40, 4000)
+@examples(25, 4000)
 @given(words("train"))
 def test_any_words_are_refused_in_one_line_or_fly(given_words):
     refusal(given_words, fly)
@@ -114,7 +115,7 @@ def test_any_words_of_a_comparison_are_refused_in_one_line_or_make_a_plan(given_
     refusal(given_words, compare, "compare")
 
 
-@examples(20, 1000)
+@examples(12, 1000)
 @given(words("train"))
 def test_the_quick_look_at_any_words_ends_without_a_traceback(given_words):
     """``damian PROGRAM`` looks at its words before it loads torch; it prints help, refuses, or goes on."""

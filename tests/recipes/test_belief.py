@@ -51,7 +51,12 @@ def printed_lines(capsys) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "overrides", [[], ["delay=none", "agents=1"], [*BADLY, "scenario=tracking", "agents=8"]]
+    "overrides",
+    [
+        ["delay=none", "agents=1"],
+        pytest.param([], marks=pytest.mark.slow),
+        pytest.param([*BADLY, "scenario=tracking", "agents=8"], marks=pytest.mark.slow),
+    ],
 )
 def test_a_run_folder_holds_configuration_table_and_figure(run, capsys, overrides):
     folder = run(*overrides, "episode.max_steps=10")

@@ -319,6 +319,7 @@ def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finis
 
 
 @pytest.mark.parametrize("name", [path.stem for path in sorted((Path(CONF) / "experiment").iterdir())])
+@pytest.mark.slow
 def test_every_experiment_file_gives_runs_whose_settings_allow_training(compare, capsys, name):
     only = ["delays=[paper]", "tasks=[flights]"] if name == "delaybench" else []
     words = [f"experiment={name}", "seeds=1", "report_only=true", *only]

@@ -107,6 +107,7 @@ def test_a_transform_works_in_worker_processes(case):
 
 
 @pytest.mark.parametrize("case", [AGENTS[name] for name in ("ObservationDelay, agents", "Channel, links")])
+@pytest.mark.slow
 def test_worker_processes_draw_different_numbers_and_the_same_again_from_the_same_seed(case):
     outputs, streams = [], []
     for _ in range(2):
