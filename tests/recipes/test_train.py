@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
@@ -105,8 +106,8 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
     fresh = run(*TINY, "agents=2", "learner.lr=1e-9", "seed=1", folder="fresh")
     trained, kept, other = (weights(folder, "actor", "critic") for folder in (first, still, fresh))
     assert {name.partition(".")[0] for name in trained} == {"actor", "critic"}
-    assert all(kept[name].equal(trained[name]) for name in trained)
-    assert not all(other[name].equal(trained[name]) for name in trained)
+    assert all(torch.allclose(kept[name], trained[name], atol=1e-6) for name in trained)
+    assert not all(torch.allclose(other[name], trained[name], atol=1e-3) for name in trained)
     assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # frames count from 0 again
     assert OmegaConf.load(still / "config.yaml").agents == 2
 
@@ -115,7 +116,7 @@ def test_one_learner_starts_from_the_policy_of_the_other(run):
     first = run(*TINY, folder="first")
     second = run(*TINY, f"checkpoint={first}", *SAC, "learner.lr=1e-9", folder="second")
     one, other = (weights(folder, "actor") for folder in (first, second))
-    assert all(other[name].equal(one[name]) for name in one)
+    assert all(torch.allclose(other[name], one[name], atol=1e-6) for name in one)
 
 
 def test_a_run_can_be_resumed_without_the_folder_of_the_policy_that_it_started_from(run):
