@@ -91,4 +91,5 @@ def make_server(scenario: ScenarioConfig, simulation: Simulation) -> Server:
         dt=scenario.clock.dt,
         time_scale=scenario.time_scale,
         readings={name: sensor.width for name, sensor in simulation.sensors.items()},
+        stops=not simulation.vehicles.instant,
     )

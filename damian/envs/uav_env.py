@@ -18,6 +18,7 @@ from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
 from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
+from damian.world.coverage import KnownCoverage
 from damian.world.simulation import Simulation
 from damian.world.state import INITIAL_CONDITION, PackedState, State
 
@@ -237,11 +238,16 @@ class UavEnv(EnvBase):
             action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
             valid: which UAVs act, [B, N] bool; all of them if not given.
         """
-        state = self.simulation.step(self.simulation.layout.unpack(worlds), action, valid)
-        packed = self.simulation.layout.pack(state)
+        before = self.simulation.layout.unpack(worlds)
+        state = self.simulation.step(before, action, valid)
         if self.messages_only:
-            return packed, self._state_outputs(state)
-        features = self.server.features(state.sent, state.steps)
+            return self.simulation.layout.pack(state), self._state_outputs(state)
+        remembers = self.server.remembers_coverage
+        known = KnownCoverage(before.sent.trail, before.coverage) if remembers else None
+        features = self.server.features(state.sent, state.steps, coverage=known)
+        if remembers:
+            state = state._replace(coverage=features["coverage"])
+        packed = self.simulation.layout.pack(state)
         outputs = self._state_outputs(state, features)
         result = self.server.reward_and_status(features, state.sent, state.steps, state.source_over)
         outputs[keys.REWARD] = result.reward.unsqueeze(-1)

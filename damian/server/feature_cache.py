@@ -8,7 +8,7 @@ from torch import Tensor
 
 from damian.common.errors import InputError
 from damian.world.battery import BatteryConfig
-from damian.world.coverage import FootprintTables
+from damian.world.coverage import FootprintTables, KnownCoverage
 from damian.world.messages import Messages
 
 
@@ -37,6 +37,8 @@ class ServerContext(NamedTuple):
     """Estimate the source's position from only the newest detections (``ObservationConfig.estimate``)."""
     readings: Mapping[str, tuple[int, int]] = MappingProxyType({})
     """First column, and number of columns, of each reading in ``Messages.readings``, by name."""
+    coverage: KnownCoverage | None = None
+    """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be computed."""
 
 
 class FeatureCache:

@@ -17,7 +17,7 @@ from damian.common.registry import Registry, require_parentheses
 from damian.common.tensors import gather_rows
 from damian.server.feature_cache import FeatureCache, ServerContext
 from damian.world.battery import observed
-from damian.world.coverage import covered_share
+from damian.world.coverage import covered_share, updated_share
 from damian.world.messages import Messages
 
 
@@ -273,8 +273,10 @@ def _agent_distances(v: FeatureCache) -> Tensor:
 def _coverage(v: FeatureCache) -> Tensor:
     if v.context.footprints is None:
         raise ValueError("coverage needs the footprint tables")
-    trail = v.messages.trail
-    return covered_share(v.context.footprints, trail, gather_rows(v.context.points, trail))
+    trail, points, known = v.messages.trail, v.context.points, v.context.coverage
+    if known is not None and trail.device.type == "cpu":  # its shapes depend on data
+        return updated_share(v.context.footprints, trail, points, known)
+    return covered_share(v.context.footprints, trail, gather_rows(points, trail))
 
 
 @FEATURES.register("mean_distance")

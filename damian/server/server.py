@@ -22,7 +22,7 @@ from damian.server.termination import EpisodeConfig, Status, status
 from damian.server.trial import try_feature, try_term
 from damian.world.airspace import Airspace
 from damian.world.battery import BatteryConfig
-from damian.world.coverage import FootprintTables, build_tables
+from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 
 Features = dict[str, Tensor]
@@ -52,6 +52,8 @@ class ServerOutputs(NamedTuple):
     """Weighted terms of the rewards by name, [*, N] each."""
     status: Status
     """Success and the end of the episode, [*]."""
+    coverage: KnownCoverage | None
+    """For the next step, if ``Server.remembers_coverage``."""
 
 
 class Server:
@@ -67,6 +69,7 @@ class Server:
         dt: length of a step [s].
         time_scale: times are divided by this [s].
         readings: width of each reading that messages carry, by name, in their order; none if not given.
+        stops: whether UAVs stay at a landing point for more than a step, so that coverage changes seldom.
 
     Raises:
         InputError: there are more landing points than a message can number.
@@ -84,6 +87,7 @@ class Server:
         dt: float,
         time_scale: float,
         readings: Mapping[str, int] | None = None,
+        stops: bool = False,
     ) -> None:
         if airspace.points.shape[:2].numel() >= MAX_EXACT_INTEGER:
             raise InputError(
@@ -104,6 +108,7 @@ class Server:
             polygons = [region.polygon for region in airspace.regions]
             places = airspace.points.double().cpu().numpy()
             self._footprints = build_tables(polygons, places, radius)
+        self.remembers_coverage = stops and self._footprints is not None
 
     def to(self, device: torch.device) -> "Server":
         """Move the tables to a device, in place."""
@@ -116,28 +121,49 @@ class Server:
         """Messages from their packed rows [*, N, M], with the readings of all sensors."""
         return Messages.unpack(rows, self._n_readings)
 
-    def __call__(self, messages: Messages, steps: Tensor, source_over: Tensor | None = None) -> ServerOutputs:
+    def __call__(
+        self,
+        messages: Messages,
+        steps: Tensor,
+        source_over: Tensor | None = None,
+        coverage: KnownCoverage | None = None,
+    ) -> ServerOutputs:
         """Observations, rewards and status of messages.
 
         Args:
             messages: one message of each UAV, [*, N].
             steps: elapsed steps of the episode, [*].
             source_over: has the source finished its walk, [*] or [*, 1]; if not given, it never has.
+            coverage: of an earlier step of the same worlds, which saves time.
         """
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
-        features = self.features(messages, steps)
+        features = self.features(messages, steps, coverage=coverage)
         result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
-        return ServerOutputs(*self.observations(features), *result)
+        return ServerOutputs(*self.observations(features), *result, self.known_coverage(messages, features))
 
-    def features(self, messages: Messages, steps: Tensor, names: list[str] | None = None) -> Features:
+    def features(
+        self,
+        messages: Messages,
+        steps: Tensor,
+        names: list[str] | None = None,
+        coverage: KnownCoverage | None = None,
+    ) -> Features:
         """The features that observations and rewards are made of (paper, Table 2).
 
         Args:
             messages: one message of each UAV, [*, N].
             steps: elapsed steps of the episode, [*].
             names: features to compute; if not given, all that an observation or a reward term needs.
+            coverage: of an earlier step of the same worlds, which saves time.
         """
-        return observe(messages, self._context(messages, steps), names or self._names)
+        context = self._context(messages, steps)._replace(coverage=coverage)
+        return observe(messages, context, names or self._names)
+
+    def known_coverage(self, messages: Messages, features: Features) -> KnownCoverage | None:
+        """What the next step may need of this one's features; None if that would not save time."""
+        if not self.remembers_coverage:
+            return None
+        return KnownCoverage(messages.trail, features["coverage"])
 
     def checked_features(self, messages: Messages, steps: Tensor) -> Features:
         """The features of ``features``; those of one's own, and one's own reward terms, are tried first.

@@ -8,10 +8,12 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from damian import keys
+from damian.common.tensors import expand_mask
 from damian.server.server import Server
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import Change, Entries, Memory
 from damian.transforms.order import KeyUsage
+from damian.world.coverage import KnownCoverage
 
 
 class ServerNode(StatefulTransform):
@@ -61,16 +63,24 @@ class ServerNode(StatefulTransform):
         return KeyUsage(reads=[*self.in_keys, *own], creates=self.out_keys)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        messages = tensordict.get(self.in_keys[0])
-        return {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=messages.device)}
+        rows = tensordict.get(self.in_keys[0])
+        memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=rows.device)}
+        if not self.server.remembers_coverage:
+            return memory
+        trail = self.server.messages(rows).trail
+        return memory | {"trail": trail, "coverage": -torch.ones_like(trail[..., 0], dtype=rows.dtype)}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        return {"elapsed": memory["elapsed"].masked_fill(mask, 0)}, {}
+        memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
+        if "coverage" in memory:
+            memory["coverage"] = memory["coverage"].masked_fill(expand_mask(mask, memory["coverage"]), -1)
+        return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
-        steps = elapsed.view(self.rows)
-        outputs = self.server(self.server.messages(received), steps, entries.get(keys.SOURCE_OVER))
+        steps, messages = elapsed.view(self.rows), self.server.messages(received)
+        known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
+        outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known)
         if self.own_key:
             own = self.server.observe_with_timely_messages(received, entries[self.own_key], steps)
             outputs = outputs._replace(observation=own)
@@ -81,7 +91,10 @@ class ServerNode(StatefulTransform):
         }
         if self.reward_terms:
             written |= {(*keys.REWARD_TERMS, name): term for name, term in outputs.terms.items()}
-        return {"elapsed": elapsed}, written | outputs.status.entries()
+        memory = {"elapsed": elapsed}
+        if outputs.coverage is not None:
+            memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
+        return memory, written | outputs.status.entries()
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key in self.dropped_keys:

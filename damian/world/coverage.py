@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from damian.common.errors import InputError
+from damian.common.tensors import gather_rows
 
 # Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact.
 _GRID = 321
@@ -96,6 +97,52 @@ def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor)
     worlds = _worlds_at_once(tables, ids)
     chunks = zip(ids.split(worlds), xy.split(worlds), strict=True)
     return torch.cat([_covered_share(tables, *chunk) for chunk in chunks]).reshape(*lead, n_uavs)
+
+
+class KnownCoverage(NamedTuple):
+    """The coverage of a step, from which that of the next one is computed."""
+
+    trail: Tensor
+    """Flat ids of the UAVs' latest landing points, ``[*, N, n]`` int64."""
+    share: Tensor
+    """Their coverage, ``[*, N]``; negative where it is not known."""
+
+
+def updated_share(tables: FootprintTables, point_ids: Tensor, points: Tensor, known: KnownCoverage) -> Tensor:
+    """As :func:`covered_share`, but computed only for the worlds that have changed, ``[*, N]``.
+
+    Args:
+        tables: from :func:`build_tables`.
+        point_ids: ``[*, N, n]`` int64, flat ids of the landing points where the UAVs stood.
+        points: positions of all landing points, ``[R * L, 2]`` [m].
+        known: coverage of the same worlds at an earlier step.
+    """
+    changed = (point_ids != known.trail).flatten(-2).any(-1) | (known.share[..., 0] < 0)
+    n_uavs, n_last = point_ids.shape[-2:]
+    ids, share = point_ids.reshape(-1, n_uavs, n_last), known.share.reshape(-1, n_uavs)
+    updated = _update_share(*tables, ids, points, share, changed.reshape(-1))
+    return updated.view(known.share.shape)
+
+
+@torch.library.custom_op("damian::update_share", mutates_args=())
+def _update_share(
+    masks: Tensor, cells_per_metre: float, ids: Tensor, points: Tensor, share: Tensor, changed: Tensor
+) -> Tensor:
+    """The shares ``[b, N]``, computed again for the worlds of ``changed [b]``.
+
+    This is a custom operator because the number of worlds depends on the data, which a compiler cannot trace.
+    """
+    updated, worlds = share.clone(), changed.nonzero().squeeze(-1)
+    if len(worlds):
+        ids = ids.index_select(0, worlds)
+        tables = FootprintTables(masks, cells_per_metre)
+        updated.index_copy_(0, worlds, covered_share(tables, ids, gather_rows(points, ids)))
+    return updated
+
+
+@_update_share.register_fake
+def _(masks, cells_per_metre, ids, points, share, changed):  # compilers need only the shape
+    return torch.empty_like(share)
 
 
 def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:

@@ -250,6 +250,7 @@ class Simulation:
             motions=torch.zeros_like(goal),
             source=drawn.walk.stop[:, 0],
             source_over=torch.zeros_like(number, dtype=torch.bool),
+            coverage=zeros - 1,
             message_sent=torch.ones_like(goal, dtype=torch.bool),
             sent=Messages.blank(
                 goal.unsqueeze(-1).repeat(1, 1, trail), sum(sensor.width for sensor in self.sensors.values())

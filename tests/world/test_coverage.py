@@ -16,7 +16,7 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 
 from damian.common.errors import InputError
 from damian.world import coverage
-from damian.world.coverage import build_tables, covered_share
+from damian.world.coverage import KnownCoverage, build_tables, covered_share, updated_share
 
 DATA = Path(__file__).parents[1] / "data"
 R = 56.2341
@@ -195,6 +195,39 @@ def test_splitting_the_worlds_into_chunks_does_not_change_the_shares(square, mon
     for words in (1, 16 * 3 * 2 * 4 * 3):  # one world, and three worlds, at a time
         monkeypatch.setattr(coverage, "_CHUNK_WORDS", words)
         assert torch.equal(covered_share(tables, ids, positions), whole)
+
+
+def test_a_sequence_of_steps_equals_each_step_by_itself(square):
+    tables, _, points = square
+    generator, places = torch.Generator().manual_seed(0), torch.tensor(points, dtype=torch.float32)
+    ids, _ = at_random(points, (40, 3, 2))
+    known = KnownCoverage(ids, -torch.ones(40, 3))
+    computed = []
+    for _ in range(30):
+        moved = torch.rand(40, 3, 1, generator=generator) < 0.1
+        ids = torch.where(moved, ids.roll(1, -1) + 1, ids) % len(points)
+        known = KnownCoverage(
+            known.trail, known.share.where(torch.rand(40, 1, generator=generator) < 0.9, -1)
+        )
+        share = updated_share(tables, ids, places, known)
+        assert torch.equal(share, covered_share(tables, ids, places[ids]))
+        computed.append((ids != known.trail).any())
+        known = KnownCoverage(ids, share)
+    assert all(computed)
+
+
+def test_only_worlds_that_have_changed_are_computed_again(square, monkeypatch):
+    tables, _, points = square
+    places, (ids, positions) = torch.tensor(points, dtype=torch.float32), at_random(points, (5, 3, 2))
+    known = KnownCoverage(ids, covered_share(tables, ids, positions))
+    changed = ids.clone()
+    changed[3, 1, 0] = (ids[3, 1, 0] + 1) % len(points)
+    sizes = []
+    whole = coverage.covered_share
+    monkeypatch.setattr(coverage, "covered_share", lambda *args: sizes.append(len(args[1])) or whole(*args))
+    updated_share(tables, changed, places, known)
+    updated_share(tables, ids, places, known)
+    assert sizes == [1]
 
 
 def test_permuting_the_uavs_permutes_their_shares(square):
