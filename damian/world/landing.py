@@ -18,6 +18,8 @@ MAX_TABLE_BYTES = 4_000_000_000
 """Largest size of the tables of discrete actions [bytes]."""
 _POINTS_AT_ONCE = 1024
 """Landing points whose actions are ranked together."""
+_FEW_AGENTS = 4
+"""Most UAVs of a world to which a graph gives landing points one after the other."""
 _EDGES_AT_ONCE = 2**18
 """Pairs of target and polygon edge compared at once, which bounds the memory: a few arrays of 2 MB."""
 
@@ -247,6 +249,8 @@ def assign_landing_points(ranking: Ranking, row: Tensor, standing: Tensor, reach
     Returns:
         Point that each UAV books, [B, N].
     """
+    if torch.compiler.is_compiling() and row.shape[1] <= _FEW_AGENTS:
+        return _assign_one_by_one(ranking, row, standing, reach)
     reached = gather_rows(ranking.distance[:, 0], row) <= reach
     choice = torch.where(reached, gather_rows(ranking.point[:, 0], row).long(), standing)
     departs = choice != standing
@@ -254,6 +258,28 @@ def assign_landing_points(ranking: Ranking, row: Tensor, standing: Tensor, reach
     claims = choice.unsqueeze(-1) == torch.cat([standing, choice], -1).unsqueeze(-2)
     contested = (departs & (claims.sum(-1, dtype=torch.int32) > 1)).any(-1)
     return _settle(*ranking, row, standing, reach, choice, contested)
+
+
+def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
+    """The same for few UAVs, one after the other in all worlds; a graph makes a single kernel of it.
+
+    A UAV takes the first of its candidates that it need not pass over. It passes over one in reach that
+    another UAV stands on, or that an earlier one has booked; one out of reach, or its own, means holding.
+    """
+    point, distance = (gather_rows(table, row).unbind(-1) for table in ranking)
+    reached = [each <= reach for each in distance]
+    points = [torch.where(r, each.long(), standing).unbind(1) for r, each in zip(reached, point, strict=True)]
+    stands = standing.unbind(1)
+    goals: list[Tensor] = []
+    for i, own in enumerate(stands):
+        goal, taken = own, [*stands[:i], *goals, *stands[i + 1 :]]
+        for candidate in (each[i] for each in reversed(points)):
+            refused = candidate != own
+            if taken:
+                refused = refused & torch.stack([candidate == point for point in taken]).any(0)
+            goal = torch.where(refused, goal, candidate) if taken else candidate
+        goals.append(goal)
+    return torch.stack(goals, 1)
 
 
 @torch.library.custom_op("damian::settle", mutates_args=())

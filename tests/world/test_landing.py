@@ -15,6 +15,7 @@ from shapely.affinity import scale, translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
+from damian.world import landing
 from damian.world.airspace import build_airspace, inside
 from damian.world.landing import ActionConfig, Candidates, Ranking, assign_landing_points, displacement
 from damian.world.regions.region import Region
@@ -57,6 +58,22 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
         for b in range(6)
     ]
     assert ours.tolist() == expected
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_agents=st.integers(1, 4),
+    spare=st.integers(0, 6),
+    together=st.booleans(),
+)
+def test_booking_of_few_uavs_one_by_one_equals_deferred_acceptance(seed, n_agents, spare, together):
+    n_points = n_agents + spare
+    ranked, row, standing, _ = map(torch.as_tensor, random_bookings(seed, 30, n_agents, n_points, together))
+    generator = torch.Generator().manual_seed(seed)
+    ranking = Ranking(ranked.int(), torch.rand(ranked.shape, generator=generator))
+    reach = 1.5 * torch.rand(row.shape, generator=generator) - 0.3  # some must stay, some reach few points
+    one_by_one = landing._assign_one_by_one(ranking, row, standing, reach)
+    assert one_by_one.equal(assign_landing_points(ranking, row, standing, reach))
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(2, 12), spare=st.integers(0, 6))
