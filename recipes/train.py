@@ -23,7 +23,6 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
-from torchrl.envs import RewardSum, StepCounter
 from tqdm import tqdm
 
 from damian import keys
@@ -48,6 +47,7 @@ from damian.replay.backupdate import BackupdateStorage
 from damian.replay.corrections import corrections_of
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
+from damian.transforms.episode_totals import EpisodeTotals
 
 from .shared.collecting import make_collector, ticks
 from .shared.known_settings import CONF
@@ -69,8 +69,7 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     env = make_env(config.train_scenario, config.worlds, config.seed, config.device, extras)
     if config.compile:
         env.compile()
-    env.append_transform(RewardSum(in_keys=[keys.REWARD], out_keys=[keys.EPISODE_REWARD]))
-    env.append_transform(StepCounter())
+    env.append_transform(EpisodeTotals())
     return env
 
 

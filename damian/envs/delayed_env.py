@@ -11,7 +11,7 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian import keys
 from damian.common.compiling import compiled
-from damian.common.tensors import tree_where
+from damian.common.tensors import expand_mask, tree_where
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
 from damian.transforms.base import StatefulTransform
@@ -132,23 +132,32 @@ class DelayedEnv(TransformedEnv):
     @torch.no_grad()
     def _step_stateful(self, stateful: list[StatefulTransform], tensordict: TensorDictBase) -> TensorDictBase:
         """Step the worlds and the leading stateful transforms."""
-        env, entries = self.uav_env, select_entries(tensordict, [keys.ACTION, keys.ACTION_VALID])
-        memories: list[Memory] = []
-        for transform in stateful:
-            if not transform.has_memory:
-                transform.check()  # raises an error that says why
-            entries |= select_entries(tensordict, transform.action_keys)
-            memories.append(transform.memory)
+        env, (memories, entries) = self.uav_env, self._step_inputs(stateful, tensordict)
         step = self._method("_whole_step", *stateful, *entries)
         worlds, memories, outputs = step(env.worlds, memories, entries)
         for transform in stateful:
             while (skipped := transform.skipped_worlds(outputs)) is not None and skipped.any():
                 step = self._method("_further_step", *stateful, *entries)
                 worlds, memories, outputs = step(transform, worlds, memories, entries, outputs, skipped)
-        env.worlds = worlds
+        self._store(stateful, worlds, memories)
+        return env.to_tensordict(outputs)
+
+    def _step_inputs(
+        self, stateful: list[StatefulTransform], tensordict: TensorDictBase
+    ) -> tuple[list[Memory], Entries]:
+        """The memories of the transforms, and the entries that they and the worlds read before a step."""
+        memories, entries = [], select_entries(tensordict, [keys.ACTION, keys.ACTION_VALID])
+        for transform in stateful:
+            if not transform.has_memory:
+                transform.check()  # raises an error that says why
+            entries |= select_entries(tensordict, transform.action_keys)
+            memories.append(transform.memory)
+        return memories, entries
+
+    def _store(self, stateful: list[StatefulTransform], worlds: PackedState, memories: list[Memory]) -> None:
+        self.uav_env.worlds = worlds
         for transform, memory in zip(stateful, memories, strict=True):
             transform.set_memory(memory)
-        return env.to_tensordict(outputs)
 
     def _whole_step(
         self, worlds: PackedState, memories: list[Memory], entries: Entries, stepped: Tensor | None = None
@@ -199,9 +208,8 @@ class DelayedEnv(TransformedEnv):
             return super()._reset(tensordict, **options)
         env, memories = self.uav_env, [transform.memory for transform in stateful]
         reset = self._method("_whole_reset", *stateful)
-        env.worlds, memories, outputs = reset(env.worlds, memories, mask)
-        for transform, memory in zip(stateful, memories, strict=True):
-            transform.set_memory(memory)
+        worlds, memories, outputs = reset(env.worlds, memories, mask)
+        self._store(stateful, worlds, memories)
         result = env.to_tensordict(outputs)
         for transform in others:
             result = transform._reset(tensordict, result)
@@ -219,15 +227,69 @@ class DelayedEnv(TransformedEnv):
             outputs = drop_keys(outputs | changed, transform.dropped_keys)
         return worlds, memories, outputs
 
+    @torch.no_grad()
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """As TorchRL's: the step, and the TensorDict with which the next one begins; but in one graph.
+
+        What a policy has written stays in that TensorDict, also after a reset; the policy replaces it.
+        """
+        stateful, others = self._split_transforms()
+        partial = "_step" in tensordict or "next" in tensordict or tensordict.device != self.device
+        if others or partial or not isinstance(self.base_env, UavEnv) or _may_skip(stateful):
+            return super()._step_and_maybe_reset(tensordict)
+        self._assert_tensordict_shape(tensordict)
+        env, (memories, entries) = self.uav_env, self._step_inputs(stateful, tensordict)
+        step = self._method("_whole_step_and_reset", *stateful, *entries)
+        worlds, memories, outputs, begin = step(env.worlds, memories, entries)
+        self._store(stateful, worlds, memories)
+        following = _keep_others(tensordict, env.to_tensordict(begin))
+        tensordict.set("next", env.to_tensordict(outputs))
+        return tensordict, following
+
+    def _whole_step_and_reset(
+        self, worlds: PackedState, memories: list[Memory], entries: Entries
+    ) -> tuple[PackedState, list[Memory], Outputs, Outputs]:
+        """One step, and a reset of the worlds whose episode it ends; a pure function.
+
+        Returns:
+            Worlds and memories, the outputs of the step, and those with which the next step begins.
+        """
+        worlds, memories, outputs = self._whole_step(worlds, memories, entries)
+        begin = {key: value for key, value in outputs.items() if key != keys.REWARD}
+        done = outputs[keys.DONE]
+        if torch.compiler.is_compiling() or done.any():
+            worlds, memories, first = self._whole_reset(worlds, memories, done)
+            mask = done.view(-1)
+            begin |= {key: torch.where(expand_mask(mask, new), new, begin[key]) for key, new in first.items()}
+        return worlds, memories, outputs, begin
+
     def _split_transforms(self) -> tuple[list[StatefulTransform], list[Transform]]:
-        """The leading transforms that are all stateful, and every transform after them."""
+        """The leading stateful transforms that step in one function, and every transform after them."""
         transform = self.transform
         transforms: list[Any] = [*transform] if isinstance(transform, Compose) else [transform]
-        others = (i for i, t in enumerate(transforms) if not isinstance(t, StatefulTransform))
-        n = next(others, len(transforms))
-        return transforms[:n], transforms[n:]
+        n = next((i for i, t in enumerate(transforms) if not isinstance(t, StatefulTransform)), None)
+        stateful, others = transforms[:n], transforms[len(transforms) if n is None else n :]
+        if _may_skip(stateful):
+            n = next((i for i, t in enumerate(stateful) if t.after_skipping), len(stateful))
+            stateful, others = stateful[:n], [*stateful[n:], *others]
+        return stateful, others
 
     def _all_stateful(self) -> Iterator[StatefulTransform]:
         for module in self.transform.modules():
             if isinstance(module, StatefulTransform):
                 yield module
+
+
+def _may_skip(transforms: list[StatefulTransform]) -> bool:
+    """Does any of the transforms make a step last longer in some worlds?"""
+    return any(type(each).skipped_worlds is not StatefulTransform.skipped_worlds for each in transforms)
+
+
+def _keep_others(before: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
+    """Add to ``after`` the entries of ``before`` that it lacks, such as what the policy has written."""
+    for name, value in before.items():
+        if name not in after:
+            after.set(name, value.copy() if isinstance(value, TensorDictBase) else value)
+        elif isinstance(value, TensorDictBase):
+            _keep_others(value, cast(TensorDictBase, after.get(name)))
+    return after

@@ -64,6 +64,8 @@ class StatefulTransform(MemoryTransform):
     """Keys of the entries that are removed from the outputs."""
     sent_key: NestedKey | None = None
     """Key of the flag that tells which rows send a message in this step; None if all do."""
+    after_skipping: bool = False
+    """Whether the transform sees only the merged steps of ``SkipUntilReady``, as TorchRL's transforms do."""
 
     def __init__(
         self,
