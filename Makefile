@@ -1,4 +1,4 @@
-# make train | test | test-deep | test-slow | bench | check | format        (each sets up what it needs)
+# make train | test | test-deep | test-slow | bench | bench-quick | check | format        (each sets up what it needs)
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -6,7 +6,7 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-deep test-slow bench check format clean
+.PHONY: train test test-deep test-slow bench bench-quick check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train $(ARGS)
@@ -23,6 +23,9 @@ test-slow: $(VENV)/test
 
 bench: $(VENV)/bench
 	$(VENV)/bin/damian bench $(ARGS)
+
+bench-quick: $(VENV)/bench
+	$(VENV)/bin/damian bench --quick
 
 check: $(VENV)/dev
 	$(VENV)/bin/ruff format --check .

@@ -1,63 +1,77 @@
-"""The training part of ``recipes/bench.py``: the arms that are compared, and the rows of the table."""
-
-import importlib.util
-from dataclasses import replace
+"""The tables of ``damian bench``, with few worlds and steps."""
 
 import pytest
+import torch
 
-from damian.envs.pipeline import has_message_delay
-from damian.recipes.bench import QUICK, delayed, scenarios, step_times
-from damian.recipes.bench_training import (
-    ARMS,
-    HEADER,
-    RIVAL,
-    RIVALS,
-    Seconds,
-    arm_config,
-    median,
-    rows,
-    training,
+from damian.recipes import bench, bench_timing
+from damian.recipes.bench_arms import BARE, RIVAL, WHOLE, arms, delayed, delays, fleet, rivals, scenarios
+from damian.recipes.bench_timing import Measured, in_turn, staggered
+
+TINY = bench.Sizes(
+    worlds=4,
+    steps=2,
+    batch=2,
+    repeats=1,
+    many_worlds=(1, 3),
+    many_uavs=(1, 5),
+    growth_steps=2,
+    modes=("eager",),
 )
 
 
-def test_arms_differ_in_delay_and_awareness_only():
-    configs = [arm_config(words, worlds=8, steps=16) for words in ARMS]
-    assert [has_message_delay(config) for config in configs] == [False, True, True, True]
-    assert [config.backupdates for config in configs] == [False, False, True, True]
-    assert [config.delay.history > 0 for config in configs] == [False, False, False, True]
-    for config in configs:
-        assert (config.agents, config.worlds, config.update_steps) == (3, 8, 16)
-        assert (config.learner, config.model) == (configs[0].learner, configs[0].model)
+@pytest.fixture(scope="module")
+def presets():
+    return scenarios()
 
 
-def test_each_part_has_its_own_median():
-    measured = [Seconds(1.0, 5.0, 7.0), Seconds(2.0, 4.0, 9.0), Seconds(3.0, 6.0, 8.0)]
-    assert median(measured) == Seconds(2.0, 5.0, 8.0)
+def test_chunks_take_turns_and_have_their_own_median_and_spread(monkeypatch):
+    ends = iter([0, 2, 2, 3, 3, 9, 9, 10, 10, 13, 13, 14])  # seconds: chunks of 2, 1, 6, 1, 3 and 1
+    monkeypatch.setattr(bench_timing.time, "perf_counter", lambda: next(ends))
+    order = []
+    chunks = {"slow": lambda: order.append("slow"), "fast": lambda: order.append("fast")}
+    times = in_turn(chunks, steps=1000, repeats=3)
+    assert order == ["slow", "fast"] * 3
+    assert times == {"slow": Measured(3, 2, 6), "fast": Measured(1, 1, 1)}
 
 
-def test_rows_hold_the_share_of_backupdating_and_the_speed_relative_to_vmas():
-    medians = {"ours": Seconds(0.3, 0.1, 0.6), RIVAL: Seconds(1.0, 0.0, 1.0)}
-    assert rows(medians, frames=8000) == [
-        ("ours", "8,000", "300", "100", "600", "10.0%", "2.00"),
-        (RIVAL, "4,000", "1000", "0", "1000", "0.0%", "1.00"),
-    ]
+def test_worlds_end_their_episodes_at_different_times(presets):
+    env = delayed(presets["everything"], delays()[WHOLE], 10)
+    staggered(env, groups=5)
+    assert env.uav_env.state.steps.tolist() == [4, 3, 2, 1, 0] * 2
 
 
-def test_without_vmas_there_are_no_ratios():
-    assert rows({"ours": Seconds(0.3, 0.1, 0.6)}, frames=8000)[0][-1] == "-"
+def test_every_environment_of_the_delay_table_is_measured(presets):
+    text = bench.cost_of_delays({"everything": presets["everything"]}, TINY)
+    assert [f"everything: {kind} " in text for kind in delays()] == [True] * len(delays())
+    assert "| everything: bare | " in text
 
 
 @pytest.mark.slow
-def test_every_arm_trains_and_has_a_row():
-    vmas = importlib.util.find_spec("vmas")
-    table = training(worlds=2, steps=8, repeats=1)
-    assert [row[0] for row in table] == [*ARMS, *(RIVALS if vmas else ())]
-    assert {len(row) for row in table} == {len(HEADER)}
+def test_the_comparison_has_a_row_for_each_arm_and_a_figure(presets, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    text = bench.comparison(presets, TINY)
+    names = [*rivals(1), *arms(presets, 1, (BARE, WHOLE), ("eager",))]
+    assert [line.split(" | ")[0] for line in text.strip().splitlines()[4:]] == [f"| {name}" for name in names]
+    assert (tmp_path / "runs" / "bench.png").exists()
 
 
-def test_every_environment_of_the_delay_table_is_measured():
-    sizes = replace(QUICK, worlds=2, steps=2, repeats=1)
-    times = step_times(delayed(scenarios()["everything"], "eager", sizes), sizes.steps, sizes.repeats)
-    assert "bare" in times
-    assert len(times) > 5
-    assert all(ms > 0 for ms in times.values())
+def test_speed_is_given_relative_to_vmas():
+    times = {RIVAL: Measured(30, 29, 31), "ours": Measured(2, 1, 3)}
+    assert bench.ratio(times, times["ours"].median) == "15.0"
+    assert bench.ratio({"ours": Measured(2, 1, 3)}, 2) == "-"
+
+
+@pytest.mark.slow
+def test_growth_has_a_row_for_each_size(presets):
+    for part, sizes in (
+        (bench.growth_with_worlds, TINY.many_worlds),
+        (bench.growth_with_uavs, TINY.many_uavs),
+    ):
+        rows = part(presets, TINY).strip().splitlines()[4:]
+        assert [int(row.split(" | ")[0].strip("| ")) for row in rows] == list(sizes)
+
+
+def test_a_hundred_uavs_have_room_to_fly(presets):
+    env = delayed(fleet(presets["everything"], 100), {}, 1)
+    assert env.rollout(2)["agents", "ready"].shape == torch.Size([1, 2, 100])
