@@ -152,7 +152,7 @@ def _seeds(config: CompareConfig, folder: Path, overrides: list[str]) -> Iterato
     """The runs of one task, delay and arm, which the folder names."""
     task, delay, name = folder.parts[-3:]
     arm = config.experiment.arms[name]
-    overrides = whole_laws(["logger=csv", *overrides, *arm.overrides, *config.overrides])
+    overrides = whole_laws(["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides])
     try:
         unseeded = checked(compose("train", overrides))
         if arm.policy_of is None:

@@ -30,6 +30,7 @@ from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common import checks
 from damian.common.errors import InputError, RunError, naming_errors
+from damian.common.threads import using_threads
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED
@@ -131,6 +132,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     collector = make_collector(env, learner.actor, config.worlds * clock.unit)
     state = TrainingState(folder, learner.components(), collector, clock, buffer)
     begin(config, state)
+    print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
     loggers, log_to = make_loggers(config.logger.custom, folder), config.logger
     log = MetricsLog(folder, log_to.tensorboard, log_to.csv, state.progress.frames, loggers)
     bar = progress_bar(config, state)
@@ -185,7 +187,7 @@ def update(
     progress.frames += batch.numel()
     progress.updates += 1
     try:
-        with own_code(config.learner.name):
+        with own_code(config.learner.name), using_threads(config.learning_threads):
             losses = check_numbers(learner.learn(batch), config.learner.name)
     except (ValueError, RuntimeError):  # torch's distributions refuse a nan
         check_convergence(config, state, {})

@@ -4,11 +4,14 @@ One thread, because many small tensors are slower on more. ``make test`` tries t
 ``make test-deep`` tries thousands of new ones (``--hypothesis-profile=deep``).
 """
 
+import os
+
 import pytest
 import torch
 from hypothesis import settings
 
 torch.set_num_threads(1)
+os.environ["OMP_NUM_THREADS"] = "1"  # for learning, and for the programs that tests start
 
 settings.register_profile("same", derandomize=True, deadline=None, max_examples=100)
 settings.register_profile("deep", deadline=None, max_examples=3000, print_blob=True)

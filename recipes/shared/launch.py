@@ -95,11 +95,11 @@ def composed_with(config_name: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def perform(config: TrainConfig, folder: Path, program: Program) -> None:
-    """Run a program with the threads and the seed of its configuration.
+    """Run a program in one thread with the seed of its configuration.
 
     A run that is refused before it has learnt or measured anything leaves no folder.
     """
-    torch.set_num_threads(config.threads)
+    torch.set_num_threads(1)
     for seed in (torch.manual_seed, np.random.seed, random.seed):  # components of one's own may use them
         seed(config.seed)
     was_empty = not is_folder(folder) or not any(folder.iterdir())

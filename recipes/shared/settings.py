@@ -10,6 +10,7 @@ from omegaconf import MISSING, OmegaConf
 
 from damian import keys
 from damian.common import checks
+from damian.common.threads import available_cores
 from damian.delays.laws import law_of
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
@@ -83,8 +84,9 @@ class TrainConfig(ScenarioConfig):
     """Run folder of the run to continue."""
     device: str = "cpu"
     """Device of all tensors: cpu, cuda, cuda:1, ..."""
-    threads: int = 1
-    """Number of torch's threads; more than one slow down small tensors."""
+    threads: int | None = None
+    """Number of threads with which the networks learn; all cores if not given. The worlds always step with
+    one, because their tensors are small. Another number of threads gives other rounding errors."""
     compile: bool = False
     """Compile the environment's step, which pays off from some hundred worlds on."""
 
@@ -99,7 +101,8 @@ class TrainConfig(ScenarioConfig):
             checks.in_range(name, getattr(self, name), 1, checks.WORLDS)
         for name in ("frames", "checkpoint_every"):
             checks.in_range(name, getattr(self, name), 1, 1e12)
-        checks.in_range("threads", self.threads, 1, 1024)
+        if self.threads is not None:
+            checks.in_range("threads", self.threads, 1, 1024)
         if self.episodes is not None:
             checks.in_range("episodes", self.episodes, 1, 1e12)
         checks.device("device", self.device)
@@ -138,6 +141,11 @@ class TrainConfig(ScenarioConfig):
         checks.require(not (self.model.recurrent and self.clock.skip), "clock.skip", True, should)
         discount, should = self.clock.skip_discount, "is set to learner.gamma in training; leave it out"
         checks.require(discount == 1, "clock.skip_discount", discount, should)
+
+    @property
+    def learning_threads(self) -> int:
+        """Number of threads with which the networks learn."""
+        return self.threads or available_cores()
 
     @property
     def longest_delay(self) -> int:

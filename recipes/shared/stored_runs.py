@@ -31,7 +31,7 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     write_atomically(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(config)))
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    write_record(folder, new_record(typed_command(), device, config.threads, own_folder()))
+    write_record(folder, new_record(typed_command(), device, config.learning_threads, own_folder()))
 
 
 def stored_run(written: Path) -> TrainConfig:
