@@ -18,6 +18,10 @@ MAX_TABLE_BYTES = 4_000_000_000
 """Largest size of the tables of discrete actions [bytes]."""
 _POINTS_AT_ONCE = 1024
 """Landing points whose actions are ranked together."""
+_KEEPERS_AT_ONCE = 2**22
+"""Landing points of contested worlds that are booked together, which bounds the memory: 32 MB."""
+_COMPARED_AGENTS = 16
+"""Most UAVs of a world whose choices are compared in pairs; with more, all are settled in turn."""
 _FEW_AGENTS = 4
 """Most UAVs of a world to which a graph gives landing points one after the other."""
 _EDGES_AT_ONCE = 2**18
@@ -233,7 +237,9 @@ def _(edges, grid, region, target, own, n):  # compilers need only the shape
     return own.new_empty(len(own), n)
 
 
-def assign_landing_points(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
+def assign_landing_points(
+    ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_points: int
+) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point.
 
     A point is free to a UAV if no other UAV stands on it or is bound for it; its own point always is. Most
@@ -245,6 +251,7 @@ def assign_landing_points(ranking: Ranking, row: Tensor, standing: Tensor, reach
         standing: point that each UAV stands on or is bound for, [B, N].
         reach: largest distance that the UAV may fly now [m], negative if it may not choose, [B, N]. A
             candidate farther away does not count, and stays free for other UAVs.
+        n_points: largest number of landing points of a region.
 
     Returns:
         Point that each UAV books, [B, N].
@@ -255,9 +262,12 @@ def assign_landing_points(ranking: Ranking, row: Tensor, standing: Tensor, reach
     choice = torch.where(reached, gather_rows(ranking.point[:, 0], row).long(), standing)
     departs = choice != standing
     # A UAV that is not alone in standing on a point or choosing it may have to yield.
-    claims = choice.unsqueeze(-1) == torch.cat([standing, choice], -1).unsqueeze(-2)
-    contested = (departs & (claims.sum(-1, dtype=torch.int32) > 1)).any(-1)
-    return _settle(*ranking, row, standing, reach, choice, contested)
+    if row.shape[1] <= _COMPARED_AGENTS:
+        claims = choice.unsqueeze(-1) == torch.cat([standing, choice], -1).unsqueeze(-2)
+        contested = (departs & (claims.sum(-1, dtype=torch.int32) > 1)).any(-1)
+    else:
+        contested = departs.any(-1)
+    return _settle(*ranking, row, standing, reach, choice, contested, n_points)
 
 
 def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
@@ -291,6 +301,7 @@ def _settle(
     reach: Tensor,
     choice: Tensor,
     contested: Tensor,
+    n_points: int,
 ) -> Tensor:
     """The choices [B, N], with those of the contested worlds [B] made again in index order.
 
@@ -298,36 +309,46 @@ def _settle(
     cannot trace.
     """
     settled = choice.clone()
-    worlds = contested.nonzero().squeeze(-1)
-    if len(worlds):
-        ranking = Ranking(point, distance)
-        row, standing, reach = (t.index_select(0, worlds) for t in (row, standing, reach))
-        settled.index_copy_(0, worlds, _assign_in_order(ranking, row, standing, reach))
+    ranking, at_once = Ranking(point, distance), max(_KEEPERS_AT_ONCE // n_points, 1)
+    for worlds in contested.nonzero().squeeze(-1).split(at_once):
+        some = (t.index_select(0, worlds) for t in (row, standing, reach))
+        settled.index_copy_(0, worlds, _assign_in_order(ranking, *some, n_points))
     return settled
 
 
 @_settle.register_fake
-def _(point, distance, row, standing, reach, choice, contested):  # compilers need only the shape
+def _(point, distance, row, standing, reach, choice, contested, n_points):  # compilers need only the shape
     return torch.empty_like(choice)
 
 
-def _assign_in_order(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
+def _assign_in_order(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_points: int) -> Tensor:
     """Serial assignment by deferred acceptance (Gale and Shapley, 1962); arguments as above.
 
-    All UAVs ask for their best candidate; those that ask for a point on which another UAV stands, or for
-    which an earlier one asks too, ask for their next. As the earliest UAV that ever asks for a free point
-    keeps it, this ends with what the UAVs would take one after the other.
+    All UAVs ask for their best candidate. Each point keeps the earliest UAV that has asked for it; all others
+    ask for their next one, and so does a UAV that has to yield to an earlier one. As the earliest UAV that
+    ever asks for a free point keeps it, this ends with what the UAVs would take one after the other. A round
+    costs as much as there are UAVs that ask.
     """
-    n_agents, n_candidates = row.shape[1], ranking.point.shape[1]
+    n_candidates = ranking.point.shape[1]
     points, distances = ranking.point.flatten(), ranking.distance.flatten()
-    earlier = torch.ones(n_agents, n_agents, dtype=torch.bool, device=row.device).tril(-1)
-    asked = row * n_candidates
-    while True:
-        reached = gather_rows(distances, asked) <= reach
-        choice = torch.where(reached, gather_rows(points, asked).long(), standing)
-        taken = choice.unsqueeze(-1) == standing.unsqueeze(-2)
-        taken = taken | ((choice.unsqueeze(-1) == choice.unsqueeze(-2)) & earlier)
-        refused = (choice != standing) & taken.any(-1)
-        if not refused.any():
-            return choice
-        asked = asked + refused
+    first = torch.arange(len(row), device=row.device).unsqueeze(-1) * n_points  # a world's first point
+    at, booked = (first + standing).flatten(), standing.flatten()
+    # The UAV that each point keeps, as a flat number; those of a world count up in index order.
+    nobody = row.numel()
+    keeper = torch.full((len(row) * n_points,), nobody, device=row.device).index_fill_(0, at, -1)
+    asking, asked = torch.arange(nobody, device=row.device), row.flatten() * n_candidates
+    reach, base = reach.flatten(), first.expand_as(row).flatten()
+    while len(asking):
+        candidate = asked[asking]
+        wanted = base[asking] + points[candidate]
+        flies = (distances[candidate] <= reach[asking]) & (wanted != at[asking])
+        asking, wanted = asking[flies], wanted[flies]
+        before = keeper[wanted]
+        keeper.scatter_reduce_(0, wanted, asking, "amin")
+        kept = keeper[wanted] == asking
+        booked = booked.index_copy(0, asking[kept], (wanted - base[asking])[kept])
+        displaced = before[kept]
+        asking = torch.cat([asking[~kept], displaced[displaced < nobody]])
+        asked[asking] += 1
+        booked[asking] = standing.flatten()[asking]
+    return booked.view_as(standing)

@@ -132,7 +132,7 @@ class Simulation:
         if action_valid is not None:
             reach = torch.where(action_valid, reach, -1.0)
         ready = reach >= 0
-        goal = assign_landing_points(ranking, row, standing, reach) + base
+        goal = assign_landing_points(ranking, row, standing, reach, self.airspace.max_points) + base
         departs = goal != state.goal
         east, north = (gather_rows(self.points, goal) - gather_rows(self.points, state.goal)).unbind(-1)
         heading = torch.remainder(torch.atan2(east, north), 2 * math.pi)

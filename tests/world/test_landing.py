@@ -39,12 +39,12 @@ def random_bookings(seed, n_worlds, n_agents, n_points, together):
 def booked(ranked, row, standing, ready):
     """Points booked by UAVs, ready or not, whose reach is unlimited."""
     ranking = Ranking(ranked, torch.zeros(ranked.shape))
-    return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0))
+    return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0), 64)
 
 
 @given(
     seed=st.integers(0, 2**32 - 1),
-    n_agents=st.integers(1, 12),
+    n_agents=st.integers(1, 25),
     spare=st.integers(0, 20),
     together=st.booleans(),
 )
@@ -73,7 +73,7 @@ def test_booking_of_few_uavs_one_by_one_equals_deferred_acceptance(seed, n_agent
     ranking = Ranking(ranked.int(), torch.rand(ranked.shape, generator=generator))
     reach = 1.5 * torch.rand(row.shape, generator=generator) - 0.3  # some must stay, some reach few points
     one_by_one = landing._assign_one_by_one(ranking, row, standing, reach)
-    assert one_by_one.equal(assign_landing_points(ranking, row, standing, reach))
+    assert one_by_one.equal(assign_landing_points(ranking, row, standing, reach, n_points))
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(2, 12), spare=st.integers(0, 6))
@@ -102,8 +102,8 @@ def test_a_point_that_a_uav_leaves_in_this_step_is_not_free_yet():
 def test_a_point_out_of_reach_of_one_uav_goes_to_another_that_can_fly_there():
     ranking = Ranking(torch.tensor([[5, 7, 1], [5, 2, 0]]), torch.tensor([[9.0, 4.0, 0.0], [9.0, 0.0, 4.0]]))
     row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
-    assert assign_landing_points(ranking, row, standing, torch.tensor([[8.0, 9.0]])).tolist() == [[1, 5]]
-    assert assign_landing_points(ranking, row, standing, torch.tensor([[9.0, 9.0]])).tolist() == [[5, 2]]
+    assert assign_landing_points(ranking, row, standing, torch.tensor([[8.0, 9.0]]), 8).tolist() == [[1, 5]]
+    assert assign_landing_points(ranking, row, standing, torch.tensor([[9.0, 9.0]]), 8).tolist() == [[5, 2]]
 
 
 def test_uavs_on_a_common_start_may_stay_there_or_leave():
