@@ -36,10 +36,14 @@ from .train import learning_env, make_learner, replay_buffer
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
-"""Is one value computed for all agents? Then VMAS's critic has a third of our critic's work, else as much."""
+"""Is one value computed for all agents, as with our ``model.shared_value``?"""
+WIDTHS = {"2 x 64": "model.hidden=[64,64]", "2 x 256": "model.hidden=[256,256]"}
+"""Overrides for the layer widths of all networks, by name."""
 UNDELAYED = "scenario=paper/usecase2"
-PAPER = f"{UNDELAYED} delay=paper"
-ARMS = (UNDELAYED, PAPER, f"{PAPER} aware=backupdate", f"{PAPER} aware=both")
+AWARE = f"{UNDELAYED} delay=paper aware=both"
+COMPILED = "compile=true"
+SHARED = f"{COMPILED} model.shared_value=true"
+ARMS = (UNDELAYED, f"{UNDELAYED} {COMPILED}", f"{UNDELAYED} {SHARED}", AWARE, f"{AWARE} {SHARED}")
 """Overrides of ``damian train``, separated by spaces."""
 HEADER = (
     "training",
@@ -51,7 +55,8 @@ HEADER = (
     "times TorchRL and VMAS",
 )
 WARM_UP = 2
-"""Iterations that do not count: from the second on, back-updating has a full replay buffer."""
+"""Iterations that do not count: the first one compiles, and back-updating has a full replay buffer from the
+second on."""
 
 
 class Seconds(NamedTuple):
@@ -65,17 +70,24 @@ class Seconds(NamedTuple):
 
 def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
     """Rows under ``HEADER``: medians of ``repeats`` iterations of each arm, with batches [worlds, steps]."""
-    arms = {words: damian(arm_config(words, worlds, steps)) for words in ARMS}
+    return [
+        (f"{width}: {name}", *cells)
+        for width, hidden in WIDTHS.items()
+        for name, *cells in rows(in_turn(hidden, worlds, steps, repeats), worlds * steps)
+    ]
+
+
+def in_turn(hidden: str, worlds: int, steps: int, repeats: int) -> dict[str, Seconds]:
+    """Median times of each arm and rival, by name; ``hidden``: an override for the layer widths."""
+    arms = {words: damian(arm_config(f"{words} {hidden}", worlds, steps)) for words in ARMS}
     if importlib.util.find_spec("vmas"):
-        arms |= {
-            name: rival(arm_config(ARMS[0], worlds, steps), together) for name, together in RIVALS.items()
-        }
+        config = arm_config(f"{UNDELAYED} {hidden}", worlds, steps)
+        arms |= {name: rival(config, together) for name, together in RIVALS.items()}
     times: dict[str, list[Seconds]] = {name: [] for name in arms}
-    for _ in tqdm(range(WARM_UP + repeats), "training", leave=False):
+    for _ in tqdm(range(WARM_UP + repeats), f"training, {hidden}", leave=False):
         for name, iterations in arms.items():
             times[name].append(next(iterations))
-    medians = {name: median(measured[WARM_UP:]) for name, measured in times.items()}
-    return rows(medians, worlds * steps)
+    return {name: median(measured[WARM_UP:]) for name, measured in times.items()}
 
 
 def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
@@ -95,7 +107,7 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
     """Train as ``damian train`` does; yields the times of each iteration."""
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     learner = cast(Mappo, make_learner(config, env, replay_buffer(config, env)))
-    collector = make_collector(env, learner.actor, config.worlds * clock.unit)
+    collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
     batches = ticks(collector, clock)
     while True:
         begin = time.perf_counter()

@@ -129,7 +129,7 @@ def train(config: TrainConfig, folder: Path) -> None:
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
     learner = make_learner(config, env, buffer)
-    collector = make_collector(env, learner.actor, config.worlds * clock.unit)
+    collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
     state = TrainingState(folder, learner.components(), collector, clock, buffer)
     begin(config, state)
     print(f"threads: {config.learning_threads} for learning, 1 for the worlds")

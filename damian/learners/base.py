@@ -67,6 +67,8 @@ class LearningSetup(NamedTuple):
     """Whether late messages also replace the actor's observations (the original authors' variant)."""
     critic_key: NestedKey = keys.GLOBAL_OBSERVATION
     """Key of the critic's observation."""
+    compile: bool = False
+    """Whether to compile what an update evaluates many times."""
 
     @property
     def settle_steps(self) -> int:

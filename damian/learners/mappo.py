@@ -1,32 +1,35 @@
-"""MAPPO on TorchRL's loss, from batches that late messages may have corrected (paper, section 4.3)."""
+"""MAPPO, from batches that late messages may have corrected (paper, section 4.3)."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torch.nn.functional import pad, smooth_l1_loss
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.modules import ProbabilisticActor
-from torchrl.objectives.multiagent import MAPPOLoss
+from torchrl.modules import ProbabilisticActor, TanhNormal, set_recurrent_mode
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
 from damian.common import checks
+from damian.common.compiling import compiled
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
-from damian.learners.networks import make_actor, make_critic
+from damian.learners.networks import COMPILE_OPTIONS, make_actor, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
 from damian.replay.backupdate import BackupdateStorage
 
+LOSSES = ("loss_objective", "loss_entropy", "loss_critic")
+"""Names of the terms of the loss (``mappo_losses``)."""
 LOSS_KEYS: list[NestedKey] = [
     keys.OBSERVATION,
     keys.ACTION_MASK,
     keys.ACTION,
     keys.ACTION_LOG_PROB,
     keys.ADVANTAGE,
-    keys.STATE_VALUE,
     keys.VALUE_TARGET,
     keys.READY,
 ]
@@ -101,8 +104,11 @@ class Mappo:
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = make_actor(env, setup.model)
         self.critic = make_critic(env, setup.model, setup.critic_key)
-        self.loss = mappo_loss(self.actor, self.critic, config)
-        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr)
+        self.weights = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = torch.optim.Adam(self.weights, lr=config.lr, fused=True)
+        # Compiling a recurrent actor, whose loop over time becomes one graph, takes many minutes.
+        compiles = setup.compile and not setup.model.recurrent
+        self.losses = compiled(self._losses, options=COMPILE_OPTIONS) if compiles else self._losses
 
     def components(self) -> dict[str, Any]:
         """Networks and optimiser that a checkpoint stores."""
@@ -140,46 +146,82 @@ class Mappo:
 
         Minibatches are drawn over steps; for a recurrent actor, over worlds with their whole sequences.
         """
+        terms = []
+        for entries in self._minibatches(batch):
+            losses = self.losses(entries)
+            self.optimizer.zero_grad()
+            losses.sum().backward()
+            torch.nn.utils.clip_grad_norm_(self.weights, self.config.max_grad_norm)
+            self.optimizer.step()
+            terms.append(losses.detach())
+        # A number that is read at once would make the device wait at every minibatch.
+        return dict(zip(LOSSES, torch.stack(terms).double().mean(0).tolist(), strict=True))
+
+    def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
+        """Entries that the loss reads, for each minibatch of each pass over a batch [B, T]."""
         recurrent = self.setup.model.recurrent
-        needed_keys = [*LOSS_KEYS, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
-        batch = batch.select(*needed_keys, strict=False)  # each entry costs time at every minibatch
-        samples = batch if recurrent else batch.reshape(-1)
-        sums: dict[str, float] = {}
-        n_minibatches = min(self.config.minibatches, len(samples))
+        read = [*LOSS_KEYS, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
+        found = {key: batch.get(key, None) for key in read}
+        samples = {k: v if recurrent else v.flatten(0, 1) for k, v in found.items() if v is not None}
+        n_samples, device = len(samples[keys.READY]), samples[keys.READY].device
+        n_minibatches = min(self.config.minibatches, n_samples)
         for _ in range(self.config.epochs):
-            for index in torch.randperm(len(samples), device=samples.device).tensor_split(n_minibatches):
-                losses = minibatch_losses(samples[index], self.loss)
-                self.optimizer.zero_grad()
-                torch.stack([*losses.values()]).sum().backward()
-                torch.nn.utils.clip_grad_norm_(self.loss.parameters(), self.config.max_grad_norm)
-                self.optimizer.step()
-                for name, value in losses.items():
-                    sums[name] = sums.get(name, 0.0) + value.item()
-        n_updates = self.config.epochs * n_minibatches
-        return {name: total / n_updates for name, total in sums.items()}
+            order = torch.randperm(n_samples, device=device)
+            parts = {key: value[order].tensor_split(n_minibatches) for key, value in samples.items()}
+            for i in range(n_minibatches):
+                yield {key: part[i] for key, part in parts.items()}
+
+    def _losses(self, entries: dict[NestedKey, Tensor]) -> Tensor:
+        return mappo_losses(entries, self.actor, self.critic, self.config)
 
 
-def mappo_loss(actor: ProbabilisticActor, critic: TensorDictModule, config: MappoConfig) -> MAPPOLoss:
-    """Clipped PPO objective with a centralised critic, with the TensorDict keys of ``UavEnv``."""
-    loss = MAPPOLoss(
-        actor,
-        critic,
-        clip_epsilon=config.clip_epsilon,
-        entropy_coeff=config.entropy_coeff,
-        critic_coeff=config.critic_coeff,
-        normalize_advantage=False,  # ``add_advantages`` normalises, over decisions only
-        reduction="none",  # ``minibatch_losses`` averages, over decisions only where needed
-        log_explained_variance=False,  # it costs time
+def mappo_losses(
+    entries: dict[NestedKey, Tensor],
+    actor: ProbabilisticActor,
+    critic: TensorDictModule,
+    config: MappoConfig,
+) -> Tensor:
+    """Mean terms of the loss on steps [*], as named in ``LOSSES``, [3].
+
+    They are the clipped objective of PPO and the entropy (Schulman et al. 2017), over decisions, and the
+    error of the critic, over all steps. The policy also outputs actions for UAVs in flight, but these have no
+    effect.
+
+    Args:
+        entries: what the networks read, and ``LOSS_KEYS``, by key. They are no TensorDict, so that a compiled
+            function works with any number of steps.
+        actor: the policy; if it is recurrent, steps are sequences [B, T].
+        critic: its network writes ``("agents", "state_value")``.
+        config: settings of the learner.
+    """
+    ready = entries[keys.READY].float()
+    steps = TensorDict(cast(Any, entries), ready.shape[:-1])
+    log_ratio, entropy = policy_terms(steps, actor)
+    ratio, advantage = log_ratio.exp(), entries[keys.ADVANTAGE].squeeze(-1)
+    clipped = ratio.clamp(1 - config.clip_epsilon, 1 + config.clip_epsilon)
+    objective = torch.minimum(ratio * advantage, clipped * advantage)
+    n_decisions = ready.sum().clamp(min=1)
+    error = smooth_l1_loss(critic(steps)[keys.STATE_VALUE], entries[keys.VALUE_TARGET])
+    return torch.stack(
+        [
+            -(objective * ready).sum() / n_decisions,
+            -config.entropy_coeff * (entropy * ready).sum() / n_decisions,
+            config.critic_coeff * error,
+        ]
     )
-    loss.set_keys(
-        reward=keys.REWARD,
-        action=keys.ACTION,
-        value=keys.STATE_VALUE,
-        advantage=keys.ADVANTAGE,
-        value_target=keys.VALUE_TARGET,
-        sample_log_prob=keys.ACTION_LOG_PROB,
-    )
-    return loss
+
+
+def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
+    """Logarithms of the importance ratios, and entropies of the policy, both [*, N], on steps [*].
+
+    The entropy of continuous actions is estimated by one draw, as there is no formula for it.
+    """
+    with set_recurrent_mode(True):
+        policy = actor.get_dist(steps)
+    log_ratio = policy.log_prob(steps[keys.ACTION]) - steps[keys.ACTION_LOG_PROB]
+    if isinstance(policy, TanhNormal):
+        return log_ratio, -policy.rsample_and_log_prob()[1]
+    return log_ratio, policy.entropy()
 
 
 @torch.no_grad()
@@ -191,17 +233,17 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     between two decisions are not used: there lambda of the generalised advantage estimate (Schulman et al.
     2016) is 1. A step at which the UAV was not ready is no decision, and its advantage is 0.
     """
-    critic(batch)
-    next_step = critic(batch["next"])
-    value, next_agents = batch[keys.STATE_VALUE], cast(TensorDictBase, next_step[keys.AGENTS])
+    next_step = cast(TensorDictBase, batch["next"])
+    value, next_value = state_values(batch, critic)
+    batch[keys.STATE_VALUE], next_step[keys.STATE_VALUE] = value, next_value
     ends = [next_step[key] for key in (keys.DONE, keys.TERMINATED)]
     # Only with ``clock.skip`` do steps have durations other than 1.
     durations = next_step.get(keys.DURATION, torch.ones_like(ends[0], dtype=torch.long))
     gamma, done, terminated = (x.unsqueeze(-2).expand_as(value) for x in (config.gamma**durations, *ends))
     # TorchRL says float, but broadcasts tensors.
-    lmbda: Any = torch.where(next_agents["ready"].unsqueeze(-1), config.lmbda, 1.0)
+    lmbda: Any = torch.where(next_step[keys.READY].unsqueeze(-1), config.lmbda, 1.0)
     advantage, batch[keys.VALUE_TARGET] = generalized_advantage_estimate(
-        gamma, lmbda, value, next_agents["state_value"], next_agents["reward"], done, terminated, time_dim=-3
+        gamma, lmbda, value, next_value, next_step[keys.REWARD], done, terminated, time_dim=-3
     )
     ready = batch[keys.READY].unsqueeze(-1)
     if config.normalize_advantage:
@@ -210,19 +252,19 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     batch[keys.ADVANTAGE] = torch.where(ready, advantage, 0.0)
 
 
-def minibatch_losses(batch: TensorDictBase, loss: MAPPOLoss) -> dict[str, Tensor]:
-    """Mean terms of the loss on a batch [*]: actor and entropy over decisions, the critic over all steps.
+def state_values(batch: TensorDictBase, critic: TensorDictModule) -> tuple[Tensor, Tensor]:
+    """Values before and after each step of a batch [B, T], both [B, T, N, 1].
 
-    The policy also outputs actions for UAVs in flight, but these have no effect.
+    What the critic observes after a step is mostly what it observes before the next one: such an observation
+    is evaluated once.
     """
-    terms = loss(batch)
-    ready = batch[keys.READY].float()
-
-    def mean_over_decisions(term: Tensor) -> Tensor:
-        return (term.view_as(ready) * ready).sum() / ready.sum().clamp(min=1)
-
-    return {
-        "loss_objective": mean_over_decisions(terms["loss_objective"]),
-        "loss_entropy": mean_over_decisions(terms["loss_entropy"]),
-        "loss_critic": terms["loss_critic"].mean(),
-    }
+    (key,) = critic.in_keys
+    before, after = batch[key], batch[keys.next_key(key)]
+    followed = (after[:, :-1] == before[:, 1:]).flatten(2).all(-1)
+    alone = pad(~followed, (0, 1), value=True)  # no step follows the last one
+    observed = torch.cat([before.flatten(0, 1), after[alone]])
+    values = critic(TensorDict({key: observed}, [len(observed)]))[keys.STATE_VALUE]
+    value = values[: batch.numel()].view(*batch.shape, *values.shape[1:])
+    next_value = value.roll(-1, 1)
+    next_value[alone] = values[batch.numel() :]
+    return value, next_value

@@ -6,7 +6,7 @@ from typing import cast
 import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor, TanhNormal
@@ -16,6 +16,11 @@ from damian import keys
 from damian.common import checks
 from damian.learners.recurrent import AgentGRU
 
+COMPILE_OPTIONS = {
+    "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
+    "fallback_random": True,  # the draws of torch's generator, as without compiling
+}
+"""Options of ``torch.compile`` for networks."""
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
@@ -30,6 +35,10 @@ class ModelConfig:
     rnn: str = "none"
     """none or gru. With gru the actor's last hidden layer is a gated recurrent unit, so that a UAV remembers
     its observations of the episode."""
+    shared_value: bool = False
+    """MAPPO's critic gives one value for all UAVs of a world, from the observations of all of them, instead
+    of a value for each UAV. This is faster, but ties the critic to the number of UAVs; the policy stays free
+    of it."""
 
     def __post_init__(self) -> None:
         checks.one_of("model.activation", self.activation, _ACTIVATIONS)
@@ -124,9 +133,29 @@ def make_critic(
     env: EnvBase, config: ModelConfig, critic_key: NestedKey = keys.GLOBAL_OBSERVATION
 ) -> TensorDictModule:
     """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1]."""
-    n_features = env.observation_spec[critic_key].shape[-1]
-    network = config.network(n_features, 1, env.device)
+    n_agents, n_features = env.observation_spec[critic_key].shape[-2:]
+    if config.shared_value:
+        network: nn.Module = SharedValue(config.network(n_agents * n_features, 1, env.device))
+    else:
+        network = config.network(n_features, 1, env.device)
     return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
+
+
+class SharedValue(nn.Module):
+    """One value for all UAVs of a world, from the observations of all of them.
+
+    Args:
+        network: from the features of all UAVs [*, N G] to a value [*, 1].
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return the value of observations [*, N, G], the same for each UAV, [*, N, 1]."""
+        value = self.network(observations.flatten(-2)).unsqueeze(-2)
+        return value.expand(*observations.shape[:-1], 1)
 
 
 def make_action_value(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, ReplayBuffer
@@ -70,6 +70,8 @@ class SacConfig(LearnerConfig):
     def check(self, setup: LearningSetup) -> None:
         should = "is for learner=mappo only: SAC learns from single decisions, without the steps before them"
         checks.require(not setup.model.recurrent, "model.rnn", setup.model.rnn, should)
+        should = "is for learner=mappo only: SAC's critics value the actions of a single UAV"
+        checks.require(not setup.model.shared_value, "model.shared_value", True, should)
         should = "is for learner=mappo only: SAC has no importance ratios"
         checks.require(not setup.recompute_actor, "recompute_actor", True, should)
         steps_per_world = setup.longest_period + 2 * setup.longest_delay
@@ -136,12 +138,13 @@ class Sac:
         decisions = find_decisions(ready, ready_next, done, terminated, self.config.n_steps)
         if len(order) * batch.shape[0] < self.config.warm_up or not len(decisions.begin):
             return dict.fromkeys(LOSSES, math.nan)
-        sums = dict.fromkeys(LOSSES, 0.0)
+        rounds = []
         for _ in range(self.config.updates):
             sample = decisions.sample(self.config.batch_size)
             losses = self.update(transitions(steps, order, sample, self.config.gamma, self.observed))
-            sums = {name: sums[name] + losses[name].item() for name in LOSSES}
-        return {name: total / self.config.updates for name, total in sums.items()}
+            rounds.append(torch.stack([losses[name] for name in LOSSES]))
+        # A number that is read at once would make the device wait at every update.
+        return dict(zip(LOSSES, torch.stack(rounds).double().mean(0).tolist(), strict=True))
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
         """Make one update from transitions [K]; returns the losses."""
@@ -205,18 +208,41 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
     def __init__(
         self, actor: ProbabilisticActor, action_value: TensorDictModule, n: int, share: float, **options: Any
     ) -> None:
-        zero: Any = 0.0  # ``actor_loss`` subtracts the target itself
+        zero: Any = 0.0  # ``forward`` adds the target itself
         super().__init__(
             actor, action_value, action_space="categorical", num_actions=n, target_entropy=zero, **options
         )
         self.share, self.n_actions = share, n
 
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return TorchRL's actor loss, with a log-probability to which each state's target entropy is added.
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return TorchRL's losses of transitions [K], with a target entropy for each state.
 
-        The temperature's loss thereby measures by how much each state's entropy misses its own target.
+        TorchRL evaluates the critics twice on the same observations, for their own loss and for the actor's.
         """
-        loss, metadata = super().actor_loss(tensordict)
+        target = self._compute_target(tensordict)
+        values = self._action_values(tensordict)
+        action = tensordict[keys.ACTION].expand(values.shape[:-1]).unsqueeze(-1)
+        error = values.gather(-1, action).squeeze(-1) - target
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            policy = self.actor_network.get_dist(tensordict.copy())
+        cost = self._alpha * policy.logits - values.detach().amin(0)
+        too_certain = (policy.probs * policy.logits).sum(-1).detach() + self.target_entropies(tensordict)
+        return TensorDict(
+            {
+                "loss_actor": (policy.probs * cost).sum(-1).mean(),
+                "loss_qvalue": error.square().sum(0).mean(),
+                "loss_alpha": -(self.log_alpha * too_certain).mean(),
+                "alpha": self._alpha,
+            }
+        )
+
+    def _action_values(self, tensordict: TensorDictBase) -> Tensor:
+        """Values of all actions by each critic, [2, K, A]."""
+        observed = tensordict.select(*self.qvalue_network.in_keys)
+        return self._vmap_qnetworkN0(observed, self.qvalue_network_params)["action_value"]
+
+    def target_entropies(self, tensordict: TensorDictBase) -> Tensor:
+        """Target entropy of each state, [K], or one for all of them if all actions are legal."""
         mask = tensordict.get(keys.ACTION_MASK, None)
         legal = torch.tensor(self.n_actions) if mask is None else mask.sum(-1)
-        return loss, {"log_prob": metadata["log_prob"] + self.share * legal.log()}
+        return self.share * legal.log()

@@ -10,16 +10,24 @@ from torchrl.envs import TransformedEnv
 
 from damian import keys
 from damian.envs.delayed_env import DelayedEnv
+from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
 from damian.server.server import Server
 
 
-def make_collector(env: TransformedEnv, actor: torch.nn.Module, frames: int) -> Collector:
-    """An endless collector of batches of ``frames`` environment steps."""
+def make_collector(
+    env: TransformedEnv, actor: torch.nn.Module, frames: int, compile: bool = False
+) -> Collector:
+    """An endless collector of batches of ``frames`` environment steps; ``compile``: with a compiled actor."""
     add_recurrent_state(env, actor)
     return Collector(
-        env, actor, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=True
+        env,
+        actor,
+        frames_per_batch=frames,
+        total_frames=-1,
+        auto_register_policy_transforms=True,
+        compile_policy={"options": COMPILE_OPTIONS} if compile else None,
     )
 
 

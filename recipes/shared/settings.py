@@ -179,6 +179,7 @@ class TrainConfig(ScenarioConfig):
             critic_key=keys.PRIVILEGED_OBSERVATION
             if self.critic == "privileged"
             else keys.GLOBAL_OBSERVATION,
+            compile=self.compile,
         )
 
     @property

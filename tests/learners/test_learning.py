@@ -18,7 +18,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.learners.mappo import Mappo, MappoConfig, add_advantages, mappo_loss, minibatch_losses
+from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig, add_advantages, mappo_losses
 from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.corrections import corrections_of
@@ -109,21 +109,27 @@ def test_the_advantage_is_zero_where_a_uav_was_not_ready(kind):
     assert (batch["agents", "advantage"][ready] != 0).any()
 
 
+def losses_of(batch: TensorDictBase, actor, critic, config: MappoConfig) -> Tensor:
+    """The loss on all steps of a batch [B, T]."""
+    read = batch.select(*LOSS_KEYS, *critic.in_keys, strict=False).reshape(-1)
+    return mappo_losses(dict(read.items(True, True)), actor, critic, config)
+
+
 @pytest.mark.parametrize(("kind", "mask"), [("discrete", True), ("discrete", False), ("continuous", True)])
 def test_steps_without_a_decision_train_the_critic_only(kind, mask):
     config = scenario(actions=ActionConfig(kind=kind, mask=mask))
     env = UavEnv(config, 4)
     actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
-    loss = mappo_loss(actor, critic, MappoConfig())
+    networks = torch.nn.ModuleDict({"actor": actor, "critic": critic})
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         batch = env.rollout(6, actor, break_when_any_done=False)
 
     def gradients(ready: bool) -> tuple[float, float]:
         batch["agents", "ready"] = torch.full_like(batch["agents", "ready"], ready)
         add_advantages(batch, critic, MappoConfig())
-        loss.zero_grad()
-        sum(minibatch_losses(batch.reshape(-1), loss).values()).backward()
-        grads = {n: p.grad.abs().sum().item() for n, p in loss.named_parameters() if p.grad is not None}
+        networks.zero_grad()
+        losses_of(batch, actor, critic, MappoConfig()).sum().backward()
+        grads = {n: p.grad.abs().sum().item() for n, p in networks.named_parameters() if p.grad is not None}
         actors = sum(g for n, g in grads.items() if n.startswith("actor"))
         return actors, sum(grads.values()) - actors
 
@@ -143,10 +149,10 @@ def test_objective_and_entropy_are_means_over_decisions():
     ready = batch["agents", "ready"]
     batch["agents", "advantage"] = torch.where(ready, 2.0, 5.0).unsqueeze(-1)
     assert not ready.all()
-    losses = minibatch_losses(batch.reshape(-1), mappo_loss(actor, critic, MappoConfig(entropy_coeff=0.1)))
-    assert losses["loss_objective"].item() == pytest.approx(-2, abs=1e-5)  # ratios of 1
+    objective, entropy_loss, _ = losses_of(batch, actor, critic, MappoConfig(entropy_coeff=0.1)).tolist()
+    assert objective == pytest.approx(-2, abs=1e-5)  # ratios of 1
     entropy = actor.get_dist(batch).entropy()[ready].mean().item()
-    assert losses["loss_entropy"].item() == pytest.approx(-0.1 * entropy, rel=1e-5)
+    assert entropy_loss == pytest.approx(-0.1 * entropy, rel=1e-5)
 
 
 def test_advantages_are_scaled_over_decisions_only():

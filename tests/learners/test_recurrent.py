@@ -1,9 +1,7 @@
 """Recurrent actors: hidden states in flight, their recomputation in training, and what memory is good for."""
 
 import itertools
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,12 +17,11 @@ from damian.envs.pipeline import make_env
 from damian.evaluation.metrics import evaluate
 from damian.evaluation.run_folder import CHECKPOINT
 from damian.keys import HIDDEN, HIDDEN_BEFORE
-from damian.learners.mappo import Mappo, MappoConfig, mappo_loss
+from damian.learners.mappo import Mappo, MappoConfig, policy_terms
 from damian.learners.networks import ModelConfig, make_actor
 from damian.learners.recurrent import add_recurrent_state
 from damian.recipes import evaluate as evaluate_recipe
 from damian.recipes import oracle, train
-from damian.recipes.shared.launch import launch
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
@@ -57,12 +54,8 @@ def batches(env: EnvBase, actor: torch.nn.Module, steps: int, n: int) -> Iterato
 
 
 def ratios(learner: Mappo, batch: TensorDictBase) -> torch.Tensor:
-    """Importance ratios in the loss, [B, T, N]: minus the objective if every advantage is 1."""
-    ones = torch.ones_like(batch["next", "agents", "reward"])
-    entries = dict.fromkeys(("advantage", "state_value", "value_target"), ones)
-    batch = batch.clone().update({"agents": entries})
-    loss = mappo_loss(learner.actor, learner.critic, MappoConfig())
-    return -loss(batch)["loss_objective"].detach()
+    """Importance ratios in the loss, [B, T, N]."""
+    return policy_terms(batch.clone(), learner.actor)[0].detach().exp()
 
 
 @both_kinds_and_motions
@@ -114,7 +107,7 @@ def test_an_update_learns_from_whole_sequences():
     _, batch = batches(env, learner.actor, 14, 2)
     losses = learner.learn(batch)
     assert abs(losses["loss_objective"]) < ROUNDING  # ratios of 1, and advantages of mean 0
-    assert all(weight.grad.abs().max() > 0 for weight in learner.loss.parameters())
+    assert all(weight.grad.abs().max() > 0 for weight in learner.weights)
 
 
 def test_two_minibatches_split_the_worlds_in_halves():
@@ -272,19 +265,6 @@ def test_only_a_recurrent_actor_learns_to_repeat_an_earlier_observation(rnn):
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]", "logger=csv"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch):
-    """Run a recipe with overrides in an empty folder; returns its run folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def run_recipe(recipe, *overrides: str, folder: str = "run") -> Path:
-        monkeypatch.setattr(sys, "argv", ["recipe.py", *overrides, f"hydra.run.dir={folder}"])
-        launch(recipe.main)
-        return tmp_path / folder
-
-    return run_recipe
 
 
 @pytest.mark.parametrize(

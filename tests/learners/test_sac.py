@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import DiscreteSACLoss
 
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
@@ -97,15 +98,42 @@ def test_the_target_entropy_is_a_share_of_the_entropy_of_a_uniform_choice_among_
     n_actions = env.full_action_spec_unbatched["agents", "action"].n
     mask = torch.zeros(2, n_actions, dtype=torch.bool)
     mask[0, :4], mask[1, :16] = True, True
-    observation = torch.rand(2, env.observation_spec["agents", "observation"].shape[-1])
-    global_observation = torch.rand(2, env.observation_spec["agents", "global_observation"].shape[-1])
-    for parameter in learner.actor.parameters():
-        parameter.data.zero_()  # a uniform choice among the legal actions
-    entries = {"observation": observation, "global_observation": global_observation, "action_mask": mask}
-    _, metadata = learner.loss.actor_loss(TensorDict({"agents": TensorDict(entries, [2])}, [2]))
-    # The log-probability is -log n, and the target entropy log n / 2.
-    log_n = torch.tensor([4.0, 16.0]).log()
-    assert torch.allclose(metadata["log_prob"], -log_n / 2, atol=1e-5)
+    states = TensorDict({"agents": TensorDict({"action_mask": mask}, [2])}, [2])
+    assert torch.allclose(learner.loss.target_entropies(states), torch.tensor([4.0, 16.0]).log() / 2)
+    unmasked = learner.loss.target_entropies(TensorDict({}, [2]))
+    assert unmasked.item() == pytest.approx(math.log(n_actions) / 2)
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_the_discrete_losses_and_their_gradients_are_torchrls(mask):
+    env = UavEnv(everything("polynomial", actions=ActionConfig(kind="discrete", mask=mask)), 8)
+    learner = recording_learner(env, lr=0.1)  # so that actor, critics and targets differ
+    batch, loss = learner.drawn[0], learner.loss
+    assert ("agents", "action_mask") not in batch.keys(True) or not batch["agents", "action_mask"].all()
+    names = ("loss_actor", "loss_qvalue", "loss_alpha")
+    found = loss(batch.copy())
+    expected = DiscreteSACLoss.forward(loss, batch.copy())
+    # TorchRL has one target for all states, here 0.
+    expected["loss_alpha"] = expected["loss_alpha"] - loss.log_alpha * loss.target_entropies(batch).mean()
+    assert found["alpha"] == expected["alpha"]
+    for name in names:
+        gradients = [
+            torch.autograd.grad(terms[name], [*loss.parameters()], retain_graph=True, materialize_grads=True)
+            for terms in (found, expected)
+        ]
+        torch.testing.assert_close(found[name], expected[name])
+        torch.testing.assert_close(*gradients)
+        assert any((gradient != 0).any() for gradient in gradients[0]), name
+
+
+def test_an_update_evaluates_each_critic_once_on_the_same_observations():
+    learner = recording_learner()
+    evaluated = []
+    network = learner.loss.qvalue_network.module
+    hook = network.register_forward_hook(lambda *call: evaluated.append(len(call[1][0])))
+    learner.loss(learner.drawn[0])
+    hook.remove()
+    assert evaluated == [64] * 4  # two critics before and after each decision
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 1.0)])
@@ -210,9 +238,9 @@ def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_ho
     assert difference.amin(0).max() < 1e-5  # every expected decision is drawn
 
 
-def recording_learner(**changed) -> RecordingSac:
+def recording_learner(env: UavEnv | None = None, **changed) -> RecordingSac:
     """A learner that has made one update."""
-    env = UavEnv(everything(kind="discrete"), 4)
+    env = env or UavEnv(everything(kind="discrete"), 4)
     config = SacConfig(**({"updates": 1, "batch_size": 64, "warm_up": 0} | changed))
     learner = RecordingSac(env, config, learning(SMALL), ReplayBuffer(storage=TimeStorage(100)))
     learner.learn(fly(env, learner.actor, 8))

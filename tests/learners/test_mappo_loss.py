@@ -1,0 +1,273 @@
+"""MAPPO's loss beside TorchRL's, its compiled form, its minibatches, and the values of its critics."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import check_refused, everything, learning
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import StepCounter
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives.multiagent import MAPPOLoss
+
+from damian import keys
+from damian.common.compiling import compiled
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
+from damian.learners.mappo import (
+    LOSS_KEYS,
+    LOSSES,
+    Mappo,
+    MappoConfig,
+    add_advantages,
+    mappo_losses,
+    policy_terms,
+    state_values,
+)
+from damian.learners.networks import COMPILE_OPTIONS, ModelConfig
+from damian.learners.recurrent import RECURRENT_KEYS, add_recurrent_state
+from damian.recipes import train
+from damian.server.termination import EpisodeConfig
+from damian.world.landing import ActionConfig
+
+SMALL = ModelConfig(hidden=[16, 8])
+CONFIG = MappoConfig(clip_epsilon=0.1, entropy_coeff=0.3, critic_coeff=0.7)
+CASES = {
+    "discrete": (ActionConfig(kind="discrete"), SMALL),
+    "unmasked": (ActionConfig(kind="discrete", mask=False), SMALL),
+    "continuous": (ActionConfig(kind="continuous"), SMALL),
+    "recurrent": (ActionConfig(kind="discrete"), replace(SMALL, rnn="gru")),
+    "recurrent, continuous": (ActionConfig(kind="continuous"), replace(SMALL, rnn="gru")),
+    "shared value": (ActionConfig(kind="discrete"), replace(SMALL, shared_value=True)),
+}
+every_case = pytest.mark.parametrize("case", CASES)
+
+
+def flown(case: str, **setup) -> tuple[DelayedEnv, Mappo, TensorDictBase]:
+    """A learner and a batch [4, 12] with advantages: several episodes of 9 steps, real flight times, and
+    importance ratios within and beyond the clipping."""
+    actions, model = CASES[case]
+    scenario = everything("polynomial", actions=actions, episode=EpisodeConfig(max_steps=9))
+    torch.manual_seed(3)
+    env = make_env(scenario, 4, seed=1)
+    env.append_transform(StepCounter())
+    learner = Mappo(env, replace(CONFIG, minibatches=2, epochs=2), learning(model, **setup))
+    add_recurrent_state(env, learner.actor)
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        batch = env.rollout(12, learner.actor, break_when_any_done=False)
+        add_advantages(batch, learner.critic, learner.config)
+    batch[keys.ACTION_LOG_PROB] += 0.2 * torch.randn_like(batch[keys.ACTION_LOG_PROB])
+    return env, learner, batch
+
+
+def loss_entries(learner: Mappo, batch: TensorDictBase) -> dict:
+    """What the loss reads of a batch [B, T]."""
+    read = [*LOSS_KEYS, *learner.critic.in_keys, *RECURRENT_KEYS]
+    return {key: value for key in read if (value := batch.get(key, None)) is not None}
+
+
+def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
+    """The terms of TorchRL's loss, averaged over decisions, or for the critic over all steps."""
+    config = learner.config
+    loss = MAPPOLoss(
+        learner.actor,
+        learner.critic,
+        clip_epsilon=config.clip_epsilon,
+        entropy_coeff=config.entropy_coeff,
+        critic_coeff=config.critic_coeff,
+        normalize_advantage=False,
+        reduction="none",
+    )
+    loss.set_keys(
+        action=keys.ACTION,
+        value=keys.STATE_VALUE,
+        advantage=keys.ADVANTAGE,
+        value_target=keys.VALUE_TARGET,
+        sample_log_prob=keys.ACTION_LOG_PROB,
+    )
+    terms, ready = loss(batch.copy()), batch[keys.READY]
+    decided = [terms[name].view_as(ready)[ready].mean() for name in ("loss_objective", "loss_entropy")]
+    return torch.stack([*decided, terms["loss_critic"].mean()])
+
+
+def with_gradients(learner: Mappo, losses: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Losses, and the gradient of each of them for every weight."""
+    gradients = [
+        torch.autograd.grad(loss, learner.weights, retain_graph=True, materialize_grads=True)
+        for loss in losses
+    ]
+    return losses.detach(), [gradient for of_loss in gradients for gradient in of_loss]
+
+
+@every_case
+def test_the_losses_and_their_gradients_are_torchrls(case):
+    _, learner, batch = flown(case)
+    with torch.no_grad():
+        log_ratio, _ = policy_terms(batch.copy(), learner.actor)
+    ready = batch[keys.READY]
+    clipped = ((log_ratio.exp() - 1).abs() > CONFIG.clip_epsilon)[ready].float().mean()
+    assert 0.2 < clipped < 0.8
+    assert 0.2 < ready.float().mean() < 0.9
+    assert keys.ACTION_MASK not in batch.keys(True) or not batch[keys.ACTION_MASK].all()
+    torch.manual_seed(0)  # the entropy of continuous actions is drawn
+    entries = loss_entries(learner, batch)
+    losses = with_gradients(learner, mappo_losses(entries, learner.actor, learner.critic, learner.config))
+    torch.manual_seed(0)
+    expected = with_gradients(learner, torchrl_losses(learner, batch))
+    torch.testing.assert_close(losses, expected, rtol=1e-5, atol=1e-7)
+    assert all(gradient.isfinite().all() for gradient in expected[1])
+    assert (losses[0] != 0).all()
+
+
+def test_no_decision_gives_no_loss_of_the_actor_and_no_nan():
+    _, learner, batch = flown("discrete")
+    batch[keys.READY] = torch.zeros_like(batch[keys.READY])
+    losses = mappo_losses(loss_entries(learner, batch), learner.actor, learner.critic, learner.config)
+    assert losses[:2].tolist() == [0.0, 0.0]
+    assert losses[2] > 0
+
+
+def test_a_ratio_may_be_clipped_down_to_zero():
+    _, learner, batch = flown("discrete")
+    widest = replace(CONFIG, clip_epsilon=1.0)
+    losses = mappo_losses(loss_entries(learner, batch), learner.actor, learner.critic, widest)
+    assert losses.isfinite().all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["discrete", "unmasked", "continuous", "shared value"])
+def test_the_compiled_losses_are_those_of_the_uncompiled_function_for_any_number_of_steps(case):
+    _, learner, batch = flown(case)
+    losses = compiled(learner._losses, options=COMPILE_OPTIONS)
+    steps = {key: value.flatten(0, 1) for key, value in loss_entries(learner, batch).items()}
+    for n in (24, 23, 48, 5):
+        entries = {key: value[:n].clone() for key, value in steps.items()}
+        torch.manual_seed(0)
+        found = losses(entries)
+        after = torch.rand(1)
+        torch.manual_seed(0)
+        expected = learner._losses(entries)
+        assert torch.rand(1) == after  # as many draws of torch's generator
+        gradients = [torch.autograd.grad(terms.sum(), learner.weights) for terms in (found, expected)]
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_learner_compiles_on_demand_and_a_recurrent_one_never_does():
+    _, learner, batch = flown("discrete")
+    _, other, _ = flown("discrete", compile=True)
+    numbers = []
+    for each in (learner, other):
+        torch.manual_seed(0)
+        numbers.append(each.learn(batch.clone()))
+    assert numbers[1] == pytest.approx(numbers[0], rel=1e-4, abs=1e-6)
+    assert hasattr(other.losses, "_torchdynamo_orig_callable")
+    assert flown("recurrent", compile=True)[1].losses.__func__ is Mappo._losses
+
+
+@pytest.mark.parametrize("case", ["discrete", "recurrent"])
+def test_every_pass_goes_once_over_all_steps_in_the_order_of_a_permutation(case):
+    _, learner, batch = flown(case)
+    recurrent = learner.setup.model.recurrent
+    samples = batch if recurrent else batch.reshape(-1)
+    torch.manual_seed(0)
+    minibatches = [*learner._minibatches(batch)]
+    assert len(minibatches) == 4  # two passes over two minibatches
+    torch.manual_seed(0)
+    drawn = [i for _ in range(2) for i in torch.randperm(len(samples)).tensor_split(2)]
+    for entries, index in zip(minibatches, drawn, strict=True):
+        assert entries.keys() == loss_entries(learner, batch).keys() - {
+            *(() if recurrent else RECURRENT_KEYS)
+        }
+        for key, value in entries.items():
+            assert value.equal(samples[key][index]), key
+
+
+def test_the_numbers_are_means_over_all_minibatches():
+    _, learner, batch = flown("discrete")
+    learner.optimizer.param_groups[0]["lr"] = 0.0  # so that every minibatch sees the same networks
+    torch.manual_seed(0)
+    numbers = learner.optimize(batch)
+    torch.manual_seed(0)
+    losses = torch.stack([learner._losses(entries).detach() for entries in learner._minibatches(batch)])
+    assert numbers == pytest.approx(dict(zip(LOSSES, losses.mean(0).tolist(), strict=True)))
+
+
+# Values.
+
+
+@pytest.mark.parametrize("case", ["discrete", "shared value"])
+def test_values_are_those_of_two_passes_over_the_batch(case):
+    _, learner, batch = flown(case)
+    key = keys.GLOBAL_OBSERVATION
+    batch[keys.next_key(key)][2, 4, 1] += 1.0  # a correction after the step that is not before the next one
+    ends = batch["next", "done"].squeeze(-1)
+    assert ends[:, :-1].any()
+    evaluated = []
+    hook = learner.critic.register_forward_hook(lambda *call: evaluated.append(call[1][0].numel()))
+    with torch.no_grad():
+        values = state_values(batch, learner.critic)
+        hook.remove()
+        expected = (learner.critic(batch.copy()), learner.critic(batch["next"].copy()))
+    torch.testing.assert_close(values, tuple(td[keys.STATE_VALUE] for td in expected))
+    assert evaluated == [
+        batch.numel() + 4 + int(ends[:, :-1].sum()) + 1
+    ]  # last steps, ends, and the correction
+
+
+def test_a_shared_value_is_one_for_all_uavs_from_the_observations_of_all_of_them():
+    env, learner, batch = flown("shared value")
+    step = batch[:, 3]
+    value = learner.critic(step.copy())[keys.STATE_VALUE]
+    assert value.shape == (4, 3, 1)
+    assert (value == value[:, :1]).all()
+    assert (value[0, 0] != value[1:, 0]).all()
+    for uav in range(3):  # each UAV's observation counts
+        other = step.clone()
+        other[keys.GLOBAL_OBSERVATION][:, uav] += 1.0
+        assert (learner.critic(other)[keys.STATE_VALUE] != value).all()
+    n_features = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1]
+    assert learner.weights[len([*learner.actor.parameters()])].shape == (16, 3 * n_features)
+
+
+def test_a_shared_value_is_trained_towards_the_mean_target_of_the_uavs():
+    _, learner, batch = flown("shared value")
+    with torch.no_grad():
+        value = learner.critic(batch.copy())[keys.STATE_VALUE]
+    n_critic = len([*learner.critic.parameters()])
+    for mean, is_reached in ((0.0, True), (0.1, False)):
+        batch[keys.VALUE_TARGET] = value + mean + torch.tensor([-0.3, 0.1, 0.2]).unsqueeze(-1)
+        losses = mappo_losses(loss_entries(learner, batch), learner.actor, learner.critic, learner.config)
+        _, gradients = with_gradients(learner, losses[2:])
+        assert all((gradient.abs() < 1e-6).all() for gradient in gradients[-n_critic:]) is is_reached
+
+
+def test_a_shared_value_goes_with_a_privileged_critic_backupdating_and_a_recurrent_actor(run):
+    words = ["model.shared_value=true", "critic=privileged", "delay.obs=2", "aware=both", "model=gru"]
+    tiny = ["worlds=4", "frames=128", "learner.steps=16", "learner.minibatches=2", "eval_episodes=2"]
+    region = ["region.lattice_step=60", "episode.max_steps=12", "model.hidden=[8]"]
+    folder = run(train, *words, *tiny, *region)
+    assert len((folder / "metrics.csv").read_text().splitlines()) == 3
+
+
+def test_sac_refuses_a_shared_value_in_one_line(run, capsys, tmp_path):
+    error = "model.shared_value: True is for learner=mappo only"
+    check_refused(lambda: run(train, "learner=sac", "model.shared_value=true"), error, capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("case", ["discrete", "recurrent, continuous"])
+def test_an_older_checkpoint_of_the_optimiser_can_be_loaded(case):
+    """It numbers the weights as TorchRL's loss does, and was not fused."""
+    _, learner, batch = flown(case)
+    weights = [*MAPPOLoss(learner.actor, learner.critic).parameters()]
+    assert [id(weight) for weight in weights] == [id(weight) for weight in learner.weights]
+    older = torch.optim.Adam(weights, lr=1e-3)
+    losses = mappo_losses(loss_entries(learner, batch), learner.actor, learner.critic, learner.config)
+    losses.sum().backward()
+    older.step()
+    learner.optimizer.load_state_dict(older.state_dict())
+    learner.learn(batch)
+    assert {int(state["step"]) for state in learner.optimizer.state.values()} == {1 + 4}
