@@ -12,7 +12,7 @@ from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
 from damian import keys
-from damian.common import checks, counter_rng
+from damian.common import checks, counter_rng, devices
 from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
@@ -212,7 +212,7 @@ class UavEnv(EnvBase):
             The worlds, and the outputs with which the new episodes begin. TorchRL keeps the entries of the
             other worlds.
         """
-        if torch.compiler.is_compiling():  # a graph allows no shapes that depend on data
+        if torch.compiler.is_compiling() or not devices.data_dependent(mask.device):
             fresh = self.simulation.next_episode(worlds)
             worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
         else:

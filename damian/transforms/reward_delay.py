@@ -8,8 +8,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
-from damian.common import checks
-from damian.common.devices import data_dependent
+from damian.common import checks, devices
 from damian.common.tensors import expand_mask
 from damian.delays.delay_line import advance_slot
 from damian.delays.laws import LOSES, law_of, sampler_of
@@ -256,7 +255,7 @@ class RewardDelay(RewardTransform):
     def _rest(self, memory: Memory, ended: Tensor) -> Tensor:
         """Sums of the rewards that arrive in later steps, [M, ...], right for the rows of the mask [M]."""
         ring = memory["past"], memory["due"], memory["time"]
-        if self.n_past > _FEW and not self.gradients and data_dependent(ended.device):
+        if self.n_past > _FEW and not self.gradients and devices.data_dependent(ended.device):
             return _rest_of(*ring, ended)
         return _sum_due_later(*ring)
 
@@ -364,7 +363,7 @@ def discounted_sum(past: Tensor, gamma: float, dtype: torch.dtype) -> Tensor:
         gamma: discount per step.
         dtype: type of the sum.
     """
-    weights = torch.tensor([gamma**age for age in range(len(past))], dtype=dtype, device=past.device)
+    weights = devices.constant(tuple(gamma**age for age in range(len(past))), dtype, past.device)
     # In double precision, so that the order of the sum, which depends on the batch, does not matter.
     precise = torch.float64 if dtype.is_floating_point else dtype
     return (weights.view(-1, *[1] * (past.dim() - 1)) * past).sum(0, dtype=precise).to(dtype)
