@@ -1,11 +1,36 @@
 """Compiles the pure inner functions of a step; the TorchRL code around them stays uncompiled."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 
 import torch
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class CompiledMethods:
+    """The methods of an object, each compiled at its first call.
+
+    A copy, and what a pickle is read as, has the same options but no graphs: these belong to the object whose
+    methods they were made from, so that the copy of this object compiles its own.
+
+    Args:
+        options: keyword arguments of ``torch.compile``, as in ``compiled``.
+    """
+
+    def __init__(self, options: dict[str, Any]) -> None:
+        self._options = options
+        self._graphs: dict[tuple[Hashable, ...], Callable[..., Any]] = {}
+
+    def get(self, method: Callable[..., Any], *variant: Hashable) -> Callable[..., Any]:
+        """The compiled method; each variant of what no guard checks has its own graph."""
+        key = (method.__name__, *variant)
+        if key not in self._graphs:
+            self._graphs[key] = compiled(method, **self._options)
+        return self._graphs[key]
+
+    def __reduce__(self) -> tuple[type["CompiledMethods"], tuple[dict[str, Any]]]:
+        return CompiledMethods, (self._options,)
 
 
 def compiled(function: Function, **options: Any) -> Function:

@@ -10,7 +10,8 @@ from torch import Tensor
 from torchrl.envs import Compose, Transform, TransformedEnv
 
 from damian import keys
-from damian.common.compiling import compiled
+from damian.common import devices
+from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask, tree_where
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
@@ -29,8 +30,8 @@ class DelayedEnv(TransformedEnv):
     TensorDict is built between two transforms, so that a step compiles into one graph.
     """
 
-    _compile_options: dict[str, Any] | None = None
-    """Options for ``torch.compile``; None if nothing is compiled."""
+    _compiled: CompiledMethods | None = None
+    """The compiled methods; None if nothing is compiled."""
 
     @property
     def uav_env(self) -> UavEnv:
@@ -94,8 +95,7 @@ class DelayedEnv(TransformedEnv):
             TypeError: the base environment is not a ``UavEnv``.
         """
         _ = self.uav_env  # raises the TypeError
-        for name, value in (("_compile_options", options), ("_graphs", {})):
-            object.__setattr__(self, name, value)  # TransformedEnv's own __setattr__ is for specs
+        object.__setattr__(self, "_compiled", CompiledMethods(options))  # TransformedEnv's own is for specs
         return self
 
     def _method(self, name: str, *variant: Any) -> Callable[..., Any]:
@@ -103,17 +103,8 @@ class DelayedEnv(TransformedEnv):
 
         Each variant (its transforms and entries) has its own graph, because no guard checks these.
         """
-        if self._compile_options is None:
-            return getattr(self, name)
-        graphs = self.__dict__["_graphs"]
-        if (name, *variant) not in graphs:
-            graphs[name, *variant] = compiled(getattr(self, name), **self._compile_options)
-        return graphs[name, *variant]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The state without the graphs, because a copy compiles its own."""
-        state = dict(cast(dict[str, Any], super().__getstate__()))
-        return state | ({"_graphs": {}} if "_graphs" in state else {})
+        method = getattr(self, name)
+        return method if self._compiled is None else self._compiled.get(method, *variant)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         partial = "_step" in tensordict or "next" in tensordict
@@ -257,7 +248,7 @@ class DelayedEnv(TransformedEnv):
         worlds, memories, outputs = self._whole_step(worlds, memories, entries)
         begin = {key: value for key, value in outputs.items() if key != keys.REWARD}
         done = outputs[keys.DONE]
-        if torch.compiler.is_compiling() or done.any():
+        if torch.compiler.is_compiling() or not devices.data_dependent(done.device) or done.any():
             worlds, memories, first = self._whole_reset(worlds, memories, done)
             mask = done.view(-1)
             begin |= {key: torch.where(expand_mask(mask, new), new, begin[key]) for key, new in first.items()}

@@ -12,8 +12,8 @@ from torchrl.data.utils import DEVICE_TYPING
 from torchrl.envs import EnvBase
 
 from damian import keys
-from damian.common import checks, counter_rng
-from damian.common.compiling import compiled
+from damian.common import checks, counter_rng, devices
+from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
 from damian.server.features import feature_bounds
@@ -102,8 +102,7 @@ class UavEnv(EnvBase):
         self._reset_outputs = self._outputs_at_reset(initial, features)
         self._make_specs(self._bounds(features))
         self.set_seed(seed)
-        self._step_fn = self._masked_step_fn = self.step_fn
-        self._reset_fn = self.reset_fn
+        self._compiled: CompiledMethods | None = None
         self.to(torch.device(device))
 
     def compile(self, **options: Any) -> "UavEnv":
@@ -115,10 +114,7 @@ class UavEnv(EnvBase):
         Returns:
             The environment itself.
         """
-        # A step has two graphs, because no guard checks whether ``action_valid`` is given.
-        self._step_fn = compiled(self.step_fn, **options)
-        self._masked_step_fn = compiled(self.step_fn, **options)
-        self._reset_fn = compiled(self.reset_fn, **options)
+        self._compiled = CompiledMethods(options)
         return self
 
     def to(self, device: DEVICE_TYPING) -> "UavEnv":
@@ -182,11 +178,10 @@ class UavEnv(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action, valid = tensordict.get(keys.ACTION), tensordict.get(keys.ACTION_VALID, None)
-        before = self.worlds
-        if valid is None:
-            self.worlds, outputs = self._step_fn(self.worlds, action)
-        else:
-            self.worlds, outputs = self._masked_step_fn(self.worlds, action, valid)
+        before, inputs = self.worlds, [action] if valid is None else [action, valid]
+        # With and without ``valid`` a step has its own graph, because no guard checks whether it is given.
+        step = self.step_fn if self._compiled is None else self._compiled.get(self.step_fn, len(inputs))
+        self.worlds, outputs = step(before, *inputs)
         if self.messages_only:  # TorchRL expects a reward from every environment
             outputs[keys.REWARD] = self.full_reward_spec[keys.REWARD].zero()
         stepped = tensordict.get(keys.STEPPED, None)
@@ -205,7 +200,8 @@ class UavEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        self.worlds, outputs = self._reset_fn(self.worlds, mask.view(-1))
+        reset = self.reset_fn if self._compiled is None else self._compiled.get(self.reset_fn)
+        self.worlds, outputs = reset(self.worlds, mask.view(-1))
         return self.to_tensordict(outputs)
 
     # Pure functions of the state, which can be compiled.
@@ -217,7 +213,7 @@ class UavEnv(EnvBase):
             The worlds, and the outputs with which the new episodes begin. TorchRL keeps the entries of the
             other worlds.
         """
-        if torch.compiler.is_compiling():  # a graph allows no shapes that depend on data
+        if torch.compiler.is_compiling() or not devices.data_dependent(mask.device):
             fresh = self.simulation.next_episode(worlds)
             worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
         else:

@@ -42,10 +42,17 @@ class ServerContext(NamedTuple):
 
 
 class FeatureCache:
-    """Messages, and intermediate results that several features share, each computed once and on demand."""
+    """Messages, and intermediate results that several features share, each computed once and on demand.
 
-    def __init__(self, messages: Messages, context: ServerContext) -> None:
-        self.messages, self.context = messages, context
+    Args:
+        messages: of N UAVs, [*, N].
+        context: with the leading dimensions [*] of the messages.
+        own_only: messages are [*, N, N] (receiver, sender), and of the values of UAV j that follow from what
+            receiver i knows, only those with i = j are wanted.
+    """
+
+    def __init__(self, messages: Messages, context: ServerContext, own_only: bool = False) -> None:
+        self.messages, self.context, self.own_only = messages, context, own_only
         self._shared: dict[Callable, Tensor] = {}
 
     def __call__(self, compute: Callable[["FeatureCache"], Tensor]) -> Tensor:
@@ -53,6 +60,17 @@ class FeatureCache:
         if compute not in self._shared:
             self._shared[compute] = compute(self)
         return self._shared[compute]
+
+    def wanted(self, field: Tensor) -> Tensor:
+        """A field [*, N, ...] of the UAVs whose values are wanted: of all, or of one for each *, [*, 1, ...].
+
+        A feature that compares every UAV with every other one computes only these, as [*, N, ...] or
+        [*, 1, ...]; any other may compute all.
+        """
+        if not self.own_only:
+            return field
+        sender = self.context.now.dim()
+        return field.diagonal(0, sender - 1, sender).movedim(-1, sender - 1).unsqueeze(sender)
 
     def reading(self, name: str) -> Tensor:
         """Values of a sensor of one's own (``damian.sensor``), [*, N], or [*, N, width] if it has several.

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from damian.common import checks
+from damian.common import checks, devices
 from damian.common.registry import Registry, require_parentheses
 from damian.common.tensors import gather_rows
 from damian.server.feature_cache import FeatureCache, ServerContext
 from damian.world.battery import observed
-from damian.world.coverage import covered_share, updated_share
+from damian.world.coverage import FootprintTables, covered_share, own_covered_share, updated_share
 from damian.world.messages import Messages
 
 
@@ -98,6 +98,27 @@ def observe(messages: Messages, context: ServerContext, names: list[str]) -> dic
     """
     cache = FeatureCache(messages, context)
     return {name: FEATURES.get(name, "feature").compute(cache) for name in names}
+
+
+def observe_own(known: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
+    """Features by name, as each UAV computes its own from the messages that it knows.
+
+    Args:
+        known: messages [*, N, N] (receiver, sender).
+        context: with the leading dimensions [*, N] of the messages.
+        names: features to compute.
+
+    Returns:
+        As ``observe``, each feature [*, N] or [*, N, width].
+    """
+    cache, sender = FeatureCache(known, context, own_only=True), known.time.dim() - 1
+    values = {name: FEATURES.get(name, "feature").compute(cache) for name in names}
+    return {
+        name: each.squeeze(sender)
+        if each.shape[sender] == 1
+        else each.diagonal(0, sender - 1, sender).movedim(-1, sender - 1)
+        for name, each in values.items()
+    }
 
 
 def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
@@ -224,9 +245,9 @@ def _bearing(v: FeatureCache) -> Tensor:
 
 
 def _pairwise(v: FeatureCache) -> Tensor:
-    """Distances between UAVs, divided by the largest vertex distance of the region, [*, N, N]."""
+    """Distances from the wanted UAVs to all, over the largest vertex distance of the region, [*, N, N]."""
     position = v.messages.position
-    offset = position.unsqueeze(-2) - position.unsqueeze(-3)
+    offset = v.wanted(position).unsqueeze(-2) - position.unsqueeze(-3)
     return torch.linalg.vector_norm(offset, dim=-1) / v.scale.unsqueeze(-1)
 
 
@@ -261,11 +282,16 @@ def _source_time(v: FeatureCache) -> Tensor:
 @FEATURES.register("agent_distances")
 @feature("global", width=None)
 def _agent_distances(v: FeatureCache) -> Tensor:
-    n = v.messages.time.shape[-1]
-    others = [[j for j in range(n) if j != i] for i in range(n)]
-    index = torch.tensor(others, dtype=torch.long, device=v.scale.device).view(n, n - 1)
     pairwise = v(_pairwise)
-    return pairwise.gather(-1, index.expand(*pairwise.shape[:-1], n - 1)).clamp(max=1)
+    uav = torch.arange(pairwise.shape[-1], device=pairwise.device)
+    wanted = uav.unsqueeze(-1) if v.own_only else uav
+    others = uav[:-1] + (uav[:-1] >= wanted.unsqueeze(-1))  # all but the UAV itself, in index order
+    return pairwise.gather(-1, others.expand(*pairwise.shape[:-1], -1)).clamp(max=1)
+
+
+def _own_coverage(v: FeatureCache, footprints: FootprintTables) -> Tensor:
+    trail = v.messages.trail
+    return own_covered_share(footprints, trail, gather_rows(v.context.points, trail)).unsqueeze(-1)
 
 
 @FEATURES.register("coverage")
@@ -273,8 +299,10 @@ def _agent_distances(v: FeatureCache) -> Tensor:
 def _coverage(v: FeatureCache) -> Tensor:
     if v.context.footprints is None:
         raise ValueError("coverage needs the footprint tables")
+    if v.own_only:
+        return _own_coverage(v, v.context.footprints)
     trail, points, known = v.messages.trail, v.context.points, v.context.coverage
-    if known is not None and trail.device.type == "cpu":  # its shapes depend on data
+    if known is not None and devices.data_dependent(trail.device):
         return updated_share(v.context.footprints, trail, points, known)
     return covered_share(v.context.footprints, trail, gather_rows(points, trail))
 
@@ -292,7 +320,7 @@ def _mean_distance_not_spotting(v: FeatureCache) -> Tensor:
     """Mean distance to the other UAVs that do not spot; 0 for a spotting UAV, or if there are no others."""
     silent = (~v.messages.spotted).to(v.scale.dtype)
     others = silent.sum(-1, keepdim=True) - 1
-    total = (v(_pairwise) * silent.unsqueeze(-2)).sum(-1) * silent
+    total = (v(_pairwise) * silent.unsqueeze(-2)).sum(-1) * v.wanted(silent)
     return (total / others.clamp(min=1)).clamp(max=1)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from damian.common.errors import InputError
 from damian.common.tensors import gather_rows
 from damian.server.feature_cache import ServerContext
-from damian.server.features import ObservationConfig, observe, stack
+from damian.server.features import ObservationConfig, observe, observe_own, stack
 from damian.server.reward_terms import Counters
 from damian.server.rewards import RewardConfig, final_reward, reward
 from damian.server.termination import EpisodeConfig, Status, status
@@ -217,9 +217,8 @@ class Server:
             known: the message of each UAV that each UAV knows, [*, N, N] (receiver, sender).
             steps: elapsed steps of the episode, [*].
         """
-        names = self.observation.actor
-        features = self.features(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]), names)
-        return stack(features, names).diagonal(dim1=-3, dim2=-2).movedim(-1, -2)
+        context = self._context(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
+        return stack(observe_own(known, context, self.observation.actor), self.observation.actor)
 
     def reward_and_status(
         self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor

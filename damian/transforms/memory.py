@@ -52,6 +52,14 @@ class MemoryTransform(Transform):
         self._rows = None
         self._buffers.clear()
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy has memory of its own: what was sent to a worker process would share the sender's."""
+        super().__setstate__(state)
+        self._buffers = {
+            name: value.clone() if value is not None and value.is_shared() else value
+            for name, value in self._buffers.items()
+        }
+
     def clone(self) -> "MemoryTransform":
         """A copy of the transform without memory."""
         copied = super().clone()

@@ -8,7 +8,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
-from damian.common import checks
+from damian.common import checks, devices
 from damian.common.tensors import expand_mask
 from damian.delays.delay_line import advance_slot
 from damian.delays.laws import LOSES, law_of, sampler_of
@@ -28,6 +28,11 @@ from damian.transforms.entries import (
     spec_rows,
 )
 from damian.transforms.order import KeyUsage
+
+_FEW = 16
+"""With up to so many slots, the rest in transit is summed for all rows, whichever episodes end."""
+_SUMMED_AT_ONCE = 2**18
+"""Rewards summed together, which bounds the memory: a few arrays of 2 MB, to stay in a cache."""
 
 
 class RewardTransform(StatefulTransform):
@@ -102,6 +107,12 @@ class RewardDelay(RewardTransform):
     are still in transit are received, so that none is lost. Hence the transform must come after every
     transform that ends episodes, such as ``StepCounter(max_steps=100)``. With delay 0 the rollout is the
     same, bit for bit, as without the transform.
+
+    Rewards in transit lie in a ring of K slots (``past``), one for each coming step; ``due`` [K, M] is the
+    time at which those in a slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a
+    reset and at the end of an episode: whatever is in transit then is never received, and a later reward
+    takes its place. So a step writes one slot of each row, in place, and costs the same however long the
+    delay is; the end of an episode costs a pass over the slots of its rows.
 
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
@@ -180,7 +191,8 @@ class RewardDelay(RewardTransform):
         streams = self.streams(tensordict.batch_size, memory["past"].device)
         channel = self.sampler.initial_state(streams)
         zero = torch.zeros_like(streams)
-        memory = memory | {"clock": zero, "slot": zero.clone(), "streams": streams, "channel": channel}
+        memory |= {"clock": zero, "slot": zero.clone(), "streams": streams, "channel": channel}
+        memory |= {"time": zero.clone(), "due": zero.repeat(self.n_past, 1)}
         if not self.sampler.sees_context:
             return memory
         return self.contexts.init_memory(memory | {"reset_at": zero.clone()}, tensordict, self.rows)
@@ -189,33 +201,67 @@ class RewardDelay(RewardTransform):
         memory = memory | {"channel": self.sampler.begin_episode(memory["channel"], mask)}
         if self.sampler.sees_context:
             memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
-        memory, _ = super().on_reset(memory, entries, mask)
+        memory["time"] = memory["time"] + self.n_past * mask
         if self.delay_key is None and self.earned_key is None:
             return memory, {}
         return memory, self._report(torch.zeros_like(memory["clock"]), torch.zeros_like(memory["past"][0]))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        clock, in_transit = memory["clock"] + 1, memory["past"]
+        clock = memory["clock"] + 1
         reward = as_rows(entries[self.reward_key], self.rows)
         context = self.contexts.read(memory, entries, None, self.rows)
         delay, channel = self.sampler(memory["streams"], clock, memory["channel"], context)
-        slot_now = advance_slot(memory["slot"], 1, self.n_past)
-        arrival = advance_slot(slot_now, delay, self.n_past)
-        rows = torch.arange(len(reward), device=delay.device)
-        row, here = (slot * len(reward) + rows for slot in (arrival, slot_now))
-        flat = in_transit.flatten(0, 1).index_add(0, row, reward)
-        received = flat.index_select(0, here)
-        in_transit = flat.index_fill(0, here, 0).view_as(in_transit)
+        slot = advance_slot(memory["slot"], 1, self.n_past)
+        memory = memory | {"clock": clock, "slot": slot, "channel": channel, "time": memory["time"] + 1}
+        memory["past"] = self._send(memory, reward, delay, self.sending_rows(entries))
+        received = self._received(memory)
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
-            ended = expand_mask(any_flag(done, self.rows), received)
-            # In double precision, so that the order of the sum, which depends on the batch, does not matter.
-            precise = torch.float64 if received.is_floating_point() else received.dtype
-            rest = in_transit.sum(0, dtype=precise).to(received.dtype)
-            received = torch.where(ended, received + rest, received)
-            in_transit = in_transit.masked_fill(ended, 0)
-        memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "past": in_transit}
+            ended = any_flag(done, self.rows)
+            received = torch.where(
+                expand_mask(ended, received), received + self._rest(memory, ended), received
+            )
+            memory["time"] = memory["time"] + self.n_past * ended
         return memory, {self.reward_key: from_rows(received, self.rows)} | self._report(delay, reward)
+
+    def _send(self, memory: Memory, reward: Tensor, delay: Tensor, stepped: Tensor | None) -> Tensor:
+        """Add rewards [M, ...] to what arrives after the delays [M], except in rows that do not step.
+
+        Returns:
+            The slots, [K, M, ...].
+        """
+        past, arrival = memory["past"], memory["time"] + delay
+        flat, due = past.flatten(0, 1), memory["due"].view(-1)
+        row = _slot_rows(advance_slot(memory["slot"], delay, self.n_past))
+        there, old = flat.index_select(0, row), due.index_select(0, row)
+        added = torch.where(expand_mask(old == arrival, there), there, 0) + reward
+        # ``old`` is never later; a compiler that sees that it is read before writes the new times in place.
+        arrival = torch.maximum(arrival, old)
+        if stepped is not None:
+            added = torch.where(expand_mask(stepped, there), added, there)
+            arrival = torch.where(stepped, arrival, old)
+        due.index_copy_(0, row, arrival)
+        if self.gradients:
+            return flat.index_copy(0, row, added).view_as(past)
+        flat.index_copy_(0, row, added)
+        return past
+
+    def _received(self, memory: Memory) -> Tensor:
+        """The rewards that arrive in this step, [M, ...]."""
+        row = _slot_rows(memory["slot"])
+        here, due = (memory[name].flatten(0, 1).index_select(0, row) for name in ("past", "due"))
+        return torch.where(expand_mask(due == memory["time"], here), here, 0)
+
+    def _rest(self, memory: Memory, ended: Tensor) -> Tensor:
+        """Sums of the rewards that arrive in later steps, [M, ...], right for the rows of the mask [M]."""
+        ring = memory["past"], memory["due"], memory["time"]
+        if self.n_past > _FEW and not self.gradients and devices.data_dependent(ended.device):
+            return _rest_of(*ring, ended)
+        return _sum_due_later(*ring)
+
+    @property
+    def row_dims(self) -> dict[str, int]:
+        return super().row_dims | {"due": 1}
 
     def _report(self, delay: Tensor, earned: Tensor) -> Entries:
         """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards [M, ...]."""
@@ -235,6 +281,38 @@ class RewardDelay(RewardTransform):
             earned = rewards[self.reward_key]
             observation_spec[self.earned_key] = Unbounded(earned.shape, dtype=earned.dtype, device=device)
         return observation_spec
+
+
+def _slot_rows(slot: Tensor) -> Tensor:
+    """Rows of [K * M, ...] that hold one slot [M] of each of the M rows."""
+    return slot * len(slot) + torch.arange(len(slot), device=slot.device)
+
+
+def _sum_due_later(past: Tensor, due: Tensor, time: Tensor) -> Tensor:
+    """Sums of the rewards [K, M, ...] that are due [K, M] after a time [M], [M, ...]."""
+    # In double precision, so that the order of the sum, which depends on the batch, does not matter.
+    precise = torch.float64 if past.is_floating_point() else past.dtype
+    return torch.where(expand_mask(due > time, past), past, 0).sum(0, dtype=precise).to(past.dtype)
+
+
+@torch.library.custom_op("damian::rest_of_rewards", mutates_args=())
+def _rest_of(past: Tensor, due: Tensor, time: Tensor, ended: Tensor) -> Tensor:
+    """The sums of ``_sum_due_later`` for the rows of the mask [M], and 0 for the others.
+
+    This is a custom operator because the number of rows depends on the data, which a compiler cannot trace.
+    """
+    rest, rows = torch.zeros_like(past[0]), ended.nonzero().squeeze(-1)
+    for part in rows.split(max(_SUMMED_AT_ONCE // len(past), 1)):
+        paid = _sum_due_later(
+            past.index_select(1, part), due.index_select(1, part), time.index_select(0, part)
+        )
+        rest.index_copy_(0, part, paid)
+    return rest
+
+
+@_rest_of.register_fake
+def _(past, due, time, ended):  # compilers need only the shape
+    return torch.empty_like(past[0])
 
 
 class CumulativeReward(RewardTransform):
@@ -285,7 +363,7 @@ def discounted_sum(past: Tensor, gamma: float, dtype: torch.dtype) -> Tensor:
         gamma: discount per step.
         dtype: type of the sum.
     """
-    weights = torch.tensor([gamma**age for age in range(len(past))], dtype=dtype, device=past.device)
+    weights = devices.constant(tuple(gamma**age for age in range(len(past))), dtype, past.device)
     # In double precision, so that the order of the sum, which depends on the batch, does not matter.
     precise = torch.float64 if dtype.is_floating_point else dtype
     return (weights.view(-1, *[1] * (past.dim() - 1)) * past).sum(0, dtype=precise).to(dtype)

@@ -153,26 +153,67 @@ def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:
     return max(1, (_CHUNK_WORDS if small else _CHUNK_WORDS_LARGE) // words_per_world)
 
 
+def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
+    """Coverage c_a in [0, 1], ``[*, N]``, of each UAV as far as it knows the footprints of the others.
+
+    The result is the diagonal of :func:`covered_share`, of what every UAV knows.
+
+    Args:
+        tables: from :func:`build_tables`, on the same device as the positions.
+        point_ids: ``[*, N, N, n]`` int64 (receiver, sender): landing points where the senders stood, as far
+            as the receiver knows.
+        positions: ``[*, N, N, n, 2]`` [m], positions of these landing points; finite (not checked).
+    """
+    lead, (n_uavs, n_last) = point_ids.shape[:-3], point_ids.shape[-2:]
+    uav = torch.arange(n_uavs, device=point_ids.device)
+    # The receiver i itself, then i + 1, i + 2, ... (modulo N).
+    known = (uav.unsqueeze(-1) * n_uavs + (uav.unsqueeze(-1) + uav) % n_uavs).flatten()
+    own = point_ids.reshape(-1, n_uavs**2, n_last).index_select(1, uav * (n_uavs + 1))
+    cells = (positions * tables.cells_per_metre).reshape(-1, n_uavs**2, n_last, 2).index_select(1, known)
+    fleet = cells.view(-1, n_uavs, n_uavs, n_last, 2).movedim(2, -1)
+    worlds = _worlds_at_once(tables, own)
+    chunks = zip(own.split(worlds), fleet.split(worlds), strict=True)
+    return torch.cat([_share_of_first(tables, *chunk) for chunk in chunks]).reshape(*lead, n_uavs)
+
+
 def _covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
     """:func:`covered_share` of a chunk of worlds: ``[b, N, n]``, ``[b, N, n, 2]`` -> ``[b, N]``."""
-    overlaps = _overlap_rows(positions * tables.cells_per_metre).movedim(-1, 0)
-    rows = torch.cat([(point_ids + _GRID**2).unsqueeze(0), overlaps])
+    cells, n_uavs = positions * tables.cells_per_metre, positions.shape[-3]
+    # Windows that slide over the UAVs: i, i + 1, i + 2, ... (modulo N), without index tensors.
+    fleet = torch.cat([cells, cells[..., :-1, :, :]], -3).unfold(-3, n_uavs, 1)
+    return _share_of_first(tables, point_ids, fleet)
+
+
+def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleet: Tensor) -> Tensor:
+    """Coverage of the first UAV of each fleet, ``[b, N]``.
+
+    Args:
+        tables: from :func:`build_tables`.
+        point_ids: of the first UAVs, ``[b, N, n]``.
+        fleet: positions of the first UAV and the others in cells, ``[b, N, n, 2, N]``.
+    """
+    rows = torch.cat([(point_ids + _GRID**2).unsqueeze(0), _overlap_rows(fleet).movedim(-1, 0)])
     masks = tables.masks.index_select(0, rows.reshape(-1))
     excluded = _or_first(masks.view(len(rows), *point_ids.shape, -1))
     counts = _bit_count(excluded).flatten(-2)
     # Summed as floats (exact: small integers), which compiles to a much faster loop than int64.
-    return 1 - counts.sum(-1, dtype=positions.dtype) / (64 * counts.shape[-1])
+    return 1 - counts.sum(-1, dtype=fleet.dtype) / (64 * counts.shape[-1])
 
 
-def _overlap_rows(cells: Tensor) -> Tensor:
-    """Table rows of the discs that may overlap a footprint, ``[b, N, n, 2]`` -> ``[b, N, n, N + n - 2]``.
+def _overlap_rows(fleet: Tensor) -> Tensor:
+    """Table rows of the discs that may overlap a footprint of the first UAV of each fleet.
 
-    First come the other UAVs i + 1, i + 2, ... (modulo N) at the same index, then UAV i itself at the
-    indices k + 1, k + 2, ...; beyond the window it is infinitely far away. Windows that slide over the
-    UAVs and over the indices leave out all other pairs, without index tensors.
+    First come the other UAVs at the same index, then the UAV itself at the indices k + 1, k + 2, ...; beyond
+    the window it is infinitely far away. A window that slides over the indices leaves out all other pairs,
+    without index tensors.
+
+    Args:
+        fleet: ``[b, N, n, 2, N]``, in cells.
+
+    Returns:
+        ``[b, N, n, N + n - 2]``.
     """
-    n_uavs, n_last = cells.shape[-3:-1]
-    fleet = torch.cat([cells, cells[..., :-1, :, :]], -3).unfold(-3, n_uavs, 1)
+    cells, n_last = fleet[..., 0], fleet.shape[-3]
     past = F.pad(cells, (0, 0, 0, n_last - 1), value=math.inf).unfold(-2, n_last, 1)
     other = torch.cat([fleet[..., 1:], past[..., 1:]], -1)
     # Adding half a cell before truncation rounds to the nearest one.

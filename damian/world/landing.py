@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from damian.common import checks
+from damian.common import checks, devices
 from damian.common.tensors import gather_rows
 from damian.world.airspace import Airspace, inside
 from damian.world.nearest import LandingGrid
@@ -26,6 +26,9 @@ _FEW_AGENTS = 4
 """Most UAVs of a world to which a graph gives landing points one after the other."""
 _EDGES_AT_ONCE = 2**18
 """Pairs of target and polygon edge compared at once, which bounds the memory: a few arrays of 2 MB."""
+_COMPARES_ALL = 1024
+"""Up to so many landing points, all are compared where shapes may not depend on data. With more, a GPU waits
+for the number of cells to search, in each step, because this costs less."""
 
 
 @dataclass
@@ -123,7 +126,13 @@ class Candidates:
         target = gather_rows(self.airspace.exact_points.flatten(0, 1), own) + move
         regions = region.unsqueeze(-1).expand_as(flat).flatten()
         nearest = _nearest_inside(
-            self.airspace.edges, [*self.airspace.grid], regions, target, own - base, self.n_candidates
+            self.airspace.edges,
+            [*self.airspace.grid],
+            regions,
+            target,
+            own - base,
+            self.n_candidates,
+            self.airspace.max_points,
         )
         points = self.airspace.points.flatten(0, 1)
         offset = gather_rows(points, nearest + base.unsqueeze(-1)) - gather_rows(points, own).unsqueeze(1)
@@ -208,7 +217,7 @@ class Candidates:
 
 @torch.library.custom_op("damian::nearest_inside", mutates_args=())
 def _nearest_inside(
-    edges: Tensor, grid: list[Tensor], region: Tensor, target: Tensor, own: Tensor, n: int
+    edges: Tensor, grid: list[Tensor], region: Tensor, target: Tensor, own: Tensor, n: int, n_points: int
 ) -> Tensor:
     """Landing points nearest to targets, [M, n]; ``own`` instead of missing ones, and if a target is outside.
 
@@ -222,18 +231,22 @@ def _nearest_inside(
         target: [M, 2] metres.
         own: landing points where the UAVs stand, [M].
         n: number of points.
+        n_points: largest number of landing points of a region.
     """
     at_once = max(_EDGES_AT_ONCE // edges.shape[1], 1)
     parts = zip(region.split(at_once), target.split(at_once), strict=True)
     within = torch.cat([inside(edges.index_select(0, r), t) for r, t in parts])
     nearest = own.unsqueeze(-1).repeat(1, n)
+    if n_points <= _COMPARES_ALL and not devices.data_dependent(own.device):
+        found = LandingGrid(*grid).nearest_of_all(region, target, n, n_points)
+        return torch.where(within.unsqueeze(-1) & (found >= 0), found, nearest)
     found = LandingGrid(*grid).nearest(region[within], target[within], n)
     nearest[within] = torch.where(found < 0, nearest[within], found)
     return nearest
 
 
 @_nearest_inside.register_fake
-def _(edges, grid, region, target, own, n):  # compilers need only the shape
+def _(edges, grid, region, target, own, n, n_points):  # compilers need only the shape
     return own.new_empty(len(own), n)
 
 
@@ -308,6 +321,8 @@ def _settle(
     This is a custom operator because the number of contested worlds depends on the data, which a compiler
     cannot trace.
     """
+    if not devices.data_dependent(choice.device):
+        return _assign_serially(Ranking(point, distance), row, standing, reach)
     settled = choice.clone()
     ranking, at_once = Ranking(point, distance), max(_KEEPERS_AT_ONCE // n_points, 1)
     for worlds in contested.nonzero().squeeze(-1).split(at_once):
@@ -352,3 +367,16 @@ def _assign_in_order(ranking: Ranking, row: Tensor, standing: Tensor, reach: Ten
         asked[asking] += 1
         booked[asking] = standing.flatten()[asking]
     return booked.view_as(standing)
+
+
+def _assign_serially(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
+    """The same, one UAV after the other in all worlds, so that nothing depends on data."""
+    reached = gather_rows(ranking.distance, row) <= reach.unsqueeze(-1)
+    wishes = torch.where(reached, gather_rows(ranking.point, row).long(), standing.unsqueeze(-1))
+    taken = torch.cat([standing, torch.full_like(standing, -1)], -1)
+    for i in range(standing.shape[1]):
+        own, wish = standing[:, i : i + 1], wishes[:, i]
+        free = (wish == own) | (wish.unsqueeze(-1) != taken.unsqueeze(1)).all(-1)
+        first = free.byte().argmax(-1, keepdim=True)  # of several, the first one
+        taken[:, standing.shape[1] + i] = wish.gather(-1, first).squeeze(-1)
+    return taken[:, standing.shape[1] :].clone()

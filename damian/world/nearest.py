@@ -17,8 +17,9 @@ from damian.common.tensors import gather_rows
 _ID_BITS = 24
 """Bits of a landing point's id below its distance; a message cannot number more points either."""
 _NEVER = torch.iinfo(torch.int64).max
-_SLOTS = 2**18
-"""Distances computed at once, which bounds the memory: a few arrays of 2 MB, to stay in a cache."""
+_SLOTS, _SLOTS_LARGE = 2**18, 2**24
+"""Distances computed at once, which bounds the memory: a few arrays of 2 MB, to stay in a CPU's cache; 128 MB
+where all points are compared."""
 
 
 class LandingGrid(NamedTuple):
@@ -52,10 +53,26 @@ class LandingGrid(NamedTuple):
         """
         found = region.new_full((len(region), n), -1)
         left, rings = torch.arange(len(region), device=region.device), 1
-        while len(left):
+        while len(left):  # until every target has found its points
             left = self._search(region, target, left, rings, found)
             rings *= 2
         return found
+
+    def nearest_of_all(self, region: Tensor, target: Tensor, n: int, n_points: int) -> Tensor:
+        """As ``nearest``, but all points of the region are compared, so that no shape depends on data.
+
+        Args:
+            region: indices of the regions, [M].
+            target: places, [M, 2] metres, float64.
+            n: number of points.
+            n_points: largest number of points of a region, at least n.
+        """
+        cells = self.shape.prod(-1)
+        start = self.first[self.first_cell[region]].unsqueeze(-1)
+        stop = self.first[(self.first_cell + cells)[region]].unsqueeze(-1)
+        parts = [t.split(max(_SLOTS_LARGE // n_points, 1)) for t in (start, stop, target)]
+        pieces = zip(*parts, strict=True)
+        return torch.cat([_ids(self._best(a, b, n_points, part, n)) for a, b, part in pieces])
 
     def _search(self, region: Tensor, target: Tensor, wanted: Tensor, rings: int, found: Tensor) -> Tensor:
         """Find the points among ``rings`` rings of cells around the targets' own, part by part.
@@ -75,19 +92,32 @@ class LandingGrid(NamedTuple):
         parts = [t.split(max(_SLOTS // (width * start.shape[1]), 1)) for t in (wanted, start, stop, border)]
         left = []
         for part, begin, end, clear in zip(*parts, strict=True):
-            slot = begin.unsqueeze(-1) + torch.arange(width, device=begin.device)
-            real = (slot < end.unsqueeze(-1)).flatten(1)
-            slot = slot.flatten(1).clamp(max=len(self.place) - 1)
-            order = _order(
-                gather_rows(self.place, slot) - target[part].unsqueeze(1), gather_rows(self.point, slot)
-            )
-            order = order.masked_fill_(~real, _NEVER)
-            best = order.topk(min(found.shape[1], order.shape[1]), largest=False).values
-            ids = torch.where(best == _NEVER, -1, best & (1 << _ID_BITS) - 1)
+            best = self._best(begin, end, width, target[part], found.shape[1])
+            ids = _ids(best)
             found[part, : ids.shape[1]] = ids
             last = best[:, -1] if best.shape[1] == found.shape[1] else torch.full_like(best[:, -1], _NEVER)
             left.append(part[(last >> _ID_BITS >= 100 * clear - 1) & clear.isfinite()])
         return torch.cat(left)
+
+    def _best(self, start: Tensor, stop: Tensor, width: int, target: Tensor, n: int) -> Tensor:
+        """Numbers of ``_order`` of the points nearest to each target, smallest first.
+
+        Args:
+            start: index of the first point of each of C rows of cells, [M, C].
+            stop: index of the one behind its last, [M, C].
+            width: most points of a row of cells.
+            target: [M, 2] metres.
+            n: largest number of points.
+
+        Returns:
+            [M, n], or fewer columns if there are fewer points; ``_NEVER`` behind the last one.
+        """
+        slot = start.unsqueeze(-1) + torch.arange(width, device=start.device)
+        real = (slot < stop.unsqueeze(-1)).flatten(1)
+        slot = slot.flatten(1).clamp(max=len(self.place) - 1)
+        order = _order(gather_rows(self.place, slot) - target.unsqueeze(1), gather_rows(self.point, slot))
+        order = order.masked_fill_(~real, _NEVER)
+        return order.topk(min(n, order.shape[1]), largest=False).values
 
     def _block(self, region: Tensor, target: Tensor, rings: int) -> tuple[Tensor, Tensor, Tensor]:
         """The points in the cell of each target and in ``rings`` rings of cells around it, row by row.
@@ -135,6 +165,11 @@ def build_grid(lattices: list[np.ndarray], areas: list[float], n: int) -> Landin
     first = np.cumsum(np.concatenate([[0], *counts]))
     fields = (np.concatenate(places), np.concatenate(points), first, np.stack(corners), np.array(sides))
     return LandingGrid(*map(torch.as_tensor, (*fields, np.stack(shapes), first_cell)))
+
+
+def _ids(best: Tensor) -> Tensor:
+    """Ids of the points of numbers of ``_order``, -1 for none, in the same shape."""
+    return torch.where(best == _NEVER, -1, best & (1 << _ID_BITS) - 1)
 
 
 def _order(offset: Tensor, point: Tensor) -> Tensor:

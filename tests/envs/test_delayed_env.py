@@ -1,7 +1,5 @@
 """``DelayedEnv``: what holds in a scenario with any delays, losses and clocks, eager and compiled."""
 
-import copy
-import pickle
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -294,16 +292,6 @@ def test_only_a_uav_env_compiles_with_its_transforms():
 def compiled_env(**changed: Any) -> DelayedEnv:
     """An environment compiled with the ``eager`` backend, which is quick to compile."""
     return delayed(everything("instant", **changed)).compile(backend="eager")
-
-
-def test_a_copy_of_a_compiled_environment_compiles_its_own_graphs():
-    env = compiled_env(**DELAYS["paper"])
-    actions = choices(env, 12)
-    play(env, actions)
-    copied, pickled = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
-    outputs = play(env, actions)
-    assert all_same(outputs, play(copied, actions))
-    assert all_same(outputs, play(pickled, actions))
 
 
 def test_a_transform_that_is_appended_later_is_compiled_too():

@@ -208,7 +208,7 @@ def test_set_seed_repeats_a_rollout_and_worlds_and_episodes_differ():
 @pytest.mark.parametrize("scenario", [usecase(2), everything(), everything("polynomial", "continuous")])
 def test_a_compiled_environment_gives_the_same_rollout(scenario):
     eager = UavEnv(scenario, num_worlds=4, seed=1)
-    compiled = UavEnv(scenario, num_worlds=4, seed=1, compile=True)
+    compiled = UavEnv(scenario, num_worlds=4, seed=1).compile()
     generator = torch.Generator().manual_seed(0)
     actions = [random_actions(eager, generator) for _ in range(30)]
     for one, other in zip(play(eager, actions), play(compiled, actions), strict=True):

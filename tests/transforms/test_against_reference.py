@@ -30,6 +30,7 @@ from damian.transforms import (
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
+    reward_delay,
 )
 
 
@@ -106,7 +107,9 @@ def rewards_of(outputs: Sequence[TensorDictBase]) -> tuple[list, list]:
     return after(outputs, *REWARD), after(outputs, "done")
 
 
-def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law):
+@pytest.mark.parametrize("few", [0, 1000], ids=["only ended rows", "all rows"])
+def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law, few, monkeypatch):
+    monkeypatch.setattr(reward_delay, "_FEW", few)  # how the rest of an episode is summed
     transform = RewardDelay(law, REWARD, delay_key="reward_delay", earned_key="earned")
     earned, done = rewards_of(play(Counting(WORLDS, N_AGENTS), choices()))
     outputs = play(delayed(transform), choices())
@@ -123,6 +126,18 @@ def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law)
             assert received[t][w][n][0] == purse.step(t, reward, table[t][row], ended)
             in_transit += reward - received[t][w][n][0]
             assert not ended or in_transit == 0
+
+
+@pytest.mark.parametrize("law", [3, 40])
+def test_worlds_that_go_on_after_an_end_are_not_paid_twice(law):
+    env, undelayed = delayed(RewardDelay(law, REWARD)), delayed(RewardDelay(0, REWARD))
+    in_transit, steps = torch.zeros(len(WORLDS), N_AGENTS, 1), [each.reset() for each in (env, undelayed)]
+    for action in choices():
+        pairs = zip((env, undelayed), steps, strict=True)
+        steps = [each.step(td.set(ACTION, action))["next"] for each, td in pairs]
+        received, earned = (td[REWARD] for td in steps)
+        in_transit = in_transit + earned - received
+        assert not in_transit[steps[0]["done"].squeeze(-1)].any()
 
 
 def test_a_reset_during_an_episode_discards_its_rewards_in_transit():

@@ -17,7 +17,14 @@ from shapely.geometry import MultiPolygon, Polygon
 from damian.common.errors import InputError
 from damian.world import landing
 from damian.world.airspace import build_airspace, inside
-from damian.world.landing import ActionConfig, Candidates, Ranking, assign_landing_points, displacement
+from damian.world.landing import (
+    ActionConfig,
+    Candidates,
+    Ranking,
+    _assign_serially,
+    assign_landing_points,
+    displacement,
+)
 from damian.world.regions.region import Region
 
 
@@ -58,6 +65,8 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
         for b in range(6)
     ]
     assert ours.tolist() == expected
+    reach = torch.where(ready, 0.0, -1.0)
+    assert _assign_serially(Ranking(ranked, torch.zeros(ranked.shape)), row, standing, reach).equal(ours)
 
 
 @given(

@@ -44,6 +44,9 @@ def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds,
         nearest_by_loop(lattices[r].tolist(), t, n) for r, t in zip(region, target.tolist(), strict=True)
     ]
     assert ours.tolist() == expected
+    if n <= (most := max(map(len, lattices))):
+        region, target = torch.as_tensor(region), torch.as_tensor(target)
+        assert grid.nearest_of_all(region, target, n, most).tolist() == expected
 
 
 @pytest.mark.parametrize("distance", [10.0, 12.345, 0.005, 77.775, 100 * math.sqrt(2)])

@@ -1,0 +1,89 @@
+"""What a UAV computes on board of its own features equals what the server would compute of what it knows."""
+
+import pytest
+import torch
+from helpers import SQUARE, everything
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from damian.common.tensors import tree_map
+from damian.envs.scenario import make_server, make_simulation
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig, feature, observe, observe_own
+from damian.server.server import Server
+from damian.world.messages import Messages
+from damian.world.regions.config import RegionConfig
+
+B = 3
+
+lag = feature("global", low=-1e3, high=1e3)(
+    lambda cache: cache.messages.time.amax(-1, True) - cache.messages.time
+)
+"""A feature of one's own that compares UAVs: how much older a message is than the newest one."""
+
+
+class Elements(TorchDispatchMode):
+    """Counts the elements of the largest tensor that an operator returns."""
+
+    largest = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for each in out if isinstance(out, list | tuple) else [out]:
+            self.largest = max(self.largest, each.numel() if isinstance(each, Tensor) else 0)
+        return out
+
+
+def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
+    """A server, and messages [B, N, N] about which everything differs, with the steps elapsed [B]."""
+    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=30.0, initial_conditions=16)
+    observation = ObservationConfig(
+        local_features=list(LOCAL), global_features=list(GLOBAL), own=True, age=True
+    )
+    scenario = everything(agents=n_agents, region=region, observation=observation)
+    simulation = make_simulation(scenario, 0)
+    generator = torch.Generator().manual_seed(n_agents)
+
+    def draw(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(B, n_agents, n_agents, *shape, generator=generator)
+
+    point = draw(0, len(simulation.points), 2).long()
+    known = Messages.blank(point)._replace(
+        time=draw(0, 20).round(),
+        position=draw(-100, 100, 2),
+        track=draw(0, 6.28),
+        battery=draw(0, 100),
+        spotted=draw(0, 1) < 0.4,
+        detected_time=draw(-10, 20).round().clamp(min=-1),
+        detected_position=draw(-100, 100, 2),
+    )
+    return make_server(scenario, simulation), known, torch.tensor([20, 30, 40])
+
+
+@pytest.mark.parametrize("n_agents", [1, 2, 5])
+def test_every_uav_computes_of_itself_what_the_server_would(n_agents):
+    server, known, steps = known_messages(n_agents)
+    found = server.observe_each(known, steps)
+    for i in range(n_agents):
+        one = tree_map(lambda field, i=i: field[:, i], known)
+        expected, _ = server.observations(
+            server.features(one, steps, server.observation.actor + server.observation.critic)
+        )
+        assert found[:, i].equal(expected[:, i])
+
+
+def test_a_feature_of_ones_own_that_knows_nothing_of_this_is_right_too(monkeypatch):
+    server, known, steps = known_messages(4)
+    context = server._context(known, steps.unsqueeze(-1).expand(B, 4))
+    monkeypatch.setattr("damian.server.features.FEATURES.get", lambda *_: lag)
+    expected = observe(known, context, ["lag"])["lag"]
+    assert observe_own(known, context, ["lag"])["lag"].equal(expected.diagonal(0, 1, 2))
+
+
+def test_the_work_of_a_world_grows_with_the_square_of_its_uavs():
+    counts = []
+    for n_agents in (4, 8):
+        server, known, steps = known_messages(n_agents)
+        with Elements() as counted:
+            server.observe_each(known, steps)
+        counts.append(counted.largest)
+    assert counts[1] <= 4.5 * counts[0]
