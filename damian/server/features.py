@@ -247,8 +247,9 @@ def _bearing(v: FeatureCache) -> Tensor:
 def _pairwise(v: FeatureCache) -> Tensor:
     """Distances from the wanted UAVs to all, over the largest vertex distance of the region, [*, N, N]."""
     position = v.messages.position
-    offset = v.wanted(position).unsqueeze(-2) - position.unsqueeze(-3)
-    return torch.linalg.vector_norm(offset, dim=-1) / v.scale.unsqueeze(-1)
+    # Not by a matrix product, which loses digits where UAVs are close to each other.
+    distance = torch.cdist(v.wanted(position), position, compute_mode="donot_use_mm_for_euclid_dist")
+    return distance / v.scale.unsqueeze(-1)
 
 
 @FEATURES.register("source_distance")
