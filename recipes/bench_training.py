@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
-from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.envs.libs.vmas import VmasEnv
 from torchrl.modules import MultiAgentMLP, ProbabilisticActor, TanhNormal
 from torchrl.modules.distributions import NormalParamExtractor
@@ -157,7 +157,7 @@ def vmas_env(worlds: int, agents: int) -> TransformedEnv:
     return TransformedEnv(env, RewardSum([("agents", "reward")], [("agents", "episode_reward")]))
 
 
-def vmas_actor(env: TransformedEnv, config: TrainConfig) -> ProbabilisticActor:
+def vmas_actor(env: EnvBase, config: TrainConfig) -> ProbabilisticActor:
     """A policy with tanh-normal actions of each agent, from its own observation."""
     spec = env.full_action_spec_unbatched["agents", "action"]
     network = vmas_network(env, config, n_out=2 * spec.shape[-1], centralised=False)
@@ -184,7 +184,7 @@ def vmas_critic(env: TransformedEnv, config: TrainConfig, together: bool) -> Ten
     )
 
 
-def vmas_network(env: TransformedEnv, config: TrainConfig, n_out: int, centralised: bool) -> MultiAgentMLP:
+def vmas_network(env: EnvBase, config: TrainConfig, n_out: int, centralised: bool) -> MultiAgentMLP:
     """One network for all agents, with the layer widths of ``config.model``."""
     return MultiAgentMLP(
         n_agent_inputs=env.observation_spec["agents", "observation"].shape[-1],

@@ -326,8 +326,8 @@ def _settle(
     settled = choice.clone()
     ranking, at_once = Ranking(point, distance), max(_KEEPERS_AT_ONCE // n_points, 1)
     for worlds in contested.nonzero().squeeze(-1).split(at_once):
-        some = (t.index_select(0, worlds) for t in (row, standing, reach))
-        settled.index_copy_(0, worlds, _assign_in_order(ranking, *some, n_points))
+        rows, places, reaches = (t.index_select(0, worlds) for t in (row, standing, reach))
+        settled.index_copy_(0, worlds, _assign_in_order(ranking, rows, places, reaches, n_points))
     return settled
 
 
