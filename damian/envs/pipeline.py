@@ -109,7 +109,7 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
         valid_key=keys.ACTION_VALID,
         context_keys=CONTEXT_KEYS,
     )
-    late.remembers = "delay.act", show(delay.act)
+    late.memory_setting = "delay.act", show(delay.act)
     return [late]
 
 
@@ -128,7 +128,7 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         delay_key=keys.DELAY if output_messages else None,
         context_keys=CONTEXT_KEYS,
     )
-    uplink.remembers = "delay.obs", show(delay.obs)
+    uplink.memory_setting = "delay.obs", show(delay.obs)
     linked = scenario.links.kind == "matrix"
     dropped = [] if output_messages else [keys.RECEIVED, *([] if linked else _SENT)]
     return [uplink, ServerNode(server, dropped_keys=dropped, reward_terms="reward_terms" in extras)]
@@ -152,7 +152,7 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         age_key=None,
         mask_key=None,
     )
-    channel.remembers = "links.delay", show(links.delay)
+    channel.memory_setting = "links.delay", show(links.delay)
     dropped = [keys.LINKED, *([] if "message" in extras else _SENT)]
     return [channel, OnboardNode(server, dropped_keys=dropped)]
 
@@ -173,11 +173,11 @@ def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list
             delay_key=keys.REWARD_DELAY if reported else None,
             earned_key=earned_key,
         )
-        late.remembers = "delay.rew", show(delay.rew)
+        late.memory_setting = "delay.rew", show(delay.rew)
         transforms.append(late)
     if delay.reward_window > 1:
         summed = CumulativeReward(delay.reward_window, delay.reward_discount, keys.REWARD)
-        summed.remembers = "delay.reward_window", delay.reward_window
+        summed.memory_setting = "delay.reward_window", delay.reward_window
         transforms.append(summed)
     return transforms
 
@@ -205,7 +205,7 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
             # Features do not reflect a flight before it has ended, though a message is sent as it begins.
             reflected_after=1 if MOTION_MODELS.get(scenario.motion.kind, "motion.kind").instant else 2,
         )
-        history.remembers = "delay.history", n_actions
+        history.memory_setting = "delay.history", n_actions
         transforms.append(history)
     return transforms
 
@@ -222,7 +222,7 @@ def downlink_transform(scenario: ScenarioConfig) -> Transform:
         age_key=None,
         context_keys=CONTEXT_KEYS,
     )
-    downlink.remembers = "links.delay", show(links.delay)
+    downlink.memory_setting = "links.delay", show(links.delay)
     return downlink
 
 

@@ -71,7 +71,7 @@ class ActionDelay(ActionTransform):
         self.sampler = sampler_of(law, dt, loss)
         self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         self.line = DelayLine(self.sampler, "generation", gradients)
-        self.remembers = "ActionDelay: delay", show(delay)
+        self.memory_setting = "ActionDelay: delay", show(delay)
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
         sent_keys = [self.sent_key] if self.sent_key else []

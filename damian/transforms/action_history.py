@@ -71,7 +71,7 @@ class ActionHistory(ActionTransform):
         self.in_keys, self.out_keys = appended, appended or [sibling_key(self.action_key, out_key)]
         self.steps, self.recorded_key = steps, sibling_key(self.action_key, recorded_key)
         self.codes = codes
-        self.remembers = "ActionHistory: steps", steps
+        self.memory_setting = "ActionHistory: steps", steps
         self.action_keys = [self.action_key, *([self.recorded_key] if self.recorded_key else [])]
         self.age_key = sibling_key(self.action_key, age_key)
         self._reads, self.reflected_after = [self.age_key] if self.age_key else [], reflected_after

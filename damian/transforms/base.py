@@ -61,7 +61,7 @@ class StatefulTransform(MemoryTransform):
     """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_reset`` and ``on_step``, if they exist."""
-    remembers: tuple[str, Any]
+    memory_setting: tuple[str, Any]
     """Key and value of the setting on which the size of the memory depends, for errors."""
     dropped_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are removed from the outputs."""
@@ -80,7 +80,7 @@ class StatefulTransform(MemoryTransform):
         super().__init__(*(read_keys(keys) for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)))
         self._seed = seed
         self.gradients = gradients
-        self.remembers = type(self).__name__, "its memory"
+        self.memory_setting = type(self).__name__, "its memory"
 
     # Pure functions, for subclasses.
 
@@ -181,10 +181,12 @@ class StatefulTransform(MemoryTransform):
         """Require that the memory of rows of this shape fits.
 
         Raises:
-            InputError: it does not; the error names the setting that ``remembers`` tells.
+            InputError: it does not; the error names the setting that ``memory_setting`` tells.
         """
         there = " x ".join(map(str, rows))
-        checks.fits(*self.remembers, n_bytes, f"take a smaller one, or fewer worlds and agents than {there}")
+        checks.fits(
+            *self.memory_setting, n_bytes, f"take a smaller one, or fewer worlds and agents than {there}"
+        )
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         """The shape of the rows, given the outputs of the first reset."""

@@ -137,7 +137,7 @@ class Channel(StatefulTransform):
         to_agents = isinstance(self.topology, DirectLinks)
         checks.require(request_key is None or to_agents, "request_key", request_key, should)
         self.draws = self.topology.draws
-        self.remembers = "Channel: delay", show(delay)
+        self.memory_setting = "Channel: delay", show(delay)
         self.flag_keys = [key for key in (self.sent_key, self.request_key) if key is not None]
         self.action_keys = [*([self.action_key] if self.action_key else []), *self.flag_keys]
         self.step_keys = [*self.required_keys, *self.flag_keys]

@@ -93,7 +93,7 @@ class ObservationDelay(StatefulTransform):
         self.sampler = sampler_of(law, dt, loss)
         self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         self.line = DelayLine(self.sampler, order, gradients)
-        self.remembers = "ObservationDelay: delay", show(delay)
+        self.memory_setting = "ObservationDelay: delay", show(delay)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )

@@ -168,7 +168,7 @@ class RewardDelay(RewardTransform):
         self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
-        self.remembers = "RewardDelay: delay", show(delay)
+        self.memory_setting = "RewardDelay: delay", show(delay)
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)
 
     @property
@@ -353,7 +353,7 @@ class CumulativeReward(RewardTransform):
         checks.in_range("gamma", gamma, 0.0, 1.0)
         super().__init__(reward_key, gradients=gradients)
         self.n_past = steps
-        self.remembers = "CumulativeReward: steps", steps
+        self.memory_setting = "CumulativeReward: steps", steps
         self.gamma = gamma
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
