@@ -27,6 +27,8 @@ HUGE, TINY = 1e9, 1e-9
 
 Products and ratios of a few such numbers do not overflow in single precision, nor vanish.
 """
+MEMORY_BYTES = 4_000_000_000
+"""Most bytes that one part of an environment may allocate, as far as its settings tell."""
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _SHOWN = 100
@@ -98,6 +100,12 @@ def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:
     for name, value in given.items():
         require(name in known, f"{key}.{name}", value, f"is not one of its options: {', '.join(known)}")
     return dict(given)
+
+
+def fits(key: str, value: Any, n_bytes: int, remedy: str) -> None:
+    """Require that what a setting makes an environment allocate fits into ``MEMORY_BYTES``."""
+    problem = f"needs {n_bytes / 1e9:.1f} GB of memory, more than {MEMORY_BYTES / 1e9:g} GB: {remedy}"
+    require(n_bytes <= MEMORY_BYTES, key, value, problem)
 
 
 def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:

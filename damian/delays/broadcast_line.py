@@ -47,6 +47,10 @@ class BroadcastLine:
             memory[f"held_{i}"] = content.new_zeros(len(sender), *content.shape[1:])
         return memory
 
+    def n_bytes(self, n_senders: int, n_links: int, size: int) -> int:
+        """Size of the memory for so many senders, links and messages of ``size`` bytes, about [bytes]."""
+        return self.line.n_bytes(n_links, 0) + n_links * (8 + size) + n_senders * (8 + self._n_slots * size)
+
     def reset(self, memory: Memory, mask: Tensor) -> Memory:
         """Where the mask [L] is true, discard the messages that are held or in transit."""
         memory, _ = self.line.reset(memory, [], mask)

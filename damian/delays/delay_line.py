@@ -75,6 +75,11 @@ class DelayLine:
             memory[f"held_{i}"] = value.clone()
         return memory
 
+    def n_bytes(self, n_senders: int, size: int) -> int:
+        """Size of the memory for so many senders and messages of ``size`` bytes, about [bytes]."""
+        n_rows = self.sampler.lost + 1
+        return n_senders * (n_rows * (8 + size) + size + 7 * 8)  # 7 tensors have a number for each sender
+
     def row_dims(self, n_values: int) -> dict[str, int]:
         """The dimension of the senders in the buffers in which it is not the first."""
         return {"stamps": 1} | {f"slots_{i}": 1 for i in range(n_values)}

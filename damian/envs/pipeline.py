@@ -9,6 +9,7 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
+from damian.common.text_files import show
 from damian.delays.config import CONTEXT_KEYS
 from damian.delays.laws import law_of
 from damian.envs.delayed_env import DelayedEnv
@@ -75,9 +76,8 @@ def make_env(
     )
     pipeline = DelayedEnv(env, make_transforms(scenario, server, extras))
     pipeline.set_seed(seed)
-    if scenario.delay.sees_context(dt) or scenario.links.reads(dt):
-        pipeline.reset()  # tries the laws, so that a mistake in them is found here
-        pipeline.set_seed(seed)
+    pipeline.reset()  # tries the laws, and whether the memory fits, so that a mistake is found here
+    pipeline.set_seed(seed)
     return pipeline
 
 
@@ -100,17 +100,17 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
     if not has_delay(delay.act, clock.dt) and clock.steps("agents") == 1:
         return []
     law, hold = law_of(delay.act, "delay.act"), hold_action(scenario.actions)
-    return [
-        ActionDelay(
-            law,
-            keys.ACTION,
-            default=hold,
-            dt=clock.dt,
-            sent_key="ready",
-            valid_key=keys.ACTION_VALID,
-            context_keys=CONTEXT_KEYS,
-        )
-    ]
+    late = ActionDelay(
+        law,
+        keys.ACTION,
+        default=hold,
+        dt=clock.dt,
+        sent_key="ready",
+        valid_key=keys.ACTION_VALID,
+        context_keys=CONTEXT_KEYS,
+    )
+    late.memory_setting = "delay.act", show(delay.act)
+    return [late]
 
 
 def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
@@ -128,6 +128,7 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         delay_key=keys.DELAY if output_messages else None,
         context_keys=CONTEXT_KEYS,
     )
+    uplink.memory_setting = "delay.obs", show(delay.obs)
     linked = scenario.links.kind == "matrix"
     dropped = [] if output_messages else [keys.RECEIVED, *([] if linked else _SENT)]
     return [uplink, ServerNode(server, dropped_keys=dropped, reward_terms="reward_terms" in extras)]
@@ -151,6 +152,7 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         age_key=None,
         mask_key=None,
     )
+    channel.memory_setting = "links.delay", show(links.delay)
     dropped = [keys.LINKED, *([] if "message" in extras else _SENT)]
     return [channel, OnboardNode(server, dropped_keys=dropped)]
 
@@ -171,9 +173,12 @@ def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list
             delay_key=keys.REWARD_DELAY if reported else None,
             earned_key=earned_key,
         )
+        late.memory_setting = "delay.rew", show(delay.rew)
         transforms.append(late)
     if delay.reward_window > 1:
-        transforms.append(CumulativeReward(delay.reward_window, delay.reward_discount, keys.REWARD))
+        summed = CumulativeReward(delay.reward_window, delay.reward_discount, keys.REWARD)
+        summed.memory_setting = "delay.reward_window", delay.reward_window
+        transforms.append(summed)
     return transforms
 
 
@@ -200,6 +205,7 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
             # Features do not reflect a flight before it has ended, though a message is sent as it begins.
             reflected_after=1 if MOTION_MODELS.get(scenario.motion.kind, "motion.kind").instant else 2,
         )
+        history.memory_setting = "delay.history", n_actions
         transforms.append(history)
     return transforms
 
@@ -207,7 +213,7 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
 def downlink_transform(scenario: ScenarioConfig) -> Transform:
     """The delay of the server's broadcast to each UAV."""
     links, dt = scenario.links, scenario.clock.dt
-    return ObservationDelay(
+    downlink = ObservationDelay(
         law_of(links.delay, "links.delay"),
         keys.OBSERVATION,
         loss=links.loss,
@@ -216,6 +222,8 @@ def downlink_transform(scenario: ScenarioConfig) -> Transform:
         age_key=None,
         context_keys=CONTEXT_KEYS,
     )
+    downlink.memory_setting = "links.delay", show(links.delay)
+    return downlink
 
 
 def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:

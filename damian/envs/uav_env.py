@@ -100,10 +100,18 @@ class UavEnv(EnvBase):
         initial = self.simulation.initial
         features = self.server.checked_features(initial.sent, initial.steps)
         self._reset_outputs = self._outputs_at_reset(initial, features)
+        self._check_memory(num_worlds)
         self._make_specs(self._bounds(features))
         self.set_seed(seed)
         self._compiled: CompiledMethods | None = None
         self.to(torch.device(device))
+
+    def _check_memory(self, n_worlds: int) -> None:
+        """Refuse so many worlds that their state and the outputs of a step do not fit."""
+        tables = [*self.simulation.packed_initial, *self._reset_outputs.values()]
+        size = n_worlds * sum(table[0].nbytes for table in tables)
+        remedy = "take fewer of these worlds (worlds or eval_episodes of a program), or fewer UAVs"
+        checks.fits("num_worlds", n_worlds, size, remedy)
 
     def compile(self, **options: Any) -> "UavEnv":
         """Compile the computation of a step as one graph.

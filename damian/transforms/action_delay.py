@@ -6,6 +6,7 @@ from typing import Any
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from damian.common.text_files import show
 from damian.delays.delay_line import DelayLine
 from damian.delays.laws import law_of, sampler_of
 from damian.transforms.action_specs import ActionTransform
@@ -70,6 +71,7 @@ class ActionDelay(ActionTransform):
         self.sampler = sampler_of(law, dt, loss)
         self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         self.line = DelayLine(self.sampler, "generation", gradients)
+        self.memory_setting = "ActionDelay: delay", show(delay)
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
         sent_keys = [self.sent_key] if self.sent_key else []
@@ -90,6 +92,10 @@ class ActionDelay(ActionTransform):
     @property
     def required_keys(self) -> Sequence[NestedKey]:
         return self.flag_to_require(self.sent_key)
+
+    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
+        initial = self.actions.initial
+        return self.line.n_bytes(n_rows, initial.nbytes // self.actions.rows.numel())
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         initial = self.action_rows(self.actions.initial)

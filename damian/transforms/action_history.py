@@ -71,6 +71,7 @@ class ActionHistory(ActionTransform):
         self.in_keys, self.out_keys = appended, appended or [sibling_key(self.action_key, out_key)]
         self.steps, self.recorded_key = steps, sibling_key(self.action_key, recorded_key)
         self.codes = codes
+        self.memory_setting = "ActionHistory: steps", steps
         self.action_keys = [self.action_key, *([self.recorded_key] if self.recorded_key else [])]
         self.age_key = sibling_key(self.action_key, age_key)
         self._reads, self.reflected_after = [self.age_key] if self.age_key else [], reflected_after
@@ -87,6 +88,19 @@ class ActionHistory(ActionTransform):
     @property
     def required_keys(self) -> Sequence[NestedKey]:
         return [*self.step_keys, *self.flag_to_require(self.recorded_key)]
+
+    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
+        return self._n_bytes(n_rows)
+
+    def _n_bytes(self, n_rows: int) -> int:
+        """Size of the memory, of what is output, and of its bounds [bytes]: five histories, and ages."""
+        return n_rows * self.steps * (5 * 4 * self._n_numbers + 8 * (self.age_key is not None))
+
+    @property
+    def _n_numbers(self) -> int:
+        """Number of numbers that represent an action, A."""
+        rows, initial = self.actions.rows, self.actions.initial
+        return initial.shape[len(rows) :].numel() if self.codes is None else self.codes.shape[-1]
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         _, initial, low, width, _ = self.actions
@@ -139,9 +153,8 @@ class ActionHistory(ActionTransform):
         return ((action.float() - scale["low"]) / scale["width"]).reshape(len(action), -1)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        rows, initial = self.actions.rows, self.actions.initial
-        n_numbers = initial.shape[len(rows) :].numel() if self.codes is None else self.codes.shape[-1]
-        width = self.steps * n_numbers
+        rows, width = self.actions.rows, self.steps * self._n_numbers
+        self.require_memory(rows, self._n_bytes(rows.numel()))
         key, device = self.out_keys[0], observation_spec.device
         if not self.in_keys:
             shape = torch.Size((*rows, width))

@@ -8,6 +8,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
+from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.keys import STEPPED
 from damian.transforms.entries import (
@@ -60,6 +61,8 @@ class StatefulTransform(MemoryTransform):
     """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_reset`` and ``on_step``, if they exist."""
+    memory_setting: tuple[str, Any]
+    """Key and value of the setting on which the size of the memory depends, for errors."""
     dropped_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are removed from the outputs."""
     sent_key: NestedKey | None = None
@@ -79,6 +82,7 @@ class StatefulTransform(MemoryTransform):
         super().__init__(*(read_keys(keys) for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)))
         self._seed = seed
         self.gradients = gradients
+        self.memory_setting = type(self).__name__, "its memory"
 
     # Pure functions, for subclasses.
 
@@ -166,6 +170,26 @@ class StatefulTransform(MemoryTransform):
         """Allocate the memory, given the outputs of the first reset."""
         return {}
 
+    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
+        """Size of the memory for so many rows, if it grows with a setting [bytes].
+
+        Args:
+            tensordict: outputs of the first reset.
+            n_rows: number of rows, M.
+        """
+        return 0
+
+    def require_memory(self, rows: torch.Size, n_bytes: int) -> None:
+        """Require that the memory of rows of this shape fits.
+
+        Raises:
+            InputError: it does not; the error names the setting that ``memory_setting`` tells.
+        """
+        there = " x ".join(map(str, rows))
+        checks.fits(
+            *self.memory_setting, n_bytes, f"take a smaller one, or fewer worlds and agents than {there}"
+        )
+
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         """The shape of the rows, given the outputs of the first reset."""
         return row_shape(tensordict, self.row_key)
@@ -210,7 +234,9 @@ class StatefulTransform(MemoryTransform):
         else:
             check_order(all_transforms(self.container))  # others may have come since this one
             require_keys(type(self).__name__, self.required_keys, tensordict_reset)
-            self._rows = self.find_rows(tensordict_reset)
+            rows = self.find_rows(tensordict_reset)
+            self.require_memory(rows, self.memory_bytes(tensordict_reset, rows.numel()))
+            self._rows = rows
             with torch.inference_mode(False):  # else the buffers could be written only in inference mode
                 self.set_memory(self.init_memory(tensordict_reset))
         memory = self.memory

@@ -10,7 +10,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from damian.common import checks
 from damian.common.errors import naming_errors
-from damian.common.text_files import listed
+from damian.common.text_files import listed, show
 from damian.delays.link_sampler import same_size
 from damian.keys import STEPPED
 from damian.transforms.base import StatefulTransform
@@ -21,6 +21,7 @@ from damian.transforms.entries import (
     as_rows,
     read_keys,
     require_keys,
+    row_bytes,
     row_shape,
     select_entries,
     sibling_key,
@@ -136,6 +137,7 @@ class Channel(StatefulTransform):
         to_agents = isinstance(self.topology, DirectLinks)
         checks.require(request_key is None or to_agents, "request_key", request_key, should)
         self.draws = self.topology.draws
+        self.memory_setting = "Channel: delay", show(delay)
         self.flag_keys = [key for key in (self.sent_key, self.request_key) if key is not None]
         self.action_keys = [*([self.action_key] if self.action_key else []), *self.flag_keys]
         self.step_keys = [*self.required_keys, *self.flag_keys]
@@ -179,6 +181,11 @@ class Channel(StatefulTransform):
         return self.rows[:-1] if isinstance(self.topology, DirectLinks) else self.rows
 
     # The memory is that of the topology; ``flag_i`` [M] holds what the policy wrote under ``flag_keys[i]``.
+
+    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
+        agents = row_shape(tensordict, self.row_key)
+        size = row_bytes(select_entries(tensordict, self.in_keys), agents.numel())
+        return self.topology.n_bytes(agents.numel(), agents[-1], size + 4 * (self.message_size or 0))
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         entries = select_entries(tensordict, self.step_keys)

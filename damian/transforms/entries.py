@@ -62,6 +62,11 @@ def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey], gradie
     return {key: value if gradients else value.detach() for key, value in found.items() if value is not None}
 
 
+def row_bytes(entries: Entries, n_rows: int) -> int:
+    """Size of all entries together for each of so many rows [bytes]."""
+    return sum(value.nbytes for value in entries.values()) // n_rows
+
+
 def require_keys(transform: str, keys: Sequence[NestedKey], present: TensorDictBase | Composite) -> None:
     """Require that the entries that a transform reads exist.
 

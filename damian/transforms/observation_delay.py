@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
 from damian.common import checks
+from damian.common.text_files import show
 from damian.delays.delay_line import ORDERS, DelayLine, Delivery
 from damian.delays.laws import law_of, sampler_of
 from damian.transforms.base import StatefulTransform
@@ -20,6 +21,7 @@ from damian.transforms.entries import (
     as_rows,
     from_rows,
     require_keys,
+    row_bytes,
     select_entries,
     sibling_key,
     spec_rows,
@@ -91,6 +93,7 @@ class ObservationDelay(StatefulTransform):
         self.sampler = sampler_of(law, dt, loss)
         self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         self.line = DelayLine(self.sampler, order, gradients)
+        self.memory_setting = "ObservationDelay: delay", show(delay)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
@@ -114,6 +117,9 @@ class ObservationDelay(StatefulTransform):
     @property
     def required_keys(self) -> Sequence[NestedKey]:
         return [*self.in_keys, *([self.sent_key] if self.sent_key else [])]
+
+    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
+        return self.line.n_bytes(n_rows, row_bytes(select_entries(tensordict, self.in_keys), n_rows))
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))

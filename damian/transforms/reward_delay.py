@@ -10,6 +10,7 @@ from torchrl.data import Composite, Unbounded
 
 from damian.common import checks, devices
 from damian.common.tensors import expand_mask
+from damian.common.text_files import show
 from damian.delays.delay_line import advance_slot
 from damian.delays.laws import LOSES, law_of, sampler_of
 from damian.transforms.base import StatefulTransform
@@ -71,6 +72,11 @@ class RewardTransform(StatefulTransform):
         specs = self.env.full_reward_spec
         require_keys(type(self).__name__, [self.reward_key], specs)
         return rows_of_batch(tensordict.batch_size, self.env, spec_rows(specs, self.reward_key))
+
+    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
+        specs = self.env.full_reward_spec
+        spec, rows = specs[self.reward_key], spec_rows(specs, self.reward_key)
+        return self.n_past * n_rows * (spec.shape.numel() // rows.numel()) * spec.dtype.itemsize
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         specs = self.env.full_reward_spec
@@ -162,6 +168,7 @@ class RewardDelay(RewardTransform):
         self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
+        self.memory_setting = "RewardDelay: delay", show(delay)
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)
 
     @property
@@ -185,6 +192,9 @@ class RewardDelay(RewardTransform):
         return super().key_usage._replace(
             reads=list(self.contexts.keys.values()), creates=created, pays_at_end=True
         )
+
+    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
+        return super().memory_bytes(tensordict, n_rows) + 8 * (self.n_past + 5) * n_rows
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         memory = super().init_memory(tensordict)
@@ -343,6 +353,7 @@ class CumulativeReward(RewardTransform):
         checks.in_range("gamma", gamma, 0.0, 1.0)
         super().__init__(reward_key, gradients=gradients)
         self.n_past = steps
+        self.memory_setting = "CumulativeReward: steps", steps
         self.gamma = gamma
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:

@@ -78,6 +78,10 @@ class Topology(nn.Module, ABC):
         """Create the memory for contents such as these, [B * N, ...] each, and random streams [M]."""
 
     @abstractmethod
+    def n_bytes(self, n_total: int, n_agents: int, size: int) -> int:
+        """Size of the memory, for messages of ``size`` bytes of B * N = ``n_total`` agents, about [bytes]."""
+
+    @abstractmethod
     def try_laws(self, memory: Memory, position: Tensor | None) -> None:
         """Try the laws that see the context of messages once; their errors stay as they are."""
 
@@ -189,6 +193,9 @@ class DirectLinks(Topology):
             hears = hears & matrix.repeat(len(streams) // len(matrix))
         return memory | {"hears": hears}
 
+    def n_bytes(self, n_total: int, n_agents: int, size: int) -> int:
+        return self.line.n_bytes(n_total, n_total * n_agents, size)
+
     def try_laws(self, memory: Memory, position: Tensor | None) -> None:
         if self.sampler.sees_context:
             self.sampler.try_context(self._links_context(memory, memory["hears"], position))
@@ -262,6 +269,11 @@ class ServerLinks(Topology):
         down_streams = streams_for(self.down_sampler, down_streams, n_agents)
         examples = self._broadcast(up, n_agents)
         return _joined(up, self.down_line.init_memory(examples, down_streams, agents // n_agents))
+
+    def n_bytes(self, n_total: int, n_agents: int, size: int) -> int:
+        broadcast = n_agents * (8 + size)
+        up = self.line.n_bytes(n_total, n_total, size)
+        return up + self.down_line.n_bytes(n_total // n_agents, n_total, broadcast)
 
     def try_laws(self, memory: Memory, position: Tensor | None) -> None:
         up, down = _parts(memory)

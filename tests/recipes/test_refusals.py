@@ -98,6 +98,7 @@ from damian.recipes.shared.stored_runs import save_config
         (["device=meta"], "device: meta is not one of the devices here: cpu"),
         (["source.level_db=1e4"], "source.level_db: 10000.0 dB is not between"),
         (["frames=1" + "0" * 400], "frames: "),
+        (["worlds=8192", "delay.obs=10000"], "delay.obs: 10000 needs "),
         (["worlds=1000000000000"], "worlds: 1000000000000 is not between 1 and 1e+06"),
         (["model.hidden=[100000000000]"], "model.hidden: 100000000000 is not between"),
         (["motion.max_speed=1e-300"], "motion.max_speed: 1e-300 m/s is not at least 0.001 m/s"),
