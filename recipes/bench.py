@@ -199,12 +199,8 @@ def _cost_header(first: str, presets: Scenarios) -> tuple[str, ...]:
     return (first, *costs)
 
 
-def main() -> None:
-    """Measure everything, print the tables and write them to runs/bench.md."""
-    parser = Parser(description="Measure the speed of the environment and of training.")
-    parser.add_argument("--quick", action="store_true", help="only the whole chain beside VMAS; a minute")
-    with exits_with_one_line():
-        quick = parser.parse_args().quick
+def measure(quick: bool) -> None:
+    """Measure everything or, for a short look, the whole chain; print tables and write them to runs/bench.md."""
     torch.set_num_threads(1)
     Path("runs").mkdir(exist_ok=True)
     presets, sizes = scenarios(), Sizes()
@@ -225,6 +221,15 @@ def main() -> None:
     target = Path("runs/bench.md")
     target.write_text("\n".join(report))
     print(f"results: {target}, figure: {target.with_suffix('.png')}")
+
+
+def main() -> None:
+    """Read the command line, and measure."""
+    parser = Parser(description="Measure the speed of the environment and of training.")
+    parser.add_argument("--quick", action="store_true", help="only the whole chain beside VMAS; a minute")
+    with exits_with_one_line():
+        quick = parser.parse_args().quick
+    measure(quick)
 
 
 def run() -> None:

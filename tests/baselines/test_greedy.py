@@ -304,6 +304,7 @@ def test_the_age_of_messages_makes_detections_older():
     assert not torch.equal(policy(td)["agents", "action"], recent)
 
 
+@pytest.mark.slow
 def test_with_any_number_of_uavs_the_policy_is_clearly_better_than_the_random_one():
     torch.manual_seed(0)
     region = RegionConfig(min_area=60_000, max_area=90_000, pool=2, initial_conditions=16)

@@ -115,6 +115,7 @@ def test_neighbouring_seeds_give_different_keys_to_all_worlds():
     assert len(keys.unique()) == len(keys)
 
 
+@pytest.mark.slow
 def test_compiled_and_batched_draws_are_the_same():
     keys, counters = counter_rng.world_seeds(5, 100), torch.arange(100)
     eager = counter_rng.bits64(keys, counters)

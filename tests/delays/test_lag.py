@@ -191,6 +191,7 @@ SCENARIO = {
 }
 
 
+@pytest.mark.slow
 def test_a_compiled_environment_has_the_same_lags():
     scenario = square(delay=DelayConfig(**SCENARIO))
     eager, compiled = (make_env(scenario, 4, seed=5, extras=["message"]) for _ in range(2))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from delayed_envs import DELAYS, choices, delayed, every_delay
+from delayed_envs import DELAYS, choices, delayed
 from helpers import all_same, check_equal, everything, play
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -57,7 +57,9 @@ def test_a_copy_of_a_compiled_environment_steps_its_own_worlds(make, copied, unt
     assert all_same(outputs, play(env, choices(env, 8)))
 
 
-@every_delay
+@pytest.mark.parametrize(
+    "delays", [pytest.param(name, marks=[] if name == "paper" else pytest.mark.slow) for name in DELAYS]
+)
 def test_an_environment_sent_to_a_worker_process_shares_no_memory(delays):
     env, alone = (delayed(everything(**DELAYS[delays])) for _ in range(2))
     actions, outputs = choices(env, 12), []

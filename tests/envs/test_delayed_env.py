@@ -260,7 +260,7 @@ def test_an_action_delay_of_j_steps_has_the_effect_of_j_more_steps_of_observatio
 @pytest.mark.parametrize(
     "changed",
     [
-        pytest.param(changed, id=name, marks=() if name in ("everything", "nothing") else pytest.mark.slow)
+        pytest.param(changed, id=name, marks=() if name == "everything" else pytest.mark.slow)
         for name, changed in {**DELAYS, "nothing": {}}.items()
     ],
 )
@@ -294,6 +294,7 @@ def compiled_env(**changed: Any) -> DelayedEnv:
     return delayed(everything("instant", **changed)).compile(backend="eager")
 
 
+@pytest.mark.slow
 def test_a_transform_that_is_appended_later_is_compiled_too():
     delay = DelayConfig(rew=1)
     env, eager = compiled_env(delay=delay), delayed(everything("instant", delay=delay))
@@ -305,7 +306,7 @@ def test_a_transform_that_is_appended_later_is_compiled_too():
     assert all_same(play(env, actions), play(eager, actions))
 
 
-@pytest.mark.parametrize("compiles", [False, True])
+@pytest.mark.parametrize("compiles", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_uavs_without_a_valid_action_do_not_act(compiles):
     env = delayed(square())
     env = env.compile(backend="eager") if compiles else env

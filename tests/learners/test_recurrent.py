@@ -281,6 +281,7 @@ def test_the_recipe_trains_recurrent_actors(run, overrides):
     assert (folder / "result.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_recurrent_actor_flies_more_uavs_and_the_oracle_and_its_training_resumes(run, tmp_path):
     overrides = ["model=gru", *TINY, "delay.obs=2", "aware=both", "episode.max_steps=10"]
     trained = run(train, *overrides, folder="trained")

@@ -36,7 +36,7 @@ CASES = {
     "matrix": ["links=matrix", "links.delay=2", "scenario=mixed", "actions=continuous"],
     "privileged": ["critic=privileged", "source.motion=dynamic", "observation.own=true", "delay.obs=2"],
 }
-QUICK = ("recurrent", "sac")
+QUICK = ("sac", "triggered")
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,7 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
     assert OmegaConf.load(still / "config.yaml").agents == 2
 
 
+@pytest.mark.slow
 def test_one_learner_starts_from_the_policy_of_the_other(run):
     first = run(*TINY, folder="first")
     second = run(*TINY, f"checkpoint={first}", *SAC, "learner.lr=1e-9", folder="second")
@@ -119,6 +120,7 @@ def test_one_learner_starts_from_the_policy_of_the_other(run):
     assert all(torch.allclose(other[name], one[name], atol=1e-6) for name in one)
 
 
+@pytest.mark.slow
 def test_a_run_can_be_resumed_without_the_folder_of_the_policy_that_it_started_from(run):
     first = run(*TINY, folder="first")
     second = run(*TINY, f"checkpoint={first}", folder="second")
@@ -199,6 +201,7 @@ def test_each_reward_term_has_a_column_in_the_metrics(run):
     assert {"reward/spotting_agents", "reward/source_distance", "reward/source_time"} <= set(rows[0])
 
 
+@pytest.mark.slow
 def test_training_continues_after_a_batch_without_any_decision(run):
     folder = run(
         "agents=1",
@@ -215,6 +218,7 @@ def test_training_continues_after_a_batch_without_any_decision(run):
     assert len(metrics(folder)) == 15
 
 
+@pytest.mark.slow
 def test_delays_and_back_updating_change_the_losses(run):
     slow = ["delay.obs=4", "scenario=tracking"]
     naive, aware, undelayed = (
