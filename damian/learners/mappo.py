@@ -259,8 +259,8 @@ def state_values(batch: TensorDictBase, critic: TensorDictModule) -> tuple[Tenso
     is evaluated once.
     """
     (key,) = critic.in_keys
-    before, after = batch[key], batch[keys.next_key(key)]
-    followed = (after[:, :-1] == before[:, 1:]).flatten(2).all(-1)
+    before, after = (cast(Tensor, batch[at]) for at in (key, keys.next_key(key)))
+    followed = after[:, :-1].eq(before[:, 1:]).flatten(2).all(-1)
     alone = pad(~followed, (0, 1), value=True)  # no step follows the last one
     observed = torch.cat([before.flatten(0, 1), after[alone]])
     values = critic(TensorDict({key: observed}, [len(observed)]))[keys.STATE_VALUE]

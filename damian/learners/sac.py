@@ -225,11 +225,12 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
         error = values.gather(-1, action).squeeze(-1) - target
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             policy = self.actor_network.get_dist(tensordict.copy())
-        cost = self._alpha * policy.logits - values.detach().amin(0)
-        too_certain = (policy.probs * policy.logits).sum(-1).detach() + self.target_entropies(tensordict)
+        prob, log_prob = policy.probs, policy.logits
+        cost = self._alpha * log_prob - values.detach().amin(0)
+        too_certain = (prob * log_prob).sum(-1).detach() + self.target_entropies(tensordict)
         return TensorDict(
             {
-                "loss_actor": (policy.probs * cost).sum(-1).mean(),
+                "loss_actor": (prob * cost).sum(-1).mean(),
                 "loss_qvalue": error.square().sum(0).mean(),
                 "loss_alpha": -(self.log_alpha * too_certain).mean(),
                 "alpha": self._alpha,
@@ -238,8 +239,9 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
 
     def _action_values(self, tensordict: TensorDictBase) -> Tensor:
         """Values of all actions by each critic, [2, K, A]."""
+        evaluate: Any = self._vmap_qnetworkN0
         observed = tensordict.select(*self.qvalue_network.in_keys)
-        return self._vmap_qnetworkN0(observed, self.qvalue_network_params)["action_value"]
+        return evaluate(observed, self.qvalue_network_params)["action_value"]
 
     def target_entropies(self, tensordict: TensorDictBase) -> Tensor:
         """Target entropy of each state, [K], or one for all of them if all actions are legal."""
