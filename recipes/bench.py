@@ -200,7 +200,7 @@ def _cost_header(first: str, presets: Scenarios) -> tuple[str, ...]:
 
 
 def measure(quick: bool) -> None:
-    """Measure everything or, for a short look, the whole chain; print tables and write them to runs/bench.md."""
+    """Measure everything or, if quick, the whole chain; print the tables and write them to runs/bench.md."""
     torch.set_num_threads(1)
     Path("runs").mkdir(exist_ok=True)
     presets, sizes = scenarios(), Sizes()

@@ -21,7 +21,7 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 
-FORMAT = 1
+FORMAT = 2
 """Version of the format; a change that older programs cannot read raises it."""
 _MAGIC = b"damian checkpoint "
 _FIRST_LINE = re.compile(_MAGIC + rb"(\d{1,9}) (\S{1,50}) (\d{1,18}) ([0-9a-f]{64})\n")
