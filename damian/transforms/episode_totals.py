@@ -9,6 +9,7 @@ from damian import keys
 from damian.common.tensors import expand_mask
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import Change, Entries, Memory, require_keys
+from damian.transforms.order import KeyUsage
 
 
 class EpisodeTotals(StatefulTransform):
@@ -43,6 +44,10 @@ class EpisodeTotals(StatefulTransform):
     @property
     def row_key(self) -> NestedKey:
         return keys.DONE
+
+    @property
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(derives=[(self.in_keys[0], self.return_key)])
 
     @property
     def required_keys(self) -> list[NestedKey]:

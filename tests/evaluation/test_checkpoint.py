@@ -76,7 +76,7 @@ def flipped(data: bytes, place: int) -> bytes:
         (lambda data: flipped(data, -2), "it is damaged: its SHA-256"),
         (lambda data: b"\x00" * 5000, "it is no checkpoint of damian"),
         (lambda data: data.split(b"\n", 1)[1], "it is no checkpoint of damian"),
-        (lambda data: data.replace(b"checkpoint 1 ", b"checkpoint 2 ", 1), "in format 2, and damian"),
+        (lambda data: data.replace(b"checkpoint 2 ", b"checkpoint 3 ", 1), "in format 3, and damian"),
     ],
 )
 def test_a_damaged_file_is_refused_in_one_line_and_stays_as_it_is(file, damage, message):
@@ -105,7 +105,7 @@ def test_a_file_that_would_run_code_is_refused(tmp_path, nested):
     torch.save({"components": Payload(tmp_path / "ran")} if nested else Payload(tmp_path / "ran"), buffer)
     data, digest = buffer.getvalue(), hashlib.sha256(buffer.getvalue()).hexdigest()
     file = tmp_path / "checkpoint.pt"
-    file.write_bytes(f"damian checkpoint 1 0.4.0 {len(data)} {digest}\n".encode() + data)
+    file.write_bytes(f"damian checkpoint 2 0.4.0 {len(data)} {digest}\n".encode() + data)
     with pytest.raises(InputError, match="something else than tensors and numbers, and is not loaded"):
         read_checkpoint(file, "checkpoint")
     assert not (tmp_path / "ran").exists()
