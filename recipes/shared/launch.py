@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``launch`` prints them
 
@@ -171,17 +171,25 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
         try:
             with lock:
                 main(composed)
-        except (InputError, OmegaConfBaseException) as error:
+        except BaseException as error:
+            ended = isinstance(error, (InputError, OmegaConfBaseException, RunError, OSError))
+            if not (ended or is_interrupt(error)):
+                raise
             drop_empty(own_folder)
-            _give_up(error, str(HydraConfig.get().job.config_name))
-        except (RunError, OSError) as error:
-            drop_empty(own_folder)
-            _stop(error)
-        except KeyboardInterrupt:
-            drop_empty(own_folder)
-            sys.exit(interrupted(folder, signal.SIGINT))
+            if is_interrupt(error):
+                sys.exit(interrupted(folder, signal.SIGINT))
+            if isinstance(error, (RunError, OSError)):
+                _stop(error)
+            _give_up(cast(Exception, error), str(HydraConfig.get().job.config_name))
 
     return checked_main
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Was the error raised by Ctrl-C, or while a library cleaned up after it?"""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def interrupted(folder: Path, number: int) -> int:
@@ -206,15 +214,15 @@ def launch(main: Callable[[], Any], program: str = "train") -> None:
         if program == "compare" and parsed(sys.argv[1:]).multirun:
             raise InputError("-m: a comparison runs all of its arms and seeds anyway; leave it out")
         main()
-    except COMPOSITION_ERRORS as error:
+    except (*COMPOSITION_ERRORS, KeyboardInterrupt) as error:
+        if is_interrupt(error):  # before a run began
+            print("interrupted", file=sys.stderr)
+            sys.exit(exit_code(signal.SIGINT))
         if _composed:
             raise  # this is a bug, and its traceback is needed
         if folder := sweep_folder(error):
             drop_sweep(folder)
-        _give_up(error, program)
-    except KeyboardInterrupt:  # before a run began
-        print("interrupted", file=sys.stderr)
-        sys.exit(exit_code(signal.SIGINT))
+        _give_up(cast(Exception, error), program)
 
 
 def _give_up(error: Exception, program: str) -> NoReturn:

@@ -260,6 +260,35 @@ def test_damaged_metrics_are_refused_in_one_line(tmp_path, damaged, problem):
 # Signals.
 
 
+def cut_short(*_):
+    """Ctrl-C within a library whose cleaning up then fails, as OmegaConf's may, which is read as bad input."""
+    try:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            None._invalidate_flags_cache()  # type: ignore[attr-defined]
+    except AttributeError as error:
+        raise InputError(f"resume: config.yaml: {error}") from error
+
+
+def fails_in_cleaning_up(*_):
+    try:
+        raise KeyboardInterrupt
+    finally:
+        None._invalidate_flags_cache()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("failure", [cut_short, fails_in_cleaning_up])
+@pytest.mark.parametrize("place", ["learning_env", "prepare"])
+def test_ctrl_c_is_no_error_whatever_it_makes_fail(run, capsys, monkeypatch, failure, place):
+    monkeypatch.setattr(train, place, failure)
+    with pytest.raises(SystemExit) as stopped:
+        run(*TINY, folder="unused")
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
+    assert not Path("unused").exists()
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_signal_asks_and_the_second_one_stops_at_once(number):
     def handler(*_: object) -> None:
