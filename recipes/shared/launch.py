@@ -215,14 +215,14 @@ def launch(main: Callable[[], Any], program: str = "train") -> None:
             raise InputError("-m: a comparison runs all of its arms and seeds anyway; leave it out")
         main()
     except (*COMPOSITION_ERRORS, KeyboardInterrupt) as error:
-        if is_interrupt(error):  # before a run began
+        if isinstance(error, KeyboardInterrupt) or is_interrupt(error):  # before a run began
             print("interrupted", file=sys.stderr)
             sys.exit(exit_code(signal.SIGINT))
         if _composed:
             raise  # this is a bug, and its traceback is needed
         if folder := sweep_folder(error):
             drop_sweep(folder)
-        _give_up(cast(Exception, error), program)
+        _give_up(error, program)
 
 
 def _give_up(error: Exception, program: str) -> NoReturn:

@@ -261,7 +261,7 @@ def test_damaged_metrics_are_refused_in_one_line(tmp_path, damaged, problem):
 
 
 def cut_short(*_):
-    """Ctrl-C within a library whose cleaning up then fails, as OmegaConf's may, which is read as bad input."""
+    """Ctrl-C within a library whose cleaning up then fails, as that of OmegaConf may."""
     try:
         try:
             raise KeyboardInterrupt
