@@ -86,7 +86,9 @@ class TrainConfig(ScenarioConfig):
     threads: int = 1
     """Number of torch's threads; more than one slow down small tensors."""
     compile: bool = False
-    """Compile the environment's step, which pays off from some hundred worlds on."""
+    """Compile the environment's step, the actor's, and the loss of MAPPO (unless ``model.rnn`` is set). The
+    program then begins half a minute later, or a few seconds if it has run before; this pays off from about a
+    million environment steps on."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
