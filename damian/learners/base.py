@@ -68,7 +68,7 @@ class LearningSetup(NamedTuple):
     critic_key: NestedKey = keys.GLOBAL_OBSERVATION
     """Key of the critic's observation."""
     compile: bool = False
-    """Whether to compile what an update evaluates many times."""
+    """Whether to compile the loss, so that updates are faster once it is compiled."""
 
     @property
     def settle_steps(self) -> int:

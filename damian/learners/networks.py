@@ -40,8 +40,8 @@ class ModelConfig:
     its observations of the episode."""
     shared_value: bool = False
     """MAPPO's critic gives one value for all UAVs of a world, from the observations of all of them, instead
-    of a value for each UAV. This is faster, but ties the critic to the number of UAVs; the policy stays free
-    of it."""
+    of a value for each UAV. Updates are faster, but it learns less where each UAV has a reward of its own,
+    and it ties the critic, not the policy, to the number of UAVs."""
 
     def __post_init__(self) -> None:
         checks.one_of("model.activation", self.activation, _ACTIVATIONS)
@@ -87,7 +87,7 @@ class ModelConfig:
 class LegalCategorical(Distribution):
     """Categorical distribution over the legal actions.
 
-    It is TorchRL's ``MaskedCategorical``, whose log-probability and entropy take four times as long.
+    TorchRL's ``MaskedCategorical`` is the same, but its log-probability and entropy take four times as long.
 
     Args:
         logits: unnormalised log-probabilities, [*, A].
