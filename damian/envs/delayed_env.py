@@ -258,8 +258,10 @@ class DelayedEnv(TransformedEnv):
         """The leading stateful transforms that step in one function, and every transform after them."""
         transform = self.transform
         transforms: list[Any] = [*transform] if isinstance(transform, Compose) else [transform]
-        n = next((i for i, t in enumerate(transforms) if not isinstance(t, StatefulTransform)), None)
-        stateful, others = transforms[:n], transforms[len(transforms) if n is None else n :]
+        n = next(
+            (i for i, t in enumerate(transforms) if not isinstance(t, StatefulTransform)), len(transforms)
+        )
+        stateful, others = transforms[:n], transforms[n:]
         if _may_skip(stateful):
             n = next((i for i, t in enumerate(stateful) if t.after_skipping), len(stateful))
             stateful, others = stateful[:n], [*stateful[n:], *others]

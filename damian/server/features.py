@@ -17,7 +17,7 @@ from damian.common.registry import Registry, require_parentheses
 from damian.common.tensors import gather_rows
 from damian.server.feature_cache import FeatureCache, ServerContext
 from damian.world.battery import observed
-from damian.world.coverage import FootprintTables, covered_share, own_covered_share, updated_share
+from damian.world.coverage import covered_share, own_covered_share, updated_share
 from damian.world.messages import Messages
 
 
@@ -114,9 +114,7 @@ def observe_own(known: Messages, context: ServerContext, names: list[str]) -> di
     cache, sender = FeatureCache(known, context, own_only=True), known.time.dim() - 1
     values = {name: FEATURES.get(name, "feature").compute(cache) for name in names}
     return {
-        name: each.squeeze(sender)
-        if each.shape[sender] == 1
-        else each.diagonal(0, sender - 1, sender).movedim(-1, sender - 1)
+        name: (each if each.shape[sender] == 1 else cache.wanted(each)).squeeze(sender)
         for name, each in values.items()
     }
 
@@ -290,19 +288,14 @@ def _agent_distances(v: FeatureCache) -> Tensor:
     return pairwise.gather(-1, others.expand(*pairwise.shape[:-1], -1)).clamp(max=1)
 
 
-def _own_coverage(v: FeatureCache, footprints: FootprintTables) -> Tensor:
-    trail = v.messages.trail
-    return own_covered_share(footprints, trail, gather_rows(v.context.points, trail)).unsqueeze(-1)
-
-
 @FEATURES.register("coverage")
 @feature("global")
 def _coverage(v: FeatureCache) -> Tensor:
     if v.context.footprints is None:
         raise ValueError("coverage needs the footprint tables")
-    if v.own_only:
-        return _own_coverage(v, v.context.footprints)
     trail, points, known = v.messages.trail, v.context.points, v.context.coverage
+    if v.own_only:
+        return own_covered_share(v.context.footprints, trail, gather_rows(points, trail)).unsqueeze(-1)
     if known is not None and devices.data_dependent(trail.device):
         return updated_share(v.context.footprints, trail, points, known)
     return covered_share(v.context.footprints, trail, gather_rows(points, trail))

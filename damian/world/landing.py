@@ -297,10 +297,9 @@ def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: T
     for i, own in enumerate(stands):
         goal, taken = own, [*stands[:i], *goals, *stands[i + 1 :]]
         for candidate in (each[i] for each in reversed(points)):
-            refused = candidate != own
-            if taken:
-                refused = refused & torch.stack([candidate == point for point in taken]).any(0)
-            goal = torch.where(refused, goal, candidate) if taken else candidate
+            clashes = [torch.zeros_like(own, dtype=torch.bool), *(candidate == point for point in taken)]
+            refused = (candidate != own) & torch.stack(clashes).any(0)
+            goal = torch.where(refused, goal, candidate)
         goals.append(goal)
     return torch.stack(goals, 1)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``launch`` prints them
 
@@ -172,15 +172,15 @@ def reported(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]
             with lock:
                 main(composed)
         except BaseException as error:
-            ended = isinstance(error, (InputError, OmegaConfBaseException, RunError, OSError))
-            if not (ended or is_interrupt(error)):
+            if is_interrupt(error):
+                drop_empty(own_folder)
+                sys.exit(interrupted(folder, signal.SIGINT))
+            if not isinstance(error, (InputError, OmegaConfBaseException, RunError, OSError)):
                 raise
             drop_empty(own_folder)
-            if is_interrupt(error):
-                sys.exit(interrupted(folder, signal.SIGINT))
             if isinstance(error, (RunError, OSError)):
                 _stop(error)
-            _give_up(cast(Exception, error), str(HydraConfig.get().job.config_name))
+            _give_up(error, str(HydraConfig.get().job.config_name))
 
     return checked_main
 
