@@ -14,7 +14,7 @@ from unittest.mock import patch
 import pytest
 from fuzzing import LONGEST_LINE, NUMBERS, SMALL, WORDS, examples, fly, refusal, words
 from helpers import SQUARE
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
@@ -204,6 +204,7 @@ def test_what_is_no_file_is_named(file, kind, tmp_path, monkeypatch):
 
 @examples(12, 1000)
 @given(st.sampled_from([*READERS]).flatmap(lambda file: st.tuples(st.just(file), contents(file))))
+@example(("zones.geojson", b"1" * 5000))
 def test_files_of_any_content_are_refused_in_one_line_or_read(case):
     file, content = case
     with TemporaryDirectory() as folder, chdir(folder):
@@ -214,6 +215,7 @@ def test_files_of_any_content_are_refused_in_one_line_or_read(case):
 
 @examples(5, 700)
 @given(contents("own/scenario/mine.yaml"))
+@example(b"1" * 5000)
 def test_a_configuration_file_of_any_content_is_refused_in_one_line_or_used(content):
     answer("train", ["--config-dir=own", "scenario=mine"], write("own/scenario/mine.yaml", content))
 

@@ -251,6 +251,7 @@ INVALID_GEOJSON = {
     "not JSON": ('{"type":\n oops}', {}, "line 2: not JSON"),
     "cut short": ('{"type": "Polygon"', {}, "line 1: not JSON"),
     "deeply nested": ("[" * 200_000, {}, "nested too deeply"),
+    "a long number": ("1" * 5000, {}, "a number has too many digits"),
     "endless integer": ("1" * 10_000, {}, "not JSON"),
     "a list": ([], {}, "type None is not one of Polygon"),
     "wrong type": (POINT["geometry"], {}, "type 'Point' is not one of Polygon, MultiPolygon, Feat"),

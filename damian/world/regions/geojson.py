@@ -57,8 +57,8 @@ def _parse_json(text: str) -> Any:
         raise InputError(f"line {error.lineno}: not JSON: {error.msg}") from None
     except RecursionError:
         raise InputError("JSON nested too deeply for a GeoJSON file") from None
-    except ValueError as error:
-        raise InputError(f"not JSON: {error}") from None
+    except ValueError:  # Python's limit
+        raise InputError("not JSON: a number has too many digits") from None
 
 
 def _candidates(document: Any) -> list[_Candidate]:
