@@ -47,6 +47,11 @@ EARNED_REWARD = (AGENTS, "earned_reward")
 POSITION = (AGENTS, "position")
 """True position of each UAV at this instant, east and north [m], [B, N, 2]; for delay laws, never for an
 actor."""
+BELIEF = "belief"
+"""Probability that the source is in each cell of the server's grid, as far as the messages tell that have
+arrived, [B, K]."""
+OWN_BELIEF = (AGENTS, "belief")
+"""The same as each UAV knows it, whose own messages are not delayed for it, [B, N, K]."""
 STATE = "state"
 """The simulator's true state, [B, S]: for drawing and for reference arms, never for an actor."""
 SOURCE_OVER = "source_over"

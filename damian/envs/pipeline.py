@@ -26,6 +26,7 @@ from damian.transforms import (
     SampleAndHold,
     ServerNode,
 )
+from damian.transforms.belief import Belief
 from damian.transforms.onboard_node import OnboardNode
 from damian.transforms.skip_until_ready import SkipUntilReady
 from damian.world.landing import ActionConfig
@@ -58,9 +59,9 @@ def make_env(
     """
     problem = "skips steps, but back-updating and evaluation need the messages of every step"
     checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
-    delayed, linked = has_message_delay(scenario), scenario.links.kind == "matrix"
+    remote, linked = has_server_node(scenario), scenario.links.kind == "matrix"
     dt = scenario.clock.dt
-    needed = {"message"} if delayed or linked else set()
+    needed = {"message"} if remote or linked else set()
     needed |= {*scenario.delay.reads(dt), *scenario.links.reads(dt)}
     simulation = make_simulation(scenario, seed)
     server = make_server(scenario, simulation)
@@ -72,7 +73,7 @@ def make_env(
         {*extras, *needed},
         simulation=simulation,
         server=server,
-        messages_only=delayed,
+        messages_only=remote,
     )
     pipeline = DelayedEnv(env, make_transforms(scenario, server, extras))
     pipeline.set_seed(seed)
@@ -85,7 +86,7 @@ def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
     """All transforms of a scenario in order: outputs pass them forwards, a policy's actions backwards."""
     transforms = [
         *action_transforms(scenario),
-        *(server_transforms(scenario, server, extras) if has_message_delay(scenario) else []),
+        *(server_transforms(scenario, server, extras) if has_server_node(scenario) else []),
         *(link_transforms(scenario, server, extras) if scenario.links.kind == "matrix" else []),
         *reward_transforms(scenario, extras),
         *observation_transforms(scenario),
@@ -115,7 +116,35 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
 
 def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
     """The message delay (paper, section 3.4), and the server node, which uses the arrived messages."""
-    delay, output_messages = scenario.delay, "message" in extras
+    output_messages, linked = "message" in extras, scenario.links.kind == "matrix"
+    transforms: list[Transform] = []
+    delayed, longest = has_message_delay(scenario), 0
+    if delayed:
+        uplink = uplink_transform(scenario, output_messages, reads_delay=server.grid is not None)
+        longest = uplink.sampler.longest
+        transforms.append(uplink)
+    if server.grid is not None:
+        belief = Belief(server, longest, delayed=delayed, own=scenario.observation.own)
+        belief.memory_setting = "delay.obs", show(scenario.delay.obs)
+        transforms.append(belief)
+    held = keys.RECEIVED if delayed else keys.MESSAGE
+    written = [*([] if linked else _SENT), *(key for each in transforms for key in each.out_keys)]
+    if delayed and server.grid is not None:
+        written.append(keys.DELAY)
+    dropped = [] if output_messages else written
+    node = ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras)
+    return [*transforms, node]
+
+
+def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_delay: bool) -> ObservationDelay:
+    """The delay of the messages to the server.
+
+    Args:
+        scenario: all settings.
+        output_messages: output the age of the messages held and the delay of those sent.
+        reads_delay: a later transform reads the delay.
+    """
+    delay = scenario.delay
     uplink = ObservationDelay(
         delay.uplink,
         keys.MESSAGE,
@@ -125,13 +154,11 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         dt=scenario.clock.dt,
         sent_key=keys.MESSAGE_SENT,
         age_key=keys.AGE if output_messages or history_since_message(scenario) else None,
-        delay_key=keys.DELAY if output_messages else None,
+        delay_key=keys.DELAY if output_messages or reads_delay else None,
         context_keys=CONTEXT_KEYS,
     )
     uplink.memory_setting = "delay.obs", show(delay.obs)
-    linked = scenario.links.kind == "matrix"
-    dropped = [] if output_messages else [keys.RECEIVED, *([] if linked else _SENT)]
-    return [uplink, ServerNode(server, dropped_keys=dropped, reward_terms="reward_terms" in extras)]
+    return uplink
 
 
 def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
@@ -246,6 +273,14 @@ def history_since_message(scenario: ScenarioConfig) -> bool:
     slow = clock.steps("server") > 1 or clock.steps("agents") > 1 or scenario.links.kind != "server"
     immediate = not (slow or has_delay(delay.act, clock.dt))
     return delay.history > 0 and not scenario.observation.own and immediate and has_message_delay(scenario)
+
+
+def has_server_node(scenario: ScenarioConfig) -> bool:
+    """Whether a transform computes what the server knows, as it does not follow from the messages just sent.
+
+    So it is if messages are delayed, or if the server has a belief, which follows from all earlier ones.
+    """
+    return has_message_delay(scenario) or bool(scenario.observation.belief)
 
 
 def has_message_delay(scenario: ScenarioConfig) -> bool:

@@ -35,9 +35,19 @@ class ScenarioConfig(WorldConfig):
         conflict = self.observation.own and self.links.kind == "updown"
         problem = "does not go with links=updown: the server has computed what a UAV receives"
         checks.require(not conflict, "observation.own", True, problem)
+        self._check_belief()
         empty = self.agents == 1 and self.observation.actor == ["agent_distances"]
         problem = "is empty for a single UAV: add another feature"
         checks.require(not empty, "observation", "agent_distances", problem)
+
+    def _check_belief(self) -> None:
+        """Refuse beliefs that nothing computes."""
+        belief = self.observation.belief
+        problem = "does not go with links=matrix: no UAV computes a belief from what it hears directly"
+        checks.require(not (belief and self.links.kind == "matrix"), "observation.belief", belief, problem)
+        problem = "needs discrete actions: it has a value for each of them"
+        continuous = self.actions.kind == "continuous"
+        checks.require(not (continuous and "belief_gain" in belief), "observation.belief", belief, problem)
 
     def _check_ends(self) -> None:
         """Refuse end conditions of an episode that can never be met (paper, section 4.1)."""
@@ -92,4 +102,6 @@ def make_server(scenario: ScenarioConfig, simulation: Simulation) -> Server:
         time_scale=scenario.time_scale,
         readings={name: sensor.width for name, sensor in simulation.sensors.items()},
         stops=not simulation.vehicles.instant,
+        source=scenario.source,
+        goals=simulation.candidates.goals() if "belief_gain" in scenario.observation.belief else None,
     )

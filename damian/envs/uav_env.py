@@ -97,8 +97,13 @@ class UavEnv(EnvBase):
         self.extras, self.messages_only = frozenset(extras), messages_only
         self.simulation = simulation or make_simulation(self.scenario, seed)
         self.server = server or make_server(self.scenario, self.simulation)
+        problem = "needs the transform Belief before a ServerNode: build the environment by damian.make_env"
+        known = messages_only or self.server.grid is None
+        checks.require(known, "observation.belief", self.server.observation.belief, problem)
         initial = self.simulation.initial
         features = self.server.checked_features(initial.sent, initial.steps)
+        self.action_columns = self.server.action_columns(features)
+        """Columns of the actors' observations with a value for each action; None if there are none."""
         self._reset_outputs = self._outputs_at_reset(initial, features)
         self._check_memory(num_worlds)
         self._make_specs(self._bounds(features))

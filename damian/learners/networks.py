@@ -24,6 +24,8 @@ COMPILE_OPTIONS = {
     "fallback_random": True,  # the draws of torch's generator, as without compiling
 }
 """Options of ``torch.compile`` for networks."""
+FIRST_WEIGHT = 8.0
+"""Weight with which a skip connection begins."""
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
@@ -38,6 +40,10 @@ class ModelConfig:
     rnn: str = "none"
     """none or gru. With gru the actor's last hidden layer is a gated recurrent unit, so that a UAV remembers
     its observations of the episode."""
+    skip: bool = False
+    """The actor's logits are the network's outputs plus, times a learnt weight, the feature of the
+    observation that has a value for each action (``observation.belief=[belief_gain]``). The actor begins as
+    one that prefers actions of high value."""
     shared_value: bool = False
     """MAPPO's critic gives one value for all UAVs of a world, from the observations of all of them, instead
     of a value for each UAV. Updates are faster, but it learns less where each UAV has a reward of its own,
@@ -165,6 +171,9 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
     n_features = env.observation_spec[keys.OBSERVATION].shape[-1]
 
     def head(network: nn.Module, in_key: NestedKey) -> TensorDictModule:
+        if config.skip:
+            module: nn.Module = SkipConnection(network, action_columns(env, n_out))
+            return TensorDictModule(module, in_keys=[in_key, keys.OBSERVATION], out_keys=list(out_keys))
         normal = len(out_keys) == 2
         module = nn.Sequential(network, NormalParamExtractor()) if normal else network
         return TensorDictModule(module, in_keys=[in_key], out_keys=list(out_keys))
@@ -174,6 +183,42 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
     linear = nn.Linear(config.hidden[-1], n_out, device=env.device)
     gru = config.gru(n_features, env.device)
     return TensorDictSequential([gru, head(linear, keys.HIDDEN)])  # type: ignore[list-item]
+
+
+def action_columns(env: EnvBase, n_actions: int) -> slice:
+    """The columns of the actor's observation that have a value for each action.
+
+    Raises:
+        InputError: the environment has no attribute ``action_columns``, or none such.
+    """
+    columns = getattr(env, "action_columns", None)
+    good = isinstance(columns, slice) and columns.stop - columns.start == n_actions
+    should = "needs a feature with a value for each discrete action: observation.belief=[belief_gain]"
+    checks.require(good, "model.skip", True, should)
+    return cast(slice, columns)
+
+
+class SkipConnection(nn.Module):
+    """Logits that are the outputs of a network plus, times a learnt weight, a feature of each action.
+
+    Args:
+        network: from its input to outputs [*, A], whose last layer begins near zero.
+        columns: of the observation, which hold the feature of each action.
+    """
+
+    def __init__(self, network: nn.Module, columns: slice) -> None:
+        super().__init__()
+        self.network, self.columns = network, columns
+        self.weight = nn.Parameter(torch.tensor(FIRST_WEIGHT))
+        last = [each for each in network.modules() if isinstance(each, nn.Linear)][-1]
+        with torch.no_grad():
+            last.weight *= 0.01
+            last.bias *= 0.01
+        self.to(last.weight.device)
+
+    def forward(self, features: Tensor, observation: Tensor) -> Tensor:
+        """Logits [*, A] of the network's input [*, H] and observations [*, F]."""
+        return self.network(features) + self.weight * observation[..., self.columns]
 
 
 def make_critic(

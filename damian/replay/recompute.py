@@ -1,11 +1,13 @@
 """Recomputes stored steps of UAVs with the server node, for ``BackupdateStorage``."""
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian import keys
 from damian.keys import next_key
 from damian.replay.step_keys import Recompute
+from damian.server.belief import Evidence, evidence, predict, report_rows, weigh
 from damian.server.server import Server
 
 
@@ -25,19 +27,52 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
         elapsed = steps[next_key(keys.STEP_COUNT)].squeeze(-1)
         source_over = steps.get(next_key(keys.SOURCE_OVER), None)
-        outputs = server(server.messages(messages), elapsed, source_over)
+        belief = beliefs_in_hindsight(server, steps) if server.grid is not None else None
+        outputs = server(server.messages(messages), elapsed, source_over, belief=belief)
         entries: dict[NestedKey, Tensor] = {
             keys.GLOBAL_OBSERVATION: outputs.global_observation,
             keys.REWARD: outputs.reward.unsqueeze(-1),
             **outputs.status.entries(),
         }
+        if belief is not None:
+            entries[keys.BELIEF] = belief
         if actor:
             sent, own = steps[next_key(keys.MESSAGE)], server.observation.own
             entries[keys.OBSERVATION] = (
-                server.observe_with_timely_messages(messages, sent, elapsed) if own else outputs.observation
+                server.observe_with_timely_messages(
+                    messages, sent, elapsed, belief=steps.get(next_key(keys.OWN_BELIEF), None)
+                )
+                if own
+                else outputs.observation
             )
         if reward_terms:
             entries |= {(*keys.REWARD_TERMS, name): term for name, term in outputs.terms.items()}
         return {next_key(key): value for key, value in entries.items()}
 
     return recompute
+
+
+def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
+    """The server's belief after each step, had it known all messages up to it that have arrived by now.
+
+    Args:
+        server: server node of the environment.
+        steps: stored steps [T, B], the last of which is the latest one. The belief before the first of them
+            must be final.
+
+    Returns:
+        Probability that the source is in each cell of ``server.grid``, [T, B, K].
+    """
+    assert server.grid is not None
+    grid, messages = server.grid, server.messages(steps[next_key(keys.MESSAGE)])
+    delay = steps[next_key(keys.DELAY)].squeeze(-1)
+    step = torch.arange(len(delay), device=delay.device).view(-1, 1, 1)
+    arrived = (delay >= 0) & (step + delay < len(delay))
+    found, region = evidence(grid, report_rows(grid, messages, arrived)), server.region_of(messages)
+    begins, before = steps[keys.STEP_COUNT] == 0, steps[keys.BELIEF]
+    belief, corrected = before[0], []
+    for i in range(len(delay)):  # each belief follows from the one before
+        belief = torch.where(begins[i], before[i], belief)
+        belief = weigh(grid, predict(grid, belief, region[i]), Evidence(found.match[i], found.silent[i]))
+        corrected.append(belief)
+    return torch.stack(corrected)

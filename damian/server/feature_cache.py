@@ -4,9 +4,12 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from damian.common.errors import InputError
+from damian.server.belief import first_belief, report_rows
+from damian.server.source_grid import SourceGrid
 from damian.world.battery import BatteryConfig
 from damian.world.coverage import FootprintTables, KnownCoverage
 from damian.world.messages import Messages
@@ -37,6 +40,18 @@ class ServerContext(NamedTuple):
     """Estimate the source's position from only the newest detections (``ObservationConfig.estimate``)."""
     readings: Mapping[str, tuple[int, int]] = MappingProxyType({})
     """First column, and number of columns, of each reading in ``Messages.readings``, by name."""
+    radius: float = 0.0
+    """Radius of a UAV's footprint [m]."""
+    n_points: int = 0
+    """Largest number of landing points in a region, L."""
+    goals: Tensor | None = None
+    """For ``belief_gain``: index in its region of the landing point to which each discrete action leads, by
+    the flat id of the landing point on which it begins, [R*L, A]."""
+    grid: SourceGrid | None = None
+    """Cells in which the source may be; None if no feature reads the belief."""
+    belief: Tensor | None = None
+    """Probability that the source is in each cell, [*, K]; if not given, that after these messages, as if
+    they were the first ones."""
     coverage: KnownCoverage | None = None
     """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be computed."""
 
@@ -87,6 +102,35 @@ class FeatureCache:
         return values.squeeze(-1) if width == 1 else values
 
     @property
+    def region(self) -> Tensor:
+        """Index of the region, [*]."""
+        return self.messages.trail[..., 0, 0] // self.context.n_points
+
+    @property
+    def grid(self) -> SourceGrid:
+        """Cells in which the source may be.
+
+        Raises:
+            InputError: there are none, because no feature declares that it reads the belief.
+        """
+        if self.context.grid is None:
+            raise InputError('belief: only a feature of scope "belief" may read it')
+        return self.context.grid
+
+    @property
+    def belief(self) -> Tensor:
+        """Probability that the source is in each cell of ``grid``, [*, K]."""
+        return self(_belief)
+
+    @property
     def scale(self) -> Tensor:
         """Largest vertex distance of the region [m], [*, 1]."""
         return self.context.scale.unsqueeze(-1)
+
+
+def _belief(v: FeatureCache) -> Tensor:
+    """The belief of the context, or that after the first messages, [*, K]."""
+    if v.context.belief is not None:
+        return v.context.belief
+    rows = report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted))
+    return first_belief(v.grid, rows, v.region)

@@ -48,6 +48,12 @@ class ObservationConfig:
     """How the server estimates the source's position. ``mean``: the mean position of all UAVs' latest
     detections. ``newest``: the mean of only the newest of these, as a moving source has left the older
     ones."""
+    belief: list[str] = field(default_factory=list)
+    """Features of where the source is, by Bayes' rule from all messages that have arrived, appended to what
+    actor and critic observe: belief_gain (for each discrete action, the probability that it leads to where
+    the source is detected), belief_moments, belief_map, or ``package.module:feature`` of one's own."""
+    belief_cell: float | None = None
+    """Edge of a cell of the belief [m]; if not given, 0.8 footprint radii, or more in large regions."""
     window: int = 2
     """Number of each UAV's latest landing points whose footprints the coverage counts."""
 
@@ -56,6 +62,11 @@ class ObservationConfig:
             for name in getattr(self, f"{scope}_features"):
                 check_feature(f"observation.{scope}_features", name, scope)
             checks.distinct(f"observation.{scope}_features", getattr(self, f"{scope}_features"))
+        for name in self.belief:
+            check_feature("observation.belief", name, "belief")
+        checks.distinct("observation.belief", self.belief)
+        if self.belief_cell is not None:
+            checks.above("observation.belief_cell", self.belief_cell, 0.0, "m")
         if self.time_scale is not None:
             checks.above("observation.time_scale", self.time_scale, 0.0, "s")
         checks.above("observation.age_scale", self.age_scale, 0.0, "s")
@@ -71,13 +82,13 @@ class ObservationConfig:
     @property
     def actor(self) -> list[str]:
         """Features of the actor's observation, in order."""
-        features = self.local_features if self.ctde else self.critic
-        return [*features, "age"] if self.age else list(features)
+        features = [*self.local_features, *self.belief] if self.ctde else self.critic
+        return [*features, "age"] if self.age else features
 
     @property
     def critic(self) -> list[str]:
         """Features of the critic's observation, in order."""
-        return [*self.global_features, *self.local_features]
+        return [*self.global_features, *self.local_features, *self.belief]
 
 
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
@@ -140,9 +151,10 @@ class Feature(NamedTuple):
     compute: Callable[[FeatureCache], Tensor]
     """From messages [*, N] to values [*, N] or, if it has several for each UAV, [*, N, width]."""
     scope: str
-    """``local`` (of the UAV itself), ``global`` (of all UAVs) or ``actor`` (never for the critic)."""
+    """``local`` (of the UAV itself), ``global`` (of all UAVs), ``belief`` (of all UAVs' messages so far) or
+    ``actor`` (never for the critic)."""
     width: int | None = 1
-    """Number of values for each UAV; None if it depends on the number of UAVs."""
+    """Number of values for each UAV; None if it depends on the settings."""
     low: float = 0.0
     """Lowest possible value."""
     high: float = 1.0
@@ -160,7 +172,8 @@ def feature(
     features.
 
     Args:
-        scope: ``local`` (follows from the UAV's own message) or ``global`` (from the messages of all UAVs).
+        scope: ``local`` (follows from the UAV's own message), ``global`` (from the messages of all UAVs) or
+            ``belief`` (from all messages so far, by ``cache.belief`` and ``cache.grid``).
         width: number of values for each UAV. With 1 the function returns [*, N], with more [*, N, width];
             None if the number depends on the number of UAVs, as with the distances to the other UAVs.
         low: lowest possible value.
@@ -176,7 +189,7 @@ def feature(
         ...     return cache.messages.track / (2 * math.pi)
     """
     require_parentheses(scope, '@damian.feature("local")')
-    checks.one_of("scope of a feature", scope, ("local", "global", "actor"))
+    checks.one_of("scope of a feature", scope, ("local", "global", "belief", "actor"))
     if width is not None:
         checks.whole("width of a feature", width, 1)
     good = math.isfinite(low) and math.isfinite(high) and low < high

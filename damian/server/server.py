@@ -14,16 +14,19 @@ from torch import Tensor
 
 from damian.common.errors import InputError
 from damian.common.tensors import gather_rows
+from damian.server import belief_features  # noqa: F401 (it registers its features)
 from damian.server.feature_cache import ServerContext
 from damian.server.features import ObservationConfig, observe, observe_own, stack
 from damian.server.reward_terms import Counters
 from damian.server.rewards import RewardConfig, final_reward, reward
+from damian.server.source_grid import SourceGrid, build_source_grid
 from damian.server.termination import EpisodeConfig, Status, status
 from damian.server.trial import try_feature, try_term
 from damian.world.airspace import Airspace
 from damian.world.battery import BatteryConfig
 from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
+from damian.world.signal_source import SourceConfig
 
 Features = dict[str, Tensor]
 
@@ -70,6 +73,8 @@ class Server:
         time_scale: times are divided by this [s].
         readings: width of each reading that messages carry, by name, in their order; none if not given.
         stops: whether UAVs stay at a landing point for more than a step, so that coverage changes seldom.
+        source: settings of the source, of which the belief knows how it moves and emits.
+        goals: for ``belief_gain``, as in ``ServerContext``.
 
     Raises:
         InputError: there are more landing points than a message can number.
@@ -88,6 +93,8 @@ class Server:
         time_scale: float,
         readings: Mapping[str, int] | None = None,
         stops: bool = False,
+        source: SourceConfig | None = None,
+        goals: Tensor | None = None,
     ) -> None:
         if airspace.points.shape[:2].numel() >= MAX_EXACT_INTEGER:
             raise InputError(
@@ -108,6 +115,12 @@ class Server:
             polygons = [region.polygon for region in airspace.regions]
             places = airspace.points.double().cpu().numpy()
             self._footprints = build_tables(polygons, places, radius)
+        self.grid: SourceGrid | None = None
+        """Cells of the belief; None if no feature reads it."""
+        if observation.belief:
+            cell = observation.belief_cell
+            self.grid = build_source_grid(airspace, source or SourceConfig(), radius, dt, cell)
+        self._radius, self._goals = radius, goals
         self.remembers_coverage = stops and self._footprints is not None
 
     def to(self, device: torch.device) -> "Server":
@@ -115,11 +128,31 @@ class Server:
         self._scale, self._points = self._scale.to(device), self._points.to(device)
         if self._footprints is not None:
             self._footprints = self._footprints.to(device)
+        if self.grid is not None:
+            self.grid = self.grid.to(device)
+        if self._goals is not None:
+            self._goals = self._goals.to(device)
         return self
 
     def messages(self, rows: Tensor) -> Messages:
         """Messages from their packed rows [*, N, M], with the readings of all sensors."""
         return Messages.unpack(rows, self._n_readings)
+
+    def action_columns(self, features: Features) -> slice | None:
+        """The columns of the actors' observations that hold ``belief_gain``; None if they do not observe it.
+
+        Args:
+            features: features of any messages, as returned by ``features``.
+        """
+        names = self.observation.actor
+        if "belief_gain" not in names:
+            return None
+        parts = [stack(features, [name]).shape[-1] for name in names[: names.index("belief_gain") + 1]]
+        return slice(sum(parts[:-1]), sum(parts))
+
+    def region_of(self, messages: Messages) -> Tensor:
+        """Index of the region to which each world's landing points belong, [*]."""
+        return messages.trail[..., 0, 0] // self._max_points
 
     def __call__(
         self,
@@ -127,6 +160,7 @@ class Server:
         steps: Tensor,
         source_over: Tensor | None = None,
         coverage: KnownCoverage | None = None,
+        belief: Tensor | None = None,
     ) -> ServerOutputs:
         """Observations, rewards and status of messages.
 
@@ -135,9 +169,11 @@ class Server:
             steps: elapsed steps of the episode, [*].
             source_over: has the source finished its walk, [*] or [*, 1]; if not given, it never has.
             coverage: of an earlier step of the same worlds, which saves time.
+            belief: probability that the source is in each cell of ``grid``, [*, K]; if not given, these are
+                the first messages of the episode.
         """
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
-        features = self.features(messages, steps, coverage=coverage)
+        features = self.features(messages, steps, coverage=coverage, belief=belief)
         result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
         return ServerOutputs(*self.observations(features), *result, self.known_coverage(messages, features))
 
@@ -147,6 +183,7 @@ class Server:
         steps: Tensor,
         names: list[str] | None = None,
         coverage: KnownCoverage | None = None,
+        belief: Tensor | None = None,
     ) -> Features:
         """The features that observations and rewards are made of (paper, Table 2).
 
@@ -155,8 +192,10 @@ class Server:
             steps: elapsed steps of the episode, [*].
             names: features to compute; if not given, all that an observation or a reward term needs.
             coverage: of an earlier step of the same worlds, which saves time.
+            belief: probability that the source is in each cell of ``grid``, [*, K]; if not given, these are
+                the first messages of the episode.
         """
-        context = self._context(messages, steps)._replace(coverage=coverage)
+        context = self._context(messages, steps)._replace(coverage=coverage, belief=belief)
         return observe(messages, context, names or self._names)
 
     def known_coverage(self, messages: Messages, features: Features) -> KnownCoverage | None:
@@ -191,6 +230,7 @@ class Server:
         steps: Tensor,
         on_time: Tensor | None = None,
         fields: Sequence[str] = Messages._fields,
+        belief: Tensor | None = None,
     ) -> Tensor:
         """Observations of actors that receive some messages without delay, [*, N, F].
 
@@ -201,6 +241,7 @@ class Server:
             on_time: element (i, j) tells whether UAV i receives the messages of UAV j without delay, [N, N]
                 bool; if not given, each UAV receives only its own without delay.
             fields: fields of these messages that are received without delay; the server provides the others.
+            belief: that of each UAV, [*, N, K].
         """
         n_agents = received.shape[-2]
         if on_time is None:
@@ -208,16 +249,18 @@ class Server:
         timely = torch.where(on_time.unsqueeze(-1), sent.unsqueeze(-3), received.unsqueeze(-3))
         known = self.messages(received.unsqueeze(-3).expand_as(timely))  # [*, N receivers, N senders]
         timely = self.messages(timely)._asdict()
-        return self.observe_each(known._replace(**{name: timely[name] for name in fields}), steps)
+        return self.observe_each(known._replace(**{name: timely[name] for name in fields}), steps, belief)
 
-    def observe_each(self, known: Messages, steps: Tensor) -> Tensor:
+    def observe_each(self, known: Messages, steps: Tensor, belief: Tensor | None = None) -> Tensor:
         """Observations of actors each of which knows messages of its own, [*, N, F].
 
         Args:
             known: the message of each UAV that each UAV knows, [*, N, N] (receiver, sender).
             steps: elapsed steps of the episode, [*].
+            belief: that of each UAV, [*, N, K]; if not given, these are the first messages of the episode.
         """
         context = self._context(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
+        context = context._replace(belief=belief)
         return stack(observe_own(known, context, self.observation.actor), self.observation.actor)
 
     def reward_and_status(
@@ -249,11 +292,13 @@ class Server:
             age_scale=self.observation.age_scale,
             newest=self.observation.estimate == "newest",
             readings=self._readings,
+            radius=self._radius,
+            n_points=self._max_points,
+            goals=self._goals,
+            grid=self.grid,
         )
 
     def _scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
-        point = messages.trail[..., 0, 0]
-        if len(self._scale) == 1:
-            return self._scale.expand(point.shape)
-        return gather_rows(self._scale, point // self._max_points)
+        region = self.region_of(messages)
+        return self._scale.expand(region.shape) if len(self._scale) == 1 else gather_rows(self._scale, region)

@@ -51,7 +51,13 @@ class ServerNode(StatefulTransform):
         super().__init__([message_key], [*created, *ends])
         self.server, self.dropped_keys, self.reward_terms = server, list(dropped_keys), reward_terms
         self.own_key = keys.MESSAGE if server.observation.own else None
-        self.step_keys = [*self.in_keys, keys.SOURCE_OVER, *([self.own_key] if self.own_key else [])]
+        self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + server.observation.own] if server.grid else []
+        self.step_keys = [*self._read_keys, keys.SOURCE_OVER]
+
+    @property
+    def _read_keys(self) -> list[NestedKey]:
+        """Keys of the entries that other transforms may delay or create."""
+        return [*self.in_keys, *([self.own_key] if self.own_key else []), *self.belief_keys]
 
     @property
     def row_key(self) -> NestedKey:
@@ -59,8 +65,7 @@ class ServerNode(StatefulTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        own = [self.own_key] if self.own_key else []
-        return KeyUsage(reads=[*self.in_keys, *own], creates=self.out_keys)
+        return KeyUsage(reads=self._read_keys, creates=self.out_keys)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         rows = tensordict.get(self.in_keys[0])
@@ -80,9 +85,11 @@ class ServerNode(StatefulTransform):
         elapsed, received = memory["elapsed"] + 1, entries[self.in_keys[0]]
         steps, messages = elapsed.view(self.rows), self.server.messages(received)
         known = KnownCoverage(memory["trail"], memory["coverage"]) if "coverage" in memory else None
-        outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known)
+        outputs = self.server(messages, steps, entries.get(keys.SOURCE_OVER), known, entries.get(keys.BELIEF))
         if self.own_key:
-            own = self.server.observe_with_timely_messages(received, entries[self.own_key], steps)
+            own = self.server.observe_with_timely_messages(
+                received, entries[self.own_key], steps, belief=entries.get(keys.OWN_BELIEF)
+            )
             outputs = outputs._replace(observation=own)
         written: Entries = {
             keys.OBSERVATION: outputs.observation,

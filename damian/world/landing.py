@@ -139,6 +139,10 @@ class Candidates:
         distance = torch.linalg.vector_norm(offset, dim=-1)
         return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
 
+    def goals(self) -> Tensor:
+        """Index in its region of the nearest landing point to which each discrete action leads, [R*L, A]."""
+        return self.ranking.point[:, 0].view(-1, self.config.n_actions).long()
+
     def _rank_all(self) -> None:
         """Tabulate the candidates of every (landing point, action).
 

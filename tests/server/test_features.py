@@ -155,7 +155,7 @@ def test_the_actor_observes_the_age_of_the_uavs_message_and_the_critic_does_not(
 @pytest.mark.parametrize(
     ("declared", "message"),
     [
-        ({"scope": "locale"}, "scope of a feature: locale is not one of local, global, actor"),
+        ({"scope": "locale"}, "scope of a feature: locale is not one of local, global, belief, actor"),
         ({"width": 0}, "width of a feature: 0 is not at least 1"),
         ({"width": 1.5}, "width of a feature: 1.5 is not a whole number"),
         ({"low": 1.0}, "range of a feature: low=1.0, high=1.0 are not finite with low < high"),

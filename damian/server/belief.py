@@ -1,0 +1,109 @@
+"""Where the source is, as far as messages tell: a Bayes filter over the cells of a ``SourceGrid``.
+
+All functions are pure and batched. One step of the filter moves the probability as the source may have moved,
+and weighs it with how likely each cell makes what the UAVs have reported of that step. Messages may arrive
+late, out of order or never: a belief is exact for the messages that have arrived, if the filter runs again
+over all steps since the oldest of those that came in late (``damian.transforms.Belief``).
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from damian.common.tensors import gather_rows
+from damian.server.source_grid import SourceGrid
+from damian.world.messages import Messages
+
+_LEAST = 1e-20
+"""Added to every likelihood, so that reports which no cell makes possible change nothing."""
+
+
+class Evidence(NamedTuple):
+    """What messages of one step say about where the source was at that step."""
+
+    match: Tensor
+    """Probability of what the UAVs report, if the source emits in the cell, [*, K]."""
+    silent: Tensor
+    """1 if no UAV has detected anything, else 0: the probability of the reports if it does not emit, [*]."""
+
+
+def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor) -> Tensor:
+    """Rows of ``SourceGrid.reports`` for messages, [*, N]; a UAV in flight detects nothing.
+
+    Args:
+        grid: cells and tables.
+        messages: the latest message of each UAV, [*, N].
+        sent: which of them were sent in this step, [*, N] bool.
+    """
+    row = 2 * messages.trail[..., 0] + messages.spotted
+    return torch.where(sent & ~messages.in_flight, row, grid.no_report)
+
+
+def evidence(grid: SourceGrid, rows: Tensor) -> Evidence:
+    """What N reports of one step say.
+
+    Args:
+        grid: cells and tables.
+        rows: rows of ``SourceGrid.reports``, [*, N].
+    """
+    detected = (rows % 2 == 1).any(-1)  # the row of no report is even
+    return Evidence(gather_rows(grid.reports, rows).prod(-2), (~detected).to(grid.reports.dtype))
+
+
+def predict(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
+    """The belief one step later, before any message of that step, [*, K].
+
+    Args:
+        grid: cells and tables.
+        belief: probability of each cell, [*, K].
+        region: index of the region, [*].
+    """
+    if grid.moves is None:
+        return belief
+    if len(grid.prior) == 1:  # the moves are probabilities
+        return belief @ grid.moves
+    moved = (belief / gather_rows(grid.staying, region)) @ grid.moves
+    return moved * (gather_rows(grid.prior, region) > 0)
+
+
+def weigh(grid: SourceGrid, predicted: Tensor, found: Evidence) -> Tensor:
+    """The belief after the messages of a step, [*, K].
+
+    Args:
+        grid: cells and tables.
+        predicted: the belief before them, [*, K].
+        found: what they say.
+    """
+    likelihood = found.match
+    if grid.emits < 1:
+        likelihood = grid.emits * likelihood + (1 - grid.emits) * found.silent.unsqueeze(-1)
+    weighed = predicted * (likelihood + _LEAST)
+    return weighed / weighed.sum(-1, keepdim=True)
+
+
+def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
+    """The belief at the beginning of an episode, when everyone's first message is known, [*, K].
+
+    Args:
+        grid: cells and tables.
+        rows: rows of ``SourceGrid.reports`` for the first messages (``report_rows``), [*, N].
+        region: index of the region, [*].
+    """
+    return weigh(grid, gather_rows(grid.prior, region), evidence(grid, rows))
+
+
+def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor, n_points: int) -> Tensor:
+    """Probability of detecting the source from each landing point of the region in the next step, [*, L].
+
+    Args:
+        grid: cells and tables.
+        belief: probability of each cell now, [*, K].
+        region: index of the region, [*].
+        n_points: largest number of landing points in a region, L.
+    """
+    predicted, detects = predict(grid, belief, region), grid.reports[1:-1:2]
+    if len(grid.prior) == 1:
+        return grid.emits * (predicted @ detects.T)
+    here = gather_rows(detects.reshape(-1, n_points, belief.shape[-1]), region)
+    return grid.emits * (here @ predicted.unsqueeze(-1)).squeeze(-1)

@@ -1,0 +1,65 @@
+"""Features of where the source is believed to be (``damian.server.belief``); beyond the paper's Table 2."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from damian.common.tensors import gather_rows
+from damian.server.belief import detection_chance
+from damian.server.feature_cache import FeatureCache
+from damian.server.features import FEATURES, feature
+
+RINGS = (1.0, 3.0)
+"""Outer radii of the inner rings of ``belief_map``, in footprint radii; the outermost ring has no end."""
+SECTORS = 8
+"""Sectors of ``belief_map``; the first one is centred on north, the others follow clockwise."""
+
+
+@FEATURES.register("belief_gain")
+@feature("belief", width=None)
+def _belief_gain(v: FeatureCache) -> Tensor:
+    """Probability of detecting the source in the next step from where each discrete action leads, [*, N, A].
+
+    Actions begin at the landing point that the UAV has reached last, and are taken to be flown at once.
+    """
+    chance = detection_chance(v.grid, v.belief, v.region, v.context.n_points)
+    if v.context.goals is None:
+        raise ValueError("belief_gain needs the landing points to which actions lead")
+    goal = gather_rows(v.context.goals, v.wanted(v.messages.trail[..., 0]))
+    return chance.unsqueeze(-2).expand(*goal.shape[:-1], -1).gather(-1, goal)
+
+
+@FEATURES.register("belief_moments")
+@feature("belief", width=4, low=-1.0)
+def _belief_moments(v: FeatureCache) -> Tensor:
+    """Way from the UAV to the mean place (east, north), spread, and entropy over its maximum, [*, N, 4].
+
+    Lengths are over the largest vertex distance of the region, and at most 1.
+    """
+    belief, centres = v.belief, v.grid.centres
+    mean = belief @ centres
+    variance = (belief @ centres.square() - mean.square()).sum(-1).clamp(min=0)
+    offset = (mean.unsqueeze(-2) - v.wanted(v.messages.position)) / v.scale.unsqueeze(-1)
+    entropy = torch.special.entr(belief).sum(-1) / math.log(max(belief.shape[-1], 2))
+    shared = torch.stack([variance.sqrt() / v.context.scale, entropy], -1).unsqueeze(-2)
+    return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1)
+
+
+@FEATURES.register("belief_map")
+@feature("belief", width=(len(RINGS) + 1) * SECTORS)
+def _belief_map(v: FeatureCache) -> Tensor:
+    """Probability that the source is in each part of three rings about the UAV, [*, N, 24].
+
+    The parts are ``SECTORS`` sectors of each ring, the innermost ring first. A cell counts where its centre
+    is.
+    """
+    position = v.wanted(v.messages.position)
+    east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, K]
+    distance = torch.hypot(east, north) / v.context.radius
+    ring = sum((distance > edge).long() for edge in RINGS)
+    turn = torch.atan2(east, north) / (2 * math.pi)
+    part = ring * SECTORS + (turn * SECTORS).round().long() % SECTORS
+    share = v.belief.unsqueeze(-2).expand_as(east)
+    bins = share.new_zeros(*part.shape[:-1], (len(RINGS) + 1) * SECTORS)
+    return bins.scatter_add(-1, part, share).clamp(max=1)

@@ -1,0 +1,261 @@
+"""The beliefs of the latest steps, corrected as messages of these steps come in late.
+
+A ring of slots holds, for each of the latest steps, the belief and what the messages of that step say as far
+as they are known. A message that comes in late changes what is known of its step; from there the filter runs
+again. No message is later than the longest delay, so that older beliefs are final.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from damian.common import devices
+from damian.common.tensors import expand_mask, gather_rows
+from damian.server.belief import Evidence, evidence, first_belief, predict, report_rows, weigh
+from damian.server.source_grid import SourceGrid
+from damian.world.messages import Messages
+
+
+class Window(NamedTuple):
+    """The ring, with S slots for B worlds and V receivers of the messages in each world.
+
+    The first receiver is the server. If there are more, the others are the N UAVs, each of which knows its
+    own messages at once.
+    """
+
+    belief: Tensor
+    """Probability of each cell after the messages of the step, [S, B, V, K]."""
+    match: Tensor
+    """``Evidence.match`` of the messages of the step that are known, [S, B, V, K]."""
+    silent: Tensor
+    """``Evidence.silent`` of them, [S, B, V]."""
+    report: Tensor
+    """What the UAVs report in the step (``report_rows``), [S, B, N]."""
+    delay: Tensor
+    """The delay of these messages [steps], negative if they never arrive, [S, B, N]."""
+    slot: Tensor
+    """The slot of the latest step, [B]."""
+
+
+def empty_window(grid: SourceGrid, longest: int, n_worlds: int, n_agents: int, own: bool) -> Window:
+    """A window for messages that are at most ``longest`` steps late; ``own``: also for each UAV."""
+    device, n_slots, n_viewers = grid.prior.device, longest + 2, 1 + n_agents * own
+    weights = torch.ones(n_slots, n_worlds, n_viewers, grid.prior.shape[-1], device=device)
+    report = torch.full((n_slots, n_worlds, n_agents), grid.no_report, device=device)
+    slot = torch.zeros_like(report[0, :, 0])
+    return Window(weights, weights.clone(), weights[..., 0].clone(), report, report.clone(), slot)
+
+
+def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor) -> Tensor:
+    """Begin new episodes in the worlds of the mask, in place.
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        messages: the first messages [B, N], which all receivers know at once.
+        region: index of the region of each world, [B].
+        mask: worlds that begin an episode, [B] bool.
+
+    Returns:
+        The beliefs of the latest step, [B, V, K].
+    """
+    report = report_rows(grid, messages, torch.ones_like(messages.spotted))
+    return _begin(*grid, *window, report, region, mask)
+
+
+def advance(
+    grid: SourceGrid, window: Window, report: Tensor, delay: Tensor, region: Tensor, stepped: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Take one step: note what is sent, and correct the beliefs by what arrives, in place.
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps; its ``slot`` is still that of the step before.
+        report: what the messages of this step report (``report_rows``), [B, N].
+        delay: their delays [steps], negative if they never arrive, [B, N].
+        region: index of the region of each world, [B].
+        stepped: worlds that take the step, [B] bool; nothing of the others changes.
+
+    Returns:
+        The slot of the latest step of each world, [B], by which the caller replaces ``Window.slot``, and the
+        beliefs of that step, [B, V, K].
+    """
+    return _advance(*grid, *window, report, delay, region, stepped)
+
+
+# Operators of their own: the number of worlds to work on depends on data, which no compiler can trace.
+
+_RING = ("belief", "match", "silent", "report", "delay")
+
+
+@torch.library.custom_op("damian::begin_belief", mutates_args=_RING)
+def _begin(
+    centres: Tensor,
+    prior: Tensor,
+    moves: Tensor | None,
+    staying: Tensor,
+    reports: Tensor,
+    emits: float,
+    belief: Tensor,
+    match: Tensor,
+    silent: Tensor,
+    report: Tensor,
+    delay: Tensor,
+    slot: Tensor,
+    first: Tensor,
+    region: Tensor,
+    mask: Tensor,
+) -> Tensor:
+    grid = SourceGrid(centres, prior, moves, staying, reports, emits)
+    chosen, n_viewers = _chosen(mask), belief.shape[2]
+    at = slot * len(mask) + torch.arange(len(mask), device=mask.device)
+    known = first.index_select(0, chosen)
+    new = first_belief(grid, known, region.index_select(0, chosen))
+    _write(belief, at, new.unsqueeze(1).expand(-1, n_viewers, -1), mask, chosen)
+    report.masked_fill_(mask.unsqueeze(-1), grid.no_report)  # nothing is in transit
+    return _read(belief, at)
+
+
+@_begin.register_fake
+def _(*arguments):
+    return arguments[6].new_empty(arguments[6].shape[1:])
+
+
+@torch.library.custom_op("damian::advance_belief", mutates_args=_RING)
+def _advance(
+    centres: Tensor,
+    prior: Tensor,
+    moves: Tensor | None,
+    staying: Tensor,
+    reports: Tensor,
+    emits: float,
+    belief: Tensor,
+    match: Tensor,
+    silent: Tensor,
+    report: Tensor,
+    delay: Tensor,
+    slot: Tensor,
+    sent: Tensor,
+    sent_delay: Tensor,
+    region: Tensor,
+    stepped: Tensor,
+) -> tuple[Tensor, Tensor]:
+    grid = SourceGrid(centres, prior, moves, staying, reports, emits)
+    window = Window(belief, match, silent, report, delay, slot)
+    n_slots, n_worlds = belief.shape[:2]
+    latest = torch.where(stepped, (slot + 1) % n_slots, slot)
+    lags = torch.arange(n_slots, device=slot.device).unsqueeze(-1)
+    at = (latest - lags) % n_slots * n_worlds + torch.arange(n_worlds, device=slot.device)  # [S, B]
+    _write(report, at[0], sent, stepped)
+    _write(delay, at[0], sent_delay, stepped)
+    arrives = _arriving(grid, window, at[:-1]) & stepped.view(-1, 1, 1)
+    late = arrives.flatten(2).any(-1)
+    is_late = late.any(-1).tolist() if devices.data_dependent(slot.device) else [True] * len(late)
+    stale = torch.zeros_like(stepped)  # worlds whose beliefs change from the step with this lag on
+    for lag in range(len(late) - 1, 0, -1):
+        if any(is_late[lag:]):
+            stale = stale | late[lag]
+            _learn(grid, window, at[lag], arrives[lag], late[lag], more=True)
+            _filter(grid, window, at[lag], at[lag + 1], region, stale)
+    _learn(grid, window, at[0], arrives[0], stepped, more=False)
+    _filter(grid, window, at[0], at[1], region, stepped)
+    return latest, _read(belief, at[0])
+
+
+@_advance.register_fake
+def _(*arguments):
+    return torch.empty_like(arguments[11]), arguments[6].new_empty(arguments[6].shape[1:])
+
+
+def _arriving(grid: SourceGrid, window: Window, at: Tensor) -> Tensor:
+    """Which reports become known in this step, by the number of steps since they were sent, [L, B, V, N].
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        at: row of each step in the flattened ring, [L, B], the latest step first.
+    """
+    report, delay = (gather_rows(held.flatten(0, 1), at) for held in (window.report, window.delay))
+    lag = torch.arange(len(at), device=at.device).view(-1, 1, 1)
+    tells = report != grid.no_report
+    arrives = (tells & (delay == lag)).unsqueeze(2)
+    n_viewers, n_agents = window.belief.shape[2], report.shape[-1]
+    if n_viewers == 1:
+        return arrives
+    own = torch.eye(n_viewers, n_agents + 1, dtype=torch.bool, device=at.device)[:, 1:]
+    return torch.where(own, (tells & (lag == 0)).unsqueeze(2), arrives)
+
+
+def _learn(
+    grid: SourceGrid, window: Window, at: Tensor, arrives: Tensor, worlds: Tensor, *, more: bool
+) -> None:
+    """Note what the arriving messages of one step say, in place.
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        at: row of the step in the flattened ring, [B].
+        arrives: which of its messages become known, [B, V, N].
+        worlds: worlds in which any does, [B] bool.
+        more: in addition to what is known of the step already.
+    """
+    chosen = _chosen(worlds)
+    rows = at.index_select(0, chosen)
+    report = _read(window.report, rows).unsqueeze(1)
+    found = evidence(grid, torch.where(arrives.index_select(0, chosen), report, grid.no_report))
+    for held, new in zip((window.match, window.silent), found, strict=True):
+        _write(held, at, new * _read(held, rows) if more else new, worlds, chosen)
+
+
+def _filter(
+    grid: SourceGrid, window: Window, at: Tensor, before: Tensor, region: Tensor, worlds: Tensor
+) -> None:
+    """Compute the belief of one step from that of the step before, in place.
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        at: row of the step in the flattened ring, [B].
+        before: row of the step before it, [B].
+        region: index of the region of each world, [B].
+        worlds: worlds in which the belief has changed, [B] bool.
+    """
+    chosen = _chosen(worlds)
+    rows, before, region = (each.index_select(0, chosen) for each in (at, before, region))
+    found = Evidence(_read(window.match, rows), _read(window.silent, rows))
+    region = region.unsqueeze(-1).expand(found.silent.shape)
+    new = weigh(grid, predict(grid, _read(window.belief, before), region), found)
+    _write(window.belief, at, new, worlds, chosen)
+
+
+def _read(held: Tensor, rows: Tensor) -> Tensor:
+    """Rows of a flattened ring [S, B, ...]."""
+    return held.flatten(0, 1).index_select(0, rows)
+
+
+def _chosen(worlds: Tensor) -> Tensor:
+    """Indices of the worlds of a mask [B]; of all of them where shapes must not depend on data."""
+    if devices.data_dependent(worlds.device):
+        return worlds.nonzero().squeeze(-1)
+    return torch.arange(len(worlds), device=worlds.device)
+
+
+def _write(held: Tensor, at: Tensor, new: Tensor, worlds: Tensor, chosen: Tensor | None = None) -> None:
+    """Write into a ring [S, B, ...] in place, in the worlds of a mask.
+
+    Args:
+        held: the ring.
+        at: row of each world in the flattened ring, [B].
+        new: values of the worlds ``chosen``, of all if not given, [C, ...].
+        worlds: the mask, [B] bool.
+        chosen: ``_chosen(worlds)``.
+    """
+    flat = held.flatten(0, 1)
+    if chosen is None:
+        chosen = _chosen(worlds)
+        new = new.index_select(0, chosen)
+    rows = at.index_select(0, chosen)
+    if not devices.data_dependent(at.device):
+        new = torch.where(expand_mask(worlds, new), new, flat.index_select(0, rows))
+    flat.index_copy_(0, rows, new.contiguous())

@@ -1,0 +1,103 @@
+"""A transform that computes, from the messages that have arrived, where the source is believed to be."""
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite
+
+from damian import keys
+from damian.server.belief import report_rows
+from damian.server.belief_window import Window, advance, begin, empty_window
+from damian.server.server import Server
+from damian.server.source_grid import SourceGrid
+from damian.transforms.base import StatefulTransform
+from damian.transforms.entries import Change, Entries, Memory
+from damian.transforms.order import KeyUsage
+
+
+class Belief(StatefulTransform):
+    """Writes the probability that the source is in each cell of a grid, by Bayes' rule.
+
+    The belief of the server is exact for the messages that have arrived by now, whenever they were sent, and
+    it knows no others. For each world the memory holds the beliefs of the latest steps, as they follow from
+    what is known now, and the messages sent in them; when a message comes in late, the filter runs again from
+    the step in which it was sent. ``damian.make_env`` adds the transform if a feature reads the belief.
+
+    It writes ``belief`` [B, K] and, if ``own``, ``("agents", "belief")`` [B, N, K]: that of each UAV, which
+    knows its own messages at once.
+
+    Args:
+        server: server node, whose grid the belief is about.
+        longest: longest delay of a message [steps].
+        delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is delayed.
+        own: compute the belief of each UAV too.
+
+    Examples:
+        >>> env = UavEnv(scenario, num_worlds=64, extras=["message"], messages_only=True)
+        >>> uplink = ObservationDelay(3, keys.MESSAGE, keys.RECEIVED, delay_key=keys.DELAY)
+        >>> believe = Belief(env.server, longest=3, delayed=True)
+        >>> env = TransformedEnv(env, Compose(uplink, believe, ServerNode(env.server)))
+    """
+
+    def __init__(self, server: Server, longest: int, *, delayed: bool, own: bool = False) -> None:
+        reads: list[NestedKey] = [keys.MESSAGE, keys.MESSAGE_SENT, *([keys.DELAY] if delayed else [])]
+        super().__init__(reads, [keys.BELIEF, *([keys.OWN_BELIEF] if own else [])])
+        self.server, self.longest, self.delayed, self.own = server, longest, delayed, own
+        self.step_keys = reads
+
+    @property
+    def row_key(self) -> NestedKey:
+        return keys.DONE
+
+    @property
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(reads=self.in_keys, creates=self.out_keys)
+
+    @property
+    def row_dims(self) -> dict[str, int]:
+        return dict.fromkeys(("belief", "match", "silent", "report", "delay"), 1)
+
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        n_worlds, n_agents = tensordict.get(keys.MESSAGE).shape[:2]
+        return empty_window(self._grid, self.longest, n_worlds, n_agents, self.own)._asdict()
+
+    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
+        n_agents, n_cells = tensordict.get(keys.MESSAGE).shape[1], self._grid.prior.shape[-1]
+        viewers = 1 + n_agents * self.own
+        return n_rows * (self.longest + 2) * (viewers * 4 * (2 * n_cells + 1) + n_agents * 16)
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        messages = self.server.messages(entries[keys.MESSAGE])
+        region = self.server.region_of(messages)
+        return memory, self._written(begin(self._grid, Window(**memory), messages, region, mask))
+
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
+        messages, sent = self.server.messages(entries[keys.MESSAGE]), entries[keys.MESSAGE_SENT]
+        report = report_rows(self._grid, messages, sent)
+        delay = entries[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(report)
+        region = self.server.region_of(messages)
+        stepped = (
+            entries[keys.STEPPED].view(-1) if keys.STEPPED in entries else torch.ones_like(region).bool()
+        )
+        slot, belief = advance(self._grid, Window(**memory), report, delay, region, stepped)
+        return memory | {"slot": slot}, self._written(belief)
+
+    def _written(self, belief: Tensor) -> Entries:
+        """The entries to write, from the beliefs of all receivers, [B, V, K]."""
+        own: Entries = {keys.OWN_BELIEF: belief[:, 1:]} if self.own else {}
+        return {keys.BELIEF: belief[:, 0], **own}
+
+    @property
+    def _grid(self) -> SourceGrid:
+        if self.server.grid is None:
+            raise RuntimeError("the server has no grid, because no feature reads the belief")
+        return self.server.grid
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        worlds, n_agents = observation_spec[keys.MESSAGE].shape[:-2], observation_spec[keys.MESSAGE].shape[-2]
+        n_cells = self._grid.prior.shape[-1]
+        for key, shape in ((keys.BELIEF, worlds), (keys.OWN_BELIEF, (*worlds, n_agents))):
+            if key in self.out_keys:
+                size = torch.Size((*shape, n_cells))
+                observation_spec[key] = Bounded(0.0, 1.0, size, device=observation_spec.device)
+        return observation_spec

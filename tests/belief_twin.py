@@ -1,0 +1,66 @@
+"""The Bayes filter of the source again, plainly: one world, one receiver, from the start at every step."""
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from damian.server.source_grid import SourceGrid
+
+Steps = Sequence[tuple[list[int], list[int]]]
+"""For each step the rows of ``SourceGrid.reports`` that the UAVs send, and the delays of these messages."""
+
+
+def belief(
+    grid: SourceGrid, region: int, first: list[int], steps: Steps, now: int, viewer: int | None = None
+) -> list[float]:
+    """Probability of each cell after the last of the steps, knowing what has arrived by step ``now``.
+
+    ``viewer`` is the UAV that knows its own messages at once; None is the server.
+    """
+    prior = grid.prior[region].tolist()
+    cells = range(len(prior))
+    probable = _weighed(grid, prior, first)
+    for sent_at, (rows, delays) in enumerate(steps, 1):
+        moved = [0.0] * len(prior)
+        for a in cells:
+            if grid.moves is None:
+                moved[a] = probable[a]
+                continue
+            inside = [float(grid.moves[a, b]) if prior[b] > 0 else 0.0 for b in cells]
+            for b in cells:
+                moved[b] += probable[a] * inside[b] / sum(inside) if probable[a] else 0.0
+        known = [
+            row
+            for uav, (row, delay) in enumerate(zip(rows, delays, strict=True))
+            if uav == viewer or (delay >= 0 and sent_at + delay <= now)
+        ]
+        probable = _weighed(grid, moved, known)
+    return probable
+
+
+def _weighed(grid: SourceGrid, probable: list[float], rows: list[int]) -> list[float]:
+    weighed = []
+    for cell, chance in enumerate(probable):
+        heard, silent = 1.0, 1.0
+        for row in rows:
+            heard *= float(grid.reports[row, cell])
+            silent *= 0.0 if row % 2 == 1 else 1.0
+        weighed.append(chance * (grid.emits * heard + (1 - grid.emits) * silent))
+    return [each / sum(weighed) for each in weighed]
+
+
+def chance_at(grid: SourceGrid, region: int, probable: Tensor, point: int) -> float:
+    """Probability of detecting the source in the next step from a landing point, by its flat id."""
+    prior, total = grid.prior[region].tolist(), 0.0
+    for a, chance in enumerate(probable.tolist()):
+        inside = {
+            b: float(grid.moves[a, b]) if grid.moves is not None else float(a == b)
+            for b in range(len(prior))
+            if prior[b] > 0
+        }
+        if chance:
+            total += sum(
+                chance * w / sum(inside.values()) * float(grid.reports[2 * point + 1, b])
+                for b, w in inside.items()
+            )
+    return grid.emits * total

@@ -1,0 +1,237 @@
+"""The Bayes filter of the source against its slow twin, and whether its probabilities are frequencies."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from belief_twin import belief, chance_at
+from helpers import everything, square, walking
+from torch import Tensor
+
+from damian.common.errors import InputError
+from damian.envs.scenario import make_simulation
+from damian.server.belief import detection_chance
+from damian.server.belief_window import _advance, _begin, empty_window
+from damian.server.source_grid import SourceGrid, build_source_grid
+from damian.world.signal_source import SourceConfig
+
+LONGEST = 4
+
+
+def make_grid(emission: float = 0.6, motion: str = "dynamic", regions: int = 1) -> SourceGrid:
+    """A small grid, over one or several regions."""
+    source = (
+        walking(emission="per_step", emission_probability=emission) if motion == "dynamic" else SourceConfig()
+    )
+    scenario = square() if regions == 1 else everything()
+    airspace = make_simulation(scenario, 0).airspace
+    return build_source_grid(airspace, source, radius=50.0, dt=1.0, cell=45.0)
+
+
+grids = {
+    "one region": make_grid(),
+    "always emitting": make_grid(1.0),
+    "static": make_grid(motion="static"),
+    "several regions": make_grid(regions=3),
+}
+every_grid = pytest.mark.parametrize("grid", grids.values(), ids=grids)
+
+
+class Flight:
+    """Random reports with random delays, in worlds that begin new episodes and pause at random."""
+
+    def __init__(self, grid: SourceGrid, n_worlds: int, own: bool, seed: int = 0) -> None:
+        self.grid, self.rng, self.n_agents = grid, np.random.default_rng(seed), 3
+        self.window = empty_window(grid, LONGEST, n_worlds, self.n_agents, own)
+        self.region = self.draw(len(grid.prior), n_worlds)
+        self.steps: list[list] = [[] for _ in range(n_worlds)]
+        self.first = torch.zeros(n_worlds, self.n_agents, dtype=torch.long)
+        self.beliefs = torch.zeros(0)
+        self.begin(torch.ones(n_worlds, dtype=torch.bool))
+
+    def draw(self, below: int, *shape: int) -> Tensor:
+        return torch.as_tensor(self.rng.integers(below, size=shape))
+
+    def rows(self) -> Tensor:
+        """Reports from landing points of the world's own region; some UAVs send none."""
+        per_region = (len(self.grid.reports) - 1) // 2 // len(self.grid.prior)
+        shape = (len(self.region), self.n_agents)
+        point = self.draw(5, *shape) + self.region.unsqueeze(-1) * per_region
+        row = 2 * point + (self.draw(3, *shape) == 0)
+        return torch.where(self.draw(5, *shape) == 0, self.grid.no_report, row)
+
+    def begin(self, mask: Tensor) -> None:
+        new = self.rows()
+        self.first = torch.where(mask.unsqueeze(-1), new, self.first)
+        self.beliefs = _begin(*self.grid, *self.window, new, self.region, mask)
+        for world in mask.nonzero().squeeze(-1).tolist():
+            self.steps[world] = []
+
+    def step(self, stepped: Tensor) -> None:
+        rows, delay = self.rows(), self.draw(LONGEST + 2, *self.first.shape) - 1
+        slot, self.beliefs = _advance(*self.grid, *self.window, rows, delay, self.region, stepped)
+        self.window = self.window._replace(slot=slot)
+        for world in stepped.nonzero().squeeze(-1).tolist():
+            self.steps[world].append((rows[world].tolist(), delay[world].tolist()))
+
+    def check(self) -> None:
+        """Compare the beliefs of all receivers with the slow twin's."""
+        for world, steps in enumerate(self.steps):
+            for viewer in range(self.beliefs.shape[1]):
+                expected = belief(
+                    self.grid,
+                    int(self.region[world]),
+                    self.first[world].tolist(),
+                    steps,
+                    len(steps),
+                    viewer - 1 if viewer else None,
+                )
+                torch.testing.assert_close(
+                    self.beliefs[world, viewer], torch.tensor(expected), rtol=1e-3, atol=1e-6
+                )
+
+
+@every_grid
+@pytest.mark.parametrize("own", [False, True], ids=["server", "each UAV"])
+def test_beliefs_equal_the_slow_twins_for_any_delays_losses_resets_and_pauses(grid, own):
+    flight = Flight(grid, n_worlds=3, own=own)
+    for i in range(14):
+        flight.step(flight.draw(5, 3) > 0)
+        if i % 5 == 4:
+            flight.begin(flight.draw(2, 3) == 0)
+        if i % 3 == 1 or i == 13:
+            flight.check()
+
+
+@every_grid
+def test_where_shapes_may_not_depend_on_data_the_beliefs_are_the_same(grid, monkeypatch):
+    one, other = Flight(grid, 4, own=True), Flight(grid, 4, own=True)
+    for i in range(8):
+        stepped, mask = one.draw(4, 4) > 0, one.draw(3, 4) == 0
+        other.draw(4, 4), other.draw(3, 4)
+        one.step(stepped)
+        with monkeypatch.context() as patch:
+            patch.setattr("damian.common.devices.data_dependent", lambda device: False)
+            other.step(stepped)
+        torch.testing.assert_close(one.beliefs, other.beliefs, rtol=1e-5, atol=1e-7)
+        if i % 3 == 2:
+            one.begin(mask)
+            with monkeypatch.context() as patch:
+                patch.setattr("damian.common.devices.data_dependent", lambda device: False)
+                other.begin(mask)
+        torch.testing.assert_close(one.beliefs, other.beliefs, rtol=1e-5, atol=1e-7)
+
+
+def test_a_message_changes_nothing_before_it_arrives():
+    grid = grids["one region"]
+    flights = [Flight(grid, 1, own=False), Flight(grid, 1, own=False)]
+    loud, quiet = (
+        torch.tensor([[1, grid.no_report, grid.no_report]]) - torch.tensor([[i, 0, 0]]) for i in (0, 1)
+    )
+    everyone, nothing = torch.ones(1, dtype=torch.bool), torch.full((1, 3), grid.no_report)
+    for age in range(LONGEST + 1):
+        for flight, row in zip(flights, (loud, quiet), strict=True):
+            sent = row if age == 0 else nothing
+            delay = torch.full((1, 3), 3)
+            slot, flight.beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+            flight.window = flight.window._replace(slot=slot)
+        assert torch.equal(flights[0].beliefs, flights[1].beliefs) == (age < 3)
+
+
+def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Tensor]:
+    """Beliefs, and whether the source is in the cell, where all happens as the grid assumes."""
+    torch.manual_seed(0)
+    n_points, everyone = (len(grid.reports) - 1) // 2, torch.ones(n_worlds, dtype=torch.bool)
+    region = torch.zeros(n_worlds, dtype=torch.long)
+    window = empty_window(grid, LONGEST, n_worlds, 3, own=False)
+
+    def reports(cell: Tensor) -> Tensor:
+        point = torch.randint(n_points, (n_worlds, 3))
+        heard = torch.rand(n_worlds, 3) < grid.reports[2 * point + 1, cell.unsqueeze(-1)]
+        return 2 * point + (heard & (torch.rand(n_worlds, 1) < grid.emits))
+
+    cell = torch.multinomial(grid.prior[0], n_worlds, replacement=True)
+    _begin(*grid, *window, reports(cell), region, everyone)
+    said, was = [], []
+    for _ in range(n_steps):
+        cell = torch.multinomial(grid.moves[cell], 1).squeeze(-1) if grid.moves is not None else cell
+        delay = torch.where(torch.rand(n_worlds, 3) < 0.5, 0, torch.randint(-1, LONGEST + 1, (n_worlds, 3)))
+        slot, beliefs = _advance(*grid, *window, reports(cell), delay, region, everyone)
+        window = window._replace(slot=slot)
+        said.append(beliefs[:, 0])
+        was.append(torch.nn.functional.one_hot(cell, beliefs.shape[-1]))
+    return torch.stack(said).flatten(), torch.stack(was).flatten().float()
+
+
+@pytest.mark.parametrize("name", ["one region", "always emitting", "static"])
+def test_of_the_times_when_it_says_so_often_the_source_is_there_so_often(name):
+    said, was = simulated(grids[name], n_worlds=2000, n_steps=10)
+    for low, high in (
+        (0.001, 0.01),
+        (0.01, 0.05),
+        (0.05, 0.2),
+        (0.2, 0.4),
+        (0.4, 0.6),
+        (0.6, 0.8),
+        (0.8, 1.0),
+    ):
+        here = (said >= low) & (said < high)
+        share, n = said[here].mean().item(), int(here.sum())
+        # Beliefs of a world follow from each other, so that they count for less than independent ones.
+        error = 4 * math.sqrt(share * (1 - share) / max(n / 4, 1))
+        assert n > 100
+        assert abs(was[here].mean().item() - share) < error, (low, high, n)
+
+
+@every_grid
+def test_the_chance_of_a_detection_equals_the_slow_twins(grid):
+    n_regions, n_cells = grid.prior.shape
+    n_points = (len(grid.reports) - 1) // 2 // n_regions
+    region = torch.arange(n_regions)
+    beliefs = torch.rand(n_regions, n_cells) * (grid.prior > 0)
+    beliefs = beliefs / beliefs.sum(-1, keepdim=True)
+    chance = detection_chance(grid, beliefs, region, n_points)
+    for r in range(n_regions):
+        for p in (0, 3, n_points - 1):
+            expected = chance_at(grid, r, beliefs[r], r * n_points + p)
+            assert chance[r, p].item() == pytest.approx(expected, rel=1e-4)
+
+
+@every_grid
+def test_a_grid_has_probabilities(grid):
+    torch.testing.assert_close(grid.prior.sum(-1), torch.ones(len(grid.prior)))
+    assert grid.reports[:-1].min() > 0
+    assert grid.reports[:-1].max() < 1
+    torch.testing.assert_close(
+        grid.reports[0:-1:2] + grid.reports[1:-1:2], torch.ones_like(grid.reports[1::2])
+    )
+    if grid.moves is not None:
+        inside = grid.moves @ (grid.prior > 0).float().T / (grid.staying.T if len(grid.prior) > 1 else 1)
+        torch.testing.assert_close(inside, torch.ones_like(inside))
+
+
+def test_a_report_is_as_likely_as_a_source_in_the_cell_is_in_the_footprint():
+    airspace = make_simulation(square(), 0).airspace
+    grid = build_source_grid(airspace, SourceConfig(), radius=50.0, dt=1.0, cell=45.0)
+    place = grid.centres.unsqueeze(1) + (torch.rand(len(grid.centres), 4000, 2) - 0.5) * 45.0
+    inside = (place.abs() < 100).all(-1)  # the local origin is the square's centre
+    for point, at in enumerate(airspace.points[0][:10]):
+        heard = (place - at).norm(dim=-1) < 50.0
+        share = (heard & inside).sum(-1) / inside.sum(-1).clamp(min=1)
+        torch.testing.assert_close(grid.reports[2 * point + 1], share, atol=0.08, rtol=0)
+
+
+def test_a_grid_has_cells_that_fit_the_footprint_and_not_too_many():
+    airspace = make_simulation(square(), 0).airspace
+    sizes = {
+        r: build_source_grid(airspace, SourceConfig(), r, 1.0).prior.shape[-1] for r in (1.0, 20.0, 60.0)
+    }
+    assert sizes[1.0] < 2 * 256
+    assert sizes[1.0] > sizes[20.0] > sizes[60.0] > 4
+
+
+def test_a_grid_that_does_not_fit_is_refused():
+    airspace = make_simulation(square(), 0).airspace
+    with pytest.raises(InputError, match=r"observation.belief_cell: 0.05 m"):
+        build_source_grid(airspace, SourceConfig(), 50.0, 1.0, cell=0.05)
