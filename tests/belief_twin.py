@@ -1,5 +1,6 @@
 """The Bayes filter of the source again, plainly: one world, one receiver, from the start at every step."""
 
+import math
 from collections.abc import Sequence
 
 from torch import Tensor
@@ -7,7 +8,7 @@ from torch import Tensor
 from damian.server.source_grid import SourceGrid
 
 Steps = Sequence[tuple[list[int], list[int]]]
-"""For each step the rows of ``SourceGrid.reports`` that the UAVs send, and the delays of these messages."""
+"""For each step the rows of ``SourceGrid.log_reports`` that UAVs send, and the delays of these messages."""
 
 
 def belief(
@@ -43,7 +44,7 @@ def _weighed(grid: SourceGrid, probable: list[float], rows: list[int]) -> list[f
     for cell, chance in enumerate(probable):
         heard, silent = 1.0, 1.0
         for row in rows:
-            heard *= float(grid.reports[row, cell])
+            heard *= math.exp(float(grid.log_reports[row, cell]))
             silent *= 0.0 if row % 2 == 1 else 1.0
         weighed.append(chance * (grid.emits * heard + (1 - grid.emits) * silent))
     return [each / sum(weighed) for each in weighed]
@@ -60,7 +61,6 @@ def chance_at(grid: SourceGrid, region: int, probable: Tensor, point: int) -> fl
         }
         if chance:
             total += sum(
-                chance * w / sum(inside.values()) * float(grid.reports[2 * point + 1, b])
-                for b, w in inside.items()
+                chance * w / sum(inside.values()) * float(grid.detects[point, b]) for b, w in inside.items()
             )
     return grid.emits * total

@@ -18,6 +18,7 @@ from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
+from damian.server.features import ObservationConfig
 
 PAPER = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
 BURST = {"law": "burst", "enter": 0.2, "leave": 0.3, "bad": 4, "bad_loss": 0.3}
@@ -28,6 +29,10 @@ DELAYS = {
     "slow clocks": {
         "delay": DelayConfig(obs=PAPER, act={"law": "uniform", "high": 2}, history=2),
         "clock": ClockConfig(agents="2s", server="4s"),
+    },
+    "belief": {
+        "delay": DelayConfig(obs=PAPER, loss=0.1),
+        "observation": ObservationConfig(own=True, belief=["belief_moments", "belief_map"]),
     },
     "context": {"delay": DelayConfig(obs=Crowd(), act=Crowd(column=1), rew=Crowd(loses=False), loss=0.1)},
 }

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from damian.common.tensors import gather_rows
 from damian.server.source_grid import SourceGrid
@@ -29,7 +30,7 @@ class Evidence(NamedTuple):
 
 
 def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor) -> Tensor:
-    """Rows of ``SourceGrid.reports`` for messages, [*, N]; a UAV in flight detects nothing.
+    """Rows of ``SourceGrid.log_reports`` for messages, [*, N]; a UAV in flight detects nothing.
 
     Args:
         grid: cells and tables.
@@ -45,10 +46,11 @@ def evidence(grid: SourceGrid, rows: Tensor) -> Evidence:
 
     Args:
         grid: cells and tables.
-        rows: rows of ``SourceGrid.reports``, [*, N].
+        rows: rows of ``SourceGrid.log_reports``, [*, N].
     """
-    detected = (rows % 2 == 1).any(-1)  # the row of no report is even
-    return Evidence(gather_rows(grid.reports, rows).prod(-2), (~detected).to(grid.reports.dtype))
+    log = embedding_bag(rows.flatten(0, -2), grid.log_reports, mode="sum")  # gathers and sums at once
+    silent = ~(rows % 2 == 1).any(-1)  # the row of no report is even
+    return Evidence(log.exp().view(*rows.shape[:-1], log.shape[-1]), silent.to(log.dtype))
 
 
 def predict(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
@@ -87,7 +89,7 @@ def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
 
     Args:
         grid: cells and tables.
-        rows: rows of ``SourceGrid.reports`` for the first messages (``report_rows``), [*, N].
+        rows: rows of ``SourceGrid.log_reports`` for the first messages (``report_rows``), [*, N].
         region: index of the region, [*].
     """
     return weigh(grid, gather_rows(grid.prior, region), evidence(grid, rows))
@@ -102,8 +104,8 @@ def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor, n_points:
         region: index of the region, [*].
         n_points: largest number of landing points in a region, L.
     """
-    predicted, detects = predict(grid, belief, region), grid.reports[1:-1:2]
+    predicted = predict(grid, belief, region)
     if len(grid.prior) == 1:
-        return grid.emits * (predicted @ detects.T)
-    here = gather_rows(detects.reshape(-1, n_points, belief.shape[-1]), region)
+        return grid.emits * (predicted @ grid.detects.T)
+    here = gather_rows(grid.detects.view(-1, n_points, belief.shape[-1]), region)
     return grid.emits * (here @ predicted.unsqueeze(-1)).squeeze(-1)

@@ -41,7 +41,7 @@ def _belief_moments(v: FeatureCache) -> Tensor:
     mean = belief @ centres
     variance = (belief @ centres.square() - mean.square()).sum(-1).clamp(min=0)
     offset = (mean.unsqueeze(-2) - v.wanted(v.messages.position)) / v.scale.unsqueeze(-1)
-    entropy = torch.special.entr(belief).sum(-1) / math.log(max(belief.shape[-1], 2))
+    entropy = -(belief * belief.clamp(min=1e-12).log()).sum(-1) / math.log(max(belief.shape[-1], 2))
     shared = torch.stack([variance.sqrt() / v.context.scale, entropy], -1).unsqueeze(-2)
     return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1)
 

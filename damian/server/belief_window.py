@@ -95,7 +95,8 @@ def _begin(
     prior: Tensor,
     moves: Tensor | None,
     staying: Tensor,
-    reports: Tensor,
+    detects: Tensor,
+    log_reports: Tensor,
     emits: float,
     belief: Tensor,
     match: Tensor,
@@ -107,7 +108,7 @@ def _begin(
     region: Tensor,
     mask: Tensor,
 ) -> Tensor:
-    grid = SourceGrid(centres, prior, moves, staying, reports, emits)
+    grid = SourceGrid(centres, prior, moves, staying, detects, log_reports, emits)
     chosen, n_viewers = _chosen(mask), belief.shape[2]
     at = slot * len(mask) + torch.arange(len(mask), device=mask.device)
     known = first.index_select(0, chosen)
@@ -119,7 +120,7 @@ def _begin(
 
 @_begin.register_fake
 def _(*arguments):
-    return arguments[6].new_empty(arguments[6].shape[1:])
+    return arguments[7].new_empty(arguments[7].shape[1:])
 
 
 @torch.library.custom_op("damian::advance_belief", mutates_args=_RING)
@@ -128,7 +129,8 @@ def _advance(
     prior: Tensor,
     moves: Tensor | None,
     staying: Tensor,
-    reports: Tensor,
+    detects: Tensor,
+    log_reports: Tensor,
     emits: float,
     belief: Tensor,
     match: Tensor,
@@ -141,7 +143,7 @@ def _advance(
     region: Tensor,
     stepped: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    grid = SourceGrid(centres, prior, moves, staying, reports, emits)
+    grid = SourceGrid(centres, prior, moves, staying, detects, log_reports, emits)
     window = Window(belief, match, silent, report, delay, slot)
     n_slots, n_worlds = belief.shape[:2]
     latest = torch.where(stepped, (slot + 1) % n_slots, slot)
@@ -149,23 +151,22 @@ def _advance(
     at = (latest - lags) % n_slots * n_worlds + torch.arange(n_worlds, device=slot.device)  # [S, B]
     _write(report, at[0], sent, stepped)
     _write(delay, at[0], sent_delay, stepped)
+    for held in (match, silent):
+        _write(held, at[0], torch.ones_like(held[0]), stepped)
     arrives = _arriving(grid, window, at[:-1]) & stepped.view(-1, 1, 1)
-    late = arrives.flatten(2).any(-1)
-    is_late = late.any(-1).tolist() if devices.data_dependent(slot.device) else [True] * len(late)
+    changed = arrives.flatten(2).any(-1)
+    _learn(grid, window, at[:-1], arrives, changed)
+    changed[0] = stepped
     stale = torch.zeros_like(stepped)  # worlds whose beliefs change from the step with this lag on
-    for lag in range(len(late) - 1, 0, -1):
-        if any(is_late[lag:]):
-            stale = stale | late[lag]
-            _learn(grid, window, at[lag], arrives[lag], late[lag], more=True)
-            _filter(grid, window, at[lag], at[lag + 1], region, stale)
-    _learn(grid, window, at[0], arrives[0], stepped, more=False)
-    _filter(grid, window, at[0], at[1], region, stepped)
+    for lag in range(_oldest(changed), -1, -1):
+        stale = stale | changed[lag]
+        _filter(grid, window, at[lag], at[lag + 1], region, stale)
     return latest, _read(belief, at[0])
 
 
 @_advance.register_fake
 def _(*arguments):
-    return torch.empty_like(arguments[11]), arguments[6].new_empty(arguments[6].shape[1:])
+    return torch.empty_like(arguments[12]), arguments[7].new_empty(arguments[7].shape[1:])
 
 
 def _arriving(grid: SourceGrid, window: Window, at: Tensor) -> Tensor:
@@ -187,25 +188,30 @@ def _arriving(grid: SourceGrid, window: Window, at: Tensor) -> Tensor:
     return torch.where(own, (tells & (lag == 0)).unsqueeze(2), arrives)
 
 
-def _learn(
-    grid: SourceGrid, window: Window, at: Tensor, arrives: Tensor, worlds: Tensor, *, more: bool
-) -> None:
-    """Note what the arriving messages of one step say, in place.
+def _learn(grid: SourceGrid, window: Window, at: Tensor, arrives: Tensor, changed: Tensor) -> None:
+    """Note what the arriving messages say of the steps in which they were sent, in place.
 
     Args:
         grid: cells and tables.
         window: beliefs of the latest steps.
-        at: row of the step in the flattened ring, [B].
-        arrives: which of its messages become known, [B, V, N].
-        worlds: worlds in which any does, [B] bool.
-        more: in addition to what is known of the step already.
+        at: row of each step in the flattened ring, [L, B].
+        arrives: which of its messages become known, [L, B, V, N].
+        changed: in which steps of which worlds any does, [L, B] bool.
     """
+    at, worlds = at.flatten(), changed.flatten()
     chosen = _chosen(worlds)
     rows = at.index_select(0, chosen)
-    report = _read(window.report, rows).unsqueeze(1)
-    found = evidence(grid, torch.where(arrives.index_select(0, chosen), report, grid.no_report))
+    known = arrives.flatten(0, 1).index_select(0, chosen)
+    found = evidence(grid, torch.where(known, _read(window.report, rows).unsqueeze(1), grid.no_report))
     for held, new in zip((window.match, window.silent), found, strict=True):
-        _write(held, at, new * _read(held, rows) if more else new, worlds, chosen)
+        _write(held, at, new * _read(held, rows), worlds, chosen)
+
+
+def _oldest(changed: Tensor) -> int:
+    """The last row of ``changed`` [L, B] in which any is true; L - 1 where it must not depend on data."""
+    if not devices.data_dependent(changed.device):
+        return len(changed) - 1
+    return max(changed.any(-1).nonzero().squeeze(-1).tolist(), default=0)
 
 
 def _filter(

@@ -5,6 +5,7 @@ one table; a region's prior tells which of the cells lie in it.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -47,17 +48,19 @@ class SourceGrid(NamedTuple):
     is only one region, they are probabilities."""
     staying: Tensor
     """Sum of the weights of the moves from each cell that end in the region, [R, K]."""
-    reports: Tensor
-    """Probability of what a UAV on a landing point reports if the source emits in a cell, [2*R*L + 1, K]: for
-    the landing point of flat id p, row 2p that it detects nothing, and row 2p + 1 that it detects the source.
-    The last row, of ones, stands for no report."""
+    detects: Tensor
+    """Probability that a UAV on a landing point detects a source that emits in a cell, [R*L, K]."""
+    log_reports: Tensor
+    """Log-probability of what a UAV on a landing point reports if the source emits in a cell, [2*R*L + 1, K]:
+    for the landing point of flat id p, row 2p that it detects nothing, and row 2p + 1 that it detects the
+    source. The last row, of zeros, stands for no report."""
     emits: float
     """Probability that the source emits in a step."""
 
     @property
     def no_report(self) -> int:
-        """The row of ``reports`` that stands for no report."""
-        return len(self.reports) - 1
+        """The row of ``log_reports`` that stands for no report."""
+        return len(self.log_reports) - 1
 
     def to(self, device: torch.device) -> "SourceGrid":
         """Copy of the grid on another device."""
@@ -86,7 +89,7 @@ def build_source_grid(
     edge = cell or max(CELL * radius, math.sqrt(max(p.area for p in polygons) / MOST_CELLS))
     area, n_points = max(polygon.area for polygon in polygons), airspace.points.shape[:2].numel()
     n_cells = math.ceil(area / edge**2)  # at least
-    size = 4 * n_cells * (2 * n_points + n_cells + 4 * len(polygons))
+    size = 4 * n_cells * (3 * n_points + n_cells + 4 * len(polygons))
     checks.fits("observation.belief_cell", f"{edge:g} m", size, "take larger cells")
     columns = _columns(polygons, edge)
     centres = torch.as_tensor(columns * edge, dtype=torch.float32)
@@ -104,9 +107,10 @@ def build_source_grid(
         for each in zip(polygons, airspace.points, strict=True)
     ]
     detects = DOUBT + (1 - 2 * DOUBT) * torch.cat(shares)
-    reports = torch.cat([torch.stack([1 - detects, detects], 1).flatten(0, 1), torch.ones(1, len(columns))])
+    reports = torch.stack([1 - detects, detects], 1).flatten(0, 1)
+    log_reports = torch.cat([reports.log(), torch.zeros(1, len(columns))])
     emits = 1.0 if source.emission == "constant" else source.emission_probability
-    return SourceGrid(centres, prior, moves, staying, reports, emits)
+    return SourceGrid(centres, prior, moves, staying, detects, log_reports, emits)
 
 
 def _columns(polygons: list, edge: float) -> np.ndarray:
@@ -128,8 +132,8 @@ def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarra
 
     Independent moves like these get as far in ``_SPAN`` steps as the source does.
     """
-    rng = np.random.default_rng(_SEED)
-    polygons = polygons[:_WALKS]
+    rng, polygons = np.random.default_rng(_SEED), polygons[:_WALKS]
+    source = replace(source, position=None)  # where it begins is not told
     time = torch.arange(_STEPS + 1, dtype=torch.float64) * dt
     found = []
     for polygon in polygons:

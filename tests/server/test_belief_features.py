@@ -1,0 +1,140 @@
+"""The features of a belief against plain loops."""
+
+import math
+
+import pytest
+import torch
+from belief_twin import chance_at
+from helpers import everything, square, walking
+
+from damian.common.errors import InputError
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
+from damian.envs.uav_env import UavEnv
+from damian.server.belief_features import RINGS, SECTORS
+from damian.server.features import ObservationConfig, feature
+from damian.world.landing import ActionConfig
+
+ALL = ["belief_gain", "belief_moments", "belief_map"]
+
+
+def believing(own: bool = False, **changed) -> ScenarioConfig:
+    observation = ObservationConfig(local_features=["spotted"], global_features=[], belief=ALL, own=own)
+    return everything(observation=observation, source=walking(), **changed)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """A server, and messages [B, N], elapsed steps [B] and beliefs [B, K] of worlds in several regions."""
+    scenario = believing()
+    simulation = make_simulation(scenario, 0)
+    server = make_server(scenario, simulation)
+    messages, steps = simulation.initial.sent, simulation.initial.steps
+    torch.manual_seed(0)
+    weight = torch.rand(len(steps), server.grid.prior.shape[-1]).square() * (
+        server.grid.prior[server.region_of(messages)] > 0
+    )
+    belief = weight / weight.sum(-1, keepdim=True)
+    return simulation, server, messages, server.features(messages, steps, belief=belief), belief
+
+
+def test_gain_is_the_chance_of_detecting_the_source_where_an_action_leads(flown):
+    simulation, server, messages, features, belief = flown
+    candidates, n_actions = simulation.candidates, simulation.config.actions.n_actions
+    for world, uav in ((0, 0), (3, 1), (7, 2)):
+        region = int(server.region_of(messages)[world])
+        standing = int(messages.trail[world, uav, 0])
+        for action in (0, 5, n_actions - 1):
+            point = int(candidates.ranking.point[standing * n_actions + action, 0])
+            flat = region * simulation.airspace.max_points + point
+            expected = chance_at(server.grid, region, belief[world], flat)
+            assert features["belief_gain"][world, uav, action].item() == pytest.approx(expected, rel=1e-3)
+
+
+def test_moments_are_mean_spread_and_entropy(flown):
+    simulation, server, messages, features, belief = flown
+    for world, uav in ((0, 0), (5, 2)):
+        scale = float(simulation.airspace.scale[server.region_of(messages)[world]])
+        chance, cells = belief[world].tolist(), server.grid.centres.tolist()
+        east, north = (sum(p * cell[i] for p, cell in zip(chance, cells, strict=True)) for i in (0, 1))
+        variance = sum(
+            p * ((cell[0] - east) ** 2 + (cell[1] - north) ** 2)
+            for p, cell in zip(chance, cells, strict=True)
+        )
+        entropy = -sum(p * math.log(p) for p in chance if p) / math.log(len(chance))
+        x, y = messages.position[world, uav].tolist()
+        expected = [(east - x) / scale, (north - y) / scale, math.sqrt(variance) / scale, entropy]
+        torch.testing.assert_close(
+            features["belief_moments"][world, uav], torch.tensor(expected).clamp(-1, 1), rtol=1e-3, atol=1e-4
+        )
+
+
+def test_the_map_sums_the_belief_in_each_part_of_the_rings(flown):
+    simulation, server, messages, features, belief = flown
+    for world, uav in ((0, 0), (5, 2)):
+        expected = [0.0] * (len(RINGS) + 1) * SECTORS
+        x, y = messages.position[world, uav].tolist()
+        for p, (east, north) in zip(belief[world].tolist(), server.grid.centres.tolist(), strict=True):
+            distance = math.hypot(east - x, north - y)
+            ring = sum(distance > radius * simulation.radius for radius in RINGS)
+            sector = round(math.atan2(east - x, north - y) / (2 * math.pi) * SECTORS) % SECTORS
+            expected[ring * SECTORS + sector] += p
+        found = features["belief_map"][world, uav]
+        torch.testing.assert_close(found, torch.tensor(expected), rtol=1e-4, atol=1e-5)
+        assert found.sum().item() == pytest.approx(1, abs=1e-4)
+
+
+def test_a_uavs_own_features_are_those_of_its_own_belief():
+    env = make_env(believing(own=True, delay=believing().delay), 3, extras=["message"])
+    td = env.rollout(5)[:, -1]["next"]
+    server = env.server
+    messages, steps = server.messages(td["agents", "message"]), torch.full((3,), 5)
+    for uav in range(env.uav_env.n_agents):
+        features = server.features(messages, steps, ALL, belief=td["agents", "belief"][:, uav])
+        own = torch.cat([features[name][:, uav] for name in ALL], -1)
+        torch.testing.assert_close(td["agents", "observation"][:, uav, 1:], own)
+
+
+def test_the_columns_with_a_value_for_each_action_are_those_of_the_gain():
+    env = make_env(believing(), 2, extras=["message"])
+    columns = env.uav_env.action_columns
+    td = env.reset()
+    messages = env.server.messages(td["agents", "message"])
+    gain = env.server.features(messages, torch.zeros(2, dtype=torch.long), ["belief_gain"])["belief_gain"]
+    torch.testing.assert_close(td["agents", "observation"][..., columns], gain)
+    assert make_env(everything(), 2).uav_env.action_columns is None
+
+
+def certain(cache):
+    return cache.belief.amax(-1, keepdim=True).expand_as(cache.messages.time)
+
+
+surest = feature("belief")(certain)
+thief = feature("global")(certain)
+
+
+def test_a_feature_of_ones_own_may_read_the_belief():
+    observation = ObservationConfig(belief=[f"{__name__}:surest"])
+    env = make_env(square(observation=observation, source=walking()), 2, extras=["message"])
+    td = env.rollout(3)[:, -1]["next"]
+    torch.testing.assert_close(
+        td["agents", "observation"][..., -1], td["belief"].amax(-1, keepdim=True).expand(2, 3)
+    )
+
+
+def test_a_feature_that_does_not_declare_the_belief_cannot_read_it():
+    observation = ObservationConfig(global_features=[f"{__name__}:thief"])
+    with pytest.raises(InputError, match='only a feature of scope "belief" may read it'):
+        make_env(square(observation=observation), 2)
+
+
+def test_beliefs_that_nothing_computes_are_refused():
+    observation = ObservationConfig(belief=["belief_gain"])
+    with pytest.raises(InputError, match=r"observation.belief: .* needs discrete actions"):
+        square(observation=observation, actions=ActionConfig(kind="continuous"))
+    with pytest.raises(InputError, match=r"observation.belief: .* damian.make_env"):
+        UavEnv(square(observation=observation), 2)
+    with pytest.raises(InputError, match=r"observation.belief: spotted is not one of belief_gain"):
+        ObservationConfig(belief=["spotted"])
+    with pytest.raises(InputError, match=r"observation.belief_cell: -1"):
+        ObservationConfig(belief_cell=-1.0)

@@ -1,0 +1,126 @@
+"""The transform ``Belief`` in an environment, and back-updated beliefs, against the slow twin."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from belief_twin import belief
+from delayed_envs import PAPER
+from helpers import square, walking
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+from torchrl.envs import Compose, StepCounter, TransformedEnv
+
+from damian import keys
+from damian.delays.config import DelayConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.recompute import server_recompute
+from damian.server.belief import report_rows
+from damian.server.features import ObservationConfig
+from damian.world.motion import MotionConfig
+
+LONGEST = 7
+
+
+def tracking(law: object = PAPER, own: bool = False, **changed) -> ScenarioConfig:
+    """A moving, intermittent source in a small square, with a coarse grid, which the slow twin can bear."""
+    return square(
+        source=walking(emission="per_step", emission_probability=0.6, position=[100.0, 100.0]),
+        observation=ObservationConfig(belief=["belief_gain"], belief_cell=50.0, own=own),
+        delay=DelayConfig(obs=law, loss=0.1 if law else 0.0),
+        **changed,
+    )
+
+
+def rollout(env: DelayedEnv, steps: int = 14) -> TensorDictBase:
+    """Steps [B, T] over the ends of several episodes."""
+    return env.rollout(steps, break_when_any_done=False)
+
+
+def episodes(data: TensorDictBase) -> list[tuple[int, int]]:
+    """First and last step of each episode of one world [T]."""
+    ends = data["next", "done"].flatten().nonzero().flatten().tolist()
+    begins = [0, *(end + 1 for end in ends)]
+    return [(a, b) for a, b in zip(begins, [*ends, len(data) - 1], strict=False) if a <= b]
+
+
+def expected(
+    env: DelayedEnv, data: TensorDictBase, begin: int, end: int, now: int, viewer: int | None = None
+):
+    """The slow twin's belief after step ``end`` of an episode that begins at ``begin``, of one world [T]."""
+    grid, server = env.server.grid, env.server
+    assert grid is not None
+    first = server.messages(data[keys.MESSAGE][begin])
+    sent = server.messages(data["next", *keys.MESSAGE])
+    flag = data["next", *keys.MESSAGE_SENT]
+    rows = report_rows(grid, sent, flag)
+    delay = data.get(("next", *keys.DELAY), torch.where(flag, 0, -1).unsqueeze(-1)).squeeze(-1)
+    steps = [(rows[t].tolist(), delay[t].tolist()) for t in range(begin, end + 1)]
+    first_rows = report_rows(grid, first, torch.ones_like(flag[0])).tolist()
+    return torch.tensor(belief(grid, 0, first_rows, steps, now - begin + 1, viewer))
+
+
+def check(actual: Tensor, wanted: Tensor) -> None:
+    torch.testing.assert_close(actual, wanted, rtol=2e-3, atol=1e-5)
+
+
+SCENARIOS = {
+    "no delay": tracking(0),
+    "late": tracking(),
+    "late, each UAV": tracking(own=True),
+    "in flight": tracking(motion=MotionConfig(kind="polynomial"), own=True),
+    "arrival": replace(tracking(), delay=DelayConfig(obs=PAPER, order="arrival")),
+}
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
+def test_a_belief_knows_what_has_arrived_and_nothing_else(scenario):
+    env = make_env(scenario, 2, extras=["message"])
+    data = rollout(env)
+    for world in data:
+        for begin, last in episodes(world):
+            check(world[keys.BELIEF][begin], expected(env, world, begin, begin - 1, begin))
+            for end in (begin, (begin + last) // 2, last):
+                after = world["next"][end]
+                check(after[keys.BELIEF], expected(env, world, begin, end, end))
+                for uav in range(3 * scenario.observation.own):
+                    check(after[keys.OWN_BELIEF][uav], expected(env, world, begin, end, end, uav))
+
+
+def test_without_the_extra_message_a_belief_is_no_output_but_the_observations_are_the_same():
+    one, other = make_env(tracking(own=True), 2), make_env(tracking(own=True), 2, extras=["message"])
+    torch.manual_seed(0)
+    data = rollout(other)
+    actions = iter(data["agents", "action"].unbind(1))
+    bare = one.rollout(14, lambda td: td.set(keys.ACTION, next(actions)), break_when_any_done=False)
+    torch.testing.assert_close(bare["next", *keys.OBSERVATION], data["next", *keys.OBSERVATION])
+    assert not {"belief", "received", "delay", "message"} & {str(key[-1]) for key in bare.keys(True, True)}
+
+
+@pytest.mark.parametrize("batch", [4, 9])
+def test_back_updated_beliefs_know_what_has_arrived_since(batch):
+    env = make_env(tracking(), 2, extras=["message"])
+    counted = TransformedEnv(env, Compose(StepCounter()))
+    data = counted.rollout(5 * batch, break_when_any_done=False)
+    recompute = server_recompute(env.server)
+    storage = BackupdateStorage(1000, recompute, LONGEST, env=counted)
+    buffer = ReplayBuffer(storage=storage, batch_size=1)
+    corrected = 0
+    for part in data.split(batch, 1):
+        buffer.extend(part)
+    stored = storage[storage.latest(data.shape[1])].transpose(0, 1)
+    for world, raw in zip(stored, data, strict=True):
+        for begin, last in episodes(raw):
+            for end in range(begin, last + 1):
+                # All that had been generated when the storage looked at the step last had arrived by then.
+                now = len(raw) - 1
+                wanted = expected(env, raw, begin, end, now)
+                check(world["next"][keys.BELIEF][end], wanted)
+                corrected += not torch.allclose(raw["next"][keys.BELIEF][end], wanted, atol=1e-3)
+                if end < last:
+                    check(world[keys.BELIEF][end + 1], wanted)
+    assert corrected > 3
