@@ -20,7 +20,7 @@ def belief(
     """
     prior = grid.prior[region].tolist()
     cells = range(len(prior))
-    probable = _weighed(grid, prior, first)
+    probable, before = _weighed(grid, prior, first), first
     for sent_at, (rows, delays) in enumerate(steps, 1):
         moved = [0.0] * len(prior)
         for a in cells:
@@ -31,11 +31,14 @@ def belief(
             for b in cells:
                 moved[b] += probable[a] * inside[b] / sum(inside) if probable[a] else 0.0
         known = [
-            row
+            row if uav == viewer or (delay >= 0 and sent_at + delay <= now) else grid.no_report
             for uav, (row, delay) in enumerate(zip(rows, delays, strict=True))
-            if uav == viewer or (delay >= 0 and sent_at + delay <= now)
         ]
-        probable = _weighed(grid, moved, known)
+        again = [
+            row + grid.no_report // 2 if row == earlier != grid.no_report else row
+            for row, earlier in zip(known, before, strict=True)
+        ]
+        probable, before = _weighed(grid, moved, again), known
     return probable
 
 

@@ -17,7 +17,9 @@ from damian import keys
 from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
+from damian.server.belief import detection_chance
 from damian.world.messages import Messages
 
 BLUR_M = 5.0
@@ -30,6 +32,8 @@ _FLIGHT_COST = 1e-6
 """Cost of a flight [weight per metre]: it only decides between equally good places, for the nearest."""
 _LEAST_GAIN = 1e-3
 """If no choice gains more weight than this, all weight lies out of reach."""
+PROBABLE = 0.2
+"""If a UAV detects the source with this probability somewhere in the next step, it leaves its own ground."""
 MAX_PAIRS = 400_000_000
 """Most pairs of landing points: the script weighs each of them against every other one of its region."""
 
@@ -47,10 +51,18 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
     checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
+    if keys.BELIEF in available and seeks_source(env.uav_env.scenario):
+        return searching_policy(env)
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
     arguments = {"message": message, "age": keys.AGE, "mask": keys.ACTION_MASK}
     in_keys: dict[str, NestedKey] = {name: key for name, key in arguments.items() if key in available}
     return TensorDictModule(Greedy(env.uav_env), in_keys, [keys.ACTION])
+
+
+def seeks_source(scenario: ScenarioConfig) -> bool:
+    """Whether anything is won by finding the source."""
+    terms = {*scenario.reward.terms} - {"coverage", "battery", "mean_distance"}
+    return bool(terms) or scenario.episode.success_share is not None
 
 
 class Greedy:
@@ -58,13 +70,13 @@ class Greedy:
 
     def __init__(self, worlds: UavEnv) -> None:
         scenario, simulation = worlds.scenario, worlds.simulation
-        source, terms = scenario.source, {*scenario.reward.terms} - {"coverage", "battery", "mean_distance"}
-        self.unpack = worlds.server.messages
+        source = scenario.source
+        self.unpack, self.grid = worlds.server.messages, worlds.server.grid
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
         self.emits = 1.0 if source.emission == "constant" else source.emission_probability
-        self.seeks = bool(terms) or scenario.episode.success_share is not None
+        self.seeks = seeks_source(scenario)
         self.real = simulation.airspace.points[..., 0].isfinite()
         self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
         near = _distances(self.points, self.points) <= self.radius
@@ -88,6 +100,18 @@ class Greedy:
             likely, recent = self.believe(held, ground, time.amax(-1, keepdim=True))
             weight = torch.where(recent, likely, weight * likely)
         gain = weight @ (self.near if len(self.near) == 1 else self.near[region])
+        return self.choose(held, gain, region, mask)
+
+    def choose(self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None) -> Tensor:
+        """Actions that lead to the landing points of most gain, [B, N] or, if continuous, [B, N, 2].
+
+        Args:
+            held: messages [B, N], whose targets are where the UAVs begin.
+            gain: what is won on each landing point, [B, N, L].
+            region: index of the region, [B].
+            mask: legal discrete actions, [B, N, A]; all if not given.
+        """
+        ground = self.points[region]
         gain = gain.where(self.real[region].unsqueeze(1), -torch.inf)
         flown = _distances(held.target, ground)
         goal = (gain - _FLIGHT_COST * flown).argmax(-1)
@@ -196,3 +220,59 @@ def _places_at(ground: Tensor, index: Tensor) -> Tensor:
 def _distances(places: Tensor, others: Tensor) -> Tensor:
     """Distances [*, P, Q] between places [*, P, 2] and others [*, Q, 2], exact also for small distances."""
     return torch.cdist(places, others, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def searching_policy(env: DelayedEnv) -> TensorDictModule:
+    """Build the scripted policy that reads the belief, that of each UAV where the environment outputs it."""
+    available = env.observation_spec.keys(True, True)
+    held = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
+    arguments = {"message": held, "belief": keys.BELIEF, "mask": keys.ACTION_MASK}
+    arguments |= (
+        {"own_message": keys.MESSAGE, "own_belief": keys.OWN_BELIEF} if keys.OWN_BELIEF in available else {}
+    )
+    in_keys: dict[str, NestedKey] = {name: key for name, key in arguments.items() if key in available}
+    return TensorDictModule(Searcher(env.uav_env), in_keys, [keys.ACTION])
+
+
+class Searcher(Greedy):
+    """Function from the belief to actions: each UAV flies where it most probably detects the source next.
+
+    Unless that is probable enough somewhere, it searches its own ground: the landing points nearer to it than
+    to any other UAV, as far as it knows.
+    """
+
+    def __call__(  # type: ignore[override]
+        self,
+        message: Tensor,
+        belief: Tensor,
+        own_message: Tensor | None = None,
+        own_belief: Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> Tensor:
+        """Choose actions, [B, N] or, if continuous, [B, N, 2].
+
+        Args:
+            message: packed messages that the server holds, [B, N, M].
+            belief: that of the server, [B, K].
+            own_message: packed messages that the UAVs have sent last, if each knows its own, [B, N, M].
+            own_belief: that of each UAV, [B, N, K].
+            mask: legal discrete actions, [B, N, A]; all if not given.
+        """
+        known = self.unpack(message)
+        own = known if own_message is None else self.unpack(own_message)
+        region = known.trail[:, 0, 0] // self.points.shape[1]
+        belief = belief.unsqueeze(1) if own_belief is None else own_belief
+        assert self.grid is not None
+        regions = region.unsqueeze(1).expand(belief.shape[:2])
+        chance = detection_chance(self.grid, belief, regions, self.points.shape[1])
+        ground = self.points[region]
+        near = _distances(own.target, ground) <= self.from_others(known, ground)
+        probable = chance.amax(-1, keepdim=True) >= PROBABLE
+        return self.choose(own, torch.where(probable | near, chance, 0.0), region, mask)
+
+    def from_others(self, known: Messages, ground: Tensor) -> Tensor:
+        """Distance from the nearest other UAV to each landing point [m], [B, N, L]; infinite for one UAV."""
+        distance = _distances(known.target, ground).unsqueeze(1)
+        n = distance.shape[2]
+        itself = torch.eye(n, dtype=torch.bool, device=distance.device).unsqueeze(-1)
+        return distance.masked_fill(itself, torch.inf).amin(2)

@@ -7,7 +7,7 @@ from torch import Tensor
 from damian import keys
 from damian.keys import next_key
 from damian.replay.step_keys import Recompute
-from damian.server.belief import Evidence, evidence, predict, report_rows, weigh
+from damian.server.belief import Evidence, evidence, predict, repeated, report_rows, weigh
 from damian.server.server import Server
 
 
@@ -57,8 +57,8 @@ def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
 
     Args:
         server: server node of the environment.
-        steps: stored steps [T, B], the last of which is the latest one. The belief before the first of them
-            must be final.
+        steps: stored steps [T, B], the last of which is the latest one. The belief after the first of them
+            must be final, unless its episode begins with it.
 
     Returns:
         Probability that the source is in each cell of ``server.grid``, [T, B, K].
@@ -68,11 +68,17 @@ def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     delay = steps[next_key(keys.DELAY)].squeeze(-1)
     step = torch.arange(len(delay), device=delay.device).view(-1, 1, 1)
     arrived = (delay >= 0) & (step + delay < len(delay))
-    found, region = evidence(grid, report_rows(grid, messages, arrived)), server.region_of(messages)
-    begins, before = steps[keys.STEP_COUNT] == 0, steps[keys.BELIEF]
+    begins = steps[keys.STEP_COUNT] == 0
+    before, after = steps[keys.BELIEF], steps[next_key(keys.BELIEF)]
+    rows, first = report_rows(grid, messages, arrived), server.messages(steps[keys.MESSAGE])
+    first = report_rows(grid, first, torch.ones_like(first.spotted))
+    previous = torch.where(begins, first, rows.roll(1, 0))
+    found, region = evidence(grid, repeated(grid, rows, previous)), server.region_of(messages)
     belief, corrected = before[0], []
     for i in range(len(delay)):  # each belief follows from the one before
         belief = torch.where(begins[i], before[i], belief)
         belief = weigh(grid, predict(grid, belief, region[i]), Evidence(found.match[i], found.silent[i]))
+        if i == 0:  # where its episode began earlier, what had been reported then is not known
+            belief = torch.where(begins[0], belief, after[0])
         corrected.append(belief)
     return torch.stack(corrected)

@@ -20,6 +20,18 @@ _LEAST = 1e-20
 """Added to every likelihood, so that reports which no cell makes possible change nothing."""
 
 
+def repeated(grid: SourceGrid, rows: Tensor, before: Tensor) -> Tensor:
+    """The rows, with those that are as in the step before marked as repeated, [*, N].
+
+    Args:
+        grid: cells and tables.
+        rows: rows of ``SourceGrid.log_reports``, [*, N].
+        before: the rows of the same UAVs one step before, [*, N].
+    """
+    same = (rows == before) & (rows != grid.no_report)
+    return torch.where(same, rows + grid.no_report // 2, rows)
+
+
 class Evidence(NamedTuple):
     """What messages of one step say about where the source was at that step."""
 

@@ -12,7 +12,15 @@ from torch import Tensor
 
 from damian.common import devices
 from damian.common.tensors import expand_mask, gather_rows
-from damian.server.belief import Evidence, evidence, first_belief, predict, report_rows, weigh
+from damian.server.belief import (
+    Evidence,
+    evidence,
+    first_belief,
+    predict,
+    repeated,
+    report_rows,
+    weigh,
+)
 from damian.server.source_grid import SourceGrid
 from damian.world.messages import Messages
 
@@ -115,6 +123,8 @@ def _begin(
     new = first_belief(grid, known, region.index_select(0, chosen))
     _write(belief, at, new.unsqueeze(1).expand(-1, n_viewers, -1), mask, chosen)
     report.masked_fill_(mask.unsqueeze(-1), grid.no_report)  # nothing is in transit
+    _write(report, at, known, mask, chosen)
+    _write(delay, at, torch.zeros_like(known), mask, chosen)
     return _read(belief, at)
 
 
@@ -151,12 +161,11 @@ def _advance(
     at = (latest - lags) % n_slots * n_worlds + torch.arange(n_worlds, device=slot.device)  # [S, B]
     _write(report, at[0], sent, stepped)
     _write(delay, at[0], sent_delay, stepped)
-    for held in (match, silent):
-        _write(held, at[0], torch.ones_like(held[0]), stepped)
-    arrives = _arriving(grid, window, at[:-1]) & stepped.view(-1, 1, 1)
-    changed = arrives.flatten(2).any(-1)
-    _learn(grid, window, at[:-1], arrives, changed)
+    rows, arrives = _known(grid, window, at)
+    changed = arrives.flatten(2).any(-1) & stepped
+    changed[:-1] |= changed[1:].clone()  # what is known of a step tells whether the next report is repeated
     changed[0] = stepped
+    _learn(grid, window, at[:-1], rows, changed)
     stale = torch.zeros_like(stepped)  # worlds whose beliefs change from the step with this lag on
     for lag in range(_oldest(changed), -1, -1):
         stale = stale | changed[lag]
@@ -169,42 +178,44 @@ def _(*arguments):
     return torch.empty_like(arguments[12]), arguments[7].new_empty(arguments[7].shape[1:])
 
 
-def _arriving(grid: SourceGrid, window: Window, at: Tensor) -> Tensor:
-    """Which reports become known in this step, by the number of steps since they were sent, [L, B, V, N].
+def _known(grid: SourceGrid, window: Window, at: Tensor) -> tuple[Tensor, Tensor]:
+    """The known reports of each step, and which of them have become known in this step.
 
     Args:
         grid: cells and tables.
         window: beliefs of the latest steps.
-        at: row of each step in the flattened ring, [L, B], the latest step first.
+        at: row of each step in the flattened ring, [S, B], the latest step first.
+
+    Returns:
+        Rows of ``SourceGrid.log_reports`` and a mask, both [S - 1, B, V, N].
     """
     report, delay = (gather_rows(held.flatten(0, 1), at) for held in (window.report, window.delay))
     lag = torch.arange(len(at), device=at.device).view(-1, 1, 1)
-    tells = report != grid.no_report
-    arrives = (tells & (delay == lag)).unsqueeze(2)
+    known, arrives = ((delay >= 0) & (delay <= lag)).unsqueeze(2), (delay == lag).unsqueeze(2)
     n_viewers, n_agents = window.belief.shape[2], report.shape[-1]
-    if n_viewers == 1:
-        return arrives
-    own = torch.eye(n_viewers, n_agents + 1, dtype=torch.bool, device=at.device)[:, 1:]
-    return torch.where(own, (tells & (lag == 0)).unsqueeze(2), arrives)
+    if n_viewers > 1:
+        own = torch.eye(n_viewers, n_agents + 1, dtype=torch.bool, device=at.device)[:, 1:]
+        known, arrives = known | own, torch.where(own, (lag == 0).unsqueeze(2), arrives)
+    rows = torch.where(known, report.unsqueeze(2), grid.no_report)
+    arrives = arrives & (report != grid.no_report).unsqueeze(2)
+    return repeated(grid, rows[:-1], rows[1:]), arrives[:-1]
 
 
-def _learn(grid: SourceGrid, window: Window, at: Tensor, arrives: Tensor, changed: Tensor) -> None:
-    """Note what the arriving messages say of the steps in which they were sent, in place.
+def _learn(grid: SourceGrid, window: Window, at: Tensor, rows: Tensor, changed: Tensor) -> None:
+    """Note what the known messages say of the steps in which they were sent, in place.
 
     Args:
         grid: cells and tables.
         window: beliefs of the latest steps.
         at: row of each step in the flattened ring, [L, B].
-        arrives: which of its messages become known, [L, B, V, N].
-        changed: in which steps of which worlds any does, [L, B] bool.
+        rows: known reports of these steps, [L, B, V, N].
+        changed: for which steps of which worlds they have changed, [L, B] bool.
     """
     at, worlds = at.flatten(), changed.flatten()
     chosen = _chosen(worlds)
-    rows = at.index_select(0, chosen)
-    known = arrives.flatten(0, 1).index_select(0, chosen)
-    found = evidence(grid, torch.where(known, _read(window.report, rows).unsqueeze(1), grid.no_report))
+    found = evidence(grid, rows.flatten(0, 1).index_select(0, chosen))
     for held, new in zip((window.match, window.silent), found, strict=True):
-        _write(held, at, new * _read(held, rows), worlds, chosen)
+        _write(held, at, new, worlds, chosen)
 
 
 def _oldest(changed: Tensor) -> int:

@@ -51,9 +51,9 @@ class SourceGrid(NamedTuple):
     detects: Tensor
     """Probability that a UAV on a landing point detects a source that emits in a cell, [R*L, K]."""
     log_reports: Tensor
-    """Log-probability of what a UAV on a landing point reports if the source emits in a cell, [2*R*L + 1, K]:
-    for the landing point of flat id p, row 2p that it detects nothing, and row 2p + 1 that it detects the
-    source. The last row, of zeros, stands for no report."""
+    """Log-probability of what a UAV on a landing point reports if the source emits in a cell,
+    [4*R*L + 1, K]. For the landing point of flat id p, row 2p: it detects nothing; row 2p + 1: it detects the
+    source; 2*R*L further: the same, and so it did in the step before. The last row, of zeros: no report."""
     emits: float
     """Probability that the source emits in a step."""
 
@@ -89,7 +89,7 @@ def build_source_grid(
     edge = cell or max(CELL * radius, math.sqrt(max(p.area for p in polygons) / MOST_CELLS))
     area, n_points = max(polygon.area for polygon in polygons), airspace.points.shape[:2].numel()
     n_cells = math.ceil(area / edge**2)  # at least
-    size = 4 * n_cells * (3 * n_points + n_cells + 4 * len(polygons))
+    size = 4 * n_cells * (5 * n_points + n_cells + 4 * len(polygons))
     checks.fits("observation.belief_cell", f"{edge:g} m", size, "take larger cells")
     columns = _columns(polygons, edge)
     centres = torch.as_tensor(columns * edge, dtype=torch.float32)
@@ -107,9 +107,8 @@ def build_source_grid(
         for each in zip(polygons, airspace.points, strict=True)
     ]
     detects = DOUBT + (1 - 2 * DOUBT) * torch.cat(shares)
-    reports = torch.stack([1 - detects, detects], 1).flatten(0, 1)
-    log_reports = torch.cat([reports.log(), torch.zeros(1, len(columns))])
     emits = 1.0 if source.emission == "constant" else source.emission_probability
+    log_reports = _log_reports(detects, emits, _renewed(centres, moves, edge))
     return SourceGrid(centres, prior, moves, staying, detects, log_reports, emits)
 
 
@@ -167,6 +166,35 @@ def _moves(columns: np.ndarray, displacement: np.ndarray) -> Tensor:
     weight = np.mean([np.rot90(each, turns) for each in (weight, weight.T) for turns in range(4)], 0)
     offset = columns[None].astype(int) - columns[:, None].astype(int) + reach
     return torch.as_tensor(weight[offset[..., 0], offset[..., 1]], dtype=torch.float32)
+
+
+def _renewed(centres: Tensor, moves: Tensor | None, edge: float) -> float:
+    """How far the source moves in a step on average, in cells, at most 1; 0 if it does not move."""
+    if moves is None:
+        return 0.0
+    mean = (moves * torch.cdist(centres, centres)).sum() / moves.sum()
+    return min(float(mean) / edge, 1.0)
+
+
+def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
+    """The table ``SourceGrid.log_reports``.
+
+    A cell that a footprint covers in part would be ruled out by the same silence again and again, although a
+    source that stays may be in its other part. So a repeated report counts only as far as the source may have
+    moved since: with probability ``renewed`` it is anywhere in its cell, else it is where it was.
+
+    Args:
+        detects: probability of a detection if the source emits, [P, K].
+        emits: probability that it emits.
+        renewed: share of a cell by which it moves in a step.
+    """
+    silent = 1 - detects
+    again = renewed * silent + (1 - renewed) * silent / (1 - emits * detects)
+    fresh, repeated = (
+        torch.stack(each, 1).flatten(0, 1)
+        for each in ((silent, detects), (again, renewed * detects + 1 - renewed))
+    )
+    return torch.cat([fresh, repeated, torch.ones_like(fresh[:1])]).log()
 
 
 def _detected_shares(

@@ -55,7 +55,7 @@ class Flight:
 
     def rows(self) -> Tensor:
         """Reports from landing points of the world's own region; some UAVs send none."""
-        per_region = (len(self.grid.log_reports) - 1) // 2 // len(self.grid.prior)
+        per_region = (len(self.grid.log_reports) - 1) // 4 // len(self.grid.prior)
         shape = (len(self.region), self.n_agents)
         point = self.draw(5, *shape) + self.region.unsqueeze(-1) * per_region
         row = 2 * point + (self.draw(3, *shape) == 0)
@@ -142,7 +142,7 @@ def test_a_message_changes_nothing_before_it_arrives():
 def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Tensor]:
     """Beliefs, and whether the source is in the cell, where all happens as the grid assumes."""
     torch.manual_seed(0)
-    n_points, everyone = (len(grid.log_reports) - 1) // 2, torch.ones(n_worlds, dtype=torch.bool)
+    n_points, everyone = (len(grid.log_reports) - 1) // 4, torch.ones(n_worlds, dtype=torch.bool)
     region = torch.zeros(n_worlds, dtype=torch.long)
     window = empty_window(grid, LONGEST, n_worlds, 3, own=False)
 
@@ -187,7 +187,7 @@ def test_of_the_times_when_it_says_so_often_the_source_is_there_so_often(name):
 @every_grid
 def test_the_chance_of_a_detection_equals_the_slow_twins(grid):
     n_regions, n_cells = grid.prior.shape
-    n_points = (len(grid.log_reports) - 1) // 2 // n_regions
+    n_points = (len(grid.log_reports) - 1) // 4 // n_regions
     region = torch.arange(n_regions)
     beliefs = torch.rand(n_regions, n_cells) * (grid.prior > 0)
     beliefs = beliefs / beliefs.sum(-1, keepdim=True)
@@ -203,7 +203,8 @@ def test_a_grid_has_probabilities(grid):
     torch.testing.assert_close(grid.prior.sum(-1), torch.ones(len(grid.prior)))
     assert grid.detects.min() > 0
     assert grid.detects.max() < 1
-    silent, detected = grid.log_reports[0:-1:2].exp(), grid.log_reports[1:-1:2].exp()
+    n = 2 * len(grid.detects)
+    silent, detected = grid.log_reports[0:n:2].exp(), grid.log_reports[1:n:2].exp()
     torch.testing.assert_close(detected, grid.detects)
     torch.testing.assert_close(silent + detected, torch.ones_like(silent))
     assert (grid.log_reports[grid.no_report] == 0).all()
