@@ -19,7 +19,7 @@ from damian.common.tensors import gather_rows
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.server.belief import detection_chance
+from damian.server.belief import chance_of_staying, detection_chance, predict, report_rows
 from damian.world.messages import Messages
 
 BLUR_M = 5.0
@@ -32,8 +32,11 @@ _FLIGHT_COST = 1e-6
 """Cost of a flight [weight per metre]: it only decides between equally good places, for the nearest."""
 _LEAST_GAIN = 1e-3
 """If no choice gains more weight than this, all weight lies out of reach."""
-PROBABLE = 0.2
+PROBABLE = 0.1
 """If a UAV detects the source with this probability somewhere in the next step, it leaves its own ground."""
+WORTH = 0.3
+"""A UAV does not fly where it detects the source with less than this share of the highest probability, but as
+near to the best landing point as it can."""
 MAX_PAIRS = 400_000_000
 """Most pairs of landing points: the script weighs each of them against every other one of its region."""
 
@@ -264,11 +267,20 @@ class Searcher(Greedy):
         belief = belief.unsqueeze(1) if own_belief is None else own_belief
         assert self.grid is not None
         regions = region.unsqueeze(1).expand(belief.shape[:2])
-        chance = detection_chance(self.grid, belief, regions, self.points.shape[1])
-        ground = self.points[region]
+        predicted, ground = predict(self.grid, belief, regions), self.points[region]
+        chance = detection_chance(self.grid, predicted, regions).expand(-1, known.time.shape[1], -1)
+        here = own.trail[..., :1] % self.points.shape[1]
+        rows = report_rows(self.grid, own, ~own.in_flight)
+        if own_belief is None:
+            stays = chance_of_staying(self.grid, predicted.squeeze(1), rows)
+        else:
+            stays = chance_of_staying(self.grid, predicted, rows.unsqueeze(-1)).squeeze(-1)
+        chance = chance.scatter(-1, here, stays.unsqueeze(-1)).masked_fill(self.taken(known), 0.0)
         near = _distances(own.target, ground) <= self.from_others(known, ground)
         probable = chance.amax(-1, keepdim=True) >= PROBABLE
-        return self.choose(own, torch.where(probable | near, chance, 0.0), region, mask)
+        chance = torch.where(probable | near, chance, 0.0)
+        worth = chance >= WORTH * chance.amax(-1, keepdim=True)
+        return self.choose(own, torch.where(worth, chance, 0.0), region, mask)
 
     def from_others(self, known: Messages, ground: Tensor) -> Tensor:
         """Distance from the nearest other UAV to each landing point [m], [B, N, L]; infinite for one UAV."""
@@ -276,3 +288,11 @@ class Searcher(Greedy):
         n = distance.shape[2]
         itself = torch.eye(n, dtype=torch.bool, device=distance.device).unsqueeze(-1)
         return distance.masked_fill(itself, torch.inf).amin(2)
+
+    def taken(self, known: Messages) -> Tensor:
+        """Landing points on which another UAV stands, as far as it is known, [B, N, L] bool."""
+        point = known.trail[..., :1] % self.points.shape[1]
+        stands = torch.zeros(*point.shape[:2], self.points.shape[1], device=point.device).scatter(
+            -1, point, 1.0
+        )
+        return stands.sum(1, keepdim=True) > stands

@@ -107,17 +107,31 @@ def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
     return weigh(grid, gather_rows(grid.prior, region), evidence(grid, rows))
 
 
-def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor, n_points: int) -> Tensor:
-    """Probability of detecting the source from each landing point of the region in the next step, [*, L].
+def detection_chance(grid: SourceGrid, predicted: Tensor, region: Tensor) -> Tensor:
+    """Probability that a UAV which lands on a landing point of the region detects the source there, [*, L].
 
     Args:
         grid: cells and tables.
-        belief: probability of each cell now, [*, K].
+        predicted: probability of each cell at that time, [*, K].
         region: index of the region, [*].
-        n_points: largest number of landing points in a region, L.
     """
-    predicted = predict(grid, belief, region)
-    if len(grid.prior) == 1:
-        return grid.emits * (predicted @ grid.detects.T)
-    here = gather_rows(grid.detects.view(-1, n_points, belief.shape[-1]), region)
+    detects = grid.detects.view(len(grid.prior), -1, predicted.shape[-1])
+    if len(detects) == 1:
+        return grid.emits * (predicted @ detects[0].T)
+    here = gather_rows(detects, region)
     return grid.emits * (here @ predicted.unsqueeze(-1)).squeeze(-1)
+
+
+def chance_of_staying(grid: SourceGrid, predicted: Tensor, rows: Tensor) -> Tensor:
+    """Probability that a UAV which stays where it is detects the source in the next step, [*, N].
+
+    That is less than for a UAV which lands there, if it has just detected nothing.
+
+    Args:
+        grid: cells and tables.
+        predicted: probability of each cell at that time, [*, K].
+        rows: rows of ``SourceGrid.log_reports`` for what the UAVs report now, [*, N].
+    """
+    again = gather_rows(grid.log_reports, repeated(grid, rows, rows)).exp()
+    detects = torch.where((rows % 2 == 1).unsqueeze(-1), again, 1 - again)
+    return grid.emits * (detects @ predicted.unsqueeze(-1)).squeeze(-1)

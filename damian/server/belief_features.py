@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from damian.common.tensors import gather_rows
-from damian.server.belief import detection_chance
+from damian.server.belief import chance_of_staying, detection_chance, predict, report_rows
 from damian.server.feature_cache import FeatureCache
 from damian.server.features import FEATURES, feature
 
@@ -23,11 +23,16 @@ def _belief_gain(v: FeatureCache) -> Tensor:
 
     Actions begin at the landing point that the UAV has reached last, and are taken to be flown at once.
     """
-    chance = detection_chance(v.grid, v.belief, v.region, v.context.n_points)
     if v.context.goals is None:
         raise ValueError("belief_gain needs the landing points to which actions lead")
-    goal = gather_rows(v.context.goals, v.wanted(v.messages.trail[..., 0]))
-    return chance.unsqueeze(-2).expand(*goal.shape[:-1], -1).gather(-1, goal)
+    predicted, n_points = predict(v.grid, v.belief, v.region), v.context.n_points
+    chance = detection_chance(v.grid, predicted, v.region)
+    point = v.wanted(v.messages.trail[..., 0])
+    goal = gather_rows(v.context.goals, point)
+    gain = chance.unsqueeze(-2).expand(*goal.shape[:-1], -1).gather(-1, goal)
+    rows = v.wanted(report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted)))
+    stays = goal == (point % n_points).unsqueeze(-1)
+    return torch.where(stays, chance_of_staying(v.grid, predicted, rows).unsqueeze(-1), gain)
 
 
 @FEATURES.register("belief_moments")
