@@ -18,6 +18,7 @@ from torchrl.modules.distributions import NormalParamExtractor
 from damian import keys
 from damian.common import checks
 from damian.learners.recurrent import AgentGRU
+from damian.learners.reward_scale import NormalizedValue, check_stored_values
 
 COMPILE_OPTIONS = {
     "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
@@ -177,15 +178,25 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
 
 
 def make_critic(
-    env: EnvBase, config: ModelConfig, critic_key: NestedKey = keys.GLOBAL_OBSERVATION
+    env: EnvBase,
+    config: ModelConfig,
+    critic_key: NestedKey = keys.GLOBAL_OBSERVATION,
+    normalize: bool = False,
 ) -> TensorDictModule:
-    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1]."""
+    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1].
+
+    With ``normalize`` its network learns normalised values (``NormalizedValue``).
+    """
     n_agents, n_features = env.observation_spec[critic_key].shape[-2:]
     if config.shared_value:
         network: nn.Module = SharedValue(config.network(n_agents * n_features, 1, env.device))
     else:
         network = config.network(n_features, 1, env.device)
-    return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
+    if normalize:
+        network = NormalizedValue(network, env.device)
+    critic = TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
+    critic.register_load_state_dict_pre_hook(check_stored_values)
+    return critic
 
 
 class SharedValue(nn.Module):
