@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 import os
 import socket
 import time
@@ -24,6 +25,9 @@ EVENTS = "events.out.tfevents."
 
 class MetricsLog:
     """Writes named numbers to ``metrics.csv``, TensorBoard and other loggers; a resumed run appends to them.
+
+    All rows have the same columns: a number that a row lacks is nan, as where a run of an older damian, which
+    logged fewer of them, is resumed.
 
     Args:
         folder: the run folder.
@@ -50,7 +54,7 @@ class MetricsLog:
         self._path = folder / METRICS if to_csv else None
         self.rows = [row for row in read_metrics(folder) if row["frames"] <= frames]
         if self._path and self.rows:
-            write_atomically(self._path, "".join([_line(self.rows[0]), *map(_values, self.rows)]))
+            write_atomically(self._path, _table(self.rows))
         elif self._path:
             with writing(self._path):
                 self._path.unlink(missing_ok=True)
@@ -68,7 +72,13 @@ class MetricsLog:
                     logger.log_scalar(name, number, frames)
         if self._events:
             self._events.add(frames, numbers)
-        row = {_FIRST_COLUMN: float(frames), **numbers}
+        known = dict.fromkeys(self.rows[0], math.nan) if self.rows else {}
+        row = {**known, _FIRST_COLUMN: float(frames), **numbers}
+        if self.rows and len(row) > len(known):
+            columns = dict.fromkeys(row, math.nan)
+            self.rows[:] = [columns | older for older in self.rows]
+            if self._path:
+                write_atomically(self._path, _table(self.rows))
         self.rows.append(row)
         if self._path:
             with writing(self._path), self._path.open("a", newline="") as file:
@@ -158,6 +168,11 @@ def _line(cells: Sequence[object] | Mapping[str, float]) -> str:
     text = io.StringIO(newline="")
     csv.writer(text).writerow(list(cells))
     return text.getvalue()
+
+
+def _table(rows: Sequence[Mapping[str, float]]) -> str:
+    """Rows with the same columns, and the line of their names, as a CSV file."""
+    return "".join([_line(rows[0]), *map(_values, rows)])
 
 
 def _values(row: Mapping[str, float]) -> str:

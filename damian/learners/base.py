@@ -69,6 +69,8 @@ class LearningSetup(NamedTuple):
     """Key of the critic's observation."""
     compile: bool = False
     """Whether to compile the loss, so that updates are faster once it is compiled."""
+    frames: int = 300_000
+    """Environment steps of the run, over all worlds."""
 
     @property
     def settle_steps(self) -> int:

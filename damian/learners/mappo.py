@@ -20,10 +20,14 @@ from damian.common.compiling import compiled
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.networks import COMPILE_OPTIONS, make_actor, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
+from damian.learners.reward_scale import update_value_scale, value_scale
+from damian.learners.schedule import LinearSchedule
 from damian.replay.backupdate import BackupdateStorage
 
 LOSSES = ("loss_objective", "loss_entropy", "loss_critic")
 """Names of the terms of the loss (``mappo_losses``)."""
+NUMBERS = ("kl", "clip_fraction", "entropy")
+"""Names of the further numbers that ``mappo_losses`` returns."""
 LOSS_KEYS: list[NestedKey] = [
     keys.OBSERVATION,
     keys.ACTION_MASK,
@@ -48,6 +52,9 @@ class MappoConfig(LearnerConfig):
     """Clipping of the importance ratio."""
     entropy_coeff: float = 0.01
     """Weight of the entropy bonus."""
+    entropy_coeff_end: float | None = None
+    """If set, the weight of the entropy bonus goes linearly from ``entropy_coeff`` to this, which it reaches
+    after ``frames`` environment steps; a run that is resumed with more frames reaches it later."""
     critic_coeff: float = 0.5
     """Weight of the critic's loss."""
     max_grad_norm: float = 0.5
@@ -58,6 +65,10 @@ class MappoConfig(LearnerConfig):
     """Minibatches per pass."""
     normalize_advantage: bool = True
     """Whether to scale the advantages of a batch to mean 0 and standard deviation 1."""
+    normalize_value: bool = False
+    """Whether the critic learns values of mean 0 and standard deviation 1, by running statistics of its
+    targets, so that learning does not depend on the scale of the rewards. Advantages that
+    ``normalize_advantage`` does not scale are then divided by the same standard deviation."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,6 +77,8 @@ class MappoConfig(LearnerConfig):
         checks.in_range("learner.clip_epsilon", self.clip_epsilon, 0.0, 1.0)  # a ratio is not negative
         for name in ("entropy_coeff", "critic_coeff"):
             checks.in_range(f"learner.{name}", getattr(self, name), 0.0)
+        if self.entropy_coeff_end is not None:
+            checks.in_range("learner.entropy_coeff_end", self.entropy_coeff_end, 0.0)
         for name in ("epochs", "minibatches"):
             checks.in_range(f"learner.{name}", getattr(self, name), 1, checks.STEPS)
 
@@ -103,25 +116,36 @@ class Mappo:
     ) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = make_actor(env, setup.model)
-        self.critic = make_critic(env, setup.model, setup.critic_key)
+        self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(self.weights, lr=config.lr, fused=True)
+        last = config.entropy_coeff if config.entropy_coeff_end is None else config.entropy_coeff_end
+        self.entropy_coeff = LinearSchedule(config.entropy_coeff, last, setup.frames, env.device)
         # Compiling a recurrent actor, whose loop over time becomes one graph, takes many minutes.
         compiles = setup.compile and not setup.model.recurrent
         self.losses = compiled(self._losses, options=COMPILE_OPTIONS) if compiles else self._losses
 
     def components(self) -> dict[str, Any]:
-        """Networks and optimiser that a checkpoint stores."""
-        return {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
+        """What a checkpoint stores: networks, optimiser, and the entropy's weight if it changes."""
+        networks = {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
+        anneals = self.config.entropy_coeff_end is not None
+        return {**networks, "entropy_coeff": self.entropy_coeff} if anneals else networks
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make one update from a batch [B, T]; returns mean losses and the share of back-updated messages."""
+        """Make one update from a batch [B, T].
+
+        Returns:
+            what ``optimize`` returns, ``explained_variance`` of the critic before the update, and with a
+            replay buffer the share of ``backupdated`` messages.
+        """
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
-        losses = self.optimize(corrected)
+        numbers = self.optimize(corrected)
+        self.entropy_coeff.advance(batch.numel())
+        numbers["explained_variance"] = explained_variance(corrected).item()
         if self.buffer is None:
-            return losses
-        return {"backupdated": corrected[keys.BACKUPDATED].float().mean().item(), **losses}
+            return numbers
+        return {"backupdated": corrected[keys.BACKUPDATED].float().mean().item(), **numbers}
 
     @torch.no_grad()
     def backupdated_batch(self, batch: TensorDictBase) -> TensorDictBase:
@@ -142,20 +166,25 @@ class Mappo:
         return batch
 
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make ``epochs`` passes over a batch [B, T] with advantages; returns the mean losses.
+        """Make ``epochs`` passes over a batch [B, T] with advantages.
 
         Minibatches are drawn over steps; for a recurrent actor, over worlds with their whole sequences.
+
+        Returns:
+            means over all minibatches of ``LOSSES``, ``NUMBERS`` and the norm of the gradient before it is
+            scaled down, ``gradient_norm``.
         """
         terms = []
         for entries in self._minibatches(batch):
-            losses = self.losses(entries)
+            losses, numbers = self.losses(entries, self.entropy_coeff.value)
             self.optimizer.zero_grad()
             losses.sum().backward()
-            torch.nn.utils.clip_grad_norm_(self.weights, self.config.max_grad_norm)
+            norm = torch.nn.utils.clip_grad_norm_(self.weights, self.config.max_grad_norm)
             self.optimizer.step()
-            terms.append(losses.detach())
+            terms.append(torch.cat([losses.detach(), numbers, norm.view(1)]))
         # A number that is read at once would make the device wait at every minibatch.
-        return dict(zip(LOSSES, torch.stack(terms).double().mean(0).tolist(), strict=True))
+        names = (*LOSSES, *NUMBERS, "gradient_norm")
+        return dict(zip(names, torch.stack(terms).double().mean(0).tolist(), strict=True))
 
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
         """Entries that the loss reads, for each minibatch of each pass over a batch [B, T]."""
@@ -171,8 +200,8 @@ class Mappo:
             for i in range(n_minibatches):
                 yield {key: part[i] for key, part in parts.items()}
 
-    def _losses(self, entries: dict[NestedKey, Tensor]) -> Tensor:
-        return mappo_losses(entries, self.actor, self.critic, self.config)
+    def _losses(self, entries: dict[NestedKey, Tensor], entropy_coeff: Tensor) -> tuple[Tensor, Tensor]:
+        return mappo_losses(entries, self.actor, self.critic, self.config, entropy_coeff)
 
 
 def mappo_losses(
@@ -180,12 +209,15 @@ def mappo_losses(
     actor: ProbabilisticActor,
     critic: TensorDictModule,
     config: MappoConfig,
-) -> Tensor:
-    """Mean terms of the loss on steps [*], as named in ``LOSSES``, [3].
+    entropy_coeff: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names, [3].
 
-    They are the clipped objective of PPO and the entropy (Schulman et al. 2017), over decisions, and the
-    error of the critic, over all steps. The policy also outputs actions for UAVs in flight, but these have no
-    effect.
+    The terms of the loss are the clipped objective of PPO and the entropy (Schulman et al. 2017), over
+    decisions, and the error of the critic, over all steps. The policy also outputs actions for UAVs in
+    flight, but these have no effect. The numbers are means over decisions, without gradients: an estimate of
+    the Kullback-Leibler divergence from the policy that collected the steps (ratio - 1 - log ratio, which is
+    never negative), the share of importance ratios beyond the clipping, and the entropy [nats].
 
     Args:
         entries: what the networks read, and ``LOSS_KEYS``, by key. They are no TensorDict, so that a compiled
@@ -193,6 +225,7 @@ def mappo_losses(
         actor: the policy; if it is recurrent, steps are sequences [B, T].
         critic: its network writes ``("agents", "state_value")``.
         config: settings of the learner.
+        entropy_coeff: weight of the entropy bonus, [].
     """
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
@@ -200,15 +233,19 @@ def mappo_losses(
     ratio, advantage = log_ratio.exp(), entries[keys.ADVANTAGE].squeeze(-1)
     clipped = ratio.clamp(1 - config.clip_epsilon, 1 + config.clip_epsilon)
     objective = torch.minimum(ratio * advantage, clipped * advantage)
-    n_decisions = ready.sum().clamp(min=1)
-    error = smooth_l1_loss(critic(steps)[keys.STATE_VALUE], entries[keys.VALUE_TARGET])
-    return torch.stack(
-        [
-            -(objective * ready).sum() / n_decisions,
-            -config.entropy_coeff * (entropy * ready).sum() / n_decisions,
-            config.critic_coeff * error,
-        ]
-    )
+    n_decisions, scale = ready.sum().clamp(min=1), value_scale(critic)
+    mean_entropy = (entropy * ready).sum() / n_decisions
+    error = smooth_l1_loss(critic(steps)[keys.STATE_VALUE] / scale, entries[keys.VALUE_TARGET] / scale)
+    losses = [
+        -(objective * ready).sum() / n_decisions,
+        -entropy_coeff * mean_entropy,
+        config.critic_coeff * error,
+    ]
+    with torch.no_grad():
+        divergence = (ratio - 1 - log_ratio) * ready
+        beyond = ((ratio - 1).abs() > config.clip_epsilon) * ready
+        means = torch.stack([divergence.sum(), beyond.sum()]) / n_decisions
+    return torch.stack(losses), torch.cat([means, mean_entropy.detach().view(1)])
 
 
 def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
@@ -228,6 +265,8 @@ def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tens
 def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: MappoConfig) -> None:
     """Write values, advantages and value targets into a batch [B, T], in place.
 
+    A critic that normalises its values adds the targets to its running statistics.
+
     The return of a decision sums the rewards until the UAV's next decision, k steps later, whose value is
     discounted by gamma^k (a semi-Markov decision process; Sutton, Precup and Singh 1999). Values at the steps
     between two decisions are not used: there lambda of the generalised advantage estimate (Schulman et al.
@@ -245,11 +284,24 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     advantage, batch[keys.VALUE_TARGET] = generalized_advantage_estimate(
         gamma, lmbda, value, next_value, next_step[keys.REWARD], done, terminated, time_dim=-3
     )
+    update_value_scale(critic, batch[keys.VALUE_TARGET])
     ready = batch[keys.READY].unsqueeze(-1)
     if config.normalize_advantage:
         decisions = advantage[ready] if ready.any() else torch.zeros(1, device=advantage.device)
         advantage = (advantage - decisions.mean()) / decisions.std(correction=0).clamp(min=1e-6)
+    else:
+        advantage = advantage / value_scale(critic)
     batch[keys.ADVANTAGE] = torch.where(ready, advantage, 0.0)
+
+
+def explained_variance(batch: TensorDictBase) -> Tensor:
+    """Share of the variance of a batch's value targets that its values explain, []; nan if there is none.
+
+    It is 1 for a perfect critic, and 0 for one that is no better than a constant.
+    """
+    target = batch[keys.VALUE_TARGET].double()
+    variance, left = target.var(correction=0), (target - batch[keys.STATE_VALUE]).var(correction=0)
+    return torch.where(variance > 0, 1 - left / variance, torch.nan)
 
 
 def state_values(batch: TensorDictBase, critic: TensorDictModule) -> tuple[Tensor, Tensor]:

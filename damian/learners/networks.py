@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from tensordict import NestedKey
@@ -18,6 +18,7 @@ from torchrl.modules.distributions import NormalParamExtractor
 from damian import keys
 from damian.common import checks
 from damian.learners.recurrent import AgentGRU
+from damian.learners.reward_scale import NormalizedValue, check_stored_values
 
 COMPILE_OPTIONS = {
     "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
@@ -26,6 +27,9 @@ COMPILE_OPTIONS = {
 """Options of ``torch.compile`` for networks."""
 FIRST_WEIGHT = 8.0
 """Weight with which a skip connection begins."""
+POLICY_GAIN = 0.01
+"""Gain of the policy's output layer, if its initial weights are orthogonal."""
+Network = TypeVar("Network", bound=nn.Module)
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
@@ -48,10 +52,15 @@ class ModelConfig:
     """MAPPO's critic gives one value for all UAVs of a world, from the observations of all of them, instead
     of a value for each UAV. Updates are faster, but it learns less where each UAV has a reward of its own,
     and it ties the critic, not the policy, to the number of UAVs."""
+    init: str = "default"
+    """Initial weights: default (PyTorch's), or orthogonal: orthogonal matrices and biases of 0 (Saxe et al.
+    2014), with a gain of sqrt(2) in hidden layers (1 in a recurrent one), of 0.01 at the policy's output, so
+    that it begins close to chance, and of 1 at a critic's output."""
 
     def __post_init__(self) -> None:
         checks.one_of("model.activation", self.activation, _ACTIVATIONS)
         checks.one_of("model.rnn", self.rnn, ["none", "gru"])
+        checks.one_of("model.init", self.init, ["default", "orthogonal"])
         checks.require(
             not self.recurrent or bool(self.hidden),
             "model.hidden",
@@ -67,16 +76,20 @@ class ModelConfig:
         """Whether the actor has a recurrent layer."""
         return self.rnn != "none"
 
-    def network(self, n_in: int, n_out: int, device: torch.device | None) -> MLP:
-        """Make a multilayer perceptron from features [*, n_in] to outputs [*, n_out]."""
+    def network(self, n_in: int, n_out: int, device: torch.device | None, gain: float = 1.0) -> MLP:
+        """Make a multilayer perceptron from features [*, n_in] to outputs [*, n_out].
+
+        ``gain`` is that of the output layer; it counts for an orthogonal initialisation only.
+        """
         activation = _ACTIVATIONS[self.activation]
-        return MLP(n_in, n_out, num_cells=self.hidden, activation_class=activation, device=device)
+        network = MLP(n_in, n_out, num_cells=self.hidden, activation_class=activation, device=device)
+        return self.initialized(network, gain)
 
     def gru(self, n_in: int, device: torch.device | None) -> AgentGRU:
         """Make all hidden layers for features [*, n_in]; the last one is recurrent."""
         *widths, n_hidden = self.hidden
         if not widths:
-            return AgentGRU(nn.Identity(), n_in, n_hidden, device)
+            return self.initialized(AgentGRU(nn.Identity(), n_in, n_hidden, device), 1.0)
         *inner_widths, n_out = widths
         activation = _ACTIVATIONS[self.activation]
         encoder = MLP(
@@ -87,7 +100,19 @@ class ModelConfig:
             activate_last_layer=True,
             device=device,
         )
-        return AgentGRU(encoder, n_out, n_hidden, device)
+        return self.initialized(AgentGRU(encoder, n_out, n_hidden, device), 1.0)
+
+    def initialized(self, network: Network, gain: float) -> Network:
+        """Give a network its initial weights, as ``init`` says; ``gain`` is that of its last layer."""
+        if self.init == "orthogonal":
+            layers = [each for each in network.modules() if isinstance(each, nn.Linear | nn.GRUCell)]
+            for layer in layers:
+                for weights in layer.parameters():
+                    if weights.ndim == 1:
+                        nn.init.zeros_(weights)
+                    else:
+                        nn.init.orthogonal_(weights, gain if layer is layers[-1] else math.sqrt(2))
+        return network
 
 
 class LegalCategorical(Distribution):
@@ -179,8 +204,8 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
         return TensorDictModule(module, in_keys=[in_key], out_keys=list(out_keys))
 
     if not config.recurrent:
-        return head(config.network(n_features, n_out, env.device), keys.OBSERVATION)
-    linear = nn.Linear(config.hidden[-1], n_out, device=env.device)
+        return head(config.network(n_features, n_out, env.device, POLICY_GAIN), keys.OBSERVATION)
+    linear = config.initialized(nn.Linear(config.hidden[-1], n_out, device=env.device), POLICY_GAIN)
     gru = config.gru(n_features, env.device)
     return TensorDictSequential([gru, head(linear, keys.HIDDEN)])  # type: ignore[list-item]
 
@@ -202,7 +227,7 @@ class SkipConnection(nn.Module):
     """Logits that are the outputs of a network plus, times a learnt weight, a feature of each action.
 
     Args:
-        network: from its input to outputs [*, A], whose last layer begins near zero.
+        network: from its input to outputs [*, A], whose last layer begins with zeros.
         columns: of the observation, which hold the feature of each action.
     """
 
@@ -211,9 +236,8 @@ class SkipConnection(nn.Module):
         self.network, self.columns = network, columns
         self.weight = nn.Parameter(torch.tensor(FIRST_WEIGHT))
         last = [each for each in network.modules() if isinstance(each, nn.Linear)][-1]
-        with torch.no_grad():
-            last.weight *= 0.01
-            last.bias *= 0.01
+        for parameter in last.parameters():
+            nn.init.zeros_(parameter)
         self.to(last.weight.device)
 
     def forward(self, features: Tensor, observation: Tensor) -> Tensor:
@@ -222,15 +246,25 @@ class SkipConnection(nn.Module):
 
 
 def make_critic(
-    env: EnvBase, config: ModelConfig, critic_key: NestedKey = keys.GLOBAL_OBSERVATION
+    env: EnvBase,
+    config: ModelConfig,
+    critic_key: NestedKey = keys.GLOBAL_OBSERVATION,
+    normalize: bool = False,
 ) -> TensorDictModule:
-    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1]."""
+    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1].
+
+    With ``normalize`` its network learns normalised values (``NormalizedValue``).
+    """
     n_agents, n_features = env.observation_spec[critic_key].shape[-2:]
     if config.shared_value:
         network: nn.Module = SharedValue(config.network(n_agents * n_features, 1, env.device))
     else:
         network = config.network(n_features, 1, env.device)
-    return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
+    if normalize:
+        network = NormalizedValue(network, env.device)
+    critic = TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
+    critic.register_load_state_dict_pre_hook(check_stored_values)
+    return critic
 
 
 class SharedValue(nn.Module):

@@ -18,11 +18,16 @@ from damian.common import checks
 from damian.keys import next_key
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.networks import make_action_value, make_actor
+from damian.learners.reward_scale import ReturnScale
 from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
 
-LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha")
-"""Numbers that a round of updates logs, by their names in TorchRL's losses."""
+LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
+"""Terms of the loss, by their names in TorchRL's losses."""
+NUMBERS = (*LOSSES, "alpha", "entropy", "gradient_norm_actor", "gradient_norm_critic")
+"""Numbers that a round of updates logs; ``alpha`` is the temperature, ``entropy`` in nats."""
+N_CRITICS = 2
+"""Number of critics, of which the lower value counts."""
 
 
 @LEARNERS.register("sac")
@@ -55,6 +60,9 @@ class SacConfig(LearnerConfig):
     """Capacity of the replay buffer [environment steps over all worlds]."""
     warm_up: int = 5_000
     """Environment steps, over all worlds, before learning begins."""
+    normalize_reward: bool = False
+    """Whether to divide rewards by the running root mean square of the discounted returns, so that learning
+    does not depend on their scale. The temperature is then the weight of the entropy against such rewards."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -106,29 +114,40 @@ class Sac:
     def __init__(self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = make_actor(env, setup.model)
-        action_value = make_action_value(env, setup.model, setup.critic_key)
-        self.loss = sac_loss(self.actor, action_value, env, config)
+        critics = [make_action_value(env, setup.model, setup.critic_key) for _ in range(N_CRITICS)]
+        self.loss = sac_loss(self.actor, critics, env, config)
         # A checkpoint also holds the discount of its run, which must not replace this run's.
         self.loss.register_load_state_dict_post_hook(
             lambda loss, _: loss.make_value_estimator(gamma=config.gamma)
         )
-        networks = [weights for name, weights in self.loss.named_parameters() if name != "log_alpha"]
+        parameters = dict(self.loss.named_parameters())
+        networks = [weights for name, weights in parameters.items() if name != "log_alpha"]
+        self.actor_weights, self.critic_weights = (
+            [weights for name, weights in parameters.items() if name.startswith(network)]
+            for network in ("actor_network", "qvalue_network")
+        )
         temperature = {"params": [self.loss.log_alpha], "lr": config.alpha_lr}
         self.optimizer = torch.optim.Adam([{"params": networks}, temperature], lr=config.lr, fused=True)
         self.targets = SoftUpdate(self.loss, tau=config.tau)
         masked = keys.ACTION_MASK in self.actor.in_keys
         self.observed = ["observation", setup.critic_key[-1], *["action_mask"] * masked]
+        self.return_scale = None
+        if config.normalize_reward:
+            self.return_scale = ReturnScale(env.full_reward_spec[keys.REWARD].zero(), config.gamma)
 
     def components(self) -> dict[str, Any]:
-        """Networks and optimiser that a checkpoint stores, beside the replay buffer."""
-        return {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
+        """Networks, optimiser and statistics that a checkpoint stores, beside the replay buffer."""
+        networks = {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
+        return networks if self.return_scale is None else {**networks, "return_scale": self.return_scale}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Store a batch [B, T], and make a round of updates.
 
         Returns:
-            the mean losses; nan before learning begins.
+            the means of ``NUMBERS``; nan before learning begins.
         """
+        if self.return_scale is not None:
+            self.return_scale.update(batch)
         self.buffer.extend(batch.exclude(*_UNREAD))
         storage = cast(TimeStorage, self.buffer.storage)
         steps, order = storage.steps, storage.latest()
@@ -137,20 +156,26 @@ class Sac:
         done, terminated = (steps[next_key(key)][settled].squeeze(-1) for key in (keys.DONE, keys.TERMINATED))
         decisions = find_decisions(ready, ready_next, done, terminated, self.config.n_steps)
         if len(order) * batch.shape[0] < self.config.warm_up or not len(decisions.begin):
-            return dict.fromkeys(LOSSES, math.nan)
+            return dict.fromkeys(NUMBERS, math.nan)
         rounds = []
         for _ in range(self.config.updates):
             sample = decisions.sample(self.config.batch_size)
-            losses = self.update(transitions(steps, order, sample, self.config.gamma, self.observed))
-            rounds.append(torch.stack([losses[name] for name in LOSSES]))
+            drawn = transitions(steps, order, sample, self.config.gamma, self.observed)
+            if self.return_scale is not None:
+                drawn[next_key(keys.REWARD)] /= self.return_scale.value
+            numbers = self.update(drawn)
+            rounds.append(torch.stack([numbers[name] for name in NUMBERS]))
         # A number that is read at once would make the device wait at every update.
-        return dict(zip(LOSSES, torch.stack(rounds).double().mean(0).tolist(), strict=True))
+        return dict(zip(NUMBERS, torch.stack(rounds).double().mean(0).tolist(), strict=True))
 
     def update(self, batch: TensorDictBase) -> TensorDictBase:
-        """Make one update from transitions [K]; returns the losses."""
+        """Make one update from transitions [K]; returns ``NUMBERS``."""
         losses = self.loss(batch)
         self.optimizer.zero_grad()
-        (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
+        torch.stack([losses[name] for name in LOSSES]).sum().backward()
+        for name, weights in (("actor", self.actor_weights), ("critic", self.critic_weights)):
+            gradients = [cast(Tensor, each.grad) for each in weights]
+            losses[f"gradient_norm_{name}"] = torch.nn.utils.get_total_norm(gradients)
         self.optimizer.step()
         self.targets.step()
         return losses.detach()
@@ -175,24 +200,25 @@ _UNREAD: list[NestedKey] = [
 
 
 def sac_loss(
-    actor: ProbabilisticActor, action_value: TensorDictModule, env: EnvBase, config: SacConfig
+    actor: ProbabilisticActor, critics: list[TensorDictModule], env: EnvBase, config: SacConfig
 ) -> SACLoss | DiscreteSACLoss:
-    """Loss with two critics and a learnt temperature, on single decisions [K] with the keys of ``UavEnv``."""
+    """Loss with a learnt temperature on single decisions [K] with the keys of ``UavEnv``."""
     spec = env.full_action_spec_unbatched[keys.ACTION]
     # A loop over two critics is faster on a CPU than vmap.
     options: dict[str, Any] = {
         "loss_function": "l2",
         "alpha_init": config.alpha_init,
+        "num_qvalue_nets": len(critics),
         "deactivate_vmap": True,
     }
     if isinstance(spec, Categorical):
-        loss = MaskedDiscreteSACLoss(actor, action_value, spec.n, config.target_entropy, **options)
+        loss = MaskedDiscreteSACLoss(actor, critics, spec.n, config.target_entropy, **options)
     else:
         # Target entropy of one UAV: minus its action dimensions on [-1, 1], shifted to its actions' bounds.
         bounds = cast(Bounded, spec)
         width = (bounds.high - bounds.low).reshape(-1, spec.shape[-1])[0]
         target = ((width / 2).log() - 1).sum().item()
-        loss = SACLoss(actor, action_value, target_entropy=target, **options)
+        loss = SACLoss(actor, cast(Any, critics), target_entropy=target, **options)
     loss.set_keys(action=keys.ACTION, reward=keys.REWARD)
     loss.make_value_estimator(gamma=config.gamma)
     return loss
@@ -206,11 +232,21 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
     """
 
     def __init__(
-        self, actor: ProbabilisticActor, action_value: TensorDictModule, n: int, share: float, **options: Any
+        self,
+        actor: ProbabilisticActor,
+        critics: list[TensorDictModule],
+        n: int,
+        share: float,
+        **options: Any,
     ) -> None:
         zero: Any = 0.0  # ``forward`` adds the target itself
         super().__init__(
-            actor, action_value, action_space="categorical", num_actions=n, target_entropy=zero, **options
+            actor,
+            cast(Any, critics),
+            action_space="categorical",
+            num_actions=n,
+            target_entropy=zero,
+            **options,
         )
         self.share, self.n_actions = share, n
 
@@ -227,13 +263,15 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
             policy = self.actor_network.get_dist(tensordict.copy())
         prob, log_prob = policy.probs, policy.logits
         cost = self._alpha * log_prob - values.detach().amin(0)
-        too_certain = (prob * log_prob).sum(-1).detach() + self.target_entropies(tensordict)
+        entropy = -(prob * log_prob).sum(-1).detach()
+        too_certain = self.target_entropies(tensordict) - entropy
         return TensorDict(
             {
                 "loss_actor": (prob * cost).sum(-1).mean(),
                 "loss_qvalue": error.square().sum(0).mean(),
                 "loss_alpha": -(self.log_alpha * too_certain).mean(),
                 "alpha": self._alpha,
+                "entropy": entropy.mean(),
             }
         )
 

@@ -1,8 +1,9 @@
-"""The system clock: how many steps are collected between two updates (paper, section 3.6)."""
+"""What changes with time: the period between two updates (paper, section 3.6), and annealed coefficients."""
 
 import math
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from damian.common import checks
@@ -53,3 +54,33 @@ class SystemClock:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the state that a checkpoint has stored."""
         self.period = int(state["period"])
+
+
+class LinearSchedule:
+    """A coefficient that goes linearly from one value to another as a run learns, and stays there.
+
+    Args:
+        first: value before the first environment step.
+        last: value after ``frames`` environment steps.
+        frames: environment steps of the run, over all worlds.
+        device: device of the value.
+    """
+
+    def __init__(self, first: float, last: float, frames: int, device: torch.device | None = None) -> None:
+        self.first, self.last, self.frames, self.learnt = first, last, frames, 0
+        self.value = torch.tensor(first, device=device)
+        """The coefficient, []; always this tensor, so that a function that gets it stays compiled."""
+
+    def advance(self, n_steps: int) -> None:
+        """Count environment steps that have been learnt from, over all worlds."""
+        self.learnt += n_steps
+        self.value.fill_(self.first + (self.last - self.first) * min(self.learnt / self.frames, 1.0))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state that a checkpoint stores."""
+        return {"learnt": self.learnt}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the state that a checkpoint has stored."""
+        self.learnt = 0
+        self.advance(int(state["learnt"]))

@@ -103,7 +103,8 @@ def _about_unnamed(text: str) -> str | None:
     """The message for Python's errors inside Hydra; they name no word, but the command line tells which."""
     if "Exceeds the limit (4300 digits)" in text:
         long = (word for word in sys.argv[1:] if re.search(r"\d{4300}", word))
-        return f"{next(long, '').partition('=')[0] or 'a number in a configuration file'}: it has more than 4300 digits"
+        key = next(long, "").partition("=")[0] or "a number in a configuration file"
+        return f"{key}: it has more than 4300 digits"
     if index := re.search(r"invalid literal for int\(\) with base 10: '(.*)'$", text):
         keys = (word.partition("=")[0].lstrip("+~") for word in sys.argv[1:])
         key = next((key for key in keys if key.endswith(f".{index[1]}")), index[1])

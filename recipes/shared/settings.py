@@ -182,6 +182,7 @@ class TrainConfig(ScenarioConfig):
             if self.critic == "privileged"
             else keys.GLOBAL_OBSERVATION,
             compile=self.compile,
+            frames=self.frames,
         )
 
     @property

@@ -269,6 +269,16 @@ def test_results_are_written_with_every_measure(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"result.csv", "result.md"}
 
 
+def test_rows_of_an_older_run_get_the_columns_that_a_newer_version_logs(tmp_path):
+    MetricsLog(tmp_path, tensorboard=False, to_csv=True).add(10, {"loss": 2.0, "old": 3.0})
+    log = MetricsLog(tmp_path, tensorboard=False, to_csv=True, frames=10)
+    log.add(20, {"new": 4.0, "loss": 5.0})
+    log.add(30, {"loss": 6.0})
+    lines = ["frames,loss,old,new", "10.0,2.0,3.0,nan", "20.0,5.0,nan,4.0", "30.0,6.0,nan,nan"]
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == lines
+    assert repr(log.rows) == repr(read_metrics(tmp_path))
+
+
 def test_a_broken_metrics_file_is_refused_with_its_line(tmp_path):
     log = MetricsLog(tmp_path, tensorboard=False, to_csv=True)
     log.add(10, {"steps": 2.0})

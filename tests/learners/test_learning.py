@@ -112,7 +112,9 @@ def test_the_advantage_is_zero_where_a_uav_was_not_ready(kind):
 def losses_of(batch: TensorDictBase, actor, critic, config: MappoConfig) -> Tensor:
     """The loss on all steps of a batch [B, T]."""
     read = batch.select(*LOSS_KEYS, *critic.in_keys, strict=False).reshape(-1)
-    return mappo_losses(dict(read.items(True, True)), actor, critic, config)
+    return mappo_losses(
+        dict(read.items(True, True)), actor, critic, config, torch.tensor(config.entropy_coeff)
+    )[0]
 
 
 @pytest.mark.parametrize(("kind", "mask"), [("discrete", True), ("discrete", False), ("continuous", True)])

@@ -1,5 +1,7 @@
 """MAPPO's loss beside TorchRL's, its compiled form, its minibatches, and the values of its critics."""
 
+import copy
+import math
 from dataclasses import replace
 
 import pytest
@@ -18,9 +20,11 @@ from damian.envs.pipeline import make_env
 from damian.learners.mappo import (
     LOSS_KEYS,
     LOSSES,
+    NUMBERS,
     Mappo,
     MappoConfig,
     add_advantages,
+    explained_variance,
     mappo_losses,
     policy_terms,
     state_values,
@@ -40,6 +44,7 @@ CASES = {
     "recurrent": (ActionConfig(kind="discrete"), replace(SMALL, rnn="gru")),
     "recurrent, continuous": (ActionConfig(kind="continuous"), replace(SMALL, rnn="gru")),
     "shared value": (ActionConfig(kind="discrete"), replace(SMALL, shared_value=True)),
+    "normalised": (ActionConfig(kind="discrete"), SMALL),
 }
 every_case = pytest.mark.parametrize("case", CASES)
 
@@ -52,7 +57,8 @@ def flown(case: str, **setup) -> tuple[DelayedEnv, Mappo, TensorDictBase]:
     torch.manual_seed(3)
     env = make_env(scenario, 4, seed=1)
     env.append_transform(StepCounter())
-    learner = Mappo(env, replace(CONFIG, minibatches=2, epochs=2), learning(model, **setup))
+    config = replace(CONFIG, minibatches=2, epochs=2, normalize_value=case == "normalised")
+    learner = Mappo(env, config, learning(model, **setup))
     add_recurrent_state(env, learner.actor)
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         batch = env.rollout(12, learner.actor, break_when_any_done=False)
@@ -70,9 +76,13 @@ def loss_entries(learner: Mappo, batch: TensorDictBase) -> dict:
 def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
     """The terms of TorchRL's loss, averaged over decisions, or for the critic over all steps."""
     config = learner.config
+    norm = copy.deepcopy(learner.critic.module.norm).float() if config.normalize_value else None
+    if norm is not None:
+        norm.update = lambda targets: None  # a learner has updated it already, once for the whole batch
     loss = MAPPOLoss(
         learner.actor,
         learner.critic,
+        value_norm=norm,
         clip_epsilon=config.clip_epsilon,
         entropy_coeff=config.entropy_coeff,
         critic_coeff=config.critic_coeff,
@@ -89,6 +99,13 @@ def torchrl_losses(learner: Mappo, batch: TensorDictBase) -> Tensor:
     terms, ready = loss(batch.copy()), batch[keys.READY]
     decided = [terms[name].view_as(ready)[ready].mean() for name in ("loss_objective", "loss_entropy")]
     return torch.stack([*decided, terms["loss_critic"].mean()])
+
+
+def losses_of(learner: Mappo, batch: TensorDictBase, config: MappoConfig | None = None) -> Tensor:
+    """The terms of our loss on all steps of a batch [B, T]."""
+    coeff = learner.entropy_coeff.value
+    entries, config = loss_entries(learner, batch), config or learner.config
+    return mappo_losses(entries, learner.actor, learner.critic, config, coeff)[0]
 
 
 def with_gradients(learner: Mappo, losses: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -111,8 +128,7 @@ def test_the_losses_and_their_gradients_are_torchrls(case):
     assert 0.2 < ready.float().mean() < 0.9
     assert keys.ACTION_MASK not in batch.keys(True) or not batch[keys.ACTION_MASK].all()
     torch.manual_seed(0)  # the entropy of continuous actions is drawn
-    entries = loss_entries(learner, batch)
-    losses = with_gradients(learner, mappo_losses(entries, learner.actor, learner.critic, learner.config))
+    losses = with_gradients(learner, losses_of(learner, batch))
     torch.manual_seed(0)
     expected = with_gradients(learner, torchrl_losses(learner, batch))
     torch.testing.assert_close(losses, expected, rtol=1e-5, atol=1e-7)
@@ -123,7 +139,7 @@ def test_the_losses_and_their_gradients_are_torchrls(case):
 def test_no_decision_gives_no_loss_of_the_actor_and_no_nan():
     _, learner, batch = flown("discrete")
     batch[keys.READY] = torch.zeros_like(batch[keys.READY])
-    losses = mappo_losses(loss_entries(learner, batch), learner.actor, learner.critic, learner.config)
+    losses = losses_of(learner, batch)
     assert losses[:2].tolist() == [0.0, 0.0]
     assert losses[2] > 0
 
@@ -131,26 +147,26 @@ def test_no_decision_gives_no_loss_of_the_actor_and_no_nan():
 def test_a_ratio_may_be_clipped_down_to_zero():
     _, learner, batch = flown("discrete")
     widest = replace(CONFIG, clip_epsilon=1.0)
-    losses = mappo_losses(loss_entries(learner, batch), learner.actor, learner.critic, widest)
+    losses = losses_of(learner, batch, widest)
     assert losses.isfinite().all()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["discrete", "unmasked", "continuous", "shared value"])
+@pytest.mark.parametrize("case", ["discrete", "unmasked", "continuous", "shared value", "normalised"])
 def test_the_compiled_losses_are_those_of_the_uncompiled_function_for_any_number_of_steps(case):
     _, learner, batch = flown(case)
-    losses = compiled(learner._losses, options=COMPILE_OPTIONS)
+    losses, coeff = compiled(learner._losses, options=COMPILE_OPTIONS), learner.entropy_coeff.value
     steps = {key: value.flatten(0, 1) for key, value in loss_entries(learner, batch).items()}
     for n in (24, 23, 48, 5):
         entries = {key: value[:n].clone() for key, value in steps.items()}
         torch.manual_seed(0)
-        found = losses(entries)
+        found, numbers = losses(entries, coeff)
         after = torch.rand(1)
         torch.manual_seed(0)
-        expected = learner._losses(entries)
+        expected, expected_numbers = learner._losses(entries, coeff)
         assert torch.rand(1) == after  # as many draws of torch's generator
         gradients = [torch.autograd.grad(terms.sum(), learner.weights) for terms in (found, expected)]
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close((found, numbers), (expected, expected_numbers), rtol=1e-4, atol=1e-6)
         torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
 
 
@@ -191,8 +207,54 @@ def test_the_numbers_are_means_over_all_minibatches():
     torch.manual_seed(0)
     numbers = learner.optimize(batch)
     torch.manual_seed(0)
-    losses = torch.stack([learner._losses(entries).detach() for entries in learner._minibatches(batch)])
-    assert numbers == pytest.approx(dict(zip(LOSSES, losses.mean(0).tolist(), strict=True)))
+    parts = []
+    for entries in learner._minibatches(batch):
+        losses, further = learner._losses(entries, learner.entropy_coeff.value)
+        gradients = torch.autograd.grad(losses.sum(), learner.weights, materialize_grads=True)
+        norm = torch.cat([gradient.flatten() for gradient in gradients]).norm()
+        parts.append([*losses.tolist(), *further.tolist(), norm.item()])
+    expected = torch.tensor(parts, dtype=torch.double).mean(0).tolist()
+    names = (*LOSSES, *NUMBERS, "gradient_norm")
+    assert numbers == pytest.approx(dict(zip(names, expected, strict=True)), rel=1e-4)
+    assert numbers["gradient_norm"] > learner.config.max_grad_norm  # before it is scaled down
+
+
+@pytest.mark.parametrize("case", ["discrete", "continuous"])
+def test_divergence_clipping_and_entropy_are_means_over_decisions(case):
+    _, learner, batch = flown(case)
+    torch.manual_seed(0)  # the entropy of continuous actions is drawn
+    _, numbers = learner._losses(loss_entries(learner, batch), learner.entropy_coeff.value)
+    torch.manual_seed(0)
+    log_ratios, entropies = policy_terms(batch.copy(), learner.actor)
+    divergences, clipped, chosen = [], [], []
+    for place in batch[keys.READY].nonzero().tolist():
+        log_ratio = log_ratios[*place].item()
+        divergences.append(math.exp(log_ratio) - 1 - log_ratio)
+        clipped.append(abs(math.exp(log_ratio) - 1) > learner.config.clip_epsilon)
+        chosen.append(entropies[*place].item())
+    expected = [sum(each) / len(each) for each in (divergences, clipped, chosen)]
+    assert dict(zip(NUMBERS, numbers.tolist(), strict=True)) == pytest.approx(
+        dict(zip(("kl", "clip_fraction", "entropy"), expected, strict=True)), rel=1e-4
+    )
+    assert 0.2 < numbers[1] < 0.8
+    assert not numbers.requires_grad
+
+
+def test_the_explained_variance_is_1_for_exact_values_and_0_for_a_constant():
+    _, _, batch = flown("discrete")
+    target = batch[keys.VALUE_TARGET]
+    for value, share in ((target + 2.0, 1.0), (torch.ones_like(target), 0.0), (2 * target, 0.0)):
+        batch[keys.STATE_VALUE] = value
+        assert explained_variance(batch).item() == pytest.approx(share, abs=1e-5)
+    batch[keys.VALUE_TARGET] = torch.ones_like(target)
+    assert explained_variance(batch).isnan()
+
+
+def test_an_update_logs_the_variance_that_the_values_of_the_batch_explained_before_it():
+    _, learner, batch = flown("discrete")
+    numbers = learner.learn(batch)
+    assert numbers["explained_variance"] == pytest.approx(explained_variance(batch).item())
+    assert list(numbers) == [*LOSSES, *NUMBERS, "gradient_norm", "explained_variance"]
 
 
 # Values.
@@ -239,7 +301,7 @@ def test_a_shared_value_is_trained_towards_the_mean_target_of_the_uavs():
     n_critic = len([*learner.critic.parameters()])
     for mean, is_reached in ((0.0, True), (0.1, False)):
         batch[keys.VALUE_TARGET] = value + mean + torch.tensor([-0.3, 0.1, 0.2]).unsqueeze(-1)
-        losses = mappo_losses(loss_entries(learner, batch), learner.actor, learner.critic, learner.config)
+        losses = losses_of(learner, batch)
         _, gradients = with_gradients(learner, losses[2:])
         assert all((gradient.abs() < 1e-6).all() for gradient in gradients[-n_critic:]) is is_reached
 
@@ -265,7 +327,7 @@ def test_an_older_checkpoint_of_the_optimiser_can_be_loaded(case):
     weights = [*MAPPOLoss(learner.actor, learner.critic).parameters()]
     assert [id(weight) for weight in weights] == [id(weight) for weight in learner.weights]
     older = torch.optim.Adam(weights, lr=1e-3)
-    losses = mappo_losses(loss_entries(learner, batch), learner.actor, learner.critic, learner.config)
+    losses = losses_of(learner, batch)
     losses.sum().backward()
     older.step()
     learner.optimizer.load_state_dict(older.state_dict())

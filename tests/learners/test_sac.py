@@ -18,7 +18,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.keys import OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.networks import ModelConfig
-from damian.learners.sac import LOSSES, Sac, SacConfig
+from damian.learners.sac import NUMBERS, Sac, SacConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.replay.smdp import find_decisions, transitions
@@ -49,7 +49,7 @@ def test_a_round_of_updates_changes_actor_critics_and_temperature(kind, motion):
     learner = learner_of(env)
     before = {name: value.clone() for name, value in learner.loss.state_dict().items()}
     losses = learner.learn(fly(env, learner.actor))
-    assert set(losses) == set(LOSSES)
+    assert set(losses) == set(NUMBERS)
     assert all(torch.tensor([*losses.values()]).isfinite())
     # The mean over two updates, of which the first has the initial temperature.
     assert losses["alpha"] == pytest.approx(FAST.alpha_init, rel=0.01)
@@ -259,6 +259,22 @@ def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_by_tau_t
     assert (learnt - initial).abs().max().item() == pytest.approx(1e-2, rel=1e-2)  # Adam's first step
     moved = loss.log_alpha.item() - math.log(learner.config.alpha_init)
     assert abs(moved) == pytest.approx(0.3, rel=1e-2)  # the temperature has its own rate
+
+
+@both_kinds
+def test_an_update_logs_the_entropy_and_the_norms_of_its_gradients(kind):
+    learner = recording_learner(UavEnv(everything(kind=kind), 4), lr=1e-9, alpha_lr=1e-9)
+    torch.manual_seed(0)
+    numbers = learner.update(learner.drawn[0])
+    for name, network in (("actor", "actor_network"), ("critic", "qvalue_network")):
+        of_network = [w for n, w in learner.loss.named_parameters() if n.startswith(f"{network}_params")]
+        norm = torch.cat([weight.grad.flatten() for weight in of_network]).norm()
+        torch.testing.assert_close(numbers[f"gradient_norm_{name}"], norm)
+    torch.manual_seed(0)
+    policy = learner.actor.get_dist(learner.drawn[0].copy())
+    drawn = policy.entropy() if kind == "discrete" else -policy.rsample_and_log_prob()[1]
+    tolerance = 1e-4 if kind == "discrete" else 0.5  # TorchRL draws other actions
+    assert numbers["entropy"].item() == pytest.approx(drawn.mean().item(), abs=tolerance)
 
 
 def test_an_update_clears_the_gradients_of_the_previous_one():

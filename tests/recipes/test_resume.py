@@ -23,10 +23,11 @@ WHOLE = [
     "model.rnn=gru",
 ]
 TRIGGERED = ["learner.steps=4", "clock.trigger=2s", "clock.longest=10s", "source.level_db=106", "delay.obs=2"]
+TRIGGERED += ["learner.normalize_value=true", "learner.entropy_coeff_end=0"]
 SLOW_CLOCKS = ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"]
 CASES = {
     "recurrent": ["delay.obs=2", "aware=backupdate", "delay.act=1", "delay.history=2", "model.rnn=gru"],
-    "sac": [*SAC, "delay.obs=3", "aware=backupdate", "delay.loss=0.1"],
+    "sac": [*SAC, "delay.obs=3", "aware=backupdate", "delay.loss=0.1", "learner.normalize_reward=true"],
     "sac bursts": [*SAC, "scenario=tracking", "delay=burst", "delay.history=2"],
     "everything": [*WHOLE, "settle=true", "learner.steps=16", "frames=512"],
     "triggered": TRIGGERED,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from damian.common.errors import InputError
 from damian.envs.scenario import make_simulation
-from damian.server.belief import detection_chance
+from damian.server.belief import chance_of_staying, detection_chance, predict
 from damian.server.belief_window import _advance, _begin, empty_window
 from damian.server.source_grid import SourceGrid, build_source_grid
 from damian.world.signal_source import SourceConfig
@@ -19,20 +19,18 @@ from damian.world.signal_source import SourceConfig
 LONGEST = 4
 
 
-def make_grid(emission: float = 0.6, motion: str = "dynamic", regions: int = 1) -> SourceGrid:
+def make_grid(emission: float = 0.6, moves: bool = True, regions: int = 1) -> SourceGrid:
     """A small grid, over one or several regions."""
-    source = (
-        walking(emission="per_step", emission_probability=emission) if motion == "dynamic" else SourceConfig()
-    )
-    scenario = square() if regions == 1 else everything()
-    airspace = make_simulation(scenario, 0).airspace
+    emits = {"emission": "per_step", "emission_probability": emission}
+    airspace = make_simulation(square() if regions == 1 else everything(), 0).airspace
+    source = walking(**emits) if moves else SourceConfig(**emits)
     return build_source_grid(airspace, source, radius=50.0, dt=1.0, cell=45.0)
 
 
 grids = {
     "one region": make_grid(),
     "always emitting": make_grid(1.0),
-    "static": make_grid(motion="static"),
+    "static": make_grid(1.0, moves=False),
     "several regions": make_grid(regions=3),
 }
 every_grid = pytest.mark.parametrize("grid", grids.values(), ids=grids)
@@ -191,11 +189,28 @@ def test_the_chance_of_a_detection_equals_the_slow_twins(grid):
     region = torch.arange(n_regions)
     beliefs = torch.rand(n_regions, n_cells) * (grid.prior > 0)
     beliefs = beliefs / beliefs.sum(-1, keepdim=True)
-    chance = detection_chance(grid, beliefs, region, n_points)
+    chance = detection_chance(grid, predict(grid, beliefs, region), region)
     for r in range(n_regions):
         for p in (0, 3, n_points - 1):
             expected = chance_at(grid, r, beliefs[r], r * n_points + p)
             assert chance[r, p].item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_who_stays_where_it_has_just_detected_nothing_detects_a_source_that_rests_only_by_its_emission():
+    grid = grids["static"]
+    point = int(grid.detects.sum(-1).argmax())
+    predicted = torch.nn.functional.one_hot((grid.detects[point] - 0.5).abs().argmin(), grid.prior.shape[-1])
+    rows = torch.tensor([2 * point, 2 * point + 1, grid.no_report])
+    silent, detected, unknown = chance_of_staying(grid, predicted.float(), rows).tolist()
+    assert silent == pytest.approx(0, abs=1e-6)
+    assert detected == pytest.approx(1)
+    assert unknown == pytest.approx(0)
+    half = make_grid(0.5, moves=False)
+    silent, detected, _ = chance_of_staying(half, predicted.float(), rows).tolist()
+    share = float(half.detects[point] @ predicted.float())
+    # By Bayes: it is in the footprint, but did not emit; then it emits with the same probability again.
+    assert silent == pytest.approx(0.5 * share * 0.5 / (1 - 0.5 * share), rel=1e-3)
+    assert detected == pytest.approx(0.5)
 
 
 @every_grid

@@ -11,6 +11,7 @@ from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
 from damian.envs.uav_env import UavEnv
+from damian.server.belief import predict
 from damian.server.belief_features import RINGS, SECTORS
 from damian.server.features import ObservationConfig, feature
 from damian.world.landing import ActionConfig
@@ -48,6 +49,12 @@ def test_gain_is_the_chance_of_detecting_the_source_where_an_action_leads(flown)
             point = int(candidates.ranking.point[standing * n_actions + action, 0])
             flat = region * simulation.airspace.max_points + point
             expected = chance_at(server.grid, region, belief[world], flat)
+            if flat == standing:  # the UAV stays
+                row = 2 * standing + int(messages.spotted[world, uav]) + server.grid.no_report // 2
+                again = server.grid.log_reports[row].exp()
+                found = again if messages.spotted[world, uav] else 1 - again
+                next_ = predict(server.grid, belief[world : world + 1], torch.tensor([region]))[0]
+                expected = server.grid.emits * float(found @ next_)
             assert features["belief_gain"][world, uav, action].item() == pytest.approx(expected, rel=1e-3)
 
 

@@ -1,0 +1,72 @@
+"""Initial weights of the networks: PyTorch's, or orthogonal ones."""
+
+import math
+
+import pytest
+import torch
+from helpers import both_kinds, everything, learning
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
+
+from damian.common.errors import InputError
+from damian.envs.uav_env import UavEnv
+from damian.learners.networks import ModelConfig, make_actor, make_critic
+from damian.learners.sac import Sac, SacConfig
+from damian.replay.time_storage import TimeStorage
+
+ENV = UavEnv(everything(), 2)
+
+
+def gains(weights: Tensor) -> Tensor:
+    """Singular values of matrices [*, n, m]: all of them equal the gain if the weights are orthogonal."""
+    return torch.linalg.svdvals(weights.detach())
+
+
+def check_gains(network: nn.Module, expected: list[float]) -> None:
+    """Assert that each matrix of a network has the expected gain, and each vector is 0."""
+    matrices = [each for each in network.parameters() if each.ndim == 2]
+    vectors = [each for each in network.parameters() if each.ndim == 1]
+    assert len(matrices) == len(expected) == len(vectors)
+    for weights, gain in zip(matrices, expected, strict=True):
+        torch.testing.assert_close(gains(weights), torch.full([min(weights.shape)], gain))
+    assert all((each == 0).all() for each in vectors)
+
+
+@both_kinds
+def test_orthogonal_weights_have_a_gain_by_the_place_of_their_layer(kind):
+    config, hidden = ModelConfig(hidden=[16, 8], init="orthogonal"), math.sqrt(2)
+    env = UavEnv(everything(kind=kind), 2)
+    check_gains(make_actor(env, config), [hidden, hidden, 0.01])
+    for shared, normalize in ((False, False), (True, True)):
+        config.shared_value = shared
+        check_gains(make_critic(env, config, normalize=normalize), [hidden, hidden, 1.0])
+
+
+@pytest.mark.parametrize("widths", [[8], [16, 8]])
+def test_a_recurrent_layer_has_a_gain_of_1(widths):
+    config = ModelConfig(hidden=widths, rnn="gru", init="orthogonal")
+    encoder = [math.sqrt(2)] * (len(widths) - 1)
+    check_gains(make_actor(ENV, config), [*encoder, 1.0, 1.0, 0.01])
+
+
+def test_both_critics_of_sac_and_their_targets_begin_with_orthogonal_weights_of_their_own():
+    model = ModelConfig(hidden=[16], init="orthogonal")
+    learner = Sac(ENV, SacConfig(), learning(model), ReplayBuffer(storage=TimeStorage(100)))
+    for name in ("qvalue_network_params", "target_qvalue_network_params"):
+        params = getattr(learner.loss, name)
+        first, second = (params["module", layer, "weight"] for layer in ("0", "2"))
+        for weights, gain in ((first, math.sqrt(2)), (second, 1.0)):
+            torch.testing.assert_close(gains(weights), torch.full([2, min(weights.shape[1:])], gain))
+            assert not weights[0].equal(weights[1])
+
+
+def test_the_default_is_pytorchs():
+    torch.manual_seed(0)
+    weights = ModelConfig(hidden=[16]).network(5, 3, None)[0].weight
+    torch.manual_seed(0)
+    assert weights.equal(nn.Linear(5, 16).weight)
+
+
+def test_another_kind_of_initial_weights_is_refused_in_one_line():
+    with pytest.raises(InputError, match=r"^model\.init: xavier is not one of default, orthogonal$"):
+        ModelConfig(init="xavier")

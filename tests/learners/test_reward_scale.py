@@ -1,0 +1,217 @@
+"""Learning does not depend on the scale of the rewards: normalised values of MAPPO, scaled rewards of SAC."""
+
+import copy
+import functools
+from typing import Any
+
+import pytest
+import torch
+from helpers import everything, learning
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+from torchrl.envs import StepCounter
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import PopArtValueNorm
+
+from damian import keys
+from damian.common.errors import InputError
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
+from damian.evaluation.checkpoint import plain, restore
+from damian.learners.base import Learner
+from damian.learners.mappo import Mappo, MappoConfig, add_advantages
+from damian.learners.networks import ModelConfig
+from damian.learners.recurrent import add_recurrent_state
+from damian.learners.reward_scale import FORGETTING, ReturnScale, value_scale
+from damian.learners.sac import Sac, SacConfig
+from damian.replay.time_storage import TimeStorage
+from damian.server.termination import EpisodeConfig
+
+REWARD = keys.next_key(keys.REWARD)
+MODELS: dict[str, dict[str, Any]] = {
+    "own value": {},
+    "shared value": {"shared_value": True},
+    "recurrent": {"rnn": "gru"},
+}
+
+
+@functools.cache
+def small_env(kind: str = "discrete", model: str = "own value") -> DelayedEnv:
+    """An environment for all tests of a kind of action and a model."""
+    env = make_env(everything("polynomial", kind=kind, episode=EpisodeConfig(max_steps=9)), 4, seed=1)
+    env.append_transform(StepCounter())
+    return env
+
+
+def mappo(normalize: bool, model: str = "own value", **changed: Any) -> tuple[Mappo, DelayedEnv]:
+    env = small_env(model=model)
+    torch.manual_seed(3)
+    config = MappoConfig(epochs=2, minibatches=2, normalize_value=normalize, **changed)
+    learner = Mappo(env, config, learning(ModelConfig(hidden=[8], **MODELS[model])))
+    add_recurrent_state(env, learner.actor)
+    return learner, env
+
+
+def sac(normalize: bool, kind: str) -> tuple[Sac, DelayedEnv]:
+    env = small_env(kind)
+    torch.manual_seed(3)
+    config = SacConfig(updates=4, batch_size=32, warm_up=0, normalize_reward=normalize)
+    buffer = ReplayBuffer(storage=TimeStorage(400))
+    return Sac(env, config, learning(ModelConfig(hidden=[8])), buffer), env
+
+
+def flights(
+    env: DelayedEnv, actor: torch.nn.Module, n_batches: int = 2, steps: int = 12
+) -> list[TensorDictBase]:
+    """Consecutive batches [4, T] with episodes of 9 steps."""
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        flight = env.rollout(n_batches * steps, actor, break_when_any_done=False)
+    return list(flight.split(steps, 1))
+
+
+def learnt(learner: Learner, batches: list[TensorDictBase], scale: float) -> Tensor:
+    """The weights of the actor after it has learnt from batches with scaled rewards."""
+    torch.manual_seed(0)
+    for batch in batches:
+        scaled = batch.clone()
+        scaled[REWARD] *= scale
+        learner.learn(scaled)
+    return torch.cat([weights.detach().flatten() for weights in learner.actor.parameters()])
+
+
+def spread(make: Any, *arguments: Any) -> float:
+    """By how much other scales of the rewards change the actor's weights, as a share of what it learns."""
+    learner, env = make(*arguments)
+    batches, begin = flights(env, learner.actor), learnt(learner, [], 1.0)
+    end, *others = (learnt(make(*arguments)[0], batches, scale) for scale in (1.0, 0.01, 100.0))
+    moved = (end - begin).abs().max().item()
+    assert moved > 1e-3
+    return max((other - end).abs().max().item() for other in others) / moved
+
+
+@pytest.mark.parametrize(("model", "advantage"), [*((model, True) for model in MODELS), ("own value", False)])
+def test_mappo_learns_the_same_from_rewards_of_any_scale_if_values_are_normalised(model, advantage):
+    def make(normalize: bool) -> tuple[Mappo, DelayedEnv]:
+        return mappo(normalize, model, normalize_advantage=advantage)
+
+    assert spread(make, True) < 1e-2
+    assert spread(make, False) > 5e-2
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_sac_learns_the_same_from_rewards_of_any_scale_if_rewards_are_normalised(kind):
+    assert spread(sac, True, kind) < 1e-2
+    assert spread(sac, False, kind) > 5e-2
+
+
+def test_the_network_of_a_normalised_critic_learns_targets_of_mean_0_and_deviation_1():
+    learner, env = mappo(True)
+    seen = []
+    for batch in flights(env, learner.actor):
+        batch[REWARD] = 30.0 + 7.0 * batch[REWARD]
+        add_advantages(batch, learner.critic, learner.config)
+        seen.append(batch[keys.VALUE_TARGET].double())
+    shares = torch.tensor([FORGETTING**k for k in reversed(range(len(seen)))], dtype=torch.double)
+    mean, square = (
+        (shares * torch.stack([(targets**power).mean() for targets in seen])).sum() / shares.sum()
+        for power in (1, 2)
+    )
+    deviation = (square - mean**2).sqrt()
+    observed = batch.select(*learner.critic.in_keys)
+    network = learner.critic.module.network
+    expected = network(observed[learner.critic.in_keys[0]]) * deviation + mean
+    torch.testing.assert_close(learner.critic(observed)[keys.STATE_VALUE], expected, check_dtype=False)
+    assert value_scale(learner.critic).item() == pytest.approx(deviation.item(), rel=1e-5)
+    assert value_scale(mappo(False)[0].critic) == 1.0
+
+
+def test_a_critic_without_rewards_stays_finite():
+    learner, env = mappo(True, normalize_advantage=False)
+    for batch in flights(env, learner.actor):
+        batch[REWARD] = torch.zeros_like(batch[REWARD])
+        learner.learn(batch)
+    assert all(weights.isfinite().all() for weights in learner.weights)
+
+
+def slow_returns(batches: list[TensorDictBase], gamma: float) -> list[float]:
+    """Discounted sums of the rewards so far in each episode, world by world and step by step."""
+    flight = torch.cat(batches, 1)
+    found = []
+    for world in range(flight.shape[0]):
+        for agent in range(3):
+            so_far = 0.0
+            for t in range(flight.shape[1]):
+                so_far = gamma * so_far + flight[REWARD][world, t, agent].item()
+                found.append(so_far)
+                if flight["next", "done"][world, t].item():
+                    so_far = 0.0
+    return found
+
+
+def test_rewards_are_divided_by_the_root_mean_square_of_discounted_returns_over_all_batches():
+    learner, env = sac(False, "discrete")
+    batches = flights(env, learner.actor, 6, 6)
+    done = torch.cat([batch["next", "done"] for batch in batches], 1)
+    assert done[:, 5:-1:6].any()  # between two batches
+    assert done[:, 8].any()  # within a batch
+    scale = ReturnScale(torch.zeros(4, 3, 1), 0.8)
+    for batch in batches:
+        before = batch.clone()
+        scale.update(batch)
+        assert (batch == before).all()
+    expected = torch.tensor(slow_returns(batches, 0.8)).square().mean().sqrt()
+    assert scale.value.item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_equal_returns_and_missing_ones_leave_rewards_finite():
+    for reward in (0.0, 3.0):
+        scale = ReturnScale(torch.zeros(2, 3, 1), 0.0)
+        rewards = torch.full((2, 4, 3, 1), reward)
+        done = torch.zeros(2, 4, 1, dtype=torch.bool)
+        scale.update(TensorDict({"next": {"agents": {"reward": rewards}, "done": done}}, [2, 4]))
+        assert (rewards / scale.value).amax().item() == pytest.approx(min(reward, 1.0))
+
+
+# Checkpoints.
+
+
+def stored(learner: Learner) -> dict[str, Any]:
+    states = {name: part.state_dict() for name, part in learner.components().items()}
+    return copy.deepcopy(plain(states))
+
+
+@pytest.mark.parametrize("make", [lambda: mappo(True), lambda: sac(True, "discrete")], ids=["mappo", "sac"])
+def test_running_statistics_are_among_what_a_checkpoint_stores(make, tmp_path):
+    (whole, env), (other, _) = make(), make()
+    first, second, third = flights(env, whole.actor, 3)
+    learnt(whole, [first, second], 100.0)
+    restore(other.components(), stored(whole), tmp_path, "resume")
+    if isinstance(whole, Sac):  # a checkpoint stores the replay buffer beside the components
+        other.buffer = whole.buffer = copy.deepcopy(whole.buffer)
+        other.buffer = copy.deepcopy(whole.buffer)
+    assert learnt(other, [third], 100.0).equal(learnt(whole, [third], 100.0))
+
+
+@pytest.mark.parametrize("normalize", [True, False])
+def test_a_checkpoint_of_a_critic_with_other_values_is_refused_in_one_line(normalize, tmp_path):
+    here, there = mappo(normalize)[0], mappo(not normalize)[0]
+    message = f"its critic does not fit this run: learner.normalize_value: {normalize} does not go with"
+    with pytest.raises(InputError, match=message) as refused:
+        restore(here.components(), stored(there), tmp_path, "resume")
+    assert "\n" not in str(refused.value)
+    restore(here.components(), stored(here), tmp_path, "resume")
+
+
+@pytest.mark.slow
+def test_changing_statistics_and_coefficients_do_not_compile_the_loss_again():
+    env = small_env()
+    torch.manual_seed(3)
+    config = MappoConfig(minibatches=2, normalize_value=True, entropy_coeff=0.1, entropy_coeff_end=0.0)
+    learner = Mappo(env, config, learning(ModelConfig(hidden=[8]), compile=True, frames=200))
+    first, *later = flights(env, learner.actor, 4)
+    learner.learn(first)
+    with torch._dynamo.config.patch(error_on_recompile=True):
+        for batch in later:
+            learner.learn(batch)
+    assert isinstance(learner.critic.module.norm, PopArtValueNorm)
