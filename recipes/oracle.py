@@ -46,6 +46,8 @@ def foresee(config: TrainConfig, folder: Path) -> None:
         raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
     should = "is not supported: the rows replace what the server broadcasts; choose links=server"
     checks.require(config.links.kind == "server", "links", config.links.kind, should)
+    should = "is not supported: what a UAV believes follows from more messages than the latest ones"
+    checks.require(not config.observation.belief, "observation.belief", config.observation.belief, should)
     env, actor = stored(config)
     save_config(config, folder)
     env.append_transform(StepCounter())

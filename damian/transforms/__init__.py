@@ -1,9 +1,10 @@
 """Delays, action histories and slow clocks as TorchRL transforms, on any TorchRL environment.
 
-Only ``ServerNode``, and ``SkipUntilReady`` in ``damian.transforms.skip_until_ready``, need a ``UavEnv``. The
-world of the UAVs is loaded when ``ServerNode`` is first used.
+Only ``ServerNode``, ``Belief``, and ``SkipUntilReady`` in ``damian.transforms.skip_until_ready``, need a
+``UavEnv``. The world of the UAVs is loaded when one of the first two is first used.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from damian.transforms.action_delay import ActionDelay
@@ -17,11 +18,13 @@ from damian.transforms.sample_and_hold import SampleAndHold
 from damian.transforms.stored import delay_trajectories
 
 if TYPE_CHECKING:
+    from damian.transforms.belief import Belief
     from damian.transforms.server_node import ServerNode
 
 __all__ = [
     "ActionDelay",
     "ActionHistory",
+    "Belief",
     "Channel",
     "CumulativeReward",
     "ObservationDelay",
@@ -35,8 +38,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name != "ServerNode":
+    if name not in _OF_UAVS:
         raise AttributeError(f"module {__name__} has no attribute {name}")
-    from damian.transforms.server_node import ServerNode  # noqa: PLC0415 (it loads the world of the UAVs)
+    return getattr(importlib.import_module(_OF_UAVS[name]), name)
 
-    return ServerNode
+
+_OF_UAVS = {"Belief": "damian.transforms.belief", "ServerNode": "damian.transforms.server_node"}
+"""Modules that load the world of the UAVs, by the transform in them."""
