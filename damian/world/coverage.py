@@ -23,9 +23,10 @@ from damian.common.tensors import gather_rows
 
 # Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact.
 _GRID = 321
-# Words looked up at once, which bounds the memory of many UAVs in many worlds: 8 MiB on a CPU, to stay
-# in its cache; 128 MiB on a GPU and in compiled graphs, which grow with the number of chunks.
-_CHUNK_WORDS, _CHUNK_WORDS_LARGE = 2**20, 2**24
+# Words and table rows of the worlds computed at once, which bounds the memory of many UAVs in many worlds:
+# 2 MiB on a CPU, to stay in its cache; 128 MiB on a GPU and in compiled graphs, which grow with the number of
+# chunks.
+_CHUNK_WORDS, _CHUNK_WORDS_LARGE = 2**18, 2**24
 
 # Landing points whose samples are tested at once, which bounds the memory: arrays of 16 MiB.
 _POINTS_AT_ONCE = 1024
@@ -148,7 +149,7 @@ def _(masks, cells_per_metre, ids, points, share, changed):  # compilers need on
 def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:
     """Number of worlds of ``point_ids [b, N, n]`` to look up together; depends on shapes only."""
     _, n_uavs, n_last = point_ids.shape
-    words_per_world = n_uavs * n_last * (n_uavs + n_last - 1) * tables.masks.shape[-1]
+    words_per_world = n_uavs * n_last * (n_uavs + n_last - 1 + tables.masks.shape[-1])
     small = point_ids.device.type == "cpu" and not torch.compiler.is_compiling()
     return max(1, (_CHUNK_WORDS if small else _CHUNK_WORDS_LARGE) // words_per_world)
 
@@ -193,9 +194,8 @@ def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleet: Tensor) -
         fleet: positions of the first UAV and the others in cells, ``[b, N, n, 2, N]``.
     """
     rows = torch.cat([(point_ids + _GRID**2).unsqueeze(0), _overlap_rows(fleet).movedim(-1, 0)])
-    masks = tables.masks.index_select(0, rows.reshape(-1))
-    excluded = _or_first(masks.view(len(rows), *point_ids.shape, -1))
-    counts = _bit_count(excluded).flatten(-2)
+    excluded = _or_rows(tables.masks, rows.flatten(1)).view(*point_ids.shape[:-1], -1)
+    counts = _bit_count(excluded)
     # Summed as floats (exact: small integers), which compiles to a much faster loop than int64.
     return 1 - counts.sum(-1, dtype=fleet.dtype) / (64 * counts.shape[-1])
 
@@ -221,12 +221,16 @@ def _overlap_rows(fleet: Tensor) -> Tensor:
     return cell[..., 0, :] * _GRID + cell[..., 1, :]
 
 
-def _or_first(masks: Tensor) -> Tensor:
-    """Bitwise OR over the first dimension, in log2 steps: ``[M, *]`` -> ``[*]``."""
-    while len(masks) > 1:
-        half = (len(masks) + 1) // 2
-        masks = masks[:half] | masks[-half:]  # an odd mask in the middle is used twice: no harm
-    return masks[0]
+def _or_rows(table: Tensor, rows: Tensor) -> Tensor:
+    """Bitwise OR of M rows of a table [R, words] for each of K sets of them: ``[M, K]`` -> ``[K, words]``.
+
+    The rows are looked up one after the other, so that they stay in the cache until they are used.
+    """
+    first, *others = rows.unbind(0)
+    combined = table.index_select(0, first)
+    for row in others:
+        combined |= table.index_select(0, row)
+    return combined
 
 
 def _bit_count(words: Tensor) -> Tensor:

@@ -172,10 +172,11 @@ def test_bits_of_extreme_words_are_counted(word):
 
 
 @pytest.mark.parametrize("count", range(1, 10))
-def test_or_over_the_first_dimension_equals_numpys(count):
-    masks = np.random.default_rng(count).integers(-(2**63), 2**63 - 1, (count, 5, 2))
-    got = coverage._or_first(torch.tensor(masks))
-    assert got.tolist() == np.bitwise_or.reduce(masks, 0).tolist()
+def test_or_of_rows_equals_numpys(count):
+    rng = np.random.default_rng(count)
+    table, rows = rng.integers(-(2**63), 2**63 - 1, (20, 3)), rng.integers(0, 20, (count, 5))
+    got = coverage._or_rows(torch.tensor(table), torch.tensor(rows))
+    assert got.tolist() == np.bitwise_or.reduce(table[rows], 0).tolist()
 
 
 @pytest.mark.parametrize(("n_uavs", "n_last"), [(1, 1), (1, 3), (2, 2), (3, 2), (5, 1)])
@@ -192,7 +193,7 @@ def test_splitting_the_worlds_into_chunks_does_not_change_the_shares(square, mon
     tables, _, points = square
     ids, positions = at_random(points, (11, 3, 2))
     whole = covered_share(tables, ids, positions)
-    for words in (1, 16 * 3 * 2 * 4 * 3):  # one world, and three worlds, at a time
+    for words in (1, (16 + 4) * 3 * 2 * 3):  # one world, and three worlds, at a time
         monkeypatch.setattr(coverage, "_CHUNK_WORDS", words)
         assert torch.equal(covered_share(tables, ids, positions), whole)
 
