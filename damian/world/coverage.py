@@ -9,7 +9,7 @@ A step only has to look masks up, combine them with OR and count the bits that s
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from damian.common.compiling import LONG_ROWS, compiled
 from damian.common.errors import InputError
 from damian.common.tensors import gather_rows
 
@@ -121,13 +122,20 @@ def updated_share(tables: FootprintTables, point_ids: Tensor, points: Tensor, kn
     changed = (point_ids != known.trail).flatten(-2).any(-1) | (known.share[..., 0] < 0)
     n_uavs, n_last = point_ids.shape[-2:]
     ids, share = point_ids.reshape(-1, n_uavs, n_last), known.share.reshape(-1, n_uavs)
-    updated = _update_share(*tables, ids, points, share, changed.reshape(-1))
+    compiles = torch.compiler.is_compiling()
+    updated = _update_share(*tables, ids, points, share, changed.reshape(-1), compiles)
     return updated.view(known.share.shape)
 
 
 @torch.library.custom_op("damian::update_share", mutates_args=())
 def _update_share(
-    masks: Tensor, cells_per_metre: float, ids: Tensor, points: Tensor, share: Tensor, changed: Tensor
+    masks: Tensor,
+    cells_per_metre: float,
+    ids: Tensor,
+    points: Tensor,
+    share: Tensor,
+    changed: Tensor,
+    compiles: bool,
 ) -> Tensor:
     """The shares ``[b, N]``, computed again for the worlds of ``changed [b]``.
 
@@ -135,23 +143,50 @@ def _update_share(
     """
     updated, worlds = share.clone(), changed.nonzero().squeeze(-1)
     if len(worlds):
-        ids = ids.index_select(0, worlds)
-        tables = FootprintTables(masks, cells_per_metre)
-        updated.index_copy_(0, worlds, covered_share(tables, ids, gather_rows(points, ids)))
+        ids, tables = ids.index_select(0, worlds), FootprintTables(masks, cells_per_metre)
+        compute = _share_by_graph if compiles else _share_at
+        updated.index_copy_(0, worlds, compute(tables, ids, points))
     return updated
 
 
 @_update_share.register_fake
-def _(masks, cells_per_metre, ids, points, share, changed):  # compilers need only the shape
+def _(masks, cells_per_metre, ids, points, share, changed, compiles):  # compilers need only the shape
     return torch.empty_like(share)
 
 
-def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:
+def _share_at(tables: FootprintTables, ids: Tensor, points: Tensor) -> Tensor:
+    """:func:`covered_share` at flat ids ``[b, N, n]`` of the landing points ``[R * L, 2]``, ``[b, N]``."""
+    return covered_share(tables, ids, gather_rows(points, ids))
+
+
+def _share_by_graph(tables: FootprintTables, ids: Tensor, points: Tensor) -> Tensor:
+    """:func:`_share_at`, compiled once for any number of worlds."""
+    graph = _share_graph(tables.cells_per_metre, *tables.masks.shape, *points.shape, *ids.shape[1:])
+    shares = []
+    for part in ids.split(_worlds_at_once(tables, ids, large=True)):
+        torch._dynamo.mark_dynamic(part, 0)
+        # A graph of a single world would be a special one, which takes seconds to compile.
+        shares.append(graph(tables.masks, part, points) if len(part) > 1 else _share_at(tables, part, points))
+    return torch.cat(shares)
+
+
+@functools.cache
+def _share_graph(cells_per_metre: float, *_sizes: int) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """The graph for masks, landing points and UAVs of these sizes, which no guard may find changed."""
+
+    def share(masks: Tensor, ids: Tensor, points: Tensor) -> Tensor:
+        tables = FootprintTables(masks, cells_per_metre)
+        return _covered_share(tables, ids, gather_rows(points, ids))
+
+    return compiled(share, options=LONG_ROWS)
+
+
+def _worlds_at_once(tables: FootprintTables, point_ids: Tensor, large: bool = False) -> int:
     """Number of worlds of ``point_ids [b, N, n]`` to look up together; depends on shapes only."""
     _, n_uavs, n_last = point_ids.shape
     words_per_world = n_uavs * n_last * (n_uavs + n_last - 1 + tables.masks.shape[-1])
-    small = point_ids.device.type == "cpu" and not torch.compiler.is_compiling()
-    return max(1, (_CHUNK_WORDS if small else _CHUNK_WORDS_LARGE) // words_per_world)
+    large = large or point_ids.device.type != "cpu" or torch.compiler.is_compiling()
+    return max(1, (_CHUNK_WORDS_LARGE if large else _CHUNK_WORDS) // words_per_world)
 
 
 def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
