@@ -172,7 +172,8 @@ def _share_by_graph(tables: FootprintTables, ids: Tensor, points: Tensor) -> Ten
 
 @functools.cache
 def _share_graph(cells_per_metre: float, *_sizes: int) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """The graph for masks, landing points and UAVs of these sizes, which no guard may find changed."""
+    """A graph of its own for each scale and all sizes but the number of worlds, because no guard checks the
+    scale, and other sizes would compile the same graph again and again."""
 
     def share(masks: Tensor, ids: Tensor, points: Tensor) -> Tensor:
         tables = FootprintTables(masks, cells_per_metre)
