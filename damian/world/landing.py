@@ -1,5 +1,6 @@
 """Actions (paper, section 4.2): a distance and a heading that lead to a landing point of the UAV's own."""
 
+import functools
 import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -296,13 +297,13 @@ def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: T
     point, distance = (gather_rows(table, row).unbind(-1) for table in ranking)
     reached = [each <= reach for each in distance]
     points = [torch.where(r, each.long(), standing).unbind(1) for r, each in zip(reached, point, strict=True)]
-    stands = standing.unbind(1)
+    stands, no = standing.unbind(1), torch.zeros_like(standing[:, 0], dtype=torch.bool)
     goals: list[Tensor] = []
     for i, own in enumerate(stands):
         goal, taken = own, [*stands[:i], *goals, *stands[i + 1 :]]
         for candidate in (each[i] for each in reversed(points)):
-            clashes = [torch.zeros_like(own, dtype=torch.bool), *(candidate == point for point in taken)]
-            refused = (candidate != own) & torch.stack(clashes).any(0)
+            clashes = (candidate == point for point in taken)
+            refused = (candidate != own) & functools.reduce(torch.logical_or, clashes, no)
             goal = torch.where(refused, goal, candidate)
         goals.append(goal)
     return torch.stack(goals, 1)

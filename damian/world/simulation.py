@@ -20,7 +20,7 @@ from damian.world.landing import Candidates, assign_landing_points
 from damian.world.messages import Messages
 from damian.world.sensors import sensors_of
 from damian.world.signal_source import footprint_radius, locate
-from damian.world.state import EPISODE, SEED, PackedState, State, StateLayout
+from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
 from damian.world.vehicles import check_model, make_model
 
 
@@ -88,8 +88,9 @@ class Simulation:
         """Begin a new episode in all of the given worlds."""
         seed, episode = worlds.integers[:, SEED], worlds.integers[:, EPISODE] + 1
         condition = counter_rng.bits(seed, episode) % self.n_initial_conditions
+        kept = torch.stack([seed, episode, condition], 1)  # the first three columns
+        condition = kept[:, INITIAL_CONDITION]  # or else a graph computes it anew for every column
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)
-        kept = torch.stack([seed, episode], 1)  # SEED and EPISODE are the first two columns
         fresh = fresh._replace(integers=torch.cat([kept, fresh.integers[:, kept.shape[1] :]], 1))
         return self._read_anew(fresh) if self.sensors else fresh
 

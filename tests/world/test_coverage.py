@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Point, Polygon
+from torch._dynamo import lookup_backend
 
 from damian.common.errors import InputError
 from damian.world import coverage
@@ -172,10 +173,11 @@ def test_bits_of_extreme_words_are_counted(word):
 
 
 @pytest.mark.parametrize("count", range(1, 10))
-def test_or_over_the_first_dimension_equals_numpys(count):
-    masks = np.random.default_rng(count).integers(-(2**63), 2**63 - 1, (count, 5, 2))
-    got = coverage._or_first(torch.tensor(masks))
-    assert got.tolist() == np.bitwise_or.reduce(masks, 0).tolist()
+def test_or_of_rows_equals_numpys(count):
+    rng = np.random.default_rng(count)
+    table, rows = rng.integers(-(2**63), 2**63 - 1, (20, 3)), rng.integers(0, 20, (count, 5))
+    got = coverage._or_rows(torch.tensor(table), torch.tensor(rows))
+    assert got.tolist() == np.bitwise_or.reduce(table[rows], 0).tolist()
 
 
 @pytest.mark.parametrize(("n_uavs", "n_last"), [(1, 1), (1, 3), (2, 2), (3, 2), (5, 1)])
@@ -192,7 +194,7 @@ def test_splitting_the_worlds_into_chunks_does_not_change_the_shares(square, mon
     tables, _, points = square
     ids, positions = at_random(points, (11, 3, 2))
     whole = covered_share(tables, ids, positions)
-    for words in (1, 16 * 3 * 2 * 4 * 3):  # one world, and three worlds, at a time
+    for words in (1, (16 + 4) * 3 * 2 * 3):  # one world, and three worlds, at a time
         monkeypatch.setattr(coverage, "_CHUNK_WORDS", words)
         assert torch.equal(covered_share(tables, ids, positions), whole)
 
@@ -228,6 +230,28 @@ def test_only_worlds_that_have_changed_are_computed_again(square, monkeypatch):
     updated_share(tables, changed, places, known)
     updated_share(tables, ids, places, known)
     assert sizes == [1]
+
+
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_one_graph_computes_the_shares_of_any_number_of_worlds(square, monkeypatch, backend):
+    tables, _, points = square
+    graphs, make = [], lookup_backend(backend)
+
+    def compiled(function, **_):
+        return torch.compile(
+            function, fullgraph=True, isolate_recompiles=True, backend=lambda *g: graphs.append(g) or make(*g)
+        )
+
+    monkeypatch.setattr(coverage, "compiled", compiled)
+    monkeypatch.setattr(coverage, "_CHUNK_WORDS_LARGE", (16 + 3) * 3 * 2 * 20)  # about 20 worlds
+    coverage._share_graph.cache_clear()
+    places = torch.tensor(points, dtype=torch.float32)
+    for n_worlds in (5, 1, 2, 39, 41, 20, 3):
+        ids, positions = at_random(points, (n_worlds, 3, 2), seed=n_worlds)
+        got = coverage._share_by_graph(tables, ids, places)
+        assert torch.equal(got, covered_share(tables, ids, positions))
+    coverage._share_graph.cache_clear()
+    assert len(graphs) == 1
 
 
 def test_permuting_the_uavs_permutes_their_shares(square):
