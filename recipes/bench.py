@@ -24,10 +24,12 @@ from damian.envs.uav_env import EXTRAS, UavEnv
 
 from .bench_arms import (
     BARE,
+    NO_BELIEF,
     RIVAL,
     WHOLE,
     Scenarios,
     arms,
+    believing,
     delayed,
     delays,
     fleet,
@@ -122,6 +124,22 @@ def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
     return table(title, ("environment", "ms/step", "times bare"), rows)
 
 
+def cost_of_belief(sizes: Sizes) -> str:
+    """Time of a step of a tracking task under the paper's delay, without and with a belief."""
+    envs = {
+        f"{name}, {mode}": delayed(scenario, delays()[WHOLE], sizes.worlds, mode)
+        for name, scenario in believing().items()
+        for mode in sizes.modes
+    }
+    times = rollout_times(envs, sizes.steps, sizes.repeats)
+    rows = []
+    for name, measured in times.items():
+        without = times[f"{NO_BELIEF}, {name.rpartition(', ')[2]}"].median
+        rows.append((name, f"{measured.median:.2f}", f"{measured.median / without:.2f}"))
+    title = f"What a belief costs: delaybench/tracking, {sizes.worlds} worlds, 3 UAVs, whole chain"
+    return table(title, ("environment", "ms/step", "times without"), rows)
+
+
 def growth_with_worlds(presets: Scenarios, sizes: Sizes) -> str:
     """Time of a step for each number of worlds, with 3 UAVs and the whole chain, not compiled."""
     rows = []
@@ -208,6 +226,7 @@ def measure(quick: bool) -> None:
     parts = (
         lambda: comparison(presets, sizes),
         lambda: cost_of_delays(presets, sizes),
+        lambda: cost_of_belief(sizes),
         lambda: growth_with_worlds(presets, sizes),
         lambda: growth_with_uavs(presets, sizes),
         lambda: memory(presets),

@@ -28,6 +28,7 @@ from .shared.settings import TrainConfig
 
 RIVAL, LIMITED = "VMAS discovery, episodes never end", "VMAS discovery, episodes of 100 steps"
 BARE, WHOLE = "bare", "whole chain"
+NO_BELIEF = "no belief"
 
 Scenarios = dict[str, ScenarioConfig]
 
@@ -48,10 +49,28 @@ def scenarios() -> Scenarios:
     return {"use case 2": paper, "everything": full}
 
 
+def believing() -> Scenarios:
+    """The tracking task of delaybench without a belief, with the server's, and with that of each UAV too."""
+    plain = _composed("scenario=delaybench/tracking")
+    features = {"belief": ["belief_gain", "belief_moments"]}
+    changes = {
+        NO_BELIEF: {},
+        "the server's belief": features,
+        "that of each UAV too": features | {"own": True},
+    }
+    return {
+        name: replace(plain, observation=replace(plain.observation, **changed))
+        for name, changed in changes.items()
+    }
+
+
 def _paper() -> TrainConfig:
+    return _composed("scenario=paper/usecase2", "model.hidden=[64,64]")
+
+
+def _composed(*overrides: str) -> TrainConfig:
     with initialize_config_dir(CONF, version_base=None):
-        composed = compose("train", overrides=["scenario=paper/usecase2", "model.hidden=[64,64]"])
-    return cast(TrainConfig, OmegaConf.to_object(composed))
+        return cast(TrainConfig, OmegaConf.to_object(compose("train", overrides=[*overrides])))
 
 
 def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:

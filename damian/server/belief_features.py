@@ -21,18 +21,35 @@ SECTORS = 8
 def _belief_gain(v: FeatureCache) -> Tensor:
     """Probability of detecting the source in the next step from where each discrete action leads, [*, N, A].
 
-    Actions begin at the landing point that the UAV has reached last, and are taken to be flown at once.
+    Actions begin at the landing point that the UAV has reached last, are taken to be flown at once, and lead
+    to the nearest landing point on which no other UAV stands, as far as is known.
     """
     if v.context.goals is None:
         raise ValueError("belief_gain needs the landing points to which actions lead")
-    predicted, n_points = predict(v.grid, v.belief, v.region), v.context.n_points
-    chance = detection_chance(v.grid, predicted, v.region)
-    point = v.wanted(v.messages.trail[..., 0])
-    goal = gather_rows(v.context.goals, point)
+    predicted = predict(v.grid, v.belief, v.region)
+    chance, everyone = detection_chance(v.grid, predicted, v.region), v.messages.trail[..., 0]
+    point = v.wanted(everyone)
+    goal = _free_goal(gather_rows(v.context.goals, point), point, everyone, v.context.n_points)
     gain = chance.unsqueeze(-2).expand(*goal.shape[:-1], -1).gather(-1, goal)
     rows = v.wanted(report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted)))
-    stays = goal == (point % n_points).unsqueeze(-1)
+    stays = goal == (point % v.context.n_points).unsqueeze(-1)
     return torch.where(stays, chance_of_staying(v.grid, predicted, rows).unsqueeze(-1), gain)
+
+
+def _free_goal(goals: Tensor, point: Tensor, everyone: Tensor, n_points: int) -> Tensor:
+    """The first goal of each action on which no other UAV stands, as an index in its region, [*, n, A].
+
+    Args:
+        goals: landing points to which the actions of the wanted UAVs may lead, [*, n, A, C].
+        point: flat ids of the landing points on which the wanted UAVs stand, [*, n].
+        everyone: flat ids of those of all UAVs, [*, N].
+        n_points: largest number of landing points in a region.
+    """
+    others = (everyone % n_points)[..., None, None, None, :]
+    own = (point % n_points)[..., None, None]
+    taken = (goals.unsqueeze(-1) == others).any(-1) & (goals != own)
+    first = taken.to(torch.uint8).argmin(-1, keepdim=True)
+    return goals.gather(-1, first).squeeze(-1)
 
 
 @FEATURES.register("belief_moments")

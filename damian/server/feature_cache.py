@@ -45,8 +45,8 @@ class ServerContext(NamedTuple):
     n_points: int = 0
     """Largest number of landing points in a region, L."""
     goals: Tensor | None = None
-    """For ``belief_gain``: index in its region of the landing point to which each discrete action leads, by
-    the flat id of the landing point on which it begins, [R*L, A]."""
+    """For ``belief_gain``: landing points to which each discrete action may lead, as indices in their region,
+    the preferred one first, by the flat id of the landing point on which it begins, [R*L, A, C]."""
     grid: SourceGrid | None = None
     """Cells in which the source may be; None if no feature reads the belief."""
     belief: Tensor | None = None

@@ -141,8 +141,8 @@ class Candidates:
         return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
 
     def goals(self) -> Tensor:
-        """Index in its region of the nearest landing point to which each discrete action leads, [R*L, A]."""
-        return self.ranking.point[:, 0].view(-1, self.config.n_actions).long()
+        """Landing points to which each discrete action may lead, nearest first, [R*L, A, C] indices."""
+        return self.ranking.point.view(-1, self.config.n_actions, self.n_candidates).long()
 
     def _rank_all(self) -> None:
         """Tabulate the candidates of every (landing point, action).

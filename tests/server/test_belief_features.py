@@ -46,7 +46,9 @@ def test_gain_is_the_chance_of_detecting_the_source_where_an_action_leads(flown)
         region = int(server.region_of(messages)[world])
         standing = int(messages.trail[world, uav, 0])
         for action in (0, 5, n_actions - 1):
-            point = int(candidates.ranking.point[standing * n_actions + action, 0])
+            others = {int(each) for i, each in enumerate(messages.trail[world, :, 0]) if i != uav}
+            first, base = standing * n_actions + action, region * simulation.airspace.max_points
+            point = next(p for p in candidates.ranking.point[first].tolist() if base + p not in others)
             flat = region * simulation.airspace.max_points + point
             expected = chance_at(server.grid, region, belief[world], flat)
             if flat == standing:  # the UAV stays
