@@ -4,16 +4,18 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from helpers import square
+from helpers import square, walking
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, Transform, TransformedEnv
 
 from damian.envs.uav_env import UavEnv
+from damian.server.features import ObservationConfig
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
+    Belief,
     Channel,
     CumulativeReward,
     ObservationDelay,
@@ -88,11 +90,19 @@ class Case(NamedTuple):
         return TransformedEnv(self.env(), self.make())
 
 
+def _belief() -> Transform:
+    observation = ObservationConfig(belief=["belief_moments"])
+    scenario = square(observation=observation, source=walking())
+    server = UavEnv(scenario, num_worlds=2, extras=["message"], messages_only=True).server
+    return Belief(server, longest=0, delayed=False, own=True)
+
+
 def _server_node() -> Transform:
     return ServerNode(unserved().server, ("agents", "message"))
 
 
 CASES = {
+    "Belief": Case(uavs, _belief),
     "ActionDelay, one world": Case(cartpole, lambda: ActionDelay(LATE)),
     "ActionDelay, worlds": Case(Drift, lambda: ActionDelay(LATE, loss=0.2)),
     "ActionDelay, agents": Case(uavs, lambda: ActionDelay(LATE, ACTION, sent_key="ready")),

@@ -11,7 +11,7 @@ from damian.server.belief_window import Window, advance, begin, empty_window
 from damian.server.server import Server
 from damian.server.source_grid import SourceGrid
 from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import Change, Entries, Memory
+from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows
 from damian.transforms.order import KeyUsage
 
 
@@ -58,34 +58,35 @@ class Belief(StatefulTransform):
         return dict.fromkeys(("belief", "match", "silent", "report", "delay"), 1)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        n_worlds, n_agents = tensordict.get(keys.MESSAGE).shape[:2]
+        n_worlds, n_agents = self.rows.numel(), tensordict.get(keys.MESSAGE).shape[-2]
         return empty_window(self._grid, self.longest, n_worlds, n_agents, self.own)._asdict()
 
     def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
-        n_agents, n_cells = tensordict.get(keys.MESSAGE).shape[1], self._grid.prior.shape[-1]
+        n_agents, n_cells = tensordict.get(keys.MESSAGE).shape[-2], self._grid.prior.shape[-1]
         viewers = 1 + n_agents * self.own
         return n_rows * (self.longest + 2) * (viewers * 4 * (2 * n_cells + 1) + n_agents * 16)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        messages = self.server.messages(entries[keys.MESSAGE])
+        messages = self.server.messages(as_rows(entries[keys.MESSAGE], self.rows))
         region = self.server.region_of(messages)
         return memory, self._written(begin(self._grid, Window(**memory), messages, region, mask))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        messages, sent = self.server.messages(entries[keys.MESSAGE]), entries[keys.MESSAGE_SENT]
-        report = report_rows(self._grid, messages, sent)
-        delay = entries[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(report)
+        rows = {key: as_rows(entries[key], self.rows) for key in self.in_keys}
+        messages = self.server.messages(rows[keys.MESSAGE])
+        report = report_rows(self._grid, messages, rows[keys.MESSAGE_SENT])
+        delay = rows[keys.DELAY].squeeze(-1) if self.delayed else torch.zeros_like(report)
         region = self.server.region_of(messages)
-        stepped = (
-            entries[keys.STEPPED].view(-1) if keys.STEPPED in entries else torch.ones_like(region).bool()
-        )
+        every = torch.ones_like(region, dtype=torch.bool)
+        stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
         slot, belief = advance(self._grid, Window(**memory), report, delay, region, stepped)
         return memory | {"slot": slot}, self._written(belief)
 
     def _written(self, belief: Tensor) -> Entries:
-        """The entries to write, from the beliefs of all receivers, [B, V, K]."""
-        own: Entries = {keys.OWN_BELIEF: belief[:, 1:]} if self.own else {}
-        return {keys.BELIEF: belief[:, 0], **own}
+        """The entries to write, from the beliefs of all receivers, [M, V, K]."""
+        belief = from_rows(belief, self.rows)
+        own: Entries = {keys.OWN_BELIEF: belief[..., 1:, :]} if self.own else {}
+        return {keys.BELIEF: belief[..., 0, :], **own}
 
     @property
     def _grid(self) -> SourceGrid:
