@@ -25,8 +25,8 @@ COMPILE_OPTIONS = {
     "fallback_random": True,  # the draws of torch's generator, as without compiling
 }
 """Options of ``torch.compile`` for networks."""
-FIRST_WEIGHT = 8.0
-"""Weight with which a skip connection begins."""
+FIRST_WEIGHT, LEAST = 8.0, 1e-3
+"""Weight with which a skip connection begins, and the least probability of which it takes the logarithm."""
 POLICY_GAIN = 0.01
 """Gain of the policy's output layer, if its initial weights are orthogonal."""
 Network = TypeVar("Network", bound=nn.Module)
@@ -45,9 +45,9 @@ class ModelConfig:
     """none or gru. With gru the actor's last hidden layer is a gated recurrent unit, so that a UAV remembers
     its observations of the episode."""
     skip: bool = False
-    """The actor's logits are the network's outputs plus, times a learnt weight, the feature of the
-    observation that has a value for each action (``observation.belief=[belief_gain]``). The actor begins as
-    one that prefers actions of high value."""
+    """The actor's logits are the network's outputs plus, times a learnt weight, the logarithm of the feature
+    that has a probability for each action (``observation.belief=[belief_gain]``). The actor begins as one
+    that prefers actions of high probability."""
     shared_value: bool = False
     """MAPPO's critic gives one value for all UAVs of a world, from the observations of all of them, instead
     of a value for each UAV. Updates are faster, but it learns less where each UAV has a reward of its own,
@@ -211,24 +211,26 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
 
 
 def action_columns(env: EnvBase, n_actions: int) -> slice:
-    """The columns of the actor's observation that have a value for each action.
+    """The columns of the actor's observation that have a probability for each action.
 
     Raises:
         InputError: the environment has no attribute ``action_columns``, or none such.
     """
     columns = getattr(env, "action_columns", None)
     good = isinstance(columns, slice) and columns.stop - columns.start == n_actions
-    should = "needs a feature with a value for each discrete action: observation.belief=[belief_gain]"
+    should = "needs a feature with a probability for each discrete action: observation.belief=[belief_gain]"
     checks.require(good, "model.skip", True, should)
     return cast(slice, columns)
 
 
 class SkipConnection(nn.Module):
-    """Logits that are the outputs of a network plus, times a learnt weight, a feature of each action.
+    """Logits that are the outputs of a network plus, times a learnt weight, the logarithm of a probability.
+
+    The policy begins as one that prefers actions of high probability, however small all of them are.
 
     Args:
         network: from its input to outputs [*, A], whose last layer begins with zeros.
-        columns: of the observation, which hold the feature of each action.
+        columns: of the observation, which hold a probability for each action.
     """
 
     def __init__(self, network: nn.Module, columns: slice) -> None:
@@ -242,7 +244,8 @@ class SkipConnection(nn.Module):
 
     def forward(self, features: Tensor, observation: Tensor) -> Tensor:
         """Logits [*, A] of the network's input [*, H] and observations [*, F]."""
-        return self.network(features) + self.weight * observation[..., self.columns]
+        log = observation[..., self.columns].clamp(min=LEAST).log()
+        return self.network(features) + self.weight * log
 
 
 def make_critic(
