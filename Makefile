@@ -9,7 +9,7 @@ PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 .PHONY: train test test-deep test-slow bench bench-quick check format clean
 
 train: $(VENV)/base
-	$(VENV)/bin/damian train $(ARGS)
+	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
 
 test: $(VENV)/test
 	$(PY) -m pytest -n 2 $(ARGS)

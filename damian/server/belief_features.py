@@ -22,7 +22,7 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     """Probability of detecting the source in the next step from where each discrete action leads, [*, N, A].
 
     Actions begin at the landing point that the UAV has reached last, are taken to be flown at once, and lead
-    to the nearest landing point on which no other UAV stands, as far as is known.
+    to the nearest landing point, or to the second nearest if another UAV is known to stand there.
     """
     if v.context.goals is None:
         raise ValueError("belief_gain needs the landing points to which actions lead")
@@ -37,7 +37,7 @@ def _belief_gain(v: FeatureCache) -> Tensor:
 
 
 def _free_goal(goals: Tensor, point: Tensor, everyone: Tensor, n_points: int) -> Tensor:
-    """The first goal of each action on which no other UAV stands, as an index in its region, [*, n, A].
+    """The goal of each action, or its second one if another UAV stands there, as an index, [*, n, A].
 
     Args:
         goals: landing points to which the actions of the wanted UAVs may lead, [*, n, A, C].
@@ -45,11 +45,9 @@ def _free_goal(goals: Tensor, point: Tensor, everyone: Tensor, n_points: int) ->
         everyone: flat ids of those of all UAVs, [*, N].
         n_points: largest number of landing points in a region.
     """
-    others = (everyone % n_points)[..., None, None, None, :]
-    own = (point % n_points)[..., None, None]
-    taken = (goals.unsqueeze(-1) == others).any(-1) & (goals != own)
-    first = taken.to(torch.uint8).argmin(-1, keepdim=True)
-    return goals.gather(-1, first).squeeze(-1)
+    first, second = goals[..., 0], goals[..., -1]
+    taken = (first.unsqueeze(-1) == (everyone % n_points)[..., None, None, :]).any(-1)
+    return torch.where(taken & (first != (point % n_points).unsqueeze(-1)), second, first)
 
 
 @FEATURES.register("belief_moments")

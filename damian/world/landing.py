@@ -141,8 +141,8 @@ class Candidates:
         return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
 
     def goals(self) -> Tensor:
-        """Landing points to which each discrete action may lead, nearest first, [R*L, A, C] indices."""
-        return self.ranking.point.view(-1, self.config.n_actions, self.n_candidates).long()
+        """The two nearest landing points to which each discrete action may lead, [R*L, A, C] indices."""
+        return self.ranking.point.view(-1, self.config.n_actions, self.n_candidates)[..., :2].long()
 
     def _rank_all(self) -> None:
         """Tabulate the candidates of every (landing point, action).
