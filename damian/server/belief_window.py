@@ -51,8 +51,8 @@ def empty_window(grid: SourceGrid, longest: int, n_worlds: int, n_agents: int, o
     device, n_slots, n_viewers = grid.prior.device, longest + 2, 1 + n_agents * own
     weights = torch.ones(n_slots, n_worlds, n_viewers, grid.prior.shape[-1], device=device)
     report = torch.full((n_slots, n_worlds, n_agents), grid.no_report, device=device)
-    slot = torch.zeros_like(report[0, :, 0])
-    return Window(weights, weights.clone(), weights[..., 0].clone(), report, report.clone(), slot)
+    slot, delay = torch.zeros_like(report[0, :, 0]), torch.full_like(report, -1)
+    return Window(weights, weights.clone(), weights[..., 0].clone(), report, delay, slot)
 
 
 def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor) -> Tensor:

@@ -4,7 +4,18 @@ import pytest
 import torch
 
 from damian.recipes import bench, bench_timing
-from damian.recipes.bench_arms import BARE, RIVAL, WHOLE, arms, delayed, delays, fleet, rivals, scenarios
+from damian.recipes.bench_arms import (
+    BARE,
+    RIVAL,
+    WHOLE,
+    arms,
+    believing,
+    delayed,
+    delays,
+    fleet,
+    rivals,
+    scenarios,
+)
 from damian.recipes.bench_timing import Measured, in_turn, staggered
 
 TINY = bench.Sizes(
@@ -60,6 +71,13 @@ def test_speed_is_given_relative_to_vmas():
     times = {RIVAL: Measured(30, 29, 31), "ours": Measured(2, 1, 3)}
     assert bench.ratio(times, times["ours"].median) == "15.0"
     assert bench.ratio({"ours": Measured(2, 1, 3)}, 2) == "-"
+
+
+@pytest.mark.slow
+def test_the_cost_of_a_belief_has_a_row_for_each_kind():
+    rows = bench.cost_of_belief(TINY).strip().splitlines()[4:]
+    assert len(rows) == len(believing()) * len(TINY.modes)
+    assert rows[0].endswith("| 1.00 |")
 
 
 @pytest.mark.slow
