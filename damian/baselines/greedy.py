@@ -54,12 +54,15 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
     checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
-    if keys.BELIEF in available and seeks_source(env.uav_env.scenario):
-        return searching_policy(env)
+    believes = keys.BELIEF in available and seeks_source(env.uav_env.scenario)
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
-    arguments = {"message": message, "age": keys.AGE, "mask": keys.ACTION_MASK}
+    arguments = {"message": message, "mask": keys.ACTION_MASK}
+    arguments |= {"belief": keys.BELIEF} if believes else {"age": keys.AGE}
+    if believes and keys.OWN_BELIEF in available:
+        arguments |= {"own_message": keys.MESSAGE, "own_belief": keys.OWN_BELIEF}
     in_keys: dict[str, NestedKey] = {name: key for name, key in arguments.items() if key in available}
-    return TensorDictModule(Greedy(env.uav_env), in_keys, [keys.ACTION])
+    script = Searcher if believes else Greedy
+    return TensorDictModule(script(env.uav_env), in_keys, [keys.ACTION])
 
 
 def seeks_source(scenario: ScenarioConfig) -> bool:
@@ -74,11 +77,12 @@ class Greedy:
     def __init__(self, worlds: UavEnv) -> None:
         scenario, simulation = worlds.scenario, worlds.simulation
         source = scenario.source
-        self.unpack, self.grid = worlds.server.messages, worlds.server.grid
+        self.unpack, self.region_of = worlds.server.messages, worlds.server.region_of
+        self.grid = worlds.server.grid
         self.radius, self.dt = simulation.radius, scenario.clock.dt
         self.candidates, self.actions = simulation.candidates, scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
-        self.emits = 1.0 if source.emission == "constant" else source.emission_probability
+        self.emits = source.emits
         self.seeks = seeks_source(scenario)
         self.real = simulation.airspace.points[..., 0].isfinite()
         self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
@@ -95,7 +99,7 @@ class Greedy:
             mask: legal discrete actions, [B, N, A]; all if not given.
         """
         held = self.unpack(message)
-        region = held.trail[:, 0, 0] // self.points.shape[1]
+        region = self.region_of(held)
         ground = self.points[region]
         weight = self.fresh(held, ground)
         if self.seeks:
@@ -225,18 +229,6 @@ def _distances(places: Tensor, others: Tensor) -> Tensor:
     return torch.cdist(places, others, compute_mode="donot_use_mm_for_euclid_dist")
 
 
-def searching_policy(env: DelayedEnv) -> TensorDictModule:
-    """Build the scripted policy that reads the belief, that of each UAV where the environment outputs it."""
-    available = env.observation_spec.keys(True, True)
-    held = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
-    arguments = {"message": held, "belief": keys.BELIEF, "mask": keys.ACTION_MASK}
-    arguments |= (
-        {"own_message": keys.MESSAGE, "own_belief": keys.OWN_BELIEF} if keys.OWN_BELIEF in available else {}
-    )
-    in_keys: dict[str, NestedKey] = {name: key for name, key in arguments.items() if key in available}
-    return TensorDictModule(Searcher(env.uav_env), in_keys, [keys.ACTION])
-
-
 class Searcher(Greedy):
     """Function from the belief to actions: each UAV flies where it most probably detects the source next.
 
@@ -263,7 +255,7 @@ class Searcher(Greedy):
         """
         known = self.unpack(message)
         own = known if own_message is None else self.unpack(own_message)
-        region = known.trail[:, 0, 0] // self.points.shape[1]
+        region = self.region_of(known)
         belief = belief.unsqueeze(1) if own_belief is None else own_belief
         assert self.grid is not None
         regions = region.unsqueeze(1).expand(belief.shape[:2])
@@ -271,11 +263,9 @@ class Searcher(Greedy):
         chance = detection_chance(self.grid, predicted, regions).expand(-1, known.time.shape[1], -1)
         here = own.trail[..., :1] % self.points.shape[1]
         rows = report_rows(self.grid, own, ~own.in_flight)
-        if own_belief is None:
-            stays = chance_of_staying(self.grid, predicted.squeeze(1), rows)
-        else:
-            stays = chance_of_staying(self.grid, predicted, rows.unsqueeze(-1)).squeeze(-1)
-        chance = chance.scatter(-1, here, stays.unsqueeze(-1)).masked_fill(self.taken(known), 0.0)
+        each = predicted.expand(*rows.shape, -1)
+        stays = chance_of_staying(self.grid, each, rows.unsqueeze(-1))
+        chance = chance.scatter(-1, here, stays).masked_fill(self.taken(known), 0.0)
         near = _distances(own.target, ground) <= self.from_others(known, ground)
         probable = chance.amax(-1, keepdim=True) >= PROBABLE
         chance = torch.where(probable | near, chance, 0.0)
@@ -290,7 +280,7 @@ class Searcher(Greedy):
         return distance.masked_fill(itself, torch.inf).amin(2)
 
     def taken(self, known: Messages) -> Tensor:
-        """Landing points on which another UAV stands, as far as it is known, [B, N, L] bool."""
+        """Landing points on which the latest known messages place another UAV, [B, N, L] bool."""
         point = known.trail[..., :1] % self.points.shape[1]
         stands = torch.zeros(*point.shape[:2], self.points.shape[1], device=point.device).scatter(
             -1, point, 1.0

@@ -276,9 +276,9 @@ def history_since_message(scenario: ScenarioConfig) -> bool:
 
 
 def has_server_node(scenario: ScenarioConfig) -> bool:
-    """Whether a transform computes what the server knows, as it does not follow from the messages just sent.
+    """Whether a ``ServerNode`` computes observations and rewards instead of ``UavEnv``.
 
-    So it is if messages are delayed, or if the server has a belief, which follows from all earlier ones.
+    It must if messages are delayed, or if a feature reads the belief, which depends on all earlier messages.
     """
     return has_message_delay(scenario) or bool(scenario.observation.belief)
 

@@ -126,7 +126,7 @@ class Mappo:
         self.losses = compiled(self._losses, options=COMPILE_OPTIONS) if compiles else self._losses
 
     def components(self) -> dict[str, Any]:
-        """What a checkpoint stores: networks, optimiser, and the entropy's weight if it changes."""
+        """What a checkpoint stores: networks, optimiser and, if it is annealed, the entropy coefficient."""
         networks = {"actor": self.actor, "critic": self.critic, "optimizer": self.optimizer}
         anneals = self.config.entropy_coeff_end is not None
         return {**networks, "entropy_coeff": self.entropy_coeff} if anneals else networks

@@ -26,7 +26,7 @@ COMPILE_OPTIONS = {
 }
 """Options of ``torch.compile`` for networks."""
 FIRST_WEIGHT, LEAST = 8.0, 1e-3
-"""Weight with which a skip connection begins, and the least probability of which it takes the logarithm."""
+"""Initial weight of a skip connection, and the lower bound of the probabilities of which it takes the log."""
 POLICY_GAIN = 0.01
 """Gain of the policy's output layer, if its initial weights are orthogonal."""
 Network = TypeVar("Network", bound=nn.Module)
@@ -103,7 +103,7 @@ class ModelConfig:
         return self.initialized(AgentGRU(encoder, n_out, n_hidden, device), 1.0)
 
     def initialized(self, network: Network, gain: float) -> Network:
-        """Give a network its initial weights, as ``init`` says; ``gain`` is that of its last layer."""
+        """Initialise the weights as the setting ``init`` says, with ``gain`` in the last layer."""
         if self.init == "orthogonal":
             layers = [each for each in network.modules() if isinstance(each, nn.Linear | nn.GRUCell)]
             for layer in layers:

@@ -104,7 +104,7 @@ class FeatureCache:
     @property
     def region(self) -> Tensor:
         """Index of the region, [*]."""
-        return self.messages.trail[..., 0, 0] // self.context.n_points
+        return self.messages.region(self.context.n_points)
 
     @property
     def grid(self) -> SourceGrid:

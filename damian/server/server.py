@@ -152,7 +152,7 @@ class Server:
 
     def region_of(self, messages: Messages) -> Tensor:
         """Index of the region to which each world's landing points belong, [*]."""
-        return messages.trail[..., 0, 0] // self._max_points
+        return messages.region(self._max_points)
 
     def __call__(
         self,

@@ -86,8 +86,8 @@ def build_source_grid(
         InputError: the tables do not fit into memory.
     """
     polygons = [region.polygon for region in airspace.regions]
-    edge = cell or max(CELL * radius, math.sqrt(max(p.area for p in polygons) / MOST_CELLS))
     area, n_points = max(polygon.area for polygon in polygons), airspace.points.shape[:2].numel()
+    edge = cell or max(CELL * radius, math.sqrt(area / MOST_CELLS))
     n_cells = math.ceil(area / edge**2)  # at least
     size = 4 * n_cells * (5 * n_points + n_cells + 4 * len(polygons))
     checks.fits("observation.belief_cell", f"{edge:g} m", size, "take larger cells")
@@ -107,9 +107,8 @@ def build_source_grid(
         for each in zip(polygons, airspace.points, strict=True)
     ]
     detects = DOUBT + (1 - 2 * DOUBT) * torch.cat(shares)
-    emits = 1.0 if source.emission == "constant" else source.emission_probability
-    log_reports = _log_reports(detects, emits, _renewed(centres, moves, edge))
-    return SourceGrid(centres, prior, moves, staying, detects, log_reports, emits)
+    log_reports = _log_reports(detects, source.emits, _renewed(centres, moves, edge))
+    return SourceGrid(centres, prior, moves, staying, detects, log_reports, source.emits)
 
 
 def _columns(polygons: list, edge: float) -> np.ndarray:

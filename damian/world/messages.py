@@ -90,6 +90,14 @@ class Messages(NamedTuple):
         """Whether the message was sent at a takeoff, so that its UAV is bound for another point, [*, N]."""
         return (self.position != self.target).any(-1)
 
+    def region(self, n_points: int) -> Tensor:
+        """Index of the region to which the landing points of each world belong, [*].
+
+        Args:
+            n_points: largest number of landing points in a region.
+        """
+        return self.trail[..., 0, 0] // n_points
+
     def age(self, now: Tensor) -> Tensor:
         """Age of information: time since each message was generated [s], [*, N].
 

@@ -67,6 +67,11 @@ class SourceConfig:
     max_wait: float = 360.0
     """Longest wait at a stop [s]."""
 
+    @property
+    def emits(self) -> float:
+        """Probability that the source emits in a step, if nothing else is known of it."""
+        return 1.0 if self.emission == "constant" else self.emission_probability
+
     def __post_init__(self) -> None:
         checks.in_range("source.microphone_db", self.microphone_db, 0.0, unit="dB")
         checks.in_range("source.level_db", self.level_db, -300.0, 300.0, "dB")
