@@ -1,0 +1,88 @@
+"""The scripted policy that reads the belief: where it sends the UAVs for a given belief."""
+
+import torch
+from helpers import SQUARE, square
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from damian import keys
+from damian.baselines.greedy import Searcher, greedy_policy
+from damian.delays.config import DelayConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
+from damian.world.landing import ActionConfig
+from damian.world.regions.config import RegionConfig
+
+
+def believing(reach: float = 300.0, own: bool = False, **changed) -> DelayedEnv:
+    """Three UAVs in the south-west of a square, which fly up to ``reach`` metres in 16 directions."""
+    region = RegionConfig(
+        kind="vertices",
+        vertices=SQUARE,
+        lattice_step=20.0,
+        initial_conditions=1,
+        start_positions=[[20.0, 20.0], [40.0, 20.0], [20.0, 40.0]],
+    )
+    sections = {
+        "region": region,
+        "observation": ObservationConfig(belief=["belief_moments"], own=own),
+        "actions": ActionConfig(
+            distances=[reach * n / 8 for n in range(9)], headings=[22.5 * n for n in range(16)]
+        ),
+    }
+    return make_env(square(**(sections | changed)), 1, extras=["message"])
+
+
+def certain(env: DelayedEnv, place: list[float]) -> tuple[TensorDictBase, Tensor]:
+    """First outputs in which all are certain of the cell nearest to a place, and its centre [2]."""
+    td, centres = env.reset(), env.server.grid.centres
+    cell = (centres - torch.tensor(place)).norm(dim=-1).argmin()
+    belief = torch.nn.functional.one_hot(cell, len(centres)).float().unsqueeze(0)
+    td[keys.BELIEF] = belief
+    if keys.OWN_BELIEF in td.keys(True, True):
+        td[keys.OWN_BELIEF] = belief.unsqueeze(1).expand_as(td[keys.OWN_BELIEF]).clone()
+    return td, centres[cell]
+
+
+def places_after(env: DelayedEnv, td: TensorDictBase) -> Tensor:
+    """Where the UAVs stand after the step that the policy chooses, [N, 2]."""
+    return env.uav_env.server.messages(env.step(greedy_policy(env)(td))["next"][keys.MESSAGE]).position[0]
+
+
+def test_all_uavs_fly_to_where_they_detect_the_source():
+    for own in (False, True):
+        env = believing(own=own)
+        td, centre = certain(env, [50.0, 50.0])
+        distance = (places_after(env, td) - centre).norm(dim=-1)
+        assert (distance < env.uav_env.simulation.radius).all()
+
+
+def test_a_uav_that_cannot_reach_the_source_flies_towards_it():
+    env = believing(reach=40.0)
+    td, centre = certain(env, [80.0, 80.0])
+    before = env.server.messages(td[keys.MESSAGE]).position[0]
+    after = places_after(env, td)
+    assert ((after - centre).norm(dim=-1) < (before - centre).norm(dim=-1) - 20.0).all()
+
+
+def test_no_uav_aims_at_a_landing_point_on_which_another_one_stands():
+    env = believing()
+    held = env.server.messages(env.reset()[keys.MESSAGE])
+    taken, point = Searcher(env.uav_env).taken(held)[0], held.trail[0, :, 0]
+    assert [[bool(taken[i, p]) for p in point] for i in range(3)] == [
+        [i != j for j in range(3)] for i in range(3)
+    ]
+    assert taken.sum() == 6
+
+
+def test_without_a_belief_or_a_reward_for_the_source_the_script_keeps_its_own_map():
+    scripts = {
+        "belief": believing(),
+        "late": believing(delay=DelayConfig(obs=2)),
+        "none": believing(observation=ObservationConfig()),
+        "coverage": believing(reward=RewardConfig(spotted=0.0, coverage=1.0)),
+    }
+    searches = {name: isinstance(greedy_policy(env).module, Searcher) for name, env in scripts.items()}
+    assert searches == {"belief": True, "late": True, "none": False, "coverage": False}
