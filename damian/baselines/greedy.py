@@ -17,7 +17,6 @@ from damian import keys
 from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import chance_of_staying, detection_chance, predict, report_rows
 from damian.world.messages import Messages
@@ -54,7 +53,7 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
     checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
-    believes = keys.BELIEF in available and seeks_source(env.uav_env.scenario)
+    believes = keys.BELIEF in available and env.uav_env.scenario.seeks_source
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
     arguments = {"message": message, "mask": keys.ACTION_MASK}
     arguments |= {"belief": keys.BELIEF} if believes else {"age": keys.AGE}
@@ -63,12 +62,6 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     in_keys: dict[str, NestedKey] = {name: key for name, key in arguments.items() if key in available}
     script = Searcher if believes else Greedy
     return TensorDictModule(script(env.uav_env), in_keys, [keys.ACTION])
-
-
-def seeks_source(scenario: ScenarioConfig) -> bool:
-    """Whether anything is won by finding the source."""
-    terms = {*scenario.reward.terms} - {"coverage", "battery", "mean_distance"}
-    return bool(terms) or scenario.episode.success_share is not None
 
 
 class Greedy:
@@ -83,7 +76,7 @@ class Greedy:
         self.candidates, self.actions = simulation.candidates, scenario.actions
         self.speed = max(source.speed, source.local_speed) if source.motion == "dynamic" else 0.0
         self.emits = source.emits
-        self.seeks = seeks_source(scenario)
+        self.seeks = scenario.seeks_source
         self.real = simulation.airspace.points[..., 0].isfinite()
         self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
         near = _distances(self.points, self.points) <= self.radius

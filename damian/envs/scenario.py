@@ -66,6 +66,12 @@ class ScenarioConfig(WorldConfig):
         )
 
     @property
+    def seeks_source(self) -> bool:
+        """Whether anything is won by finding the source."""
+        terms = {*self.reward.terms} - {"coverage", "battery", "mean_distance"}
+        return bool(terms) or self.episode.success_share is not None
+
+    @property
     def time_scale(self) -> float:
         """Time by which time features are divided [s]: the setting, else the time limit, else one hour."""
         limit = None if self.episode.max_steps is None else self.episode.max_steps * self.clock.dt

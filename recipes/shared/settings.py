@@ -108,6 +108,13 @@ class TrainConfig(ScenarioConfig):
         if self.episodes is not None:
             checks.in_range("episodes", self.episodes, 1, 1e12)
         checks.device("device", self.device)
+        if not self.seeks_source:
+            self._leave_out_belief()
+
+    def _leave_out_belief(self) -> None:
+        """Observe no belief about a source by which nothing is won: ``aware=belief`` suits any task."""
+        self.observation = replace(self.observation, belief=[])
+        self.model = replace(self.model, skip=False)
 
     def check_learning(self) -> None:
         """Check that the settings allow training; an evaluation has fewer requirements.

@@ -12,9 +12,12 @@ from torch import Tensor
 
 from damian.envs.pipeline import make_env
 from damian.evaluation.training_state import load_networks
-from damian.learners.networks import make_actor, make_critic
+from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.shared.stored_runs import stored_config
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
+from damian.server.termination import EpisodeConfig
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
@@ -283,3 +286,17 @@ def test_training_on_the_real_region_clearly_beats_random(run):
     trained, random = float(rows[0][2]), float(rows[2][2])
     assert trained >= 0.8
     assert random <= 0.1
+
+
+@pytest.mark.parametrize(
+    ("spotted", "success", "kept"), [(0.0, None, False), (0.0, 0.5, True), (1.0, None, True)]
+)
+def test_where_nothing_is_won_by_the_source_a_belief_is_left_out(spotted, success, kept):
+    config = TrainConfig(
+        reward=RewardConfig(coverage=1.0, spotted=spotted),
+        episode=EpisodeConfig(success_share=success),
+        observation=ObservationConfig(own=True, belief=["belief_gain"]),
+        model=ModelConfig(skip=True),
+    )
+    assert bool(config.observation.belief) is config.model.skip is kept
+    assert config.observation.own
