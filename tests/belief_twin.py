@@ -53,9 +53,14 @@ def _weighed(grid: SourceGrid, probable: list[float], rows: list[int]) -> list[f
     return [each / sum(weighed) for each in weighed]
 
 
+def detection_table(grid: SourceGrid) -> Tensor:
+    """Probability that a UAV on a landing point detects a source that emits in a cell, [R*L, K]."""
+    return grid.log_reports[1 : grid.no_report // 2 : 2].exp()
+
+
 def chance_at(grid: SourceGrid, region: int, probable: Tensor, point: int) -> float:
     """Probability of detecting the source in the next step from a landing point, by its flat id."""
-    prior, total = grid.prior[region].tolist(), 0.0
+    prior, total, detects = grid.prior[region].tolist(), 0.0, detection_table(grid)[point]
     for a, chance in enumerate(probable.tolist()):
         inside = {
             b: float(grid.moves[a, b]) if grid.moves is not None else float(a == b)
@@ -63,7 +68,5 @@ def chance_at(grid: SourceGrid, region: int, probable: Tensor, point: int) -> fl
             if prior[b] > 0
         }
         if chance:
-            total += sum(
-                chance * w / sum(inside.values()) * float(grid.detects[point, b]) for b, w in inside.items()
-            )
+            total += sum(chance * w / sum(inside.values()) * float(detects[b]) for b, w in inside.items())
     return grid.emits * total

@@ -18,7 +18,7 @@ from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
-from damian.server.belief import chance_of_staying, detection_chance, predict, report_rows
+from damian.server.belief import chance_of_staying, detection_chance, report_rows
 from damian.world.messages import Messages
 
 BLUR_M = 5.0
@@ -252,11 +252,11 @@ class Searcher(Greedy):
         belief = belief.unsqueeze(1) if own_belief is None else own_belief
         assert self.grid is not None
         regions = region.unsqueeze(1).expand(belief.shape[:2])
-        predicted, ground = predict(self.grid, belief, regions), self.points[region]
-        chance = detection_chance(self.grid, predicted, regions).expand(-1, known.time.shape[1], -1)
+        ground = self.points[region]
+        chance = detection_chance(self.grid, belief, regions).expand(-1, known.time.shape[1], -1)
         here = own.trail[..., :1] % self.points.shape[1]
         rows = report_rows(self.grid, own, ~own.in_flight)
-        each = predicted.expand(*rows.shape, -1)
+        each = belief.expand(*rows.shape, -1)
         stays = chance_of_staying(self.grid, each, rows.unsqueeze(-1))
         chance = chance.scatter(-1, here, stays).masked_fill(self.taken(known), 0.0)
         near = _distances(own.target, ground) <= self.from_others(known, ground)

@@ -92,8 +92,8 @@ def weigh(grid: SourceGrid, predicted: Tensor, found: Evidence) -> Tensor:
     likelihood = found.match
     if grid.emits < 1:
         likelihood = grid.emits * likelihood + (1 - grid.emits) * found.silent.unsqueeze(-1)
-    weighed = predicted * (likelihood + _LEAST)
-    return weighed / weighed.sum(-1, keepdim=True)
+    weighed = (likelihood + _LEAST).mul_(predicted)
+    return weighed.div_(weighed.sum(-1, keepdim=True))
 
 
 def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
@@ -107,31 +107,29 @@ def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
     return weigh(grid, gather_rows(grid.prior, region), evidence(grid, rows))
 
 
-def detection_chance(grid: SourceGrid, predicted: Tensor, region: Tensor) -> Tensor:
-    """Probability that a UAV which lands on a landing point of the region detects the source there, [*, L].
+def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
+    """Probability that a UAV which lands on a landing point of the region next detects the source, [*, L].
 
     Args:
         grid: cells and tables.
-        predicted: probability of each cell at that time, [*, K].
+        belief: probability of each cell now, one step before the landing, [*, K].
         region: index of the region, [*].
     """
-    detects = grid.detects.view(len(grid.prior), -1, predicted.shape[-1])
-    if len(detects) == 1:
-        return grid.emits * (predicted @ detects[0].T)
-    here = gather_rows(detects, region)
-    return grid.emits * (here @ predicted.unsqueeze(-1)).squeeze(-1)
+    if len(grid.prior) == 1:
+        return belief @ grid.next_detection.T
+    here = gather_rows(grid.next_detection.view(len(grid.prior), -1, belief.shape[-1]), region)
+    return (here @ belief.unsqueeze(-1)).squeeze(-1)
 
 
-def chance_of_staying(grid: SourceGrid, predicted: Tensor, rows: Tensor) -> Tensor:
+def chance_of_staying(grid: SourceGrid, belief: Tensor, rows: Tensor) -> Tensor:
     """Probability that a UAV which stays where it is detects the source in the next step, [*, N].
 
-    That is less than for a UAV which lands there, if it has just detected nothing.
+    That is less than for a UAV which lands there, if it has just detected nothing; and 0 for one in flight.
 
     Args:
         grid: cells and tables.
-        predicted: probability of each cell at that time, [*, K].
-        rows: rows of ``SourceGrid.log_reports`` for what the UAVs report now, [*, N].
+        belief: probability of each cell now, [*, K].
+        rows: rows of ``SourceGrid.log_reports`` for what the UAVs report now, not marked as repeated, [*, N].
     """
-    again = gather_rows(grid.log_reports, repeated(grid, rows, rows)).exp()
-    detects = torch.where((rows % 2 == 1).unsqueeze(-1), again, 1 - again)
-    return grid.emits * (detects @ predicted.unsqueeze(-1)).squeeze(-1)
+    chance = gather_rows(grid.next_staying, rows.clamp(max=len(grid.next_staying) - 1))
+    return (chance * belief.unsqueeze(-2)).sum(-1)

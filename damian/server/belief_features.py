@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from damian.common.tensors import gather_rows
-from damian.server.belief import chance_of_staying, detection_chance, predict, report_rows
+from damian.server.belief import chance_of_staying, detection_chance, report_rows
 from damian.server.feature_cache import FeatureCache
 from damian.server.features import FEATURES, feature
 
@@ -26,28 +26,19 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     """
     if v.context.goals is None:
         raise ValueError("belief_gain needs the landing points to which actions lead")
-    predicted = predict(v.grid, v.belief, v.region)
-    chance, everyone = detection_chance(v.grid, predicted, v.region), v.messages.trail[..., 0]
-    point = v.wanted(everyone)
-    goal = _free_goal(gather_rows(v.context.goals, point), point, everyone, v.context.n_points)
-    gain = chance.unsqueeze(-2).expand(*goal.shape[:-1], -1).gather(-1, goal)
+    everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
+    standing = v.wanted(v.messages.trail[..., 0])
+    here = (standing % n_points).unsqueeze(-1)
     rows = v.wanted(report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted)))
-    stays = goal == (point % v.context.n_points).unsqueeze(-1)
-    return torch.where(stays, chance_of_staying(v.grid, predicted, rows).unsqueeze(-1), gain)
-
-
-def _free_goal(goals: Tensor, point: Tensor, everyone: Tensor, n_points: int) -> Tensor:
-    """The goal of each action, or its second one if another UAV stands there, as an index, [*, n, A].
-
-    Args:
-        goals: landing points to which the actions of the wanted UAVs may lead, [*, n, A, C].
-        point: flat ids of the landing points on which the wanted UAVs stand, [*, n].
-        everyone: flat ids of those of all UAVs, [*, N].
-        n_points: largest number of landing points in a region.
-    """
-    first, second = goals[..., 0], goals[..., -1]
-    taken = (first.unsqueeze(-1) == (everyone % n_points)[..., None, None, :]).any(-1)
-    return torch.where(taken & (first != (point % n_points).unsqueeze(-1)), second, first)
+    stays = chance_of_staying(v.grid, v.belief, rows).unsqueeze(-1)
+    chance = detection_chance(v.grid, v.belief, v.region).unsqueeze(-2)
+    chance = chance.expand(*standing.shape, -1).scatter(-1, here, stays)
+    goals = gather_rows(v.context.goals, standing)
+    nearest, second = goals[..., 0], goals[..., -1]
+    taken = torch.zeros(*everyone.shape[:-1], n_points, dtype=torch.bool, device=everyone.device)
+    taken = taken.scatter(-1, everyone, True).unsqueeze(-2).expand(*standing.shape, -1)
+    taken = taken.gather(-1, nearest) & (nearest != here)
+    return chance.gather(-1, torch.where(taken, second, nearest))
 
 
 @FEATURES.register("belief_moments")
@@ -58,8 +49,9 @@ def _belief_moments(v: FeatureCache) -> Tensor:
     Lengths are over the largest vertex distance of the region, and at most 1.
     """
     belief, centres = v.belief, v.grid.centres
-    mean = belief @ centres
-    variance = (belief @ centres.square() - mean.square()).sum(-1).clamp(min=0)
+    *mean, square = (belief @ torch.cat([centres, centres.square().sum(-1, True)], -1)).unbind(-1)
+    mean = torch.stack(mean, -1)
+    variance = (square - mean.square().sum(-1)).clamp(min=0)
     offset = (mean.unsqueeze(-2) - v.wanted(v.messages.position)) / v.scale.unsqueeze(-1)
     entropy = -(belief * belief.clamp(min=1e-12).log()).sum(-1) / math.log(max(belief.shape[-1], 2))
     shared = torch.stack([variance.sqrt() / v.context.scale, entropy], -1).unsqueeze(-2)

@@ -1,11 +1,12 @@
 """The beliefs of the latest steps, corrected as messages of these steps come in late.
 
-A ring of slots holds, for each of the latest steps, the belief and what the messages of that step say as far
-as they are known. A message that comes in late changes what is known of its step; from there the filter runs
+A ring of slots holds, for each of the latest steps, the belief, and what the messages of that step report
+with their delays. A message that comes in late changes what is known of its step; from there the filter runs
 again. No message is later than the longest delay, so that older beliefs are final.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, get_type_hints
 
 import torch
 from torch import Tensor
@@ -13,7 +14,6 @@ from torch import Tensor
 from damian.common import devices
 from damian.common.tensors import expand_mask, gather_rows
 from damian.server.belief import (
-    Evidence,
     evidence,
     first_belief,
     predict,
@@ -34,10 +34,6 @@ class Window(NamedTuple):
 
     belief: Tensor
     """Probability of each cell after the messages of the step, [S, B, V, K]."""
-    match: Tensor
-    """``Evidence.match`` of the messages of the step that are known, [S, B, V, K]."""
-    silent: Tensor
-    """``Evidence.silent`` of them, [S, B, V]."""
     report: Tensor
     """What the UAVs report in the step (``report_rows``), [S, B, N]."""
     delay: Tensor
@@ -49,10 +45,10 @@ class Window(NamedTuple):
 def empty_window(grid: SourceGrid, longest: int, n_worlds: int, n_agents: int, own: bool) -> Window:
     """A window for messages that are at most ``longest`` steps late; ``own``: also for each UAV."""
     device, n_slots, n_viewers = grid.prior.device, longest + 2, 1 + n_agents * own
-    weights = torch.ones(n_slots, n_worlds, n_viewers, grid.prior.shape[-1], device=device)
+    belief = torch.ones(n_slots, n_worlds, n_viewers, grid.prior.shape[-1], device=device)
     report = torch.full((n_slots, n_worlds, n_agents), grid.no_report, device=device)
     slot, delay = torch.zeros_like(report[0, :, 0]), torch.full_like(report, -1)
-    return Window(weights, weights.clone(), weights[..., 0].clone(), report, delay, slot)
+    return Window(belief, report, delay, slot)
 
 
 def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor) -> Tensor:
@@ -94,88 +90,71 @@ def advance(
 
 # Operators of their own: the number of worlds to work on depends on data, which no compiler can trace.
 
-_RING = ("belief", "match", "silent", "report", "delay")
+_TYPES: dict[Any, str] = {Tensor: "Tensor", Tensor | None: "Tensor?", float: "float"}
+_CHANGED = ("belief", "report", "delay")
+"""Tensors of the window that the operators change."""
 
 
-@torch.library.custom_op("damian::begin_belief", mutates_args=_RING)
-def _begin(
-    centres: Tensor,
-    prior: Tensor,
-    moves: Tensor | None,
-    staying: Tensor,
-    detects: Tensor,
-    log_reports: Tensor,
-    emits: float,
-    belief: Tensor,
-    match: Tensor,
-    silent: Tensor,
-    report: Tensor,
-    delay: Tensor,
-    slot: Tensor,
-    first: Tensor,
-    region: Tensor,
-    mask: Tensor,
-) -> Tensor:
-    grid = SourceGrid(centres, prior, moves, staying, detects, log_reports, emits)
-    chosen, n_viewers = _chosen(mask), belief.shape[2]
-    at = slot * len(mask) + torch.arange(len(mask), device=mask.device)
+def _operator(name: str, arguments: str, returns: str) -> Callable[[Callable], Any]:
+    """Decorator that makes a function of grid, window and further arguments an operator ``damian::name``."""
+    grid = [f"{_TYPES[kind]} {field}" for field, kind in get_type_hints(SourceGrid).items()]
+    window = [f"Tensor(a{i}!) {f}" if f in _CHANGED else f"Tensor {f}" for i, f in enumerate(Window._fields)]
+    schema = f"({', '.join([*grid, *window, arguments])}) -> {returns}"
+    return torch.library.custom_op(f"damian::{name}", mutates_args=_CHANGED, schema=schema)
+
+
+def _unpacked(arguments: tuple) -> tuple[SourceGrid, Window, tuple[Tensor, ...]]:
+    """The grid, the window and the further arguments of an operator."""
+    n_grid, n_both = len(SourceGrid._fields), len(SourceGrid._fields) + len(Window._fields)
+    return SourceGrid(*arguments[:n_grid]), Window(*arguments[n_grid:n_both]), arguments[n_both:]
+
+
+@_operator("begin_belief", "Tensor first, Tensor region, Tensor mask", "Tensor")
+def _begin(*arguments: Any) -> Tensor:
+    grid, window, (first, region, mask) = _unpacked(arguments)
+    chosen, n_viewers = _chosen(mask), window.belief.shape[2]
+    at = window.slot * len(mask) + torch.arange(len(mask), device=mask.device)
     known = first.index_select(0, chosen)
     new = first_belief(grid, known, region.index_select(0, chosen))
-    _write(belief, at, new.unsqueeze(1).expand(-1, n_viewers, -1), mask, chosen)
-    report.masked_fill_(mask.unsqueeze(-1), grid.no_report)  # nothing is in transit
-    _write(report, at, known, mask, chosen)
-    _write(delay, at, torch.zeros_like(known), mask, chosen)
-    return _read(belief, at)
+    _write(window.belief, at, new.unsqueeze(1).expand(-1, n_viewers, -1), mask, chosen)
+    window.report.masked_fill_(mask.unsqueeze(-1), grid.no_report)  # nothing is in transit
+    _write(window.report, at, known, mask, chosen)
+    _write(window.delay, at, torch.zeros_like(known), mask, chosen)
+    return _read(window.belief, at)
 
 
 @_begin.register_fake
-def _(*arguments):
-    return arguments[7].new_empty(arguments[7].shape[1:])
+def _(*arguments: Any) -> Tensor:
+    belief = _unpacked(arguments)[1].belief
+    return belief.new_empty(belief.shape[1:])
 
 
-@torch.library.custom_op("damian::advance_belief", mutates_args=_RING)
-def _advance(
-    centres: Tensor,
-    prior: Tensor,
-    moves: Tensor | None,
-    staying: Tensor,
-    detects: Tensor,
-    log_reports: Tensor,
-    emits: float,
-    belief: Tensor,
-    match: Tensor,
-    silent: Tensor,
-    report: Tensor,
-    delay: Tensor,
-    slot: Tensor,
-    sent: Tensor,
-    sent_delay: Tensor,
-    region: Tensor,
-    stepped: Tensor,
-) -> tuple[Tensor, Tensor]:
-    grid = SourceGrid(centres, prior, moves, staying, detects, log_reports, emits)
-    window = Window(belief, match, silent, report, delay, slot)
-    n_slots, n_worlds = belief.shape[:2]
-    latest = torch.where(stepped, (slot + 1) % n_slots, slot)
-    lags = torch.arange(n_slots, device=slot.device).unsqueeze(-1)
-    at = (latest - lags) % n_slots * n_worlds + torch.arange(n_worlds, device=slot.device)  # [S, B]
-    _write(report, at[0], sent, stepped)
-    _write(delay, at[0], sent_delay, stepped)
+@_operator(
+    "advance_belief", "Tensor sent, Tensor sent_delay, Tensor region, Tensor stepped", "(Tensor, Tensor)"
+)
+def _advance(*arguments: Any) -> tuple[Tensor, Tensor]:
+    grid, window, (sent, sent_delay, region, stepped) = _unpacked(arguments)
+    n_slots, n_worlds = window.belief.shape[:2]
+    latest = torch.where(stepped, (window.slot + 1) % n_slots, window.slot)
+    lags = torch.arange(n_slots, device=latest.device).unsqueeze(-1)
+    at = (latest - lags) % n_slots * n_worlds + torch.arange(n_worlds, device=latest.device)  # [S, B]
+    _write(window.report, at[0], sent, stepped)
+    _write(window.delay, at[0], sent_delay, stepped)
     rows, arrives = _known(grid, window, at)
     changed = arrives.flatten(2).any(-1) & stepped
     changed[:-1] |= changed[1:].clone()  # what is known of a step tells whether the next report is repeated
     changed[0] = stepped
-    _learn(grid, window, at[:-1], rows, changed)
     stale = torch.zeros_like(stepped)  # worlds whose beliefs change from the step with this lag on
     for lag in range(_oldest(changed), -1, -1):
         stale = stale | changed[lag]
-        _filter(grid, window, at[lag], at[lag + 1], region, stale)
-    return latest, _read(belief, at[0])
+        _filter(grid, window, at[lag], at[lag + 1], rows[lag], region, stale)
+    return latest, _read(window.belief, at[0])
 
 
 @_advance.register_fake
-def _(*arguments):
-    return torch.empty_like(arguments[12]), arguments[7].new_empty(arguments[7].shape[1:])
+def _(*arguments: Any) -> tuple[Tensor, Tensor]:
+    window = _unpacked(arguments)[1]
+    return torch.empty_like(window.slot), window.belief.new_empty(window.belief.shape[1:])
 
 
 def _known(grid: SourceGrid, window: Window, at: Tensor) -> tuple[Tensor, Tensor]:
@@ -201,23 +180,6 @@ def _known(grid: SourceGrid, window: Window, at: Tensor) -> tuple[Tensor, Tensor
     return repeated(grid, rows[:-1], rows[1:]), arrives[:-1]
 
 
-def _learn(grid: SourceGrid, window: Window, at: Tensor, rows: Tensor, changed: Tensor) -> None:
-    """Note what the known messages say of the steps in which they were sent, in place.
-
-    Args:
-        grid: cells and tables.
-        window: beliefs of the latest steps.
-        at: row of each step in the flattened ring, [L, B].
-        rows: known reports of these steps, [L, B, V, N].
-        changed: for which steps of which worlds they have changed, [L, B] bool.
-    """
-    at, worlds = at.flatten(), changed.flatten()
-    chosen = _chosen(worlds)
-    found = evidence(grid, rows.flatten(0, 1).index_select(0, chosen))
-    for held, new in zip((window.match, window.silent), found, strict=True):
-        _write(held, at, new, worlds, chosen)
-
-
 def _oldest(changed: Tensor) -> int:
     """The last row of ``changed`` [L, B] in which any is true; L - 1 where it must not depend on data."""
     if not devices.data_dependent(changed.device):
@@ -226,7 +188,13 @@ def _oldest(changed: Tensor) -> int:
 
 
 def _filter(
-    grid: SourceGrid, window: Window, at: Tensor, before: Tensor, region: Tensor, worlds: Tensor
+    grid: SourceGrid,
+    window: Window,
+    at: Tensor,
+    before: Tensor,
+    rows: Tensor,
+    region: Tensor,
+    worlds: Tensor,
 ) -> None:
     """Compute the belief of one step from that of the step before, in place.
 
@@ -235,14 +203,16 @@ def _filter(
         window: beliefs of the latest steps.
         at: row of the step in the flattened ring, [B].
         before: row of the step before it, [B].
+        rows: known reports of the step, [B, V, N].
         region: index of the region of each world, [B].
         worlds: worlds in which the belief has changed, [B] bool.
     """
     chosen = _chosen(worlds)
-    rows, before, region = (each.index_select(0, chosen) for each in (at, before, region))
-    found = Evidence(_read(window.match, rows), _read(window.silent, rows))
-    region = region.unsqueeze(-1).expand(found.silent.shape)
-    new = weigh(grid, predict(grid, _read(window.belief, before), region), found)
+    before, rows, region = (each.index_select(0, chosen) for each in (before, rows, region))
+    new = predict(grid, _read(window.belief, before), region.unsqueeze(-1).expand(rows.shape[:-1]))
+    unknown = devices.data_dependent(rows.device) and bool((rows == grid.no_report).all())
+    if not unknown:
+        new = weigh(grid, new, evidence(grid, rows))
     _write(window.belief, at, new, worlds, chosen)
 
 

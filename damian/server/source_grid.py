@@ -48,8 +48,12 @@ class SourceGrid(NamedTuple):
     is only one region, they are probabilities."""
     staying: Tensor
     """Sum of the weights of the moves from each cell that end in the region, [R, K]."""
-    detects: Tensor
-    """Probability that a UAV on a landing point detects a source that emits in a cell, [R*L, K]."""
+    next_detection: Tensor
+    """Probability that a UAV which lands on a landing point in the next step detects the source there, if the
+    source is in a cell now, [R*L, K]."""
+    next_staying: Tensor
+    """The same for a UAV which stays where it is, [2*R*L + 1, K]. For the landing point of flat id p, row 2p:
+    it detects nothing now; row 2p + 1: it detects the source now. The last row, of zeros: it is in flight."""
     log_reports: Tensor
     """Log-probability of what a UAV on a landing point reports if the source emits in a cell,
     [4*R*L + 1, K]. For the landing point of flat id p, row 2p: it detects nothing; row 2p + 1: it detects the
@@ -89,7 +93,7 @@ def build_source_grid(
     area, n_points = max(polygon.area for polygon in polygons), airspace.points.shape[:2].numel()
     edge = cell or max(CELL * radius, math.sqrt(area / MOST_CELLS))
     n_cells = math.ceil(area / edge**2)  # at least
-    size = 4 * n_cells * (5 * n_points + n_cells + 4 * len(polygons))
+    size = 4 * n_cells * (8 * n_points + n_cells + 4 * len(polygons))
     checks.fits("observation.belief_cell", f"{edge:g} m", size, "take larger cells")
     columns = _columns(polygons, edge)
     centres = torch.as_tensor(columns * edge, dtype=torch.float32)
@@ -108,7 +112,8 @@ def build_source_grid(
     ]
     detects = DOUBT + (1 - 2 * DOUBT) * torch.cat(shares)
     log_reports = _log_reports(detects, source.emits, _renewed(centres, moves, edge))
-    return SourceGrid(centres, prior, moves, staying, detects, log_reports, source.emits)
+    grid = SourceGrid(centres, prior, moves, staying, detects, detects, log_reports, source.emits)
+    return grid._replace(next_detection=_one_step_before(grid, detects), next_staying=_staying(grid))
 
 
 def _columns(polygons: list, edge: float) -> np.ndarray:
@@ -194,6 +199,32 @@ def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
         for each in ((silent, detects), (again, renewed * detects + 1 - renewed))
     )
     return torch.cat([fresh, repeated, torch.ones_like(fresh[:1])]).log()
+
+
+def _one_step_before(grid: SourceGrid, chances: Tensor) -> Tensor:
+    """Probability of a detection by the cell of the source one step before, [P, K].
+
+    Args:
+        grid: cells, moves and emission.
+        chances: probability of the detection if the source emits in a cell, [P, K]; P is a multiple of R, and
+            the same number of rows are of each region.
+    """
+    if grid.moves is None:
+        return grid.emits * chances
+    if len(grid.prior) == 1:
+        return grid.emits * chances @ grid.moves.T
+    inside = (grid.prior > 0).unsqueeze(1)
+    by_region = chances.view(len(grid.prior), -1, chances.shape[-1]) * inside
+    before = (by_region @ grid.moves.T) / grid.staying.unsqueeze(1)
+    return grid.emits * before.view_as(chances)
+
+
+def _staying(grid: SourceGrid) -> Tensor:
+    """The table ``SourceGrid.next_staying``, from the repeated reports of ``SourceGrid.log_reports``."""
+    again = grid.log_reports[grid.no_report // 2 : -1].exp()
+    again[::2] = 1 - again[::2]
+    again = _one_step_before(grid, again)
+    return torch.cat([again, torch.zeros_like(again[:1])])
 
 
 def _detected_shares(

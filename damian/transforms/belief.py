@@ -55,7 +55,7 @@ class Belief(StatefulTransform):
 
     @property
     def row_dims(self) -> dict[str, int]:
-        return dict.fromkeys(("belief", "match", "silent", "report", "delay"), 1)
+        return dict.fromkeys(("belief", "report", "delay"), 1)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         n_worlds, n_agents = self.rows.numel(), tensordict.get(keys.MESSAGE).shape[-2]
@@ -64,7 +64,7 @@ class Belief(StatefulTransform):
     def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
         n_agents, n_cells = tensordict.get(keys.MESSAGE).shape[-2], self._grid.prior.shape[-1]
         viewers = 1 + n_agents * self.own
-        return n_rows * (self.longest + 2) * (viewers * 4 * (2 * n_cells + 1) + n_agents * 16)
+        return n_rows * (self.longest + 2) * (viewers * 4 * n_cells + n_agents * 16)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         messages = self.server.messages(as_rows(entries[keys.MESSAGE], self.rows))
@@ -85,7 +85,8 @@ class Belief(StatefulTransform):
     def _written(self, belief: Tensor) -> Entries:
         """The entries to write, from the beliefs of all receivers, [M, V, K]."""
         belief = from_rows(belief, self.rows)
-        own: Entries = {keys.OWN_BELIEF: belief[..., 1:, :]} if self.own else {}
+        # Contiguous tensors are multiplied three times as fast.
+        own: Entries = {keys.OWN_BELIEF: belief[..., 1:, :].contiguous()} if self.own else {}
         return {keys.BELIEF: belief[..., 0, :], **own}
 
     @property
