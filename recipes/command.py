@@ -22,12 +22,16 @@ PROGRAMS = {
     "evaluate": "evaluate a trained policy, also in another scenario or under other delays",
     "compare": "train and evaluate several arms with several seeds, and compare them with intervals",
     "oracle": "evaluate a policy that knows some messages on time: which delay costs how much",
+    "ceiling": "fly a script with ever more known on time: what a delay leaves to be won",
     "belief": "draw where the server believes the UAVs to be, and where they are",
     "pendulum": "apply the delay transforms to another environment: SAC on Pendulum-v1",
     "bench": "measure the speed of environment and training beside VMAS",
 }
 """What each program does, by its name; the program is the module of this name."""
-SETTINGS = {"train": "train", "evaluate": "train", "oracle": "train", "belief": "train", "compare": "compare"}
+SETTINGS = {
+    **dict.fromkeys(("train", "evaluate", "oracle", "ceiling", "belief"), "train"),
+    "compare": "compare",
+}
 """Programs with settings of the form KEY=VALUE, and whose settings these are."""
 
 

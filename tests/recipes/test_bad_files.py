@@ -302,6 +302,10 @@ def test_a_refused_sweep_leaves_no_folder(name, given_words):
     [
         ("belief", ["checkpoint=/nope"], "checkpoint: the random policy flies"),
         ("belief", ["resume=x"], "resume: the random policy flies"),
+        ("ceiling", ["delay=paper", "checkpoint=x"], "checkpoint: the script flies"),
+        ("ceiling", ["delay=none"], "delay.obs: no message is late or lost"),
+        ("ceiling", ["scenario=coverage", "delay=paper"], "reward: nothing is won by finding the source"),
+        ("ceiling", ["links=matrix", "delay=paper"], "links: matrix is not supported"),
         ("oracle", [], "checkpoint: it is missing"),
         ("evaluate", [], "checkpoint: it is missing"),
         (

@@ -1,0 +1,57 @@
+"""The ceiling recipe: the script's results with ever more known on time."""
+
+import csv
+import sys
+
+import pytest
+import torch
+
+from damian import keys
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.recipes import ceiling
+from damian.recipes.shared.launch import launch
+from damian.server.features import ObservationConfig
+from damian.world.regions.config import RegionConfig
+from damian.world.signal_source import SourceConfig
+
+WORDS = ["scenario=delaybench/tracking", "observation.belief_cell=60", "eval_episodes=300"]
+WORDS += ["episode.max_steps=25", "delay.obs=6", "hydra.run.dir=ceiling"]
+
+
+@pytest.fixture
+def returns(tmp_path, monkeypatch):
+    """The true return of every row of the recipe's table."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["damian ceiling", *WORDS])
+    launch(ceiling.main)
+    with (tmp_path / "ceiling/result.csv").open(newline="") as file:
+        return {row["policy"]: float(row["true_return"]) for row in csv.DictReader(file)}
+
+
+def test_who_knows_more_on_time_wins_more(returns):
+    rows = ["what has arrived", "its own messages", "all messages", "the source's place"]
+    assert [*returns] == rows
+    for less, more in zip(rows, rows[1:], strict=False):
+        assert returns[less] < returns[more], (less, more)
+
+
+def test_the_true_belief_is_certain_of_the_cell_with_the_nearest_centre():
+    scenario = ScenarioConfig(
+        region=RegionConfig(kind="random", pool=3, lattice_step=40),
+        source=SourceConfig(motion="dynamic"),
+        observation=ObservationConfig(belief=["belief_moments"]),
+    )
+    env = make_env(scenario, 12, seed=0, extras=["message", "state"])
+    steps = env.rollout(5, break_when_any_done=False)[:, -1]
+    grid = env.server.grid
+    belief = ceiling.true_belief(env)(steps.clone())[keys.BELIEF]
+    assert torch.equal(belief.sum(-1), torch.ones(12))
+    region = env.server.region_of(env.server.messages(steps[keys.MESSAGE]))
+    for world in range(12):
+        cells = [k for k in range(belief.shape[-1]) if grid.prior[region[world], k] > 0]
+        east, north = steps[keys.STATE][world, -2:].tolist()
+        nearest = min(
+            cells, key=lambda k: (grid.centres[k, 0] - east) ** 2 + (grid.centres[k, 1] - north) ** 2
+        )
+        assert belief[world].argmax() == nearest
