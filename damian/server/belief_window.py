@@ -140,14 +140,12 @@ def _advance(*arguments: Any) -> tuple[Tensor, Tensor]:
     at = (latest - lags) % n_slots * n_worlds + torch.arange(n_worlds, device=latest.device)  # [S, B]
     _write(window.report, at[0], sent, stepped)
     _write(window.delay, at[0], sent_delay, stepped)
-    rows, arrives = _known(grid, window, at)
-    changed = arrives.flatten(2).any(-1) & stepped
-    changed[:-1] |= changed[1:].clone()  # what is known of a step tells whether the next report is repeated
+    changed = _changed(grid, window, at) & stepped
     changed[0] = stepped
     stale = torch.zeros_like(stepped)  # worlds whose beliefs change from the step with this lag on
     for lag in range(_oldest(changed), -1, -1):
         stale = stale | changed[lag]
-        _filter(grid, window, at[lag], at[lag + 1], rows[lag], region, stale)
+        _filter(grid, window, lag, at, region, stale)
     return latest, _read(window.belief, at[0])
 
 
@@ -157,8 +155,8 @@ def _(*arguments: Any) -> tuple[Tensor, Tensor]:
     return torch.empty_like(window.slot), window.belief.new_empty(window.belief.shape[1:])
 
 
-def _known(grid: SourceGrid, window: Window, at: Tensor) -> tuple[Tensor, Tensor]:
-    """The known reports of each step, and which of them have become known in this step.
+def _changed(grid: SourceGrid, window: Window, at: Tensor) -> Tensor:
+    """In which worlds a report has become known in this step that changes what is known of each step.
 
     Args:
         grid: cells and tables.
@@ -166,18 +164,12 @@ def _known(grid: SourceGrid, window: Window, at: Tensor) -> tuple[Tensor, Tensor
         at: row of each step in the flattened ring, [S, B], the latest step first.
 
     Returns:
-        Rows of ``SourceGrid.log_reports`` and a mask, both [S - 1, B, V, N].
+        A mask [S - 1, B].
     """
     report, delay = (gather_rows(held.flatten(0, 1), at) for held in (window.report, window.delay))
     lag = torch.arange(len(at), device=at.device).view(-1, 1, 1)
-    known, arrives = ((delay >= 0) & (delay <= lag)).unsqueeze(2), (delay == lag).unsqueeze(2)
-    n_viewers, n_agents = window.belief.shape[2], report.shape[-1]
-    if n_viewers > 1:
-        own = torch.eye(n_viewers, n_agents + 1, dtype=torch.bool, device=at.device)[:, 1:]
-        known, arrives = known | own, torch.where(own, (lag == 0).unsqueeze(2), arrives)
-    rows = torch.where(known, report.unsqueeze(2), grid.no_report)
-    arrives = arrives & (report != grid.no_report).unsqueeze(2)
-    return repeated(grid, rows[:-1], rows[1:]), arrives[:-1]
+    arrives = ((delay == lag) & (report != grid.no_report)).any(-1)
+    return arrives[:-1] | arrives[1:]  # a report also tells whether the next one is repeated
 
 
 def _oldest(changed: Tensor) -> int:
@@ -187,33 +179,42 @@ def _oldest(changed: Tensor) -> int:
     return max(changed.any(-1).nonzero().squeeze(-1).tolist(), default=0)
 
 
-def _filter(
-    grid: SourceGrid,
-    window: Window,
-    at: Tensor,
-    before: Tensor,
-    rows: Tensor,
-    region: Tensor,
-    worlds: Tensor,
-) -> None:
+def _filter(grid: SourceGrid, window: Window, lag: int, at: Tensor, region: Tensor, worlds: Tensor) -> None:
     """Compute the belief of one step from that of the step before, in place.
 
     Args:
         grid: cells and tables.
         window: beliefs of the latest steps.
-        at: row of the step in the flattened ring, [B].
-        before: row of the step before it, [B].
-        rows: known reports of the step, [B, V, N].
+        lag: number of steps since the step.
+        at: row of each step in the flattened ring, [S, B], the latest step first.
         region: index of the region of each world, [B].
         worlds: worlds in which the belief has changed, [B] bool.
     """
     chosen = _chosen(worlds)
-    before, rows, region = (each.index_select(0, chosen) for each in (before, rows, region))
-    new = predict(grid, _read(window.belief, before), region.unsqueeze(-1).expand(rows.shape[:-1]))
-    unknown = devices.data_dependent(rows.device) and bool((rows == grid.no_report).all())
+    here, before, region = (each.index_select(0, chosen) for each in (at[lag], at[lag + 1], region))
+    reports = repeated(grid, _known(grid, window, here, lag), _known(grid, window, before, lag + 1))
+    new = predict(grid, _read(window.belief, before), region.unsqueeze(-1).expand(reports.shape[:-1]))
+    unknown = devices.data_dependent(reports.device) and bool((reports == grid.no_report).all())
     if not unknown:
-        new = weigh(grid, new, evidence(grid, rows))
-    _write(window.belief, at, new, worlds, chosen)
+        new = weigh(grid, new, evidence(grid, reports))
+    _write(window.belief, at[lag], new, worlds, chosen)
+
+
+def _known(grid: SourceGrid, window: Window, rows: Tensor, lag: int) -> Tensor:
+    """The reports of a step as far as they are known, as rows of ``SourceGrid.log_reports``, [C, V, N].
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        rows: row of the step in the flattened ring, [C].
+        lag: number of steps since then.
+    """
+    report, delay = _read(window.report, rows), _read(window.delay, rows)
+    known, n_viewers = ((delay >= 0) & (delay <= lag)).unsqueeze(1), window.belief.shape[2]
+    if n_viewers > 1:
+        own = torch.eye(n_viewers, n_viewers - 1, dtype=torch.bool, device=rows.device).roll(1, 0)
+        known = known | own
+    return torch.where(known, report.unsqueeze(1), grid.no_report)
 
 
 def _read(held: Tensor, rows: Tensor) -> Tensor:

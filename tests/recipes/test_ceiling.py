@@ -2,6 +2,7 @@
 
 import csv
 import sys
+from itertools import pairwise
 
 import pytest
 import torch
@@ -32,7 +33,7 @@ def returns(tmp_path, monkeypatch):
 def test_who_knows_more_on_time_wins_more(returns):
     rows = ["what has arrived", "its own messages", "all messages", "the source's place"]
     assert [*returns] == rows
-    for less, more in zip(rows, rows[1:], strict=False):
+    for less, more in pairwise(rows):
         assert returns[less] < returns[more], (less, more)
 
 
