@@ -13,12 +13,14 @@ with 95 % intervals, J_norm, recovery) and figure.png.
 """
 
 import csv
+import math
 import re
 import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import hydra
@@ -33,6 +35,7 @@ from damian.evaluation.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPT
 from damian.evaluation.interrupt import exit_code
 from damian.evaluation.metrics_log import read_metrics
 from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
+from damian.evaluation.statistics import FEWEST
 
 from .evaluate import fly
 from .shared.command_line import command, typed_words, whole_laws
@@ -167,8 +170,8 @@ def _seeds(config: CompareConfig, folder: Path, overrides: list[str]) -> Iterato
             source_delay = delay if source.delayed else NOT_LATE
             policy = folder.parents[1] / source_delay / arm.policy_of / seed_folder
             seeded = replace(seeded, checkpoint=str(policy))
-        trains = arm.policy_of is None
-        yield Run(task, delay, name, seeded, folder / seed_folder, train if trains else fly, trains)
+        program = train if arm.policy_of is None else fly
+        yield Run(task, delay, name, seeded, folder / seed_folder, program)
 
 
 def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
@@ -188,9 +191,11 @@ def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
             "arm": run.arm,
             "regime": regime(arms, run.arm),
             "seed": run.config.seed,
+            "backupdated": backupdated if row["policy"] in POLICIES.values() else math.nan,
             **row,
         }
         for run in done
+        for backupdated in [_share_backupdated(run)]
         for row in run.results()
     ]
     comparison = Comparison(rows, arms, config.score, POLICIES[config.policy])
@@ -207,6 +212,13 @@ def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
             if run.trains:
                 curves.setdefault((run.task, run.delay, run.arm), []).append(read_metrics(run.folder))
         plot_curves(comparison, curves, config.experiment.best, never, folder / FIGURE)
+
+
+def _share_backupdated(run: Run) -> float:
+    """Share of the messages in training that late ones have replaced; nan for a run without back-updating."""
+    rows = read_metrics(run.folder) if run.trains else []
+    shares = [row["backupdated"] for row in rows if "backupdated" in row]
+    return fmean(shares) if shares else math.nan
 
 
 def _write(path: Path, rows: Sequence[dict[str, Any]]) -> None:
@@ -229,10 +241,12 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
     notes = [
         f"`{command(words)}`",
         f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {episodes} episodes per evaluation",
-        f"Mean over seeds [95 % interval: stratified bootstrap over seeds]; J: {config.score} of the "
-        f"{config.policy} policy; seen: as the server perceived it, else as it truly was; age in steps",
-        "J_norm: 0 random, 1 undelayed; recovery: 0 the stronger naive arm, 1 undelayed; not shown where "
-        "the delay costs less than a tenth of undelayed - random",
+        "Mean over seeds [95 % interval: stratified bootstrap over seeds, widened for few seeds; none below "
+        f"{FEWEST}]; J: {config.score} of the {config.policy} policy; seen: as the server perceived it, else "
+        "as it truly was; age in steps; back-updated: share of the messages in training; n: seeds",
+        "J_norm: 0 random, 1 undelayed; recovery: 0 the stronger naive arm, 1 undelayed, not shown where "
+        "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
+        "one of the stronger naive arm; n compared: seeds that all of these have",
     ]
     if len(seeds) < SEEDS or episodes < EPISODES:
         notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")

@@ -13,6 +13,7 @@ from damian.evaluation.statistics import (
     bootstrap,
     interquartile_mean,
     normalised,
+    probability_of_improvement,
     recovery,
 )
 
@@ -25,9 +26,11 @@ TRUE = ("true_return", "true_success_rate", "true_steps")
 """Measures of an ``Evaluation`` from messages without delay."""
 SEEN = ("episode_return", "success_rate", "steps")
 """The same measures as the server perceived them."""
-MEASURES = (*TRUE, *SEEN, "age", "late", "lost")
+MEASURES = (*TRUE, *SEEN, "age", "late", "lost", "backupdated")
 SCORES = (*TRUE, *SEEN)
 """Measures by which arms can be compared."""
+COMPARED = ("J_norm", "recovery", "improvement")
+"""Columns of the estimates of ``Compared``."""
 LESS_IS_BETTER = ("true_steps", "steps")
 """Scores for which lower values are better."""
 
@@ -65,7 +68,7 @@ def regime(arms: Mapping[str, Arm], name: str) -> str:
 
 
 class Estimate(NamedTuple):
-    """A value and the ends of its 95 % interval."""
+    """A value and the ends of its 95 % interval, which are nan for fewer than three seeds."""
 
     value: float
     low: float
@@ -74,11 +77,30 @@ class Estimate(NamedTuple):
     def __str__(self) -> str:
         if np.isnan(self.value):
             return "-"
+        if np.isnan(self.low):
+            return _short(self.value)
         return f"{_short(self.value)} [{_short(self.low)}, {_short(self.high)}]"
 
 
 UNKNOWN = Estimate(np.nan, np.nan, np.nan)
 """Stands for an estimate that cannot be made, or has no meaning."""
+
+
+class Compared(NamedTuple):
+    """An arm compared with the undelayed one, the random policy and the naive arms, under the same delay."""
+
+    seeds: list[int]
+    """Seeds that all of these have finished."""
+    j_norm: Estimate
+    """0: the random policy; 1: the undelayed arm."""
+    recovery: Estimate = UNKNOWN
+    """0: the stronger naive arm; 1: the undelayed arm."""
+    improvement: Estimate = UNKNOWN
+    """Probability that a run of the arm beats one of the stronger naive arm."""
+
+
+NOT_COMPARED = Compared([], UNKNOWN)
+"""Stands for an arm without a seed that all others have finished too, and for what is not compared."""
 
 
 def _short(number: float) -> str:
@@ -145,28 +167,30 @@ class Comparison:
         found = {name: self.values(task, *source, self.score) for name, source in sources.items()}
         return {name: {seed: sign * x for seed, x in runs.items()} for name, runs in found.items()}
 
-    def compared(self, task: str, delay: str) -> dict[str, tuple[Estimate, Estimate]]:
-        """J_norm and recovery of each delayed arm, over the seeds that all arms have finished."""
+    def compared(self, task: str, delay: str) -> dict[str, Compared]:
+        """Each delayed arm, over the seeds that it and all arms that it is compared with have finished."""
         scores = self.scores(task, delay)
-        seeds = sorted(set.intersection(*map(set, scores.values())))
-        names = list(scores)[2:]
-        if not seeds or not names:
-            return {}
-        array = np.array([[[runs[seed] for seed in seeds] for runs in scores.values()]])
-        norms = _estimates(_norms, array)
-        naive = [index for index, name in enumerate(names, 2) if self.arms[name].naive]
-        recoveries = _recoveries(array, naive) if naive else [UNKNOWN] * len(names)
-        return {
-            name: (norm, UNKNOWN if self.arms[name].naive else recovered)
-            for name, norm, recovered in zip(names, norms, recoveries, strict=True)
-        }
+        delayed = list(scores)[2:]
+        naive = [name for name in delayed if self.arms[name].naive]
+        found = {name: self._compared(scores, naive, name) for name in delayed}
+        return {name: result for name, result in found.items() if result.seeds}
 
-    def overall(self) -> dict[str, Estimate]:
-        """Interquartile mean of J_norm by delayed arm, over all tasks, delays and seeds.
+    def _compared(self, scores: Mapping[str, Mapping[int, float]], naive: list[str], arm: str) -> Compared:
+        names = [*list(scores)[:2], *(name for name in naive if name != arm), arm]
+        seeds, array = _paired([scores[name] for name in names])
+        if not seeds:
+            return NOT_COMPARED
+        (norm,) = _estimates(_norms, array)
+        if arm in naive or not naive:
+            return Compared(seeds, norm)
+        return Compared(seeds, norm, _recovery(array), _estimates(_improvement, array)[0])
 
-        Only the arms, delays and seeds that every task has count. The result is empty if these leave fewer
-        than two combinations of task and delay. Seeds are resampled within each task, because the delays of
-        a task share the undelayed arm.
+    def overall(self) -> dict[str, tuple[int, Estimate]]:
+        """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.
+
+        Only the arms and delays that every task has count, and of each arm the seeds that it and the
+        undelayed arm have everywhere. The result is empty if there are fewer than two combinations of task
+        and delay. Seeds are resampled within each task, because its delays share the undelayed arm.
         """
         by_task = {task: self.delays(task) for task in self.tasks()}
         delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
@@ -174,18 +198,38 @@ class Comparison:
         flat = [cell for row in cells for cell in row]
         if len(flat) < 2:
             return {}
-        names = [name for name in flat[0] if all(name in cell for cell in flat)]
-        seeds = sorted(set.intersection(*(set(cell[name]) for cell in flat for name in names)))
-        if not seeds or len(names) < 3:
-            return {}
-        array = [[[[cell[n][s] for s in seeds] for n in names] for cell in row] for row in cells]
-        return dict(zip(names[2:], _estimates(_interquartile_norms, np.array(array)), strict=True))
+        found = {}
+        for name in list(flat[0])[2:]:
+            if all(name in cell for cell in flat):
+                names = [*list(flat[0])[:2], name]
+                seeds, array = _paired([cell[name] for cell in flat for name in names])
+                if seeds:
+                    by_cell = array.reshape(len(cells), len(delays), len(names), len(seeds))
+                    found[name] = (len(seeds), *_estimates(_interquartile_norms, by_cell))
+        return found
+
+
+def _paired(runs: Sequence[Mapping[int, float]]) -> tuple[list[int], Floats]:
+    """Seeds that all runs have, and their scores, [1, runs, seeds]."""
+    seeds = sorted(set.intersection(*map(set, runs)))
+    return seeds, np.array([[[scores[seed] for seed in seeds] for scores in runs]])
 
 
 def _norms(scores: Floats) -> Floats:
-    """J_norm of mean scores, [*, 1, arms, seeds] to [*, arms - 2]; first come undelayed and random."""
+    """J_norm of the last arm's mean score, [*, 1, arms, seeds] to [*]; first come undelayed and random."""
     means = scores.mean(-1)[..., 0, :]
-    return normalised(means[..., 2:], means[..., :1], means[..., 1:2])
+    return normalised(means[..., -1], means[..., 0], means[..., 1])
+
+
+def _improvement(scores: Floats) -> Floats:
+    """Probability that the last arm beats the strongest naive one, [*, 1, arms, seeds] to [*].
+
+    First come undelayed and random, then the naive arms.
+    """
+    naive = scores[..., 0, 2:-1, :]
+    strongest = np.expand_dims(naive.mean(-1).argmax(-1), (-1, -2))
+    other = np.take_along_axis(naive, strongest, -2)[..., 0, :]
+    return probability_of_improvement(scores[..., 0, -1, :], other)
 
 
 def _interquartile_norms(scores: Floats) -> Floats:
@@ -196,17 +240,14 @@ def _interquartile_norms(scores: Floats) -> Floats:
     return interquartile_mean(by_arm.reshape(*by_arm.shape[:-3], -1))
 
 
-def _recoveries(scores: Floats, naive: list[int]) -> list[Estimate]:
-    """Recovery of all arms but the first two, from scores [1, arms, seeds] and indices of the naive arms."""
+def _recovery(scores: Floats) -> Estimate:
+    """Recovery of the last arm, [1, arms, seeds]; first come undelayed and random, then the naive arms."""
 
     def statistic(scores: Floats, least: float = 0.0) -> Floats:
         means = scores.mean(-1)[..., 0, :]
-        strongest = means[..., naive].max(-1, keepdims=True)
-        return recovery(means[..., 2:], strongest, means[..., :1], means[..., 1:2], least)
+        return recovery(means[..., -1], means[..., 2:-1].max(-1), means[..., 0], means[..., 1], least)
 
-    reported = ~np.isnan(statistic(scores, LEAST_GAP))
-    estimates = _estimates(statistic, scores)
-    return [estimate if report else UNKNOWN for estimate, report in zip(estimates, reported, strict=True)]
+    return UNKNOWN if np.isnan(statistic(scores, LEAST_GAP)) else _estimates(statistic, scores)[0]
 
 
 @dataclass(frozen=True)
@@ -220,15 +261,14 @@ class Line:
     policy: str
     seeds: list[int]
     measures: dict[str, Estimate]
-    j_norm: Estimate = UNKNOWN
-    recovery: Estimate = UNKNOWN
+    compared: Compared = NOT_COMPARED
 
     def cells(self) -> dict[str, Any]:
         """Columns of ``table.csv`` by name; unknown numbers are empty."""
-        numbers = {**self.measures, "J_norm": self.j_norm, "recovery": self.recovery}
+        compared = dict(zip(COMPARED, self.compared[1:], strict=True))
         cells: dict[str, Any] = {k: getattr(self, k) for k in ("task", "delay", "arm", "regime", "policy")}
-        cells["seeds"] = len(self.seeds)
-        for name, number in numbers.items():
+        cells |= {"seeds": len(self.seeds), "compared_seeds": len(self.compared.seeds)}
+        for name, number in {**self.measures, **compared}.items():
             parts = [float("nan")] * 3 if np.isnan(number.value) else number
             for suffix, value in zip(("", "_low", "_high"), parts, strict=True):
                 cells[name + suffix] = "" if np.isnan(value) else value
@@ -245,7 +285,7 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
                 for policy in (SAMPLED, MODE):
                     line = _line(comparison, task, delay, arm, policy)
                     found = compared.get(arm) if policy == comparison.policy else None
-                    yield replace(line, j_norm=found[0], recovery=found[1]) if found else line
+                    yield replace(line, compared=found) if found else line
             for arm in arms[:1]:
                 for policy in SCRIPTED:
                     # Older runs have not flown every scripted policy.

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from damian.common.markdown import markdown_table
 from damian.evaluation.belief_figure import COLOURS
-from damian.evaluation.comparison import NOT_LATE, RANDOM, SCRIPTED, SEEN, TRUE, Comparison, Line
+from damian.evaluation.comparison import MEASURES, NOT_LATE, RANDOM, SCRIPTED, Comparison, Line
 from damian.evaluation.statistics import Floats, bootstrap
 
 Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
@@ -20,9 +20,19 @@ Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 
 LABELS = {"episode_return": "return", "success_rate": "success rate", "steps": "steps per episode"}
 """Axis labels of the measures in training, all as the server perceived them."""
-COLUMNS = (*TRUE, *SEEN, "age", "late", "lost")
-HEADS = ("return", "success", "steps", "seen return", "seen success", "seen steps", "age", "late", "lost")
-"""Headings of ``COLUMNS`` in the Markdown table."""
+HEADS = (
+    "return",
+    "success",
+    "steps",
+    "seen return",
+    "seen success",
+    "seen steps",
+    "age",
+    "late",
+    "lost",
+    "back-updated",
+)
+"""Headings of ``MEASURES`` in the Markdown table."""
 _STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
 _POINTS = 200
 """Number of points of a learning curve."""
@@ -42,20 +52,22 @@ def markdown(comparison: Comparison, notes: Sequence[str], tasks: Mapping[str, s
         for delay in comparison.delays(task) or [NOT_LATE]:
             lines = [line for line in all_lines if line.task == task and line.delay in (NOT_LATE, delay)]
             parts += [f"## {task}, delay {delay}", tasks[task], _table(lines, task in never)]
-    overall = comparison.overall()
+    overall = [(arm, seeds, str(norm)) for arm, (seeds, norm) in comparison.overall().items()]
     if overall:
-        table = markdown_table(("arm", "interquartile mean of J_norm"), overall.items())
+        table = markdown_table(("arm", "n", "interquartile mean of J_norm"), overall)
         parts += ["## All tasks and delays", table]
     return "\n\n".join(parts) + "\n"
 
 
 def _table(lines: Sequence[Line], never: bool) -> str:
-    left, right = ("arm", "regime", "policy"), (*HEADS, "J_norm", "recovery")
+    left, right = ("arm", "regime", "policy"), ("n", *HEADS, "n compared", "J_norm", "recovery", "P > naive")
     rows = []
     for line in lines:
         name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
-        numbers = ["-" if never and "success" in key else str(line.measures[key]) for key in COLUMNS]
-        rows.append([name, line.regime, line.policy, *numbers, str(line.j_norm), str(line.recovery)])
+        numbers = ["-" if never and "success" in key else str(line.measures[key]) for key in MEASURES]
+        seeds, *compared = line.compared
+        numbers = [str(len(line.seeds)), *numbers, str(len(seeds) or "-"), *map(str, compared)]
+        rows.append([name, line.regime, line.policy, *numbers])
     return markdown_table([*left, *right], rows, left=len(left))
 
 
@@ -144,7 +156,7 @@ def _norm_panel(axis: Axes, comparison: Comparison, task: str) -> None:
     compared = [comparison.compared(task, delay) for delay in delays]
     colours = dict(zip(comparison.arms, _colours(comparison), strict=True))
     for index, arm in enumerate(arms):
-        norms = [(x, estimates[arm][0]) for x, estimates in enumerate(compared) if arm in estimates]
+        norms = [(x, estimates[arm].j_norm) for x, estimates in enumerate(compared) if arm in estimates]
         positions = [x + 0.7 * ((index + 0.5) / len(arms) - 0.5) for x, _ in norms]
         errors = [(norm.value - norm.low, norm.high - norm.value) for _, norm in norms]
         values = [norm.value for _, norm in norms]

@@ -5,7 +5,9 @@ resamples at once. Higher scores are better. Source of the stratified bootstrap 
 mean: Agarwal et al. 2021, arXiv 2108.13264.
 """
 
+import math
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,8 @@ Floats = NDArray[np.floating]
 
 LEAST_GAP = 0.1
 """Smallest cost of the delay, as a share of undelayed - random, for which a recovery is reported."""
+FEWEST = 3
+"""Smallest number of seeds for which there is an interval."""
 
 
 def normalised(score: Floats, undelayed: Floats, random: Floats) -> Floats:
@@ -94,6 +98,19 @@ def interval(values: Floats, level: float = 0.95) -> tuple[Floats, Floats]:
     return low, high
 
 
+def probability_of_improvement(scores: Floats, others: Floats) -> Floats:
+    """Probability that a run of one method beats a run of another, drawn with any two seeds, [*].
+
+    It is the share of all pairs of runs in which the first has the higher score; equal scores count half.
+
+    Args:
+        scores: scores of the first method by seed, [*, seeds].
+        others: scores of the second method by seed, [*, seeds].
+    """
+    difference = scores[..., :, None] - others[..., None, :]
+    return ((np.sign(difference) + 1) / 2).mean((-2, -1))
+
+
 def bootstrap(
     statistic: Callable[[Floats], Floats],
     scores: Floats,
@@ -103,11 +120,34 @@ def bootstrap(
 ) -> tuple[Floats, Floats]:
     """Stratified bootstrap interval of a statistic over seeds: its low and high ends.
 
+    For the mean of few seeds, the interval of the resampled statistics (``interval``) is too narrow: of those
+    for 95 %, only 83 % contain the truth with 5 seeds, and 88 % with 10. So both ends are moved away from the
+    statistic by the factor by which Student's interval of a mean is wider than the normal one without
+    correction for bias. With fewer than ``FEWEST`` seeds both ends are nan.
+
     Args:
         statistic: function from scores [*, strata, ..., seeds] to [*, ...], for any leading dimensions *.
         scores: scores by seed, [strata, ..., seeds].
         draws: number of resamples.
-        level: share of the resampled statistics inside the interval.
+        level: share of the resampled statistics inside the interval, before it is widened.
         seed: seed of the random draws.
     """
-    return interval(statistic(resampled(scores, draws, seed)), level)
+    value = np.asarray(statistic(scores), dtype=float)
+    strata, n_seeds = scores.shape[0], scores.shape[-1]
+    if n_seeds < FEWEST:
+        checks.whole("draws", draws, 1)
+        return np.full_like(value, np.nan), np.full_like(value, np.nan)
+    quantile, many = student_quantile((1 + level) / 2, strata * (n_seeds - 1)), 100_000
+    factor = math.sqrt(n_seeds / (n_seeds - 1)) * quantile / student_quantile((1 + level) / 2, many)
+    low, high = interval(statistic(resampled(scores, draws, seed)), level)
+    return value - factor * (value - low), value + factor * (high - value)
+
+
+@cache
+def student_quantile(probability: float, degrees: int) -> float:
+    """Quantile of Student's t-distribution for a probability of at least 1/2, to four digits."""
+    # With t = sqrt(degrees) tan(angle), the density is a power of the cosine.
+    angle = np.linspace(0, np.pi / 2, 200_001)
+    density = np.cos(angle) ** (degrees - 1)
+    mass = np.append(0, np.cumsum(density[1:] + density[:-1]))
+    return math.sqrt(degrees) * math.tan(np.interp(probability - 0.5, mass / (2 * mass[-1]), angle))

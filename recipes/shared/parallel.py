@@ -45,16 +45,28 @@ class Run:
     folder: Path
     program: Program
     """``train``, or ``fly`` for an arm that evaluates the policy of another one; importable by name."""
-    trains: bool
-    """Does the program train, so that it writes checkpoints and can be resumed?"""
 
     @property
     def name(self) -> str:
         return "/".join(self.folder.parts[-4:])
 
     @property
+    def policy(self) -> Path | None:
+        """Folder of the run whose policy this one flies; None: it trains, and so writes checkpoints."""
+        return None if self.config.checkpoint is None else Path(self.config.checkpoint)
+
+    @property
+    def trains(self) -> bool:
+        return self.policy is None
+
+    @property
     def finished(self) -> bool:
-        return (self.folder / RESULTS).exists()
+        """Has the run results, which belong to the finished policy that it flies, if it flies another's?"""
+        results = self.folder / RESULTS
+        if not results.exists() or self.policy is None:
+            return results.exists()
+        source = self.policy / RESULTS
+        return source.exists() and source.stat().st_mtime_ns <= results.stat().st_mtime_ns
 
     def score(self, policy: str, measure: str) -> float:
         """A measure of one policy in the results of a finished run."""
@@ -93,12 +105,18 @@ def check_stored(run: Run) -> None:
     asked = OmegaConf.create(OmegaConf.to_yaml(OmegaConf.structured(run.config)))
     old, new = (dict(_leaves(OmegaConf.to_container(config))) for config in (stored, asked))
     for key in new | old:
-        may_differ = key in ("resume", "overrides") or (key == "checkpoint" and not run.trains)
-        if not may_differ and old.get(key) != new.get(key):
+        if key == "checkpoint" and _same_run(old.get(key), new.get(key)):
+            continue
+        if key not in ("resume", "overrides") and old.get(key) != new.get(key):
             raise InputError(
                 f"{run.folder}: {key} is {old.get(key)} in this stored run, and {new.get(key)} is asked "
                 "for: delete the folder, or choose another one with hydra.run.dir"
             )
+
+
+def _same_run(folder: str | None, other: str | None) -> bool:
+    """Do two paths name the same delay, arm and seed, wherever their experiment lies?"""
+    return folder is not None and other is not None and Path(folder).parts[-3:] == Path(other).parts[-3:]
 
 
 def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -206,6 +224,8 @@ def _perform(run: Run) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
+            if run.policy is not None and not (run.policy / RESULTS).exists():
+                raise InputError(f"checkpoint: {run.policy} has no finished policy to fly")
             with locked(run.folder):
                 resumes = run.trains and (run.folder / CHECKPOINT).exists()
                 config = replace(run.config, resume=str(run.folder)) if resumes else run.config

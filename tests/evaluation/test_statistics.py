@@ -12,8 +12,10 @@ from damian.evaluation.statistics import (
     interquartile_mean,
     interval,
     normalised,
+    probability_of_improvement,
     recovery,
     resampled,
+    student_quantile,
 )
 
 
@@ -97,7 +99,7 @@ def exact_interval(values: list[float], weights: list[float]) -> tuple[float, fl
 def test_the_interval_of_a_mean_equals_that_over_all_possible_draws():
     scores = np.array([0.0, 1.0, 7.0, 20.0])
     every = [float(np.mean(draw)) for draw in itertools.product(scores, repeat=4)]
-    low, high = bootstrap(means, scores[None], draws=20_000)
+    low, high = interval(means(resampled(scores[None], draws=20_000)))
     assert (low[0], high[0]) == exact_interval(every, [4**-4] * len(every))
 
 
@@ -112,8 +114,38 @@ def test_the_interval_of_a_recovery_equals_that_over_all_possible_draws():
         a, n, u = np.moveaxis(scores.mean(-1), -1, 0)
         return recovery(a, n, u, 0.0)
 
-    low, high = bootstrap(ratio, np.stack([aware, naive, undelayed])[None], draws=20_000)
+    low, high = interval(ratio(resampled(np.stack([aware, naive, undelayed])[None], draws=20_000)))
     np.testing.assert_allclose((low[0], high[0]), exact_interval(ratios, [3**-3] * 27), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("strata", "n_seeds"), [(1, 3), (1, 5), (1, 10), (3, 5)])
+def test_95_percent_intervals_contain_the_truth_in_95_percent_of_all_experiments(strata, n_seeds):
+    experiments = np.random.default_rng(1).normal(7.0, 2.0, size=(strata, 4000, n_seeds))
+    low, high = bootstrap(lambda scores: scores.mean((-1, -3)), experiments, draws=500)
+    covered = ((low < 7) & (high > 7)).mean()
+    assert 0.94 < covered < 0.97, covered
+
+
+def test_fewer_than_three_seeds_give_no_interval():
+    low, high = bootstrap(means, np.array([[[1.0, 2.0], [3.0, 9.0]]]))
+    assert np.isnan([low, high]).all()
+
+
+@pytest.mark.parametrize(
+    ("probability", "degrees", "quantile"),
+    [(0.975, 1, 12.7062), (0.975, 2, 4.3027), (0.95, 9, 1.8331), (0.975, 9, 2.2622), (0.975, 100_000, 1.96)],
+)
+def test_quantiles_of_students_distribution_are_those_of_printed_tables(probability, degrees, quantile):
+    assert student_quantile(probability, degrees) == pytest.approx(quantile, rel=1e-4)
+
+
+def test_the_probability_of_improvement_is_the_share_of_pairs_of_runs():
+    ours, theirs = np.array([[3.0, 5.0, 5.0], [1.0, 2.0, 3.0]]), np.array([[5.0, 4.0, 1.0], [9.0, 9.0, 9.0]])
+    expected = [
+        sum(1.0 if a > b else 0.5 if a == b else 0.0 for a in mine for b in other) / 9
+        for mine, other in zip(ours, theirs, strict=True)
+    ]
+    np.testing.assert_allclose(probability_of_improvement(ours, theirs), expected)
 
 
 def test_equal_scores_of_all_seeds_give_an_interval_of_no_width():

@@ -12,10 +12,14 @@ from helpers import check_refused
 
 from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison, regime
 from damian.evaluation.report import markdown, plot_curves, plot_norms
+from damian.evaluation.run_lock import locked
 from damian.evaluation.statistics import interquartile_mean
 from damian.recipes.compare import main
+from damian.recipes.evaluate import fly
 from damian.recipes.shared.known_settings import CONF
 from damian.recipes.shared.launch import launch
+from damian.recipes.shared.parallel import Run, perform_all
+from damian.recipes.shared.settings import TrainConfig
 
 SMALL = [
     "frames=16",
@@ -114,6 +118,38 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert stamps(folder) == after
 
 
+def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compare, capsys):
+    words = [TWO[0], "seeds=1", "arms=[undelayed,deployed]", TWO[3]]
+    folder = compare(*words) / "usecase2"
+    source, flown = (folder / name / "seed_8" for name in ("none/undelayed", "paper/deployed"))
+    compare(*words)
+    before = stamps(folder)
+    (source / "result.csv").touch()
+    compare(*words)
+    rewritten = {path for path, stamp in stamps(folder).items() if stamp != before.get(path)}
+    assert str(flown / "result.csv") in rewritten
+    assert all(path.startswith((str(flown), str(source / "result.csv"))) for path in rewritten)
+    capsys.readouterr()
+    with locked(folder.parent), pytest.raises(SystemExit):
+        compare(*words)
+    assert "is in use by another run" in capsys.readouterr().err
+    stored = (flown / "config.yaml").read_text()
+    (flown / "config.yaml").write_text(stored.replace("none/undelayed", "paper/unaware"))
+    with pytest.raises(SystemExit):
+        compare(*words)
+    assert re.search("checkpoint is .*paper/unaware/seed_8 in this stored run", capsys.readouterr().err)
+
+
+def test_an_unfinished_policy_is_not_flown(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = tmp_path / "none/undelayed/seed_8"
+    source.mkdir(parents=True)
+    (source / "best.pt").write_text("a checkpoint of a run that goes on")
+    run = Run("t", "paper", "flown", TrainConfig(checkpoint=str(source)), tmp_path / "flown", fly)
+    assert perform_all([run], 1, (SAMPLED, "true_return")) == [run]
+    assert f"{source} has no finished policy to fly" in (run.folder / "log.txt").read_text()
+
+
 @pytest.mark.slow
 def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_named(compare, capsys):
     words = [*TWO[:2], "arms=[undelayed,unaware,deployed]", TWO[3]]
@@ -206,7 +242,7 @@ def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = 
     """A row of results in which every measure has the same value."""
     labels = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
     names = ("true_return", "true_success_rate", "true_steps", "episode_return", "success_rate", "steps")
-    return labels | dict.fromkeys((*names, "age", "late", "lost", "episodes"), value)
+    return labels | dict.fromkeys((*names, "age", "late", "lost", "backupdated", "episodes"), value)
 
 
 def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
@@ -219,59 +255,77 @@ def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float
     ]
 
 
+THREE = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3], "flown": [5.0, 3, 4], "aware": [6.0, 9, 7]}
 SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware": [6.0, 9.0]}
 
 
 def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
     compared = Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
-    norm, recovery = compared["aware"]
+    seeds, norm, recovery, improvement = compared["aware"]
+    assert seeds == [0, 1]
     assert norm.value == 7.5 / 10
     assert recovery.value == (7.5 - 4) / (10 - 4)
-    # Two seeds have three resamples: each seed twice, and both.
-    assert (recovery.low, recovery.high) == ((6 - 5) / (9 - 5), (9 - 5) / (11 - 5))
-    assert compared["blind"][0].value == 3 / 10
-    assert np.isnan(compared["blind"][1].value)
-    assert np.isnan(compared["flown"][1].value)
+    assert improvement.value == 1
+    assert np.isnan([norm.low, recovery.low, recovery.high]).all()  # two seeds give no interval
+    assert compared["blind"].j_norm.value == 3 / 10
+    for naive in ("blind", "flown"):
+        assert np.isnan([compared[naive].recovery.value, compared[naive].improvement.value]).all()
+
+
+def test_the_probability_of_improvement_is_over_the_naive_arm_with_the_higher_mean():
+    scores = {"best": [9.0, 9, 9], "blind": [6.0, 0, 0], "flown": [5.0, 4, 3], "aware": [4.0, 6, 7]}
+    improvement = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"].improvement
+    assert improvement.value == (1.5 + 3 + 3) / 9  # against 5, 4, 3
+    assert improvement.low < improvement.value
 
 
 def test_recovery_is_left_out_if_the_delay_costs_nothing():
     scores = SCORES | {"blind": [9.0, 9.5]}
-    norm, recovery = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
+    _, norm, recovery, _ = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
     assert norm.value == 0.75
     assert str(recovery) == "-"
 
 
 def test_fewer_steps_give_a_higher_score():
-    steps = {arm: [20 - x for x in values] for arm, values in SCORES.items()}
+    steps = {arm: [20 - x for x in values] for arm, values in THREE.items()}
     by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "true_steps").compared("t", "late")
-    assert by_steps == Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
+    by_return = Comparison(rows_of("t", "late", THREE), ARMS).compared("t", "late")
+    for arm, expected in by_return.items():
+        np.testing.assert_allclose(by_steps[arm][1:], expected[1:])
 
 
-def test_only_seeds_that_every_arm_has_are_compared():
-    rows = rows_of("t", "late", SCORES)
-    more = rows_of("t", "late", {"best": [0, 0, 99.0], "aware": [0, 0, -7.0]})
-    more = [row for row in more if row["seed"] == 2]
-    assert Comparison(rows + more, ARMS).compared("t", "late") == Comparison(rows, ARMS).compared("t", "late")
+def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
+    rows = rows_of("t", "late", THREE)
+    alone = Comparison(rows, ARMS).compared("t", "late")
+    unfinished = [row for row in rows if (row["arm"], row["seed"]) != ("aware", 2)]
+    compared = Comparison(unfinished, ARMS).compared("t", "late")
+    assert compared["aware"].seeds == [0, 1]
+    assert repr(compared["blind"]) == repr(alone["blind"])  # an unfinished arm changes no other one
+    unfinished = [row for row in rows if (row["arm"], row["seed"]) != ("blind", 0)]
+    compared = Comparison(unfinished, ARMS).compared("t", "late")
+    assert [compared[arm].seeds for arm in ("blind", "flown", "aware")] == [[1, 2]] * 3
 
 
 def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
     rows, norms = [], []
-    for task, best in (("t", [9.0, 11.0]), ("u", [3.0, 5.0])):
-        for delay, aware in (("late", [6.0, 1.0]), ("later", [2.0, 0.0])):
-            rows += rows_of(task, delay, {"blind": [0.0, 0.0], "aware": aware})
+    for task, best in (("t", [9.0, 11.0, 10.0]), ("u", [3.0, 5.0, 7.0])):
+        for delay, aware in (("late", [6.0, 1.0, 2.0]), ("later", [2.0, 0.0, 1.0])):
+            rows += rows_of(task, delay, {"blind": [0.0] * 3, "aware": aware})
             norms += [x / np.mean(best) for x in aware]
         rows += rows_of(task, "none", {"best": best})
     overall = Comparison(rows, ARMS).overall()
-    assert overall["aware"].value == pytest.approx(interquartile_mean(np.array(norms)), abs=1e-12)
-    assert overall["aware"].low < overall["aware"].value < overall["aware"].high
-    assert overall["blind"].value == 0
+    n_seeds, norm = overall["aware"]
+    assert n_seeds == 3
+    assert norm.value == pytest.approx(interquartile_mean(np.array(norms)), abs=1e-12)
+    assert norm.low < norm.value < norm.high
+    assert overall["blind"][1].value == 0
     assert Comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")], ARMS).overall()
     one = Comparison(rows_of("t", "late", SCORES), ARMS)
     assert one.overall() == {}
 
 
 def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
-    lines = Comparison(rows_of("t", "late", SCORES), ARMS).lines
+    lines = Comparison(rows_of("t", "late", THREE), ARMS).lines
     labels = [(line.delay, line.arm, line.policy) for line in lines]
     assert labels == [
         ("none", "best", SAMPLED),
@@ -281,9 +335,14 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
         ("late", RANDOM, RANDOM),
     ]
     cells = lines[7].cells()
-    assert [cells[name] for name in ("arm", "regime", "policy", "seeds")] == ["aware", "R0", SAMPLED, 2]
-    assert [cells[f"true_return{end}"] for end in ("", "_low", "_high")] == [7.5, 6.0, 9.0]
-    assert (cells["J_norm"], cells["recovery"]) == (0.75, 3.5 / 6)
+    assert [cells[name] for name in ("arm", "regime", "policy")] == ["aware", "R0", SAMPLED]
+    assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
+    value, low, high = (cells[f"true_return{end}"] for end in ("", "_low", "_high"))
+    assert value == pytest.approx(22 / 3)
+    assert low < value < high
+    assert cells["J_norm"] == pytest.approx(22 / 30)
+    assert cells["recovery"] == pytest.approx((22 / 3 - 4) / 6)
+    assert cells["improvement"] == 1
     assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
@@ -291,21 +350,20 @@ def test_the_table_lists_the_greedy_policy_where_it_was_evaluated():
     rows = rows_of("t", "late", SCORES)
     greedy = [row("t", delay, arm, 0, 7.0, GREEDY) for delay, arm in (("none", "best"), ("late", "blind"))]
     table = markdown(Comparison(rows + greedy, ARMS), [], {"t": "long"}, never=set())
-    cells = [line.split(" |")[:4] for line in table.splitlines() if "greedy" in line]
-    assert cells == [
-        [f"| {name}", " ", " greedy", " 7.000 [7.000, 7.000]"] for name in ("greedy (undelayed)", "greedy")
-    ]
+    cells = [line.split(" |")[:5] for line in table.splitlines() if "greedy" in line]
+    names = ("greedy (undelayed)", "greedy")
+    assert cells == [[f"| {name}", " ", " greedy", " 1", " 7.000"] for name in names]
 
 
 def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
     rows = rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES)
     text = markdown(Comparison(rows, ARMS), ["a note"], {"t": "long", "u": "short"}, never={"u"})
     first, second, overall = text.split("##")[1:]
-    aware = "| aware | R0 | trained, sampled | 7.500 [6.000, 9.000] |"
+    aware = "| aware | R0 | trained, sampled | 2 | 7.500 |"
     assert aware + " 7.500" in first
     assert aware + " - |" in second
-    assert "| 0.750 [0.667, 0.818] | 0.583 [0.250, 0.667] |" in first
-    assert "| aware | 0.750 [" in overall
+    assert "| 2 | 0.750 | 0.583 | 1.000 |" in first
+    assert "| aware | 2 | 0.750 |" in overall
 
 
 def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finished_episode(tmp_path):
