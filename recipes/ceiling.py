@@ -29,6 +29,7 @@ from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
+from damian.evaluation.comparison import CEILING
 from damian.evaluation.metrics import Evaluation, evaluate
 from damian.evaluation.run_folder import save_results
 from damian.server.source_grid import SourceGrid
@@ -51,11 +52,10 @@ def fly(config: TrainConfig, folder: Path) -> None:
     on_time = replace(config.delay, obs=0, loss=0.0, hold="none")
     server, own = (_believing(config, own) for own in (False, True))
     undelayed = replace(server, delay=on_time)
+    flights = (server, False), (own, False), (undelayed, False), (undelayed, True)
     rows = {
-        "what has arrived": _script(config, server),
-        "its own messages": _script(config, own),
-        "all messages": _script(config, undelayed),
-        "the source's place": _script(config, undelayed, true_place=True),
+        known: _script(config, scenario, true_place)
+        for known, (scenario, true_place) in zip(CEILING, flights, strict=True)
     }
     table = save_results(rows, folder, config.episode.success_share is not None, late=True)
     print(f"\nwhat is known on time:\n\n{table}")
@@ -67,7 +67,7 @@ def _believing(config: TrainConfig, own: bool) -> ScenarioConfig:
     return replace(config.eval_scenario, observation=replace(config.observation, own=own, belief=features))
 
 
-def _script(config: TrainConfig, scenario: ScenarioConfig, true_place: bool = False) -> Evaluation:
+def _script(config: TrainConfig, scenario: ScenarioConfig, true_place: bool) -> Evaluation:
     """Evaluate the script in a scenario, in the same episodes at every call."""
     env = make_env(scenario, config.eval_episodes, config.eval_seed, config.device, ["message", "state"])
     script: TensorDictModuleBase = greedy_policy(env)

@@ -37,6 +37,7 @@ from damian.evaluation.metrics_log import read_metrics
 from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
 from damian.evaluation.statistics import FEWEST
 
+from . import ceiling
 from .evaluate import fly
 from .shared.command_line import command, typed_words, whole_laws
 from .shared.composition_errors import COMPOSITION_ERRORS, one_line
@@ -83,6 +84,10 @@ class Experiment:
         for name, arm in self.arms.items():
             if arm.regime:
                 checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))
+            if arm.ceiling:
+                should = "flies the script under delay: it has no policy_of, and delayed is not false"
+                good = arm.policy_of is None and arm.delayed
+                checks.require(good, f"experiment.arms.{name}", "ceiling", should)
         for name in self.best:
             checks.one_of("experiment.best", name, LABELS)
 
@@ -125,7 +130,7 @@ class CompareConfig:
                 checks.one_of(kind, name, getattr(self.experiment, kind))
         for name, arm in self.chosen("arms").items():
             if arm.policy_of is not None:
-                sources = [name for name, arm in self.chosen("arms").items() if arm.policy_of is None]
+                sources = [n for n, a in self.chosen("arms").items() if a.policy_of is None and not a.ceiling]
                 checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, sources)
 
     def chosen(self, kind: str) -> dict[str, Any]:
@@ -158,10 +163,12 @@ def _seeds(config: CompareConfig, folder: Path, overrides: list[str]) -> Iterato
     overrides = whole_laws(["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides])
     try:
         unseeded = checked(compose("train", overrides))
-        if arm.policy_of is None:
+        if arm.policy_of is None and not arm.ceiling:
             unseeded.check_learning()
     except COMPOSITION_ERRORS as error:
         raise InputError(f"{task}/{delay}/{name}: {one_line(error)}") from error
+    if arm.ceiling and not unseeded.seeks_source:
+        return  # the script finds the source, by which nothing is won in this task
     for seed in range(config.experiment.first_seed, config.experiment.first_seed + config.seeds):
         seed_folder = f"seed_{seed}"
         seeded = replace(unseeded, seed=seed, overrides=[*overrides, f"seed={seed}"])
@@ -170,8 +177,8 @@ def _seeds(config: CompareConfig, folder: Path, overrides: list[str]) -> Iterato
             source_delay = delay if source.delayed else NOT_LATE
             policy = folder.parents[1] / source_delay / arm.policy_of / seed_folder
             seeded = replace(seeded, checkpoint=str(policy))
-        program = train if arm.policy_of is None else fly
-        yield Run(task, delay, name, seeded, folder / seed_folder, program)
+        program = ceiling.fly if arm.ceiling else fly if arm.policy_of else train
+        yield Run(task, delay, name, seeded, folder / seed_folder, program, trains=program is train)
 
 
 def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
@@ -246,7 +253,8 @@ def _notes(config: CompareConfig, runs: Sequence[Run], rows: Sequence[dict[str, 
         "as it truly was; age in steps; back-updated: share of the messages in training; n: seeds",
         "J_norm: 0 random, 1 undelayed; recovery: 0 the stronger naive arm, 1 undelayed, not shown where "
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
-        "one of the stronger naive arm; n compared: seeds that all of these have",
+        "one of the stronger naive arm; n compared: seeds that all of these have; of ceiling: J over that of "
+        "the script which knows all messages on time",
     ]
     if len(seeds) < SEEDS or episodes < EPISODES:
         notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")

@@ -20,6 +20,9 @@ from damian.evaluation.statistics import (
 SAMPLED, MODE, RANDOM, GREEDY = "trained, sampled", "trained, mode", "random", "greedy"
 SCRIPTED = (RANDOM, GREEDY)
 """Policies that fly the same episodes beside each arm, and learn nothing."""
+ALL_MESSAGES = "all messages"
+CEILING = {"what has arrived": "R0", "its own messages": "R0", ALL_MESSAGES: "R3", "the source's place": "R3"}
+"""What is known on time in the rows of an information ceiling (``damian ceiling``), and their regimes."""
 NOT_LATE = "none"
 """Name that stands for the delay of an undelayed arm."""
 TRUE = ("true_return", "true_success_rate", "true_steps")
@@ -29,7 +32,7 @@ SEEN = ("episode_return", "success_rate", "steps")
 MEASURES = (*TRUE, *SEEN, "age", "late", "lost", "backupdated")
 SCORES = (*TRUE, *SEEN)
 """Measures by which arms can be compared."""
-COMPARED = ("J_norm", "recovery", "improvement")
+COMPARED = ("J_norm", "recovery", "improvement", "of_ceiling")
 """Columns of the estimates of ``Compared``."""
 LESS_IS_BETTER = ("true_steps", "steps")
 """Scores for which lower values are better."""
@@ -50,6 +53,8 @@ class Arm:
     """Whether the arm ignores the delay; recovery 0 is the score of the best such arm."""
     policy_of: str | None = None
     """Arm whose policies this one flies, without any training of its own; None: this arm trains."""
+    ceiling: bool = False
+    """Whether the script flies with ever more known on time (``damian ceiling``), and nothing is trained."""
     regime: str = ""
     """Information that the arm uses: R0: messages that have arrived; R1: the truth, for the critic; R2: no
     delay in training; R3: no delay at all. If it is not given, ``delayed`` and ``policy_of`` decide."""
@@ -97,6 +102,8 @@ class Compared(NamedTuple):
     """0: the stronger naive arm; 1: the undelayed arm."""
     improvement: Estimate = UNKNOWN
     """Probability that a run of the arm beats one of the stronger naive arm."""
+    of_ceiling: Estimate = UNKNOWN
+    """Score over that of the script which knows all messages on time, if an arm flies it."""
 
 
 NOT_COMPARED = Compared([], UNKNOWN)
@@ -144,10 +151,15 @@ class Comparison:
         found = (row["delay"] for row in self.rows if row["task"] == task)
         return [name for name in dict.fromkeys(found) if name != NOT_LATE]
 
+    @property
+    def ceiling(self) -> str | None:
+        """Name of the arm that flies the script with ever more known on time, if there is one."""
+        return next((name for name, arm in self.arms.items() if arm.ceiling), None)
+
     def present(self, task: str, delay: str) -> list[str]:
-        """Arms with a finished run of a task under a delay."""
+        """Arms with a policy of their own that have a finished run of a task under a delay."""
         found = {row["arm"] for row in self.rows if (row["task"], row["delay"]) == (task, delay)}
-        return [name for name in self.arms if name in found]
+        return [name for name, arm in self.arms.items() if name in found and not arm.ceiling]
 
     def values(self, task: str, delay: str, arm: str, policy: str, measure: str) -> dict[int, float]:
         """Values of a measure by seed."""
@@ -173,7 +185,12 @@ class Comparison:
         delayed = list(scores)[2:]
         naive = [name for name in delayed if self.arms[name].naive]
         found = {name: self._compared(scores, naive, name) for name in delayed}
-        return {name: result for name, result in found.items() if result.seeds}
+        ceiling = self.values(task, delay, self.ceiling or "", ALL_MESSAGES, self.score)
+        return {
+            name: result._replace(of_ceiling=_ratio(scores[name], ceiling))
+            for name, result in found.items()
+            if result.seeds
+        }
 
     def _compared(self, scores: Mapping[str, Mapping[int, float]], naive: list[str], arm: str) -> Compared:
         names = [*list(scores)[:2], *(name for name in naive if name != arm), arm]
@@ -213,6 +230,14 @@ def _paired(runs: Sequence[Mapping[int, float]]) -> tuple[list[int], Floats]:
     """Seeds that all runs have, and their scores, [1, runs, seeds]."""
     seeds = sorted(set.intersection(*map(set, runs)))
     return seeds, np.array([[[scores[seed] for seed in seeds] for scores in runs]])
+
+
+def _ratio(scores: Mapping[int, float], others: Mapping[int, float]) -> Estimate:
+    """Mean score over the mean of others, over the seeds of both; unknown unless both are positive."""
+    seeds, array = _paired([scores, others])
+    if not seeds or array.mean(-1).min() <= 0:
+        return UNKNOWN
+    return _estimates(lambda drawn: drawn.mean(-1)[..., 0, 0] / drawn.mean(-1)[..., 0, 1], array)[0]
 
 
 def _norms(scores: Floats) -> Floats:
@@ -291,6 +316,10 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
                     # Older runs have not flown every scripted policy.
                     if comparison.values(task, delay, arm, policy, comparison.score):
                         yield replace(_line(comparison, task, delay, arm, policy), arm=policy, regime="")
+            for known, information in CEILING.items():
+                if comparison.values(task, delay, comparison.ceiling or "", known, comparison.score):
+                    line = _line(comparison, task, delay, str(comparison.ceiling), known)
+                    yield replace(line, regime=information)
 
 
 def _line(comparison: Comparison, task: str, delay: str, arm: str, policy: str) -> Line:

@@ -60,7 +60,10 @@ def markdown(comparison: Comparison, notes: Sequence[str], tasks: Mapping[str, s
 
 
 def _table(lines: Sequence[Line], never: bool) -> str:
-    left, right = ("arm", "regime", "policy"), ("n", *HEADS, "n compared", "J_norm", "recovery", "P > naive")
+    left, right = (
+        ("arm", "regime", "policy"),
+        ("n", *HEADS, "n compared", "J_norm", "recovery", "P > naive", "of ceiling"),
+    )
     rows = []
     for line in lines:
         name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
@@ -147,12 +150,14 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
         for axis, task in zip(axes, tasks, strict=True):
             _norm_panel(axis, comparison, task)
         axes[0].set_ylabel("J_norm (dashed: undelayed 1, random 0)")
-        axes[-1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        if axes[-1].get_legend_handles_labels()[0]:
+            axes[-1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         figure.savefig(path, dpi=150)
 
 
 def _norm_panel(axis: Axes, comparison: Comparison, task: str) -> None:
-    delays, arms = comparison.delays(task), [name for name, arm in comparison.arms.items() if arm.delayed]
+    delays = comparison.delays(task)
+    arms = [name for name, arm in comparison.arms.items() if arm.delayed and not arm.ceiling]
     compared = [comparison.compared(task, delay) for delay in delays]
     colours = dict(zip(comparison.arms, _colours(comparison), strict=True))
     for index, arm in enumerate(arms):

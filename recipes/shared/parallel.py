@@ -44,7 +44,9 @@ class Run:
     config: TrainConfig
     folder: Path
     program: Program
-    """``train``, or ``fly`` for an arm that evaluates the policy of another one; importable by name."""
+    """The work to do, importable by name."""
+    trains: bool = True
+    """Does the program train, so that it writes checkpoints and can be resumed?"""
 
     @property
     def name(self) -> str:
@@ -52,12 +54,8 @@ class Run:
 
     @property
     def policy(self) -> Path | None:
-        """Folder of the run whose policy this one flies; None: it trains, and so writes checkpoints."""
+        """Folder of the run whose policy this one flies, if it flies another one's."""
         return None if self.config.checkpoint is None else Path(self.config.checkpoint)
-
-    @property
-    def trains(self) -> bool:
-        return self.policy is None
 
     @property
     def finished(self) -> bool:
@@ -69,8 +67,9 @@ class Run:
         return source.exists() and source.stat().st_mtime_ns <= results.stat().st_mtime_ns
 
     def score(self, policy: str, measure: str) -> float:
-        """A measure of one policy in the results of a finished run."""
-        return next(row[measure] for row in self.results() if row["policy"] == policy)
+        """A measure of one policy in the results of a finished run, or of its first one."""
+        rows = {row["policy"]: row for row in self.results()}
+        return rows.get(policy, next(iter(rows.values())))[measure]
 
     def results(self) -> list[dict[str, Any]]:
         """The results of a finished run, a row for each policy.

@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 from helpers import check_refused
 
-from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED, Arm, Comparison, regime
+from damian.evaluation.comparison import (
+    ALL_MESSAGES,
+    CEILING,
+    GREEDY,
+    MODE,
+    RANDOM,
+    SAMPLED,
+    Arm,
+    Comparison,
+    regime,
+)
 from damian.evaluation.report import markdown, plot_curves, plot_norms
 from damian.evaluation.run_lock import locked
 from damian.evaluation.statistics import interquartile_mean
@@ -261,7 +271,7 @@ SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware"
 
 def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
     compared = Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
-    seeds, norm, recovery, improvement = compared["aware"]
+    seeds, norm, recovery, improvement, _ = compared["aware"]
     assert seeds == [0, 1]
     assert norm.value == 7.5 / 10
     assert recovery.value == (7.5 - 4) / (10 - 4)
@@ -281,7 +291,7 @@ def test_the_probability_of_improvement_is_over_the_naive_arm_with_the_higher_me
 
 def test_recovery_is_left_out_if_the_delay_costs_nothing():
     scores = SCORES | {"blind": [9.0, 9.5]}
-    _, norm, recovery, _ = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
+    _, norm, recovery, *_ = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
     assert norm.value == 0.75
     assert str(recovery) == "-"
 
@@ -355,6 +365,37 @@ def test_the_table_lists_the_greedy_policy_where_it_was_evaluated():
     assert cells == [[f"| {name}", " ", " greedy", " 1", " 7.000"] for name in names]
 
 
+def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
+    arms = ARMS | {"script": Arm(ceiling=True)}
+    rows = rows_of("t", "late", THREE)
+    for known, value in (("its own messages", 8.0), (ALL_MESSAGES, 10.0)):
+        rows += [row("t", "late", "script", seed, value, known) for seed in range(3)]
+    comparison = Comparison(rows, arms)
+    compared = comparison.compared("t", "late")
+    assert set(compared) == {"blind", "flown", "aware"}
+    assert compared["aware"].of_ceiling.value == pytest.approx((22 / 3) / 10)
+    script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
+    assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
+    assert comparison.compared("t", "late")["aware"].recovery.value == pytest.approx((22 / 3 - 4) / 6)
+
+
+def test_a_comparison_flies_the_script_with_ever_more_known_on_time(compare, tmp_path):
+    (tmp_path / "mine/experiment").mkdir(parents=True)
+    (tmp_path / "mine/experiment/script.yaml").write_text(
+        """tasks:
+  follow: [scenario=delaybench/tracking]
+  cover: [scenario=delaybench/coverage]
+delays: {late: [delay.obs=2]}
+arms: {best: {delayed: false}, script: {ceiling: true}}
+"""
+    )
+    words = ["--config-dir", "mine", "experiment=script", "seeds=1"]
+    compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
+    text = (tmp_path / "runs/script/table.md").read_text()
+    for known, information in CEILING.items():
+        assert text.count(f"| script | {information} | {known} | 1 |") == 1  # in one task of the two
+
+
 def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
     rows = rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES)
     text = markdown(Comparison(rows, ARMS), ["a note"], {"t": "long", "u": "short"}, never={"u"})
@@ -362,7 +403,7 @@ def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
     aware = "| aware | R0 | trained, sampled | 2 | 7.500 |"
     assert aware + " 7.500" in first
     assert aware + " - |" in second
-    assert "| 2 | 0.750 | 0.583 | 1.000 |" in first
+    assert "| 2 | 0.750 | 0.583 | 1.000 | - |" in first
     assert "| aware | 2 | 0.750 |" in overall
 
 
