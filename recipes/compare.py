@@ -31,7 +31,17 @@ from omegaconf import MISSING, DictConfig
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.evaluation.comparison import MODE, NOT_LATE, SAMPLED, SCORES, SCRIPTED, Arm, Comparison, regime
+from damian.evaluation.comparison import (
+    HELD_OUT,
+    MODE,
+    NOT_LATE,
+    SAMPLED,
+    SCORES,
+    SCRIPTED,
+    Arm,
+    Comparison,
+    regime,
+)
 from damian.evaluation.interrupt import exit_code
 from damian.evaluation.metrics_log import read_metrics
 from damian.evaluation.report import LABELS, markdown, plot_curves, plot_norms
@@ -53,6 +63,17 @@ POLICIES = {"sampled": SAMPLED, "mode": MODE}
 
 
 @dataclass
+class HeldOut:
+    """Changes of a task under which the policies that were trained without them are evaluated too."""
+
+    overrides: list[str] = field(default_factory=list)
+    """Overrides of ``damian train``, such as another region or number of UAVs."""
+    tasks: list[str] | None = None
+    """Tasks of the experiment to change; all of them if not given. In a task whose features depend on the
+    number of UAVs, a policy can fly only as many as it was trained with."""
+
+
+@dataclass
 class Experiment:
     """Tasks, delays and arms to compare, as written in a file of conf/experiment."""
 
@@ -62,13 +83,15 @@ class Experiment:
     """Overrides of ``damian train`` for each delay."""
     arms: dict[str, Arm] = field(default_factory=dict)
     """One of them, the reference, has ``delayed: false``."""
+    held_out: dict[str, HeldOut] = field(default_factory=dict)
+    """Changed tasks to evaluate all policies in; in the tables they are called TASK@NAME."""
     first_seed: int = 0
     """The seeds of every arm count from this one."""
     best: dict[str, float] = field(default_factory=dict)
     """Best possible value of a measure: a dashed line in its learning curves."""
 
     def __post_init__(self) -> None:
-        for kind in ("tasks", "delays", "arms"):
+        for kind in ("tasks", "delays", "arms", "held_out"):
             for name in getattr(self, kind):
                 good = re.fullmatch(r"[\w.-]+", name) and name not in (NOT_LATE, *SCRIPTED)
                 should = "cannot name a folder: use letters, digits, _ . - but not none, random or greedy"
@@ -88,6 +111,9 @@ class Experiment:
                 should = "flies the script under delay: it has no policy_of, and delayed is not false"
                 good = arm.policy_of is None and arm.delayed
                 checks.require(good, f"experiment.arms.{name}", "ceiling", should)
+        for name, held_out in self.held_out.items():
+            for task in held_out.tasks or ():
+                checks.one_of(f"experiment.held_out.{name}.tasks", task, self.tasks)
         for name in self.best:
             checks.one_of("experiment.best", name, LABELS)
 
@@ -143,27 +169,39 @@ ConfigStore.instance().store(name="compare_schema", node=CompareConfig)
 
 
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
-    """Every run with its checked configuration; arms that fly the policies of other arms come last."""
-    delays = {NOT_LATE: [], **config.chosen("delays")}
+    """Every run with its checked configuration; what flies the policies of other runs comes last."""
+    tasks, delays = config.chosen("tasks"), {NOT_LATE: [], **config.chosen("delays")}
+    places = {task: (task, overrides) for task, overrides in tasks.items()}
+    for name, held_out in config.experiment.held_out.items():
+        for task in tasks if held_out.tasks is None else [t for t in tasks if t in held_out.tasks]:
+            places[f"{task}{HELD_OUT}{name}"] = (task, [*tasks[task], *held_out.overrides])
     runs = [
         run
-        for task, task_overrides in config.chosen("tasks").items()
+        for place, (task, task_overrides) in places.items()
         for delay, delay_overrides in delays.items()
         for name, arm in config.chosen("arms").items()
         if arm.delayed == (delay != NOT_LATE)
-        for run in _seeds(config, folder / task / delay / name, [*task_overrides, *delay_overrides])
+        for run in _seeds(config, folder / place / delay / name, task, [*task_overrides, *delay_overrides])
     ]
     return sorted(runs, key=lambda run: not run.trains)
 
 
-def _seeds(config: CompareConfig, folder: Path, overrides: list[str]) -> Iterator[Run]:
-    """The runs of one task, delay and arm, which the folder names."""
+def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list[str]) -> Iterator[Run]:
+    """The runs of one task, delay and arm, which the folder names.
+
+    Args:
+        config: settings of the comparison.
+        folder: folder of the arm.
+        trained_in: the task itself, or that in which the policies were trained that fly in a held-out one.
+        overrides: of the task and the delay.
+    """
     task, delay, name = folder.parts[-3:]
-    arm = config.experiment.arms[name]
+    arm, arms = config.experiment.arms[name], config.experiment.arms
+    source = arm.policy_of or (name if task != trained_in and not arm.ceiling else None)
     overrides = whole_laws(["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides])
     try:
         unseeded = checked(compose("train", overrides))
-        if arm.policy_of is None and not arm.ceiling:
+        if source is None and not arm.ceiling:
             unseeded.check_learning()
     except COMPOSITION_ERRORS as error:
         raise InputError(f"{task}/{delay}/{name}: {one_line(error)}") from error
@@ -172,12 +210,11 @@ def _seeds(config: CompareConfig, folder: Path, overrides: list[str]) -> Iterato
     for seed in range(config.experiment.first_seed, config.experiment.first_seed + config.seeds):
         seed_folder = f"seed_{seed}"
         seeded = replace(unseeded, seed=seed, overrides=[*overrides, f"seed={seed}"])
-        if arm.policy_of:
-            source = config.experiment.arms[arm.policy_of]
-            source_delay = delay if source.delayed else NOT_LATE
-            policy = folder.parents[1] / source_delay / arm.policy_of / seed_folder
+        if source:
+            source_delay = delay if arms[source].delayed else NOT_LATE
+            policy = folder.parents[2] / trained_in / source_delay / source / seed_folder
             seeded = replace(seeded, checkpoint=str(policy))
-        program = ceiling.fly if arm.ceiling else fly if arm.policy_of else train
+        program = ceiling.fly if arm.ceiling else fly if source else train
         yield Run(task, delay, name, seeded, folder / seed_folder, program, trains=program is train)
 
 
@@ -210,6 +247,7 @@ def report(config: CompareConfig, runs: Sequence[Run], folder: Path) -> None:
     _write(folder / TABLE, [line.cells() for line in comparison.lines])
     never = {run.task for run in runs if run.config.episode.success_share is None}  # tasks without success
     lengths = {run.task: _training_length(run) for run in done}
+    lengths |= {task: "Policies of another task." for task in lengths if HELD_OUT in task}
     (folder / MARKDOWN).write_text(markdown(comparison, _notes(config, runs, rows), lengths, never))
     if len(comparison.tasks()) > 1:
         plot_norms(comparison, folder / FIGURE)

@@ -23,6 +23,8 @@ SCRIPTED = (RANDOM, GREEDY)
 ALL_MESSAGES = "all messages"
 CEILING = {"what has arrived": "R0", "its own messages": "R0", ALL_MESSAGES: "R3", "the source's place": "R3"}
 """What is known on time in the rows of an information ceiling (``damian ceiling``), and their regimes."""
+HELD_OUT = "@"
+"""Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
 """Name that stands for the delay of an undelayed arm."""
 TRUE = ("true_return", "true_success_rate", "true_steps")
@@ -205,11 +207,12 @@ class Comparison:
     def overall(self) -> dict[str, tuple[int, Estimate]]:
         """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.
 
-        Only the arms and delays that every task has count, and of each arm the seeds that it and the
-        undelayed arm have everywhere. The result is empty if there are fewer than two combinations of task
-        and delay. Seeds are resampled within each task, because its delays share the undelayed arm.
+        Held-out tasks do not count. Of the others, only the arms and delays that every one has do, and of
+        each arm the seeds that it and the undelayed arm have everywhere. The result is empty if there are
+        fewer than two combinations of task and delay. Seeds are resampled within each task, because its
+        delays share the undelayed arm.
         """
-        by_task = {task: self.delays(task) for task in self.tasks()}
+        by_task = {task: self.delays(task) for task in self.tasks() if HELD_OUT not in task}
         delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
         cells = [[self.scores(task, delay) for delay in delays] for task in by_task]
         flat = [cell for row in cells for cell in row]

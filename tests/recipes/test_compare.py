@@ -330,6 +330,8 @@ def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
     assert norm.low < norm.value < norm.high
     assert overall["blind"][1].value == 0
     assert Comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")], ARMS).overall()
+    held_out = rows_of("t@other", "late", {"best": [1.0] * 3, "aware": [9.0] * 3})
+    assert repr(Comparison(rows + held_out, ARMS).overall()) == repr(overall)
     one = Comparison(rows_of("t", "late", SCORES), ARMS)
     assert one.overall() == {}
 
@@ -379,21 +381,29 @@ def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     assert comparison.compared("t", "late")["aware"].recovery.value == pytest.approx((22 / 3 - 4) / 6)
 
 
-def test_a_comparison_flies_the_script_with_ever_more_known_on_time(compare, tmp_path):
+def test_a_comparison_flies_policies_in_held_out_tasks_and_the_script_that_knows_ever_more(compare, tmp_path):
     (tmp_path / "mine/experiment").mkdir(parents=True)
     (tmp_path / "mine/experiment/script.yaml").write_text(
         """tasks:
   follow: [scenario=delaybench/tracking]
-  cover: [scenario=delaybench/coverage]
 delays: {late: [delay.obs=2]}
-arms: {best: {delayed: false}, script: {ceiling: true}}
+arms: {best: {delayed: false}, naive: {naive: true}, script: {ceiling: true}}
+held_out: {two: {overrides: [agents=2], tasks: [follow]}}
 """
     )
     words = ["--config-dir", "mine", "experiment=script", "seeds=1"]
     compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
     text = (tmp_path / "runs/script/table.md").read_text()
     for known, information in CEILING.items():
-        assert text.count(f"| script | {information} | {known} | 1 |") == 1  # in one task of the two
+        assert text.count(f"| script | {information} | {known} | 1 |") == 2
+    assert "## follow@two, delay late\n\nPolicies of another task." in text
+    results = tmp_path / "runs/script"
+    for delay, arm in (("none", "best"), ("late", "naive")):
+        flown = results / "follow@two" / delay / arm / "seed_0"
+        config = (flown / "config.yaml").read_text()
+        assert re.search(f"checkpoint: .*/follow/{delay}/{arm}/seed_0", config)
+        assert "agents: 2" in config
+        assert not (flown / "metrics.csv").exists()
 
 
 def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
