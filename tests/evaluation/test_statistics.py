@@ -148,6 +148,22 @@ def test_the_probability_of_improvement_is_the_share_of_pairs_of_runs():
     np.testing.assert_allclose(probability_of_improvement(ours, theirs), expected)
 
 
+RLIABLE = [
+    (4, 0.5208333333333334, -0.02959999643662835),
+    (8, 0.515625, -0.0058190621298199),
+    (12, 0.44675925925925924, -0.051904822102819555),
+]
+"""Runs of each of three tasks, and what rliable 1.2.0 returns for their probability of improvement and for the
+interquartile mean (which it rounds where the number of all runs is not a multiple of four)."""
+
+
+@pytest.mark.parametrize(("n_seeds", "improvement", "middle"), RLIABLE)
+def test_statistics_are_those_of_rliable(n_seeds, improvement, middle):
+    ours, theirs = np.random.default_rng(n_seeds).normal(size=(2, n_seeds, 3))
+    assert probability_of_improvement(ours.T, theirs.T).mean() == pytest.approx(improvement, abs=1e-12)
+    assert interquartile_mean(ours.reshape(-1)) == pytest.approx(middle, abs=1e-12)
+
+
 def test_equal_scores_of_all_seeds_give_an_interval_of_no_width():
     low, high = bootstrap(means, np.full((1, 2, 5), 3.5))
     np.testing.assert_array_equal(low, [[3.5, 3.5]])
