@@ -153,7 +153,7 @@ RLIABLE = [
     (8, 0.515625, -0.0058190621298199),
     (12, 0.44675925925925924, -0.051904822102819555),
 ]
-"""Runs of each of three tasks, and what rliable 1.2.0 returns for their probability of improvement and for the
+"""Runs of each of three tasks, and what rliable 1.2.0 returns for their probability of improvement and their
 interquartile mean (which it rounds where the number of all runs is not a multiple of four)."""
 
 
