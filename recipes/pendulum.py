@@ -151,7 +151,7 @@ def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
     """Train for ``steps`` environment steps, with one update after each."""
     td = env.reset()
     for step in range(steps):
-        # Without an exploration type TorchRL's actor takes the mode of its distribution, and explores nothing.
+        # Outside of such a context TorchRL's actor takes the mode of its distribution, and explores nothing.
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             td = env.rand_action(td) if step < RANDOM_STEPS else learner.actor(td)
             transition, td = env.step_and_maybe_reset(td)
