@@ -1,6 +1,6 @@
 """Apply the delay transforms to another environment: SAC on Gymnasium's Pendulum-v1 with late observations.
 
-    damian pendulum --jobs 2                  (a quarter of an hour on two free cores)
+    damian pendulum --jobs 2                  (half an hour on two free cores)
     damian pendulum --arms history,bpql       (these arms only)
     damian pendulum --seeds 0 --steps 10000 --delay 3 --out runs/pendulum3
 

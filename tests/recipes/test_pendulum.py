@@ -18,12 +18,12 @@ from damian.recipes.pendulum import ARMS, Run, draw, evaluate_under, main, make_
 TINY = ["--seeds", "4", "--steps", "1002", "--episodes", "2", "--hidden", "8", "--delay", "3"]
 
 
-def learn(delay: int, history: int, steps: int) -> nn.Module:
+def learn(delay: int, history: int, steps: int, arm: str = "history") -> nn.Module:
     """The policy that is trained with one seed."""
     torch.manual_seed(0)
     env = make_env(delay, history)
     env.set_seed(0)
-    learner = make_learner(env, Run("history", 0, steps, delay, 20, 128))
+    learner = make_learner(env, Run(arm, 0, steps, delay, 20, 128))
     train(env, learner, steps, tqdm(disable=True))
     return learner.actor
 
@@ -192,5 +192,6 @@ def test_delay_lowers_the_return_and_the_action_history_restores_it():
     assert returns[0] > -300
     assert returns[6] < returns[0] - 300
     naive = evaluate_under(6, 0, learn(delay=6, history=0, steps=12_000), 20)
-    aware = evaluate_under(6, 6, learn(delay=6, history=6, steps=12_000), 20)
-    assert aware > naive + 300
+    for arm, steps in (("history", 12_000), ("bpql", 8_000)):
+        aware = evaluate_under(6, 6, learn(delay=6, history=6, steps=steps, arm=arm), 20)
+        assert aware > naive + 300, arm
