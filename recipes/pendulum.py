@@ -1,12 +1,15 @@
 """Apply the delay transforms to another environment: SAC on Gymnasium's Pendulum-v1 with late observations.
 
-    damian pendulum --jobs 2                  (a quarter of an hour on two free cores)
+    damian pendulum --jobs 2                  (half an hour on two free cores)
+    damian pendulum --arms history,bpql       (these arms only)
     damian pendulum --seeds 0 --steps 10000 --delay 3 --out runs/pendulum3
 
-Three arms are trained for each seed: undelayed; naive, whose observations are late; and history, which also
-observes the agent's latest actions. The undelayed policy is also evaluated under several delays. The run
-folder (runs/pendulum, unless --out names another one) gets the table of mean returns as results.md and
-results.csv, and a JSON file for each arm and seed; an arm and seed that has its file is not trained again.
+Four arms are trained for each seed: undelayed; naive, whose observations are late; history, which also
+observes the agent's latest actions; and bpql, whose actor is that of history, but whose critics read only
+the state, once it has arrived (``BackupdateStorage``). The undelayed policy is also evaluated under several
+delays. The run folder (runs/pendulum, unless --out names another one) gets the table of mean returns as
+results.md and results.csv, and a JSON file for each arm and seed; an arm and seed that has its file is not
+trained again.
 """
 
 import csv
@@ -17,18 +20,21 @@ import statistics
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
-from torch import nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
 from torchrl.envs import (
+    CatTensors,
     Compose,
     EnvBase,
     GymEnv,
     RenameTransform,
     RewardSum,
     SerialEnv,
+    StepCounter,
     Transform,
     TransformedEnv,
 )
@@ -42,26 +48,30 @@ from damian.common.markdown import markdown_table
 from damian.common.text_files import named, read_text, show
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
+from damian.learners.bpql import BpqlConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.time_storage import TimeStorage
 from damian.transforms import ActionHistory, ObservationDelay
 
 from .shared.command_line import Parser, exits_with_one_line
 
-ARMS = ("undelayed", "naive", "history")
+ARMS = ("undelayed", "naive", "history", "bpql")
+AUGMENTED = ("history", "bpql")  # arms whose actor observes its latest actions
 DEPLOYED = {0: -145, 2: -153, 3: -324, 4: -757, 6: -777, 8: -977}
-REFERENCE = {("undelayed", d): r for d, r in DEPLOYED.items()} | {("naive", 6): -1154, ("history", 6): -155}
+REFERENCE = {("undelayed", d): r for d, r in DEPLOYED.items()}
+REFERENCE |= {("naive", 6): -1154, ("history", 6): -155, ("bpql", 6): -144}
 """Returns by arm and delay: one seed of an independent implementation, 20 000 steps; for orientation only."""
 
 HORIZON = 200  # steps of an episode
 RANDOM_STEPS = 1000  # steps with random actions before the first update
 EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
 BATCH, LR, GAMMA, TAU = 256, 1e-3, 0.99, 0.005
-STORED = [
-    keys.OBSERVATION,
-    keys.ACTION,
-    *map(next_key, (keys.OBSERVATION, keys.REWARD, keys.DONE, keys.TERMINATED)),
-]
+OBSERVED = (keys.OBSERVATION, keys.GLOBAL_OBSERVATION)  # of the actor, and the state for critics
+OUTPUTS = (*OBSERVED, "observation", "received", "age", "delay", "step_count", keys.REWARD)
+STORED = [*OBSERVED, "step_count", keys.ACTION]
+STORED += map(next_key, (*OUTPUTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED))
 
 
 class Run(NamedTuple):
@@ -84,44 +94,81 @@ def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
 
     Args:
         delay: of the observations [steps].
-        history: number of latest actions that are appended to the observation.
+        history: number of latest actions that are appended to the actor's observation.
         worlds: batch size of a ``SerialEnv``; a single environment without a batch size if not given.
+
+    Returns:
+        The environment. Its entry ``observation`` is sent in each step, and ``received`` is what has arrived;
+        a learner reads only what follows from the latter.
     """
 
     def pendulum() -> EnvBase:
         return GymEnv("Pendulum-v1")
 
-    transforms: list[Transform] = [RewardSum(), ObservationDelay(delay, age_key=None)]
+    transforms: list[Transform] = [
+        RewardSum(),
+        StepCounter(),
+        ObservationDelay(delay, ["observation"], ["received"], delay_key="delay"),
+        CatTensors(["received"], "state", del_keys=False),
+        CatTensors(["received"], "observed", del_keys=False),
+    ]
     if history:
-        transforms.append(ActionHistory(history, append_to="observation"))
+        transforms.append(ActionHistory(history, append_to="observed"))
     # The learner expects these keys; a single agent needs no agent dimension.
-    outputs = {"observation": keys.OBSERVATION, "reward": keys.REWARD}
+    outputs = {"observed": keys.OBSERVATION, "state": keys.GLOBAL_OBSERVATION, "reward": keys.REWARD}
     transforms.append(RenameTransform([*outputs], [*outputs.values()], ["action"], [keys.ACTION]))
     return TransformedEnv(SerialEnv(worlds, pendulum) if worlds else pendulum(), Compose(transforms))
 
 
+def arrived_states(steps: TensorDictBase, observations: Tensor) -> dict[NestedKey, Tensor]:
+    """The states after steps [T, B]: what was observed then, as far as it has arrived, [T, B, 3]."""
+    return {next_key(keys.GLOBAL_OBSERVATION): observations}
+
+
 def make_learner(env: EnvBase, run: Run) -> Sac:
-    """The SAC learner that also trains the UAVs, with a replay buffer of single steps."""
-    config = SacConfig(lr=LR, alpha_lr=LR, gamma=GAMMA, tau=TAU, alpha_init=1.0)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(run.steps), batch_size=BATCH)
+    """The learner that also trains UAVs: SAC, or BPQL with a storage that learns of states as they arrive."""
+    kind = BpqlConfig if run.arm == "bpql" else SacConfig
+    config = kind(lr=LR, alpha_lr=LR, gamma=GAMMA, tau=TAU, alpha_init=1.0)
     model = ModelConfig(hidden=[run.hidden, run.hidden], activation="relu")
     setup = LearningSetup(model, 1, 1, 1, critic_key=keys.OBSERVATION)
-    return Sac(env, config, setup, buffer)
+    if run.arm != "bpql":
+        return config.make(env, setup, ReplayBuffer(storage=TimeStorage(run.steps)))
+    storage = BackupdateStorage(
+        run.steps,
+        arrived_states,
+        longest=run.delay,
+        env=env,
+        message_key="observation",
+        received_key="received",
+        delay_key="delay",
+        age_key="age",
+    )
+    setup = setup._replace(longest_delay=run.delay, critic_key=keys.GLOBAL_OBSERVATION)
+    return config.make(env, setup, ReplayBuffer(storage=storage))
 
 
 def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
     """Train for ``steps`` environment steps, with one update after each."""
     td = env.reset()
     for step in range(steps):
-        with torch.no_grad():
+        # Outside of such a context TorchRL's actor takes the mode of its distribution, and explores nothing.
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             td = env.rand_action(td) if step < RANDOM_STEPS else learner.actor(td)
             transition, td = env.step_and_maybe_reset(td)
-        learner.buffer.add(transition.select(*STORED))
+        learner.buffer.extend(transition.select(*STORED).view(1, 1))  # one world, one step
         if step >= RANDOM_STEPS:
-            learner.update(learner.buffer.sample())
+            learner.update(draw(learner))
         bar.update()
         if transition["next", "done"].item():
             bar.set_postfix({"return": f"{transition['next', 'episode_reward'].item():.0f}"})
+
+
+def draw(learner: Sac) -> TensorDictBase:
+    """Transitions [BATCH] from all steps whose observations have arrived, if the learner waits for these."""
+    storage = cast(TimeStorage, learner.buffer.storage)
+    order = storage.latest()
+    settled = order[: len(order) - learner.setup.settle_steps]
+    return storage.steps[settled[torch.randint(len(settled), (BATCH,))], 0]
 
 
 @torch.no_grad()
@@ -140,7 +187,7 @@ def run_arm(run: Run, folder: Path, place: int) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(run.seed)
     delay = 0 if run.arm == "undelayed" else run.delay
-    history = run.delay if run.arm == "history" else 0
+    history = run.delay if run.arm in AUGMENTED else 0
     env = make_env(delay, history)
     env.set_seed(run.seed)
     learner = make_learner(env, run)
@@ -217,10 +264,11 @@ def make_folder(folder: Path) -> None:
 
 def table(runs: Sequence[Run], folder: Path) -> str:
     """Write the results as results.csv and results.md; returns the latter's text."""
-    rows = [
-        ["arm", "delay", "mean", *(f"seed {run.seed}" for run in runs if run.arm == ARMS[0]), "reference"]
-    ]
-    for arm in ARMS:
+    arms, seeds = (
+        list(dict.fromkeys(each)) for each in zip(*((run.arm, run.seed) for run in runs), strict=True)
+    )
+    rows = [["arm", "delay", "mean", *(f"seed {seed}" for seed in seeds), "reference"]]
+    for arm in arms:
         results = [returns_of(run, folder) or {} for run in runs if run.arm == arm]
         for delay in results[0]:
             values = [result[delay] for result in results]
@@ -241,6 +289,7 @@ def parse(words: Sequence[str] | None) -> tuple[list[Run], Path, int]:
         InputError: an option is unknown, or its value is impossible.
     """
     parser = Parser(description="SAC on Pendulum-v1 with late observations.")
+    parser.add_argument("--arms", default=",".join(ARMS), help="arms to train, such as history,bpql")
     parser.add_argument("--seeds", default="0,1,2", help="seeds of each arm, such as 0,1,2")
     parser.add_argument("--steps", type=int, default=20_000, help="training steps of each arm")
     parser.add_argument("--delay", type=int, default=6, help="delay of the observations [steps]")
@@ -249,6 +298,9 @@ def parse(words: Sequence[str] | None) -> tuple[list[Run], Path, int]:
     parser.add_argument("--out", type=Path, default=Path("runs/pendulum"), help="run folder")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes, each with one thread")
     args = parser.parse_args(words)
+    arms = args.arms.split(",")
+    valid = {*arms} <= {*ARMS} and len({*arms}) == len(arms)
+    checks.require(valid, "--arms", args.arms, f"is not a list of different ones of {','.join(ARMS)}")
     seeds = args.seeds.split(",")
     valid = all(re.fullmatch(r"[0-9]{1,9}", seed) for seed in seeds)
     valid = valid and len({*map(int, seeds)}) == len(seeds)
@@ -258,7 +310,7 @@ def parse(words: Sequence[str] | None) -> tuple[list[Run], Path, int]:
     for name, most in (("episodes", 10_000), ("hidden", 16_384), ("jobs", 1024)):
         checks.in_range(f"--{name}", getattr(args, name), 1, most)
     settings = args.steps, args.delay, args.episodes, args.hidden
-    return [Run(arm, int(seed), *settings) for seed in seeds for arm in ARMS], args.out, args.jobs
+    return [Run(arm, int(seed), *settings) for seed in seeds for arm in arms], args.out, args.jobs
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -17,7 +17,7 @@ from damian import keys
 from damian.common import checks
 from damian.keys import next_key
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
-from damian.learners.networks import make_action_value, make_actor
+from damian.learners.networks import ModelConfig, make_actor
 from damian.learners.reward_scale import ReturnScale
 from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
@@ -88,6 +88,14 @@ class SacConfig(LearnerConfig):
         )
         checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")
 
+    def critic_keys(self, setup: LearningSetup) -> list[NestedKey]:
+        """Entries that the critics read, beside the action.
+
+        Only the actor's observation holds the UAV's past actions: if a critic of late observations did not
+        read them, the actor could not learn to use them.
+        """
+        return list(dict.fromkeys((setup.critic_key, keys.OBSERVATION)))
+
     def buffer_size(self, setup: LearningSetup) -> int:
         return self.buffer_steps // setup.worlds * setup.worlds
 
@@ -114,7 +122,8 @@ class Sac:
     def __init__(self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = make_actor(env, setup.model)
-        critics = [make_action_value(env, setup.model, setup.critic_key) for _ in range(N_CRITICS)]
+        read = config.critic_keys(setup)
+        critics = [make_action_value(env, setup.model, read) for _ in range(N_CRITICS)]
         self.loss = sac_loss(self.actor, critics, env, config)
         # A checkpoint also holds the discount of its run, which must not replace this run's.
         self.loss.register_load_state_dict_post_hook(
@@ -197,6 +206,21 @@ _UNREAD: list[NestedKey] = [
     next_key(keys.EPISODE_REWARD),
 ]
 """Entries that SAC never reads; they are not stored, to save memory."""
+
+
+def make_action_value(env: EnvBase, model: ModelConfig, read: list[NestedKey]) -> TensorDictModule:
+    """Make a critic of actions (Q-function), which reads the entries ``read``.
+
+    Returns:
+        with discrete actions, a module that writes ``action_value`` [*, A], the value of each action; with
+        continuous ones, ``state_action_value`` [*, 1], the value of ``("agents", "action")``.
+    """
+    n_features = sum(env.observation_spec[key].shape[-1] for key in read)
+    spec = env.full_action_spec_unbatched[keys.ACTION]
+    if isinstance(spec, Categorical):
+        return TensorDictModule(model.network(n_features, spec.n, env.device), read, ["action_value"])
+    network = model.network(n_features + spec.shape[-1], 1, env.device)
+    return TensorDictModule(network, [*read, keys.ACTION], ["state_action_value"])
 
 
 def sac_loss(

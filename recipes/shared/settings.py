@@ -16,9 +16,9 @@ from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
 from damian.evaluation.loggers import check_loggers
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
+from damian.learners.bpql import BpqlConfig  # noqa: F401 (registers the learner, and SacConfig)
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
-from damian.learners.sac import SacConfig  # noqa: F401 (registers the learner)
 from damian.learners.schedule import SystemClock
 
 MAX_BATCH = 100_000_000

@@ -254,7 +254,7 @@ def test_help_may_stand_anywhere_and_explains_groups_and_experiments(capsys):
     assert scenarios.startswith("choose one with scenario=OPTION: coverage, ")
     assert "[spotting]" in scenarios
     learner = printed("train", "--help", "learner")
-    assert "choose one with learner=OPTION: [mappo], sac\n" in learner
+    assert "choose one with learner=OPTION: bpql, [mappo], sac\n" in learner
     assert "learner.name: str = 'mappo' (mappo) or 'sac' (sac)\n" in learner
     assert "learner.gamma: float = 0.95\n" in learner
     experiment = printed("compare", "--help", "experiment")

@@ -1,0 +1,169 @@
+"""BPQL: critics read states that have arrived, and the actor what had arrived and its own actions since."""
+
+import math
+import sys
+
+import pytest
+import torch
+from helpers import both_kinds, check_refused, everything, learning
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+from torchrl.envs import StepCounter
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from damian import keys
+from damian.common.errors import InputError
+from damian.delays.config import DelayConfig
+from damian.envs.pipeline import make_env
+from damian.learners.bpql import BpqlConfig
+from damian.learners.networks import ModelConfig
+from damian.learners.sac import Sac
+from damian.recipes.shared.launch import launch
+from damian.recipes.train import main
+from damian.replay.backupdate import BackupdateStorage
+from damian.replay.recompute import server_recompute
+from damian.server.termination import EpisodeConfig
+
+SMALL, LONGEST = ModelConfig(hidden=[16]), 5
+
+
+def learnt(kind: str = "discrete", steps: int = 40) -> tuple[Sac, TensorDictBase, TensorDictBase]:
+    """A learner after several batches, all steps that it was given [B, T], and the last transitions drawn."""
+    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": LONGEST}, history=3)
+    scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
+    env = make_env(scenario, 4, 1, extras=["message", "privileged"])
+    env.append_transform(StepCounter())
+    storage = BackupdateStorage(60 * 4, server_recompute(env.server), LONGEST)
+    torch.manual_seed(0)
+    config = BpqlConfig(updates=1, batch_size=300, warm_up=0, alpha_init=0.5)
+    setup = learning(SMALL, backupdate=True, longest_delay=LONGEST)
+    learner = config.make(env, setup, ReplayBuffer(storage=storage))
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        flight = env.rollout(steps, learner.actor, break_when_any_done=False)
+    drawn, update = [], learner.update
+
+    def recording(batch: TensorDictBase) -> TensorDictBase:
+        drawn.append(batch.clone())
+        return update(batch)
+
+    learner.update = recording
+    for part in flight.split(8, 1):
+        learner.learn(part)
+    return learner, flight, drawn[-1]
+
+
+def rows(before: TensorDictBase, after: TensorDictBase, state: str) -> Tensor:
+    """What an update reads of each decision: the actor's observation, and a state, before and after it."""
+    return torch.cat([agents[key] for agents in (before, after) for key in ("observation", state)], -1)
+
+
+@both_kinds
+def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_from_what_it_saw(kind):
+    _, flight, drawn = learnt(kind)
+    found = rows(drawn["agents"], drawn["next", "agents"], "global_observation")
+    expected, late = [], []
+    for world in range(4):
+        for step in range(40 - LONGEST):  # the messages of later ones may still be on their way
+            for agent in range(3):
+                place = world, step, agent
+                before, after = flight["agents"][place], flight["next", "agents"][place]
+                twin = [
+                    torch.cat(
+                        [each["observation"], each["privileged_observation"][:-2]]
+                    )  # without the source
+                    for each in (before, after)
+                ]
+                expected.append(torch.cat(twin))
+                late.append(rows(before, after, "global_observation"))
+    differences = (found.unsqueeze(1) - torch.stack(expected)).abs().amax(-1)
+    assert differences.amin(1).max() < 1e-5  # every drawn transition has undelayed states of a settled step
+    assert (torch.stack(late) - torch.stack(expected)).abs().max() > 0.1  # as collected, they were late
+
+
+@both_kinds
+def test_critics_read_the_state_only_and_the_actor_its_own_observation_only(kind):
+    learner, _, drawn = learnt(kind, steps=24)
+    other = drawn.copy()
+    other[keys.OBSERVATION] = torch.rand_like(drawn[keys.OBSERVATION])
+    values, others = (
+        learner.loss._vmap_qnetworkN0(batch.copy(), learner.loss.qvalue_network_params)[
+            "action_value" if kind == "discrete" else "state_action_value"
+        ]
+        for batch in (drawn, other)
+    )
+    assert values.equal(others)
+    other = drawn.copy()
+    other[keys.GLOBAL_OBSERVATION] = torch.rand_like(drawn[keys.GLOBAL_OBSERVATION])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        actions = [learner.actor(batch.copy())[keys.ACTION] for batch in (drawn, other)]
+    assert actions[0].equal(actions[1])
+
+
+def test_the_losses_are_those_of_bpql():
+    learner, _, drawn = learnt()
+    batch, loss = drawn[:7], learner.loss
+
+    def values(params: TensorDictBase, state: Tensor) -> Tensor:
+        """Values of all actions by each of both critics in one state, [2, A]."""
+        found = []
+        for i in range(2):
+            with params[i].to_module(loss.qvalue_network):
+                read = TensorDict({keys.GLOBAL_OBSERVATION: state})
+                found.append(loss.qvalue_network(read)["action_value"])
+        return torch.stack(found)
+
+    def policy(agents: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Probabilities and their logarithms, [A], of the policy at what the actor observed."""
+        known = {keys.OBSERVATION: agents["observation"], keys.ACTION_MASK: agents["action_mask"]}
+        chosen = learner.actor.get_dist(TensorDict(known))
+        return chosen.probs, chosen.logits
+
+    alpha, actor, critic = loss.log_alpha.exp(), 0.0, 0.0
+    for row in batch:
+        agents, after = row["agents"], row["next", "agents"]
+        probs, logs = policy(after)
+        least = values(loss.target_qvalue_network_params, after["global_observation"]).amin(0)
+        value = (probs * (least - alpha * logs)).sum()
+        if row["next", "terminated"]:
+            value = 0.0
+        target = after["reward"] + 0.95 ** row["steps_to_next_obs"] * value
+        both = values(loss.qvalue_network_params, agents["global_observation"])
+        critic += (both[:, agents["action"]] - target).square().sum() / len(batch)
+        probs, logs = policy(agents)
+        actor += (probs * (alpha * logs - both.amin(0))).sum() / len(batch)
+    losses = loss(batch)
+    torch.testing.assert_close(losses["loss_qvalue"], critic.detach(), check_dtype=False)
+    torch.testing.assert_close(losses["loss_actor"], actor, check_dtype=False)
+
+
+def test_bpql_waits_for_states_and_refuses_to_learn_without_back_updating():
+    learner, *_ = learnt(steps=8)
+    assert learner.setup.settle_steps == LONGEST
+    config = BpqlConfig()
+    with pytest.raises(InputError, match="learner: bpql needs back-updating"):
+        config.check(learning(SMALL, longest_delay=3))
+    config.check(learning(SMALL, longest_delay=3, backupdate=True))
+    config.check(
+        learning(SMALL, longest_delay=3, critic_key=keys.PRIVILEGED_OBSERVATION)
+    )  # states that are true anyway
+    config.check(learning(SMALL))  # nothing is late
+
+
+TINY = ["frames=200", "worlds=4", "learner.steps=16", "learner.warm_up=100", "learner.buffer_steps=1000"]
+TINY += ["learner.updates=1", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
+TINY += ["region.lattice_step=60", "episode.max_steps=12", "delay.obs=3"]
+
+
+@pytest.mark.parametrize("aware", [pytest.param("both", marks=pytest.mark.slow), "history"])
+def test_the_command_line_trains_with_bpql(tmp_path, monkeypatch, aware, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["train.py", "learner=bpql", f"aware={aware}", *TINY, "hydra.run.dir=run"]
+    monkeypatch.setattr(sys, "argv", words)
+    if aware == "history":
+        check_refused(lambda: launch(main), "learner: bpql needs back-updating", capsys)
+        return
+    launch(main)
+    assert (tmp_path / "run" / "result.csv").is_file()
+    last = (tmp_path / "run" / "metrics.csv").read_text().splitlines()[-1]
+    assert all(math.isfinite(float(number)) for number in last.split(",") if number)
