@@ -285,24 +285,3 @@ class SharedValue(nn.Module):
         """Return the value of observations [*, N, G], the same for each UAV, [*, N, 1]."""
         value = self.network(observations.flatten(-2)).unsqueeze(-2)
         return value.expand(*observations.shape[:-1], 1)
-
-
-def make_action_value(
-    env: EnvBase, config: ModelConfig, critic_key: NestedKey = keys.GLOBAL_OBSERVATION
-) -> TensorDictModule:
-    """Make a critic of actions (Q-function), which reads the observations of both critic and actor.
-
-    Only the actor's observation holds the UAV's past actions: if the critic did not read them, the actor
-    could not learn to use them.
-
-    Returns:
-        with discrete actions, a module that writes ``action_value`` [*, A], the value of each action; with
-        continuous ones, ``state_action_value`` [*, 1], the value of ``("agents", "action")``.
-    """
-    in_keys: list[NestedKey] = list(dict.fromkeys((critic_key, keys.OBSERVATION)))
-    n_features = sum(env.observation_spec[key].shape[-1] for key in in_keys)
-    spec = env.full_action_spec_unbatched[keys.ACTION]
-    if isinstance(spec, Categorical):
-        return TensorDictModule(config.network(n_features, spec.n, env.device), in_keys, ["action_value"])
-    network = config.network(n_features + spec.shape[-1], 1, env.device)
-    return TensorDictModule(network, [*in_keys, keys.ACTION], ["state_action_value"])
