@@ -36,6 +36,8 @@ RECEIVED = (AGENTS, "received")
 """The message of each UAV that the server holds, packed (``Messages.pack``), [B, N, M]."""
 LINKED = (AGENTS, "linked")
 """Messages that each UAV holds of each other with ``links=matrix``, [B, N, N, M] (receiver, sender)."""
+HISTORY = (AGENTS, "history")
+"""Messages of the latest steps that each UAV knows, with ages (``MessageHistory``), [B, N, L, C]."""
 AGE = (AGENTS, "age")
 """Age of information: steps since the message that the server holds was generated, [B, N, 1]."""
 DELAY = (AGENTS, "delay")
@@ -77,6 +79,11 @@ LOGITS, LOC, SCALE = (AGENTS, "logits"), (AGENTS, "loc"), (AGENTS, "scale")
 """Parameters of the actor's distribution."""
 HIDDEN, HIDDEN_BEFORE = (AGENTS, "hidden"), (AGENTS, "hidden_before")
 """Recurrent state of the actor after and before a step, [B, N, H]."""
+ENCODING = (AGENTS, "encoding")
+"""What the actor of ``PredictiveMappo`` makes of its observation and the messages it knows, [B, N, H]."""
+PREDICTION_TARGET, PREDICTION_WEIGHT = (AGENTS, "prediction_target"), (AGENTS, "prediction_weight")
+"""What the messages of a step said once they had arrived, normalised, [B, N, G]; and 1 where the UAV's own
+has arrived, else 0, [B, N, 1]."""
 IS_INIT = "is_init"
 """Does an episode begin with this step, [B, 1] bool (TorchRL's ``InitTracker``)."""
 STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")

@@ -1,6 +1,6 @@
 """MAPPO, from batches that late messages may have corrected (paper, section 4.3)."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -18,7 +18,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.compiling import compiled
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
-from damian.learners.networks import COMPILE_OPTIONS, make_actor, make_critic
+from damian.learners.networks import COMPILE_OPTIONS, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
 from damian.learners.reward_scale import update_value_scale, value_scale
 from damian.learners.schedule import LinearSchedule
@@ -111,11 +111,16 @@ class Mappo:
             None: the learner uses batches as they were collected.
     """
 
+    loss_names: Sequence[str] = LOSSES
+    """Names of the terms of the loss."""
+    loss_keys: Sequence[NestedKey] = LOSS_KEYS
+    """Entries of a step that the loss reads, beside the critic's observation."""
+
     def __init__(
         self, env: EnvBase, config: MappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None = None
     ) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
-        self.actor = make_actor(env, setup.model)
+        self.actor = config.make_actor(env, setup.model)
         self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(self.weights, lr=config.lr, fused=True)
@@ -138,7 +143,7 @@ class Mappo:
             what ``optimize`` returns, ``explained_variance`` of the critic before the update, and with a
             replay buffer the share of ``backupdated`` messages.
         """
-        corrected = self.backupdated_batch(batch)
+        corrected = self.prepared(self.backupdated_batch(batch))
         add_advantages(corrected, self.critic, self.config)
         numbers = self.optimize(corrected)
         self.entropy_coeff.advance(batch.numel())
@@ -146,6 +151,10 @@ class Mappo:
         if self.buffer is None:
             return numbers
         return {"backupdated": corrected[keys.BACKUPDATED].float().mean().item(), **numbers}
+
+    def prepared(self, batch: TensorDictBase) -> TensorDictBase:
+        """A corrected batch [B, T] with what further terms of the loss read."""
+        return batch
 
     @torch.no_grad()
     def backupdated_batch(self, batch: TensorDictBase) -> TensorDictBase:
@@ -183,13 +192,13 @@ class Mappo:
             self.optimizer.step()
             terms.append(torch.cat([losses.detach(), numbers, norm.view(1)]))
         # A number that is read at once would make the device wait at every minibatch.
-        names = (*LOSSES, *NUMBERS, "gradient_norm")
+        names = (*self.loss_names, *NUMBERS, "gradient_norm")
         return dict(zip(names, torch.stack(terms).double().mean(0).tolist(), strict=True))
 
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
         """Entries that the loss reads, for each minibatch of each pass over a batch [B, T]."""
         recurrent = self.setup.model.recurrent
-        read = [*LOSS_KEYS, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
+        read = [*self.loss_keys, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
         found = {key: batch.get(key, None) for key in read}
         samples = {k: v if recurrent else v.flatten(0, 1) for k, v in found.items() if v is not None}
         n_samples, device = len(samples[keys.READY]), samples[keys.READY].device
@@ -210,6 +219,7 @@ def mappo_losses(
     critic: TensorDictModule,
     config: MappoConfig,
     entropy_coeff: Tensor,
+    further: Callable[[TensorDictBase], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names, [3].
 
@@ -226,6 +236,8 @@ def mappo_losses(
         critic: its network writes ``("agents", "state_value")``.
         config: settings of the learner.
         entropy_coeff: weight of the entropy bonus, [].
+        further: one more term of the loss, a function of the steps, which then hold what the actor has
+            written.
     """
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
@@ -241,6 +253,7 @@ def mappo_losses(
         -entropy_coeff * mean_entropy,
         config.critic_coeff * error,
     ]
+    losses += [] if further is None else [further(steps)]
     with torch.no_grad():
         divergence = (ratio - 1 - log_ratio) * ready
         beyond = ((ratio - 1).abs() > config.clip_epsilon) * ready

@@ -18,6 +18,7 @@ from damian.evaluation.loggers import check_loggers
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
+from damian.learners.predictive_mappo import PredictiveMappoConfig  # noqa: F401 (registers the learner)
 from damian.learners.sac import SacConfig  # noqa: F401 (registers the learner)
 from damian.learners.schedule import SystemClock
 
