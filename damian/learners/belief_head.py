@@ -1,45 +1,52 @@
-"""A learnt belief: an actor that encodes the messages that have arrived, and predicts what arrives later.
+"""A learnt belief: an actor that predicts, from the messages that have arrived, what arrives later.
 
 Under delay a receiver holds a set of messages with ages, of its own and of others, and its own latest
-actions. An encoder turns it into a vector, by attention over the messages; from this vector and an action a
-predictor tells what the messages of the next step will have said, once they have arrived. The policy reads
-the vector and, for each discrete action, the prediction. Nothing here depends on what the messages mean.
+actions. The actor asks this set questions, by attention: one for each action that it might choose. From the
+answers it predicts what the messages of the next step will have said, once they have arrived, and chooses.
+Nothing here depends on what the messages mean.
 """
 
+import os
+
 import torch
-from tensordict import NestedKey
-from tensordict.nn import TensorDictModule
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import PopArtValueNorm, ProbabilisticActor
+from torchrl.modules import PopArtValueNorm, ProbabilisticActor, recurrent_mode
 from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
 from damian.common import checks
+from damian.common.tensors import expand_mask, gather_rows
 from damian.learners.networks import POLICY_GAIN, ModelConfig, with_distribution
 
 FLAGS = 3
 """Columns of ``MessageHistory`` behind those of the message: whether it has arrived, its age, is it own."""
+CODE_SIZE = 8
+"""Size of the learnt code of a discrete action."""
 PREFERENCE_UNIT = 10.0
 """Logits per unit of the learnt weights of predictions: weights move slowly, and a policy that relies on
 predictions needs large logits."""
 FORGETTING = 0.99
 """Share of the running statistics of the targets that an update keeps."""
+FI, FP = int(os.environ.get("FI", "-1")), float(os.environ.get("FP", "0"))
 
 
 class MessageEncoder(nn.Module):
-    """Encodes an observation and a set of messages with ages, by attention over the messages.
+    """Encodes an observation, a set of messages with ages, and a code of what is asked, by attention.
 
     Each message is given as it is and relative to the newest known message of the first sender, which with
-    ``MessageHistory`` is the receiver itself. The observation asks the questions (queries); keys and values
-    are an embedding of the messages. Messages that are not known have no influence.
+    ``MessageHistory`` is the receiver itself. Queries follow from the observation and the code; keys and
+    values are an embedding of the messages. Messages that are not known have no influence.
 
     Args:
         n_features: number of features of the observation, F.
         n_columns: number of columns of a row of the history, C.
-        config: networks; the hidden layers follow the attention.
-        heads: number of questions.
-        width: size of the embedding of a message.
+        n_code: size of a code, K.
+        config: the hidden layers follow the attention; the last one is the encoding.
+        heads: number of queries for a code.
+        width: size of the embedding of a message, E.
         device: of the weights.
     """
 
@@ -47,6 +54,7 @@ class MessageEncoder(nn.Module):
         self,
         n_features: int,
         n_columns: int,
+        n_code: int,
         config: ModelConfig,
         heads: int,
         width: int,
@@ -54,43 +62,49 @@ class MessageEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.n_message, self.heads, self.width = n_columns - FLAGS, heads, width
-        n_context = n_features + self.n_message
+        n_asked = n_features + self.n_message + n_code
         self.embed = nn.Sequential(nn.Linear(n_columns + self.n_message, width, device=device), nn.ReLU())
-        self.queries = nn.Linear(n_context, heads * width, device=device)
-        self.values = nn.Linear(heads * width, config.hidden[0], device=device)
-        self.layers = config.hidden_layers(config.hidden[0] + n_context, config.hidden, device)
+        self.queries = nn.Sequential(
+            nn.Linear(n_asked, 2 * width, device=device),
+            nn.ReLU(),
+            nn.Linear(2 * width, heads * width, device=device),
+        )
+        self.layers = config.hidden_layers(heads * width + n_asked, config.hidden, device)
 
-    def forward(self, observation: Tensor, history: Tensor) -> Tensor:
-        """Encode observations [*, F] and histories [*, L, C] into [*, H]."""
+    def forward(self, observation: Tensor, history: Tensor, codes: Tensor) -> Tensor:
+        """Encode observations [*, F] and histories [*, L, C], for Q codes each [*, Q, K], into [*, Q, H]."""
         message, known = history[..., : self.n_message], history[..., self.n_message]
         newest = known.argmax(-1, keepdim=True).unsqueeze(-1)  # the first of the known ones
         reference = message.gather(-2, newest.expand(*newest.shape[:-1], self.n_message))
         relative = (message - reference) * known.unsqueeze(-1)
         embedded = self.embed(torch.cat([history, relative], -1))  # [*, L, E]
-        context = torch.cat([observation, reference.squeeze(-2)], -1)
-        queries = self.queries(context).unflatten(-1, (self.heads, self.width))
-        scores = queries @ embedded.transpose(-1, -2) / self.width**0.5  # [*, heads, L]
+        context = torch.cat([observation.unsqueeze(-2), reference], -1)
+        asked = torch.cat([context.expand(*codes.shape[:-1], -1), codes], -1)
+        queries = self.queries(asked).unflatten(-1, (self.heads, self.width)).flatten(-3, -2)
+        scores = queries @ embedded.transpose(-1, -2) / self.width**0.5  # [*, Q heads, L]
         shares = (scores + (known.unsqueeze(-2) - 1) * 1e8).softmax(-1)
-        found = (shares @ embedded).flatten(-2)
-        return self.layers(torch.cat([self.values(found), context], -1))
+        found = (shares @ embedded).unflatten(-2, (-1, self.heads)).flatten(-2)
+        return self.layers(torch.cat([found, asked], -1))
 
 
-class BeliefHead(nn.Module):
-    """The network of an actor: encoder, predictor and policy.
+class BeliefHead(TensorDictModuleBase):
+    """Predicts what arrives later, for every discrete action, and encodes what is known for a policy.
 
-    The predictor tells, in units of their running standard deviation, what the G numbers of the critic's
-    observation will have been after the next step, once the messages of that step have arrived. With discrete
-    actions it tells so for every action, and the logits are those of the policy plus a weighted sum of the
-    prediction, whose G weights are learnt and begin with 0; the policy's gradient does not reach the
-    predictor.
+    The predictions tell, in units of their running standard deviation, what the G numbers of the targets will
+    have been after the next step, once the messages of that step have arrived. Code 0 asks what will have
+    been whatever the action; its encoding is for the policy.
+
+    While acting it writes ``("agents", "encoding")`` [*, H] and, with discrete actions,
+    ``("agents", "prediction")`` [*, A G]. In TorchRL's recurrent mode, which the losses of a policy switch
+    on, it does nothing: what the policy has read stays as it was, like an observation, so that learning to
+    predict never changes what a policy has done.
 
     Args:
-        encoder: from observations and histories to encodings [*, H].
+        encoder: from observations, histories and codes to encodings [*, Q, H].
         n_encoding: size of the encodings, H.
         n_targets: number of numbers to predict, G.
-        n_actions: number of discrete actions, A; None if they are continuous.
-        n_numbers: number of numbers of a continuous action.
-        config: initial weights, and the hidden layers of the predictor of continuous actions.
+        n_actions: number of discrete actions, A; None if they are continuous, and codes of themselves.
+        n_code: size of a code, K.
         device: of the weights.
     """
 
@@ -100,51 +114,66 @@ class BeliefHead(nn.Module):
         n_encoding: int,
         n_targets: int,
         n_actions: int | None,
-        n_numbers: int,
-        config: ModelConfig,
+        n_code: int,
         device: torch.device | None = None,
     ) -> None:
         super().__init__()
-        self.encoder, self.n_actions, self.n_targets = encoder, n_actions, n_targets
-        n_out = 2 * n_numbers if n_actions is None else n_actions
-        self.policy = config.initialized(nn.Linear(n_encoding, n_out, device=device), POLICY_GAIN)
-        self.predictor: nn.Module
-        if n_actions is None:
-            self.normal = NormalParamExtractor()
-            self.predictor = config.network(n_encoding + n_numbers, n_targets, device)
-        else:
-            self.predictor = nn.Linear(n_encoding, n_actions * n_targets, device=device)
-            self.preference = nn.Parameter(torch.zeros(n_targets, device=device))
+        self.encoder, self.n_actions = encoder, n_actions
+        self.codes = nn.Parameter(0.5 * torch.randn((n_actions or 0) + 1, n_code, device=device))
+        self.predictor = nn.Linear(n_encoding, n_targets, device=device)
         self.norm = PopArtValueNorm(shape=n_targets, beta=FORGETTING, device=device)
+        self.in_keys = [keys.OBSERVATION, keys.HISTORY]  # type: ignore[assignment]
+        written = [keys.ENCODING, *[keys.PREDICTION] * (n_actions is not None)]
+        self.out_keys = written  # type: ignore[assignment]
 
-    def forward(self, observation: Tensor, history: Tensor) -> tuple[Tensor, ...]:
-        """Parameters of the actions' distribution, and encodings [*, H].
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if recurrent_mode():
+            return tensordict
+        observation, history = tensordict[keys.OBSERVATION], tensordict[keys.HISTORY]
+        codes = self.codes.expand(*observation.shape[:-1], -1, -1)
+        encodings = self.encoder(observation, history, codes)
+        tensordict.set(keys.ENCODING, encodings[..., 0, :])
+        if self.n_actions is not None:
+            tensordict.set(keys.PREDICTION, self.predictor(encodings[..., 1:, :]).flatten(-2))
+        return tensordict
+
+    def predict(self, observation: Tensor, history: Tensor, action: Tensor) -> Tensor:
+        """Normalised predictions, whatever the action and for this one, [*, 2, G].
 
         Args:
             observation: observations, [*, F].
             history: messages with ages, [*, L, C].
-
-        Returns:
-            Logits [*, A] and encodings; with continuous actions, means and scales [*, n] and encodings.
+            action: actions, [*], or [*, K] if they are continuous.
         """
-        encoding = self.encoder(observation, history)
-        out = self.policy(encoding)
-        if self.n_actions is None:
-            return (*self.normal(out), encoding)
-        predicted = self.predictor(encoding).unflatten(-1, (self.n_actions, self.n_targets)).detach()
-        return out + PREFERENCE_UNIT * (predicted @ self.preference), encoding
+        code = action if self.n_actions is None else gather_rows(self.codes, action + 1)
+        codes = torch.stack([self.codes[0].expand_as(code), code], -2)
+        return self.predictor(self.encoder(observation, history, codes))
 
-    def predict(self, encoding: Tensor, action: Tensor) -> Tensor:
-        """Normalised predictions [*, G] for encodings [*, H] and actions [*] or [*, n]."""
-        if self.n_actions is None:
-            return self.predictor(torch.cat([encoding, action], -1))
-        all_actions = self.predictor(encoding).unflatten(-1, (self.n_actions, self.n_targets))
-        index = action[..., None, None].expand(*action.shape, 1, self.n_targets)
-        return all_actions.gather(-2, index).squeeze(-2)
+
+class Preference(nn.Module):
+    """Logits from observations, encodings and what is predicted for each action, with learnt weights.
+
+    Args:
+        network: from observations and encodings [*, F + H] to logits [*, A].
+        n_targets: number of predicted numbers, G.
+        device: of the weights.
+    """
+
+    def __init__(self, network: nn.Module, n_targets: int, device: torch.device | None) -> None:
+        super().__init__()
+        self.network, self.weight = network, nn.Parameter(torch.zeros(n_targets, device=device))
+        with torch.no_grad():
+            self.weight[FI] = FP
+
+    def forward(self, observation: Tensor, encoding: Tensor, prediction: Tensor) -> Tensor:
+        """Logits [*, A] from observations [*, F], encodings [*, H] and predictions [*, A G]."""
+        logits = self.network(torch.cat([observation, encoding], -1))
+        return logits + PREFERENCE_UNIT * (prediction.unflatten(-1, (logits.shape[-1], -1)) @ self.weight)
 
 
 def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int) -> ProbabilisticActor:
-    """Make the policy from observations and histories to ``("agents", "action")``; it also writes encodings.
+    """Make the policy from observations and histories to ``("agents", "action")``.
 
     Raises:
         InputError: the environment has no history of messages.
@@ -153,20 +182,24 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
     should = "reads no messages: set delay.messages, or add damian.MessageHistory to the environment"
     checks.require(keys.HISTORY in known, "learner", "predictive_mappo", should)
     observation, history = env.observation_spec[keys.OBSERVATION], env.observation_spec[keys.HISTORY]
-    n_targets = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1]
+    n_targets, n_encoding = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1] + int(os.environ.get("RW","0")), config.hidden[-1]
 
-    def network(n_out: int, *out_keys: NestedKey) -> TensorDictModule:
-        encoder = MessageEncoder(observation.shape[-1], history.shape[-1], config, heads, width, device)
-        continuous = len(out_keys) == 2
-        n_actions, n_numbers = (None, n_out // 2) if continuous else (n_out, 0)
-        head = BeliefHead(encoder, config.hidden[-1], n_targets, n_actions, n_numbers, config, device)
-        return TensorDictModule(head, [keys.OBSERVATION, keys.HISTORY], [*out_keys, keys.ENCODING])
+    def network(n_out: int, *out_keys: NestedKey) -> TensorDictSequential:
+        discrete = len(out_keys) == 1
+        n_actions, n_code = (n_out, CODE_SIZE) if discrete else (None, n_out // 2)
+        n_features = observation.shape[-1]
+        encoder = MessageEncoder(n_features, history.shape[-1], n_code, config, heads, width, device)
+        head = BeliefHead(encoder, n_encoding, n_targets, n_actions, n_code, device)
+        read = [keys.OBSERVATION, *head.out_keys]
+        policy = config.network(n_features + n_encoding, n_out, device, POLICY_GAIN)
+        module = Preference(policy, n_targets, device) if discrete else nn.Sequential(policy, NormalParamExtractor())
+        return TensorDictSequential(head, TensorDictModule(module, read, list(out_keys)))
 
     return with_distribution(env, network)
 
 
 def belief_head(actor: ProbabilisticActor) -> BeliefHead:
-    """The network of a policy that ``make_belief_actor`` has made."""
+    """The predicting part of a policy that ``make_belief_actor`` has made."""
     return next(module for module in actor.modules() if isinstance(module, BeliefHead))
 
 
@@ -179,16 +212,14 @@ def prediction_loss(predicted: Tensor, target: Tensor, weight: Tensor) -> Tensor
         weight: 1 where they have arrived, else 0, [*, 1].
     """
     error = torch.where(weight > 0, predicted - target, 0.0).square().mean(-1, keepdim=True)
-    return (error * weight).sum() / weight.sum().clamp(min=1)
+    return (error * weight).sum() / weight.expand_as(error).sum().clamp(min=1)
 
 
-def arrived_by_now(delay: Tensor, later_steps: int = 0) -> Tensor:
-    """Whether the messages sent in consecutive steps have arrived by the latest step, as delay, bool.
+def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:
+    """Whether messages have arrived by now, as ``delay``, bool.
 
     Args:
-        delay: of the message sent in each step [steps], -1 if it never arrives, [B, T, ...].
-        later_steps: number of steps after the last one of these that have been taken by now.
+        delay: of the messages [steps], -1 if they never arrive, [K, ...].
+        since: steps since each was sent, [K].
     """
-    n_steps = delay.shape[1]
-    since = later_steps + torch.arange(n_steps - 1, -1, -1, device=delay.device)
-    return (delay >= 0) & (delay <= since.view(1, -1, *[1] * (delay.dim() - 2)))
+    return (delay >= 0) & (delay <= expand_mask(since, delay))

@@ -1,6 +1,6 @@
 """MAPPO, from batches that late messages may have corrected (paper, section 4.3)."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -111,8 +111,6 @@ class Mappo:
             None: the learner uses batches as they were collected.
     """
 
-    loss_names: Sequence[str] = LOSSES
-    """Names of the terms of the loss."""
     loss_keys: Sequence[NestedKey] = LOSS_KEYS
     """Entries of a step that the loss reads, beside the critic's observation."""
 
@@ -143,7 +141,7 @@ class Mappo:
             what ``optimize`` returns, ``explained_variance`` of the critic before the update, and with a
             replay buffer the share of ``backupdated`` messages.
         """
-        corrected = self.prepared(self.backupdated_batch(batch))
+        corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
         numbers = self.optimize(corrected)
         self.entropy_coeff.advance(batch.numel())
@@ -151,10 +149,6 @@ class Mappo:
         if self.buffer is None:
             return numbers
         return {"backupdated": corrected[keys.BACKUPDATED].float().mean().item(), **numbers}
-
-    def prepared(self, batch: TensorDictBase) -> TensorDictBase:
-        """A corrected batch [B, T] with what further terms of the loss read."""
-        return batch
 
     @torch.no_grad()
     def backupdated_batch(self, batch: TensorDictBase) -> TensorDictBase:
@@ -192,7 +186,7 @@ class Mappo:
             self.optimizer.step()
             terms.append(torch.cat([losses.detach(), numbers, norm.view(1)]))
         # A number that is read at once would make the device wait at every minibatch.
-        names = (*self.loss_names, *NUMBERS, "gradient_norm")
+        names = (*LOSSES, *NUMBERS, "gradient_norm")
         return dict(zip(names, torch.stack(terms).double().mean(0).tolist(), strict=True))
 
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
@@ -219,7 +213,6 @@ def mappo_losses(
     critic: TensorDictModule,
     config: MappoConfig,
     entropy_coeff: Tensor,
-    further: Callable[[TensorDictBase], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names, [3].
 
@@ -236,8 +229,6 @@ def mappo_losses(
         critic: its network writes ``("agents", "state_value")``.
         config: settings of the learner.
         entropy_coeff: weight of the entropy bonus, [].
-        further: one more term of the loss, a function of the steps, which then hold what the actor has
-            written.
     """
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
@@ -253,7 +244,6 @@ def mappo_losses(
         -entropy_coeff * mean_entropy,
         config.critic_coeff * error,
     ]
-    losses += [] if further is None else [further(steps)]
     with torch.no_grad():
         divergence = (ratio - 1 - log_ratio) * ready
         beyond = ((ratio - 1).abs() > config.clip_epsilon) * ready
