@@ -247,13 +247,14 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     """The clocks of server and UAVs (paper, section 3.6), and the UAVs' action history (section 3.3)."""
     clock, n_actions = scenario.clock, scenario.delay.history
     transforms: list[Transform] = []
+    seen = [keys.OBSERVATION, *[keys.HISTORY] * bool(scenario.delay.messages)]
     if clock.steps("server") > 1:
-        observations = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION]
+        observations = [*seen, keys.GLOBAL_OBSERVATION]
         transforms.append(SampleAndHold(clock.steps("server"), observations))
     if scenario.links.kind == "updown" and (scenario.links.loss or has_delay(scenario.links.delay, clock.dt)):
         transforms.append(downlink_transform(scenario))
     if clock.steps("agents") > 1:
-        transforms.append(SampleAndHold(clock.steps("agents"), [keys.OBSERVATION], ready_key=keys.READY))
+        transforms.append(SampleAndHold(clock.steps("agents"), seen, ready_key=keys.READY))
     if n_actions:
         history = ActionHistory(
             n_actions,

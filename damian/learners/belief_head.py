@@ -6,14 +6,12 @@ answers it predicts what the messages of the next step will have said, once they
 Nothing here depends on what the messages mean.
 """
 
-import os
-
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import PopArtValueNorm, ProbabilisticActor, recurrent_mode
+from torchrl.modules import ProbabilisticActor, recurrent_mode
 from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
@@ -30,7 +28,6 @@ PREFERENCE_UNIT = 10.0
 predictions needs large logits."""
 FORGETTING = 0.99
 """Share of the running statistics of the targets that an update keeps."""
-FI, FP = int(os.environ.get("FI", "-1")), float(os.environ.get("FP", "0"))
 
 
 class MessageEncoder(nn.Module):
@@ -87,6 +84,37 @@ class MessageEncoder(nn.Module):
         return self.layers(torch.cat([found, asked], -1))
 
 
+class TargetScale(nn.Module):
+    """Running mean and standard deviation of each of G numbers, so that errors do not depend on their scales.
+
+    Args:
+        n_targets: how many numbers, G.
+        device: of the statistics.
+    """
+
+    moments: Tensor
+    """Running means of 1, the numbers and their squares, which begin with 0, [3, G]."""
+
+    def __init__(self, n_targets: int, device: torch.device | None = None) -> None:
+        super().__init__()
+        self.register_buffer("moments", torch.zeros(3, n_targets, dtype=torch.float64, device=device))
+
+    @torch.no_grad()
+    def update(self, target: Tensor, counts: Tensor) -> None:
+        """Add numbers [*, G] where they count, [*, 1] bool; nothing changes if none does."""
+        values = target.double().flatten(0, -2)
+        weight = counts.flatten(0, -2).double() / counts.sum().clamp(min=1)
+        new = torch.stack([torch.ones_like(values), values, values.square()])
+        kept = torch.where(counts.any(), FORGETTING, 1.0)
+        self.moments.mul_(kept).add_((1 - FORGETTING) * (new * weight).sum(1))
+
+    def normalize(self, target: Tensor) -> Tensor:
+        """Numbers [*, G] with mean 0 and standard deviation 1, as far as they vary."""
+        weight, mean, square = self.moments / self.moments[0].clamp(min=1e-12)
+        variance = (square - mean.square()).clamp(min=1e-8 * square + 1e-30)
+        return ((target - mean) * weight / variance.sqrt()).to(target.dtype)
+
+
 class BeliefHead(TensorDictModuleBase):
     """Predicts what arrives later, for every discrete action, and encodes what is known for a policy.
 
@@ -121,7 +149,7 @@ class BeliefHead(TensorDictModuleBase):
         self.encoder, self.n_actions = encoder, n_actions
         self.codes = nn.Parameter(0.5 * torch.randn((n_actions or 0) + 1, n_code, device=device))
         self.predictor = nn.Linear(n_encoding, n_targets, device=device)
-        self.norm = PopArtValueNorm(shape=n_targets, beta=FORGETTING, device=device)
+        self.norm = TargetScale(n_targets, device)
         self.in_keys = [keys.OBSERVATION, keys.HISTORY]  # type: ignore[assignment]
         written = [keys.ENCODING, *[keys.PREDICTION] * (n_actions is not None)]
         self.out_keys = written  # type: ignore[assignment]
@@ -163,13 +191,27 @@ class Preference(nn.Module):
     def __init__(self, network: nn.Module, n_targets: int, device: torch.device | None) -> None:
         super().__init__()
         self.network, self.weight = network, nn.Parameter(torch.zeros(n_targets, device=device))
-        with torch.no_grad():
-            self.weight[FI] = FP
 
     def forward(self, observation: Tensor, encoding: Tensor, prediction: Tensor) -> Tensor:
         """Logits [*, A] from observations [*, F], encodings [*, H] and predictions [*, A G]."""
         logits = self.network(torch.cat([observation, encoding], -1))
         return logits + PREFERENCE_UNIT * (prediction.unflatten(-1, (logits.shape[-1], -1)) @ self.weight)
+
+
+class NormalPolicy(nn.Module):
+    """Means and scales of continuous actions, [*, n] each, from observations and encodings.
+
+    Args:
+        network: from observations and encodings [*, F + H] to [*, 2 n].
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network, self.normal = network, NormalParamExtractor()
+
+    def forward(self, observation: Tensor, encoding: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and scales from observations [*, F] and encodings [*, H]."""
+        return self.normal(self.network(torch.cat([observation, encoding], -1)))
 
 
 def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int) -> ProbabilisticActor:
@@ -182,7 +224,7 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
     should = "reads no messages: set delay.messages, or add damian.MessageHistory to the environment"
     checks.require(keys.HISTORY in known, "learner", "predictive_mappo", should)
     observation, history = env.observation_spec[keys.OBSERVATION], env.observation_spec[keys.HISTORY]
-    n_targets, n_encoding = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1] + int(os.environ.get("RW","0")), config.hidden[-1]
+    n_targets, n_encoding = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1], config.hidden[-1]
 
     def network(n_out: int, *out_keys: NestedKey) -> TensorDictSequential:
         discrete = len(out_keys) == 1
@@ -192,7 +234,7 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
         head = BeliefHead(encoder, n_encoding, n_targets, n_actions, n_code, device)
         read = [keys.OBSERVATION, *head.out_keys]
         policy = config.network(n_features + n_encoding, n_out, device, POLICY_GAIN)
-        module = Preference(policy, n_targets, device) if discrete else nn.Sequential(policy, NormalParamExtractor())
+        module = Preference(policy, n_targets, device) if discrete else NormalPolicy(policy)
         return TensorDictSequential(head, TensorDictModule(module, read, list(out_keys)))
 
     return with_distribution(env, network)

@@ -1,9 +1,7 @@
 """MAPPO whose actor has a belief head: it also learns to predict what arrives later."""
 
-import math
-import os
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -19,6 +17,7 @@ from damian.learners.base import LEARNERS, LearningSetup
 from damian.learners.belief_head import arrived_by_now, belief_head, make_belief_actor, prediction_loss
 from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
+from damian.replay.backupdate import BackupdateStorage
 
 
 @LEARNERS.register("predictive_mappo")
@@ -42,6 +41,10 @@ class PredictiveMappoConfig(MappoConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("prediction_steps", "prediction_batch", "prediction_buffer"):
+            checks.in_range(f"learner.{name}", getattr(self, name), 1, checks.STEPS)
+        checks.above("learner.prediction_lr", self.prediction_lr, 0.0)
+        checks.in_range("learner.prediction_lr", self.prediction_lr, 0.0, 1.0)
         checks.in_range("learner.heads", self.heads, 1, 1024)
         checks.in_range("learner.width", self.width, 1, 16384)
 
@@ -70,7 +73,7 @@ class PredictiveMappoConfig(MappoConfig):
 
 
 class PredictiveMappo(Mappo):
-    """MAPPO, and after each update steps of learning to predict, from steps of the replay buffer.
+    """MAPPO that after each update also learns to predict, from random steps of the replay buffer.
 
     The target of a step is the critic's observation after it, as the back-updating storage knows it by now. A
     step whose message has not arrived by now has no weight. What follows from an action does not depend on
@@ -78,57 +81,60 @@ class PredictiveMappo(Mappo):
     """
 
     config: PredictiveMappoConfig
+    buffer: ReplayBuffer
     loss_keys = (*LOSS_KEYS, keys.ENCODING, keys.PREDICTION)
 
     def __init__(
-        self, env: EnvBase, config: MappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None = None
+        self, env: EnvBase, config: PredictiveMappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None
     ) -> None:
         super().__init__(env, config, setup, buffer)
         self.head = belief_head(self.actor)
-        self.predictor_optimizer = torch.optim.Adam(self.head.parameters(), lr=config.prediction_lr, fused=True)
+        self.head_optimizer = torch.optim.Adam(self.head.parameters(), lr=config.prediction_lr, fused=True)
 
     def components(self) -> dict[str, Any]:
-        """What a checkpoint stores: also the optimiser of the predictions."""
-        return {**super().components(), "predictor_optimizer": self.predictor_optimizer}
+        """What a checkpoint stores: also the optimiser of the belief head."""
+        return {**super().components(), "head_optimizer": self.head_optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make one update from a batch [B, T], then ``prediction_steps`` of learning to predict."""
+        """Make one update of MAPPO from a batch [B, T], then ``prediction_steps`` of learning to predict.
+
+        Returns:
+            what ``Mappo.learn`` returns, and the mean ``prediction_error``: 1 for predictions that are no
+            better than the mean.
+        """
+        # What is known after a step is what is known before the next one: it need not be stored twice.
         numbers = super().learn(batch.exclude(next_key(keys.HISTORY)))
-        self._update_scale(batch.shape[1])
-        errors = [self._prediction_step() for _ in range(self.config.prediction_steps)]
-        return {**numbers, "prediction_error": torch.stack(errors).mean().item() if errors else math.nan}
+        errors = [self.learn_prediction() for _ in range(self.config.prediction_steps)]
+        return {**numbers, "prediction_error": torch.stack(errors).mean().item()}
 
-    @torch.no_grad()
-    def _update_scale(self, n_steps: int) -> None:
-        """Add the latest ``n_steps`` steps to the running statistics of the targets."""
-        since = torch.arange(n_steps, device=self.head.codes.device) + self.setup.settle_steps
-        target, weight = self._targets(since.repeat_interleave(self.setup.worlds), torch.arange(self.setup.worlds).repeat(n_steps))
-        if (weight > 0).any():
-            self.head.norm.update(target[weight.squeeze(-1) > 0])
+    def learn_prediction(self) -> Tensor:
+        """Make one step of gradient descent on random steps of the replay buffer; the error before it, []."""
+        steps, target, arrived = self.sample()
+        self.head.norm.update(target, arrived)
+        names = (keys.OBSERVATION, keys.HISTORY, keys.ACTION)
+        predicted = self.head.predict(*(steps[key] for key in names))
+        wanted = self.head.norm.normalize(target).unsqueeze(-2)
+        error = prediction_loss(predicted, wanted, arrived.unsqueeze(-2))
+        self.head_optimizer.zero_grad()
+        error.backward()
+        self.head_optimizer.step()
+        return error.detach()
 
-    def _prediction_step(self) -> Tensor:
-        """One step of gradient descent on random steps of the replay buffer; the error, []."""
-        storage, n = self.buffer.storage, self.config.prediction_batch
-        held = len(storage.latest(10**9))
-        device = self.head.codes.device
-        since = torch.randint(held, (n,), device=device)
-        world = torch.randint(self.setup.worlds, (n,), device=device)
-        target, weight = self._targets(since, world)
-        row = storage.latest(10**9).flip(0)[since]
-        obs, hist, act = (storage.steps[key][row, world] for key in (keys.OBSERVATION, keys.HISTORY, keys.ACTION))
-        predicted = self.head.predict(obs, hist, act)
-        loss = prediction_loss(predicted, self.head.norm.normalize(target).unsqueeze(-2), weight.unsqueeze(-2))
-        self.predictor_optimizer.zero_grad()
-        loss.backward()
-        self.predictor_optimizer.step()
-        return loss.detach()
+    def sample(self) -> tuple[dict[NestedKey, Tensor], Tensor, Tensor]:
+        """Draw K stored steps: what predictions are made from, what came after, and what of it counts.
 
-    def _targets(self, since: Tensor, world: Tensor):
-        storage = self.buffer.storage
-        order = storage.latest(10**9).flip(0)
-        ok = since < len(order)
-        row = order[since.clamp(max=len(order) - 1)]
-        kk = [keys.GLOBAL_OBSERVATION] + [keys.REWARD] * int(os.environ.get("RW", "0"))
-        target = torch.cat([storage.steps[next_key(k)][row, world] for k in kk], -1)
-        arrived = arrived_by_now(storage.steps[next_key(keys.DELAY)][row, world], since) & ok.view(-1, 1, 1)
-        return target, arrived.float()
+        Returns:
+            Entries before the steps, [K, ...] by key; the critic's observation after them, [K, N, G]; and
+            whether it counts, [K, N, 1] bool: the UAV could choose, and its message has arrived by now.
+        """
+        storage = cast(BackupdateStorage, self.buffer.storage)
+        rows, n_samples = storage.latest(), self.config.prediction_batch
+        since = torch.randint(len(rows), (n_samples,), device=rows.device)
+        index = rows[-1 - since], torch.randint(self.setup.worlds, (n_samples,), device=rows.device)
+        read = (keys.OBSERVATION, keys.HISTORY, keys.ACTION)
+        ready, delay, target = (
+            storage.steps.get(key)[index]
+            for key in (keys.READY, next_key(keys.DELAY), next_key(keys.GLOBAL_OBSERVATION))
+        )
+        counts = arrived_by_now(delay, since) & ready.unsqueeze(-1)
+        return {key: storage.steps.get(key)[index] for key in read}, target, counts
