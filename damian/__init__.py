@@ -83,6 +83,7 @@ __all__ = [
     "LearnerConfig",
     "LearningSetup",
     "MessageContext",
+    "MessageHistory",
     "ObservationDelay",
     "RewardDelay",
     "SampleAndHold",

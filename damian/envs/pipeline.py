@@ -184,9 +184,9 @@ def message_history(scenario: ScenarioConfig, server: Server, delayed: bool) -> 
 
 
 def scaled_messages(server: Server, rows: Tensor) -> Tensor:
-    """Position, way to the target, spotted and battery of packed messages [*, N, M], about 1 in size, [*, N, 6].
+    """Position, way to the target, spotted and battery of packed messages [*, N, M], [*, N, 6].
 
-    Lengths are over the largest vertex distance of the region.
+    All are about 1 in size: lengths are over the largest vertex distance of the region.
     """
     messages = server.messages(rows)
     scale = server.scales(messages)[..., None, None]

@@ -23,9 +23,11 @@ FLAGS = 3
 """Columns of ``MessageHistory`` behind those of the message: whether it has arrived, its age, is it own."""
 CODE_SIZE = 8
 """Size of the learnt code of a discrete action."""
-PREFERENCE_UNIT = 10.0
+PREFERENCE_UNIT = 30.0
 """Logits per unit of the learnt weights of predictions: weights move slowly, and a policy that relies on
 predictions needs large logits."""
+LARGEST = 5.0
+"""Largest magnitude of a normalised target, so that a number that hardly ever changes weighs no more."""
 FORGETTING = 0.99
 """Share of the running statistics of the targets that an update keeps."""
 
@@ -109,10 +111,10 @@ class TargetScale(nn.Module):
         self.moments.mul_(kept).add_((1 - FORGETTING) * (new * weight).sum(1))
 
     def normalize(self, target: Tensor) -> Tensor:
-        """Numbers [*, G] with mean 0 and standard deviation 1, as far as they vary."""
-        weight, mean, square = self.moments / self.moments[0].clamp(min=1e-12)
-        variance = (square - mean.square()).clamp(min=1e-8 * square + 1e-30)
-        return ((target - mean) * weight / variance.sqrt()).to(target.dtype)
+        """Numbers [*, G] with mean 0 and standard deviation 1, within ``LARGEST``; 0 before any update."""
+        known, mean, square = self.moments / self.moments[0].clamp(min=1e-12)
+        deviation = (square - mean.square()).clamp(min=1e-8 * square + 1e-30).sqrt()
+        return ((target - mean) * known / deviation).clamp(-LARGEST, LARGEST).to(target.dtype)
 
 
 class BeliefHead(TensorDictModuleBase):
@@ -235,7 +237,8 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
         read = [keys.OBSERVATION, *head.out_keys]
         policy = config.network(n_features + n_encoding, n_out, device, POLICY_GAIN)
         module = Preference(policy, n_targets, device) if discrete else NormalPolicy(policy)
-        return TensorDictSequential(head, TensorDictModule(module, read, list(out_keys)))
+        parts = [head, TensorDictModule(module, read, list(out_keys))]
+        return TensorDictSequential(parts)  # type: ignore[arg-type]
 
     return with_distribution(env, network)
 
@@ -245,16 +248,16 @@ def belief_head(actor: ProbabilisticActor) -> BeliefHead:
     return next(module for module in actor.modules() if isinstance(module, BeliefHead))
 
 
-def prediction_loss(predicted: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """Mean square error of predictions, [].
+def prediction_loss(predicted: Tensor, target: Tensor, counts: Tensor) -> Tensor:
+    """Mean square error of predictions, []; 0 if none counts.
 
     Args:
         predicted: normalised predictions, [*, G].
-        target: normalised numbers that later arrived, [*, G]; where the weight is 0, anything.
-        weight: 1 where they have arrived, else 0, [*, 1].
+        target: normalised numbers that later arrived, [*, G]; anything where they do not count.
+        counts: whether they have arrived, [*, 1] bool.
     """
-    error = torch.where(weight > 0, predicted - target, 0.0).square().mean(-1, keepdim=True)
-    return (error * weight).sum() / weight.expand_as(error).sum().clamp(min=1)
+    error = torch.where(counts, predicted - target, 0.0).square()
+    return error.sum() / counts.expand_as(error).sum().clamp(min=1)
 
 
 def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
@@ -51,7 +51,9 @@ class PredictiveMappoConfig(MappoConfig):
     def check(self, setup: LearningSetup) -> None:
         super().check(setup)
         name, model = "learner=predictive_mappo", setup.model
-        should = "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
+        should = (
+            "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
+        )
         checks.require(setup.backupdate, "learner", "predictive_mappo", should)
         for key, value, good in (
             ("model.rnn", model.rnn, not model.recurrent),
@@ -59,7 +61,9 @@ class PredictiveMappoConfig(MappoConfig):
             ("model.hidden", model.hidden, bool(model.hidden)),
             ("recompute_actor", setup.recompute_actor, not setup.recompute_actor),
         ):
-            checks.require(good, key, value, f"does not go with {name}, whose actor has an encoder of its own")
+            checks.require(
+                good, key, value, f"does not go with {name}, whose actor has an encoder of its own"
+            )
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         least = super().buffer_size(setup)
@@ -109,32 +113,28 @@ class PredictiveMappo(Mappo):
 
     def learn_prediction(self) -> Tensor:
         """Make one step of gradient descent on random steps of the replay buffer; the error before it, []."""
-        steps, target, arrived = self.sample()
-        self.head.norm.update(target, arrived)
-        names = (keys.OBSERVATION, keys.HISTORY, keys.ACTION)
-        predicted = self.head.predict(*(steps[key] for key in names))
-        wanted = self.head.norm.normalize(target).unsqueeze(-2)
-        error = prediction_loss(predicted, wanted, arrived.unsqueeze(-2))
+        before, target, counts = self.sample()
+        self.head.norm.update(target, counts)
+        wanted = self.head.norm.normalize(target)
+        error = prediction_loss(self.head.predict(*before), wanted.unsqueeze(-2), counts.unsqueeze(-2))
         self.head_optimizer.zero_grad()
         error.backward()
         self.head_optimizer.step()
         return error.detach()
 
-    def sample(self) -> tuple[dict[NestedKey, Tensor], Tensor, Tensor]:
+    def sample(self) -> tuple[list[Tensor], Tensor, Tensor]:
         """Draw K stored steps: what predictions are made from, what came after, and what of it counts.
 
         Returns:
-            Entries before the steps, [K, ...] by key; the critic's observation after them, [K, N, G]; and
-            whether it counts, [K, N, 1] bool: the UAV could choose, and its message has arrived by now.
+            observations, histories and actions of the steps, [K, N, ...]; the critic's observation after
+            them, [K, N, G]; and whether it counts, [K, N, 1] bool: the UAV could choose, and its message has
+            arrived by now.
         """
         storage = cast(BackupdateStorage, self.buffer.storage)
         rows, n_samples = storage.latest(), self.config.prediction_batch
         since = torch.randint(len(rows), (n_samples,), device=rows.device)
         index = rows[-1 - since], torch.randint(self.setup.worlds, (n_samples,), device=rows.device)
-        read = (keys.OBSERVATION, keys.HISTORY, keys.ACTION)
-        ready, delay, target = (
-            storage.steps.get(key)[index]
-            for key in (keys.READY, next_key(keys.DELAY), next_key(keys.GLOBAL_OBSERVATION))
-        )
-        counts = arrived_by_now(delay, since) & ready.unsqueeze(-1)
-        return {key: storage.steps.get(key)[index] for key in read}, target, counts
+        after = (next_key(keys.GLOBAL_OBSERVATION), next_key(keys.DELAY))
+        read = (keys.OBSERVATION, keys.HISTORY, keys.ACTION, keys.READY, *after)
+        *before, ready, target, delay = (cast(Tensor, storage.steps[key])[index] for key in read)
+        return before, target, arrived_by_now(delay, since) & ready.unsqueeze(-1)

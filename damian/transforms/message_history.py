@@ -1,6 +1,6 @@
 """A transform that keeps the messages of the latest steps, as far as they have arrived."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -74,10 +74,10 @@ class MessageHistory(StatefulTransform):
         checks.whole("steps", steps, 1)
         super().__init__(message_key)
         self.steps, self.encode, self.group, self.own = steps, encode, group, own
-        out_key, self.delay_key, self.sent_key = (
+        written, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (out_key, delay_key, sent_key)
         )
-        self.out_keys = [out_key]
+        self.out_keys = [written]
         self.step_keys = [self.row_key, *(key for key in (self.delay_key, self.sent_key) if key is not None)]
         self.memory_setting = "MessageHistory: steps", steps
 
@@ -90,7 +90,7 @@ class MessageHistory(StatefulTransform):
         return {"steps": self.steps}
 
     @property
-    def required_keys(self) -> list[NestedKey]:
+    def required_keys(self) -> Sequence[NestedKey]:
         return self.step_keys
 
     def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:

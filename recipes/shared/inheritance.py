@@ -14,8 +14,8 @@ from .settings import TrainConfig
 def inherited(stored: TrainConfig, overrides: Sequence[str]) -> list[str]:
     """The given overrides, preceded by those of a stored run that they do not replace.
 
-    The policy keeps its histories of actions and messages, because it observes them, even if a file of the stored
-    run's scenario or an option of ``delay`` says otherwise.
+    The policy keeps its histories of actions and messages, because it observes them, even if a file of the
+    stored run's scenario or an option of ``delay`` says otherwise.
     """
     given = [key_of(override) for override in overrides]
     history = [] if {"delay.history", "aware"} & {*given} else [f"delay.history={stored.delay.history}"]

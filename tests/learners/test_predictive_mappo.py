@@ -1,6 +1,7 @@
 """The learnt belief: its attention and loss beside slow twins, what it may know, and that it learns."""
 
 import copy
+from typing import Any, cast
 
 import pytest
 import torch
@@ -26,7 +27,7 @@ LATE = {"law": "uniform", "low": 0, "high": 3}
 
 def build(kind: str = "discrete", **learner) -> tuple[PredictiveMappo, DelayedEnv, TrainConfig]:
     """A learner of few prediction steps, and an environment whose messages are up to 3 steps late or lost."""
-    few = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
+    few: dict[str, Any] = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
     scenario = square(
         source=walking(), actions=ActionConfig(kind=kind), delay=DelayConfig(obs=LATE, loss=0.1, messages=4)
     )
@@ -200,7 +201,7 @@ def test_a_learner_goes_on_from_its_components_as_if_it_had_not_stopped():
     batches = [collected(learner, env) for _ in range(2)]
     learner.learn(batches[0])
     saved = {name: copy.deepcopy(part.state_dict()) for name, part in learner.components().items()}
-    other = make_learner(config, env, learner.buffer)
+    other = cast(PredictiveMappo, make_learner(config, env, learner.buffer))
     assert saved.keys() == other.components().keys()
     for name, part in other.components().items():
         part.load_state_dict(saved[name])

@@ -44,7 +44,10 @@ from damian.recipes.shared.stored_runs import save_config
         (["clock.skip=true", "model=gru"], "clock.skip: True does not go with model.rnn"),
         (["clock.skip=true", "clock.skip_discount=0.5"], "clock.skip_discount: 0.5 is set to learner.gamma"),
         (["observation.own=true", "clock.server=2s", "clock.agents=2s"], "observation.own: True does not go"),
-        (["learner=predictive_mappo", "delay=paper"], "learner: predictive_mappo needs backupdate=true and a"),
+        (
+            ["learner=predictive_mappo", "delay=paper"],
+            "learner: predictive_mappo needs backupdate=true and a",
+        ),
         (
             ["learner=predictive_mappo", "delay=paper", "aware=backupdate"],
             "learner: predictive_mappo reads no messages: set delay.messages",

@@ -98,7 +98,10 @@ def test_a_message_changes_nothing_before_it_arrives():
     ("make", "error"),
     [
         (lambda: MessageHistory(0), "steps: 0"),
-        (lambda: TransformedEnv(UavEnv(square(), 2), MessageHistory(2, "state", group=True)).reset(), "group"),
+        (
+            lambda: TransformedEnv(UavEnv(square(), 2), MessageHistory(2, "state", group=True)).reset(),
+            "group",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(make, error):
