@@ -117,7 +117,7 @@ from damian.recipes.shared.stored_runs import save_config
         (["model.hidden=[100000000000]"], "model.hidden: 100000000000 is not between"),
         (["motion.max_speed=1e-300"], "motion.max_speed: 1e-300 m/s is not at least 0.001 m/s"),
         (["reward=3"], "reward: 3 is not one of coverage, energy"),
-        (["learner=null"], "learner: null is not one of mappo, sac"),
+        (["learner=null"], "learner: null is not one of mappo, predictive_mappo, sac"),
         (["region.pool=64"], "region.pool: 64 means nothing with region.kind=fir"),
         (["episode.discharged_share=0.5"], "episode.discharged_share: 0.5 needs battery.enabled"),
         (["episode.end_with_source=true"], "episode.end_with_source: True needs source.motion"),
