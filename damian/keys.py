@@ -81,12 +81,8 @@ HIDDEN, HIDDEN_BEFORE = (AGENTS, "hidden"), (AGENTS, "hidden_before")
 """Recurrent state of the actor after and before a step, [B, N, H]."""
 ENCODING = (AGENTS, "encoding")
 """What the actor of ``PredictiveMappo`` makes of its observation and the messages it knows, [B, N, H]."""
-PREDICTION, PREDICTED = (AGENTS, "prediction"), (AGENTS, "predicted")
-"""What it predicted for each discrete action when it acted, [B, N, A G], and what it predicts while learning,
-whatever the action and for the action that was chosen, [B, N, 2, G]."""
-PREDICTION_TARGET, PREDICTION_WEIGHT = (AGENTS, "prediction_target"), (AGENTS, "prediction_weight")
-"""What the messages of a step said once they had arrived, normalised, [B, N, G]; and 1 where the UAV's own
-has arrived, else 0, [B, N, 1]."""
+PREDICTION = (AGENTS, "prediction")
+"""What it predicted for each discrete action when it acted, [B, N, A G]."""
 IS_INIT = "is_init"
 """Does an episode begin with this step, [B, 1] bool (TorchRL's ``InitTracker``)."""
 STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")
