@@ -36,6 +36,8 @@ RECEIVED = (AGENTS, "received")
 """The message of each UAV that the server holds, packed (``Messages.pack``), [B, N, M]."""
 LINKED = (AGENTS, "linked")
 """Messages that each UAV holds of each other with ``links=matrix``, [B, N, N, M] (receiver, sender)."""
+HISTORY = (AGENTS, "history")
+"""Messages of the latest steps that each UAV knows, with ages (``MessageHistory``), [B, N, L, C]."""
 AGE = (AGENTS, "age")
 """Age of information: steps since the message that the server holds was generated, [B, N, 1]."""
 DELAY = (AGENTS, "delay")
@@ -77,6 +79,10 @@ LOGITS, LOC, SCALE = (AGENTS, "logits"), (AGENTS, "loc"), (AGENTS, "scale")
 """Parameters of the actor's distribution."""
 HIDDEN, HIDDEN_BEFORE = (AGENTS, "hidden"), (AGENTS, "hidden_before")
 """Recurrent state of the actor after and before a step, [B, N, H]."""
+ENCODING = (AGENTS, "encoding")
+"""What the actor of ``PredictiveMappo`` makes of its observation and the messages it knows, [B, N, H]."""
+PREDICTION = (AGENTS, "prediction")
+"""What it predicted for each discrete action when it acted, [B, N, A G]."""
 IS_INIT = "is_init"
 """Does an episode begin with this step, [B, 1] bool (TorchRL's ``InitTracker``)."""
 STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")

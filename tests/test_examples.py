@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 ROOT = Path(__file__).parents[1]
@@ -51,3 +52,11 @@ def test_the_document_shows_the_examples_code():
     blocks = re.findall(r"```python\n(.*?)\n```", (ROOT / "docs" / "backupdating.md").read_text(), re.DOTALL)
     assert len(blocks) == 3
     assert all(lines(block) in lines(EXAMPLE.read_text()) for block in blocks)
+
+
+@pytest.mark.slow
+def test_a_belief_head_learns_to_predict_on_an_environment_that_is_not_ours():
+    pytest.importorskip("vmas")
+    example = runpy.run_path(str(ROOT / "examples" / "belief_head.py"))
+    assert example["batch"]["agents", "history"].shape == (8, 16, 3, 12, 18 + 3)
+    assert example["errors"][-1] < example["errors"][0]

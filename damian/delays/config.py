@@ -35,6 +35,9 @@ class DelayConfig:
     then grows by at most one step per step) or the one that arrived last (``arrival``)."""
     history: int = 0
     """Number of its own latest actions that a UAV observes (section 3.3)."""
+    messages: int = 0
+    """Number of latest steps whose messages a UAV gets beside its observation, as far as they have arrived
+    (``MessageHistory``), for ``learner=predictive_mappo``."""
     reward_window: int = 1
     """Number of steps over which rewards are summed (eq. 4)."""
     reward_discount: float = 0.9
@@ -45,6 +48,7 @@ class DelayConfig:
         checks.one_of("delay.hold", self.hold, ("none", "max"))
         checks.one_of("delay.order", self.order, ORDERS)
         checks.whole("delay.history", self.history, 0, 1000, "actions")
+        checks.whole("delay.messages", self.messages, 0, 1000, "steps")
         checks.whole("delay.reward_window", self.reward_window, 1, LONGEST, "steps")
         checks.above("delay.reward_discount", self.reward_discount, 0.0)
         checks.in_range("delay.reward_discount", self.reward_discount, 0.0, 1.0)

@@ -1,6 +1,7 @@
 """Builds a scenario's environment: the one place that decides the order of its delays, losses and clocks."""
 
 from collections.abc import Collection
+from functools import partial
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from damian.transforms import (
     ActionHistory,
     Channel,
     CumulativeReward,
+    MessageHistory,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
@@ -119,17 +121,21 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
     output_messages, linked = "message" in extras, scenario.links.kind == "matrix"
     transforms: list[Transform] = []
     delayed, longest = has_message_delay(scenario), 0
+    read = server.grid is not None or scenario.delay.messages > 0
     if delayed:
-        uplink = uplink_transform(scenario, output_messages, reads_delay=server.grid is not None)
+        uplink = uplink_transform(scenario, output_messages, reads_delay=read)
         longest = uplink.sampler.longest
         transforms.append(uplink)
     if server.grid is not None:
         belief = Belief(server, longest, delayed=delayed, own=scenario.observation.own)
         belief.memory_setting = "delay.obs", show(scenario.delay.obs)
         transforms.append(belief)
+    if scenario.delay.messages:
+        transforms.append(message_history(scenario, server, delayed))
     held = keys.RECEIVED if delayed else keys.MESSAGE
     written = [*([] if linked else _SENT), *(key for each in transforms for key in each.out_keys)]
-    if delayed and server.grid is not None:
+    written = [key for key in written if key != keys.HISTORY]
+    if delayed and read:
         written.append(keys.DELAY)
     dropped = [] if output_messages else written
     node = ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras)
@@ -159,6 +165,34 @@ def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_dela
     )
     uplink.memory_setting = "delay.obs", show(delay.obs)
     return uplink
+
+
+def message_history(scenario: ScenarioConfig, server: Server, delayed: bool) -> MessageHistory:
+    """The messages of the latest steps, for the UAVs to learn a belief from them."""
+    history = MessageHistory(
+        scenario.delay.messages,
+        keys.MESSAGE,
+        keys.HISTORY,
+        delay_key=keys.DELAY if delayed else None,
+        sent_key=keys.MESSAGE_SENT,
+        encode=partial(scaled_messages, server),
+        group=True,
+        own=scenario.observation.own,
+    )
+    history.memory_setting = "delay.messages", scenario.delay.messages
+    return history
+
+
+def scaled_messages(server: Server, rows: Tensor) -> Tensor:
+    """Position, way to the target, spotted and battery of packed messages [*, N, M], [*, N, 6].
+
+    All are about 1 in size: lengths are over the largest vertex distance of the region.
+    """
+    messages = server.messages(rows)
+    scale = server.scales(messages)[..., None, None]
+    way = messages.target - messages.position
+    flags = torch.stack([messages.spotted, messages.battery / 100], -1)
+    return torch.cat([messages.position / scale, way / scale, flags], -1)
 
 
 def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
@@ -213,13 +247,14 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     """The clocks of server and UAVs (paper, section 3.6), and the UAVs' action history (section 3.3)."""
     clock, n_actions = scenario.clock, scenario.delay.history
     transforms: list[Transform] = []
+    seen = [keys.OBSERVATION, *[keys.HISTORY] * bool(scenario.delay.messages)]
     if clock.steps("server") > 1:
-        observations = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION]
+        observations = [*seen, keys.GLOBAL_OBSERVATION]
         transforms.append(SampleAndHold(clock.steps("server"), observations))
     if scenario.links.kind == "updown" and (scenario.links.loss or has_delay(scenario.links.delay, clock.dt)):
         transforms.append(downlink_transform(scenario))
     if clock.steps("agents") > 1:
-        transforms.append(SampleAndHold(clock.steps("agents"), [keys.OBSERVATION], ready_key=keys.READY))
+        transforms.append(SampleAndHold(clock.steps("agents"), seen, ready_key=keys.READY))
     if n_actions:
         history = ActionHistory(
             n_actions,
@@ -278,9 +313,11 @@ def history_since_message(scenario: ScenarioConfig) -> bool:
 def has_server_node(scenario: ScenarioConfig) -> bool:
     """Whether a ``ServerNode`` computes observations and rewards instead of ``UavEnv``.
 
-    It must if messages are delayed, or if a feature reads the belief, which depends on all earlier messages.
+    It must if messages are delayed, or if a feature reads the belief or an actor the history of messages,
+    which depend on all earlier messages.
     """
-    return has_message_delay(scenario) or bool(scenario.observation.belief)
+    remembers = bool(scenario.observation.belief) or scenario.delay.messages > 0
+    return has_message_delay(scenario) or remembers
 
 
 def has_message_delay(scenario: ScenarioConfig) -> bool:

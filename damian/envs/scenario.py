@@ -36,6 +36,9 @@ class ScenarioConfig(WorldConfig):
         problem = "does not go with links=updown: the server has computed what a UAV receives"
         checks.require(not conflict, "observation.own", True, problem)
         self._check_belief()
+        messages, links = self.delay.messages, self.links.kind
+        problem = f"does not go with links={links}: a UAV would get the messages that the server has received"
+        checks.require(not messages or links == "server", "delay.messages", messages, problem)
         empty = self.agents == 1 and self.observation.actor == ["agent_distances"]
         problem = "is empty for a single UAV: add another feature"
         checks.require(not empty, "observation", "agent_distances", problem)

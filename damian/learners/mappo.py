@@ -1,6 +1,6 @@
 """MAPPO, from batches that late messages may have corrected (paper, section 4.3)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -18,7 +18,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.compiling import compiled
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
-from damian.learners.networks import COMPILE_OPTIONS, make_actor, make_critic
+from damian.learners.networks import COMPILE_OPTIONS, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
 from damian.learners.reward_scale import update_value_scale, value_scale
 from damian.learners.schedule import LinearSchedule
@@ -111,11 +111,14 @@ class Mappo:
             None: the learner uses batches as they were collected.
     """
 
+    loss_keys: Sequence[NestedKey] = LOSS_KEYS
+    """Entries of a step that the loss reads, beside the critic's observation."""
+
     def __init__(
         self, env: EnvBase, config: MappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None = None
     ) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
-        self.actor = make_actor(env, setup.model)
+        self.actor = config.make_actor(env, setup.model)
         self.critic = make_critic(env, setup.model, setup.critic_key, config.normalize_value)
         self.weights = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = torch.optim.Adam(self.weights, lr=config.lr, fused=True)
@@ -189,7 +192,7 @@ class Mappo:
     def _minibatches(self, batch: TensorDictBase) -> Iterator[dict[NestedKey, Tensor]]:
         """Entries that the loss reads, for each minibatch of each pass over a batch [B, T]."""
         recurrent = self.setup.model.recurrent
-        read = [*LOSS_KEYS, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
+        read = [*self.loss_keys, *self.critic.in_keys, *(RECURRENT_KEYS if recurrent else [])]
         found = {key: batch.get(key, None) for key in read}
         samples = {k: v if recurrent else v.flatten(0, 1) for k, v in found.items() if v is not None}
         n_samples, device = len(samples[keys.READY]), samples[keys.READY].device

@@ -1,7 +1,7 @@
 """Actors and critics: all UAVs share one network, so that a policy works with any number of UAVs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
@@ -90,17 +90,16 @@ class ModelConfig:
         *widths, n_hidden = self.hidden
         if not widths:
             return self.initialized(AgentGRU(nn.Identity(), n_in, n_hidden, device), 1.0)
-        *inner_widths, n_out = widths
-        activation = _ACTIVATIONS[self.activation]
-        encoder = MLP(
-            n_in,
-            n_out,
-            num_cells=inner_widths,
-            activation_class=activation,
-            activate_last_layer=True,
-            device=device,
+        encoder = self.hidden_layers(n_in, widths, device)
+        return self.initialized(AgentGRU(encoder, widths[-1], n_hidden, device), 1.0)
+
+    def hidden_layers(self, n_in: int, widths: Sequence[int], device: torch.device | None) -> MLP:
+        """Make layers of these widths, each with its activation, for features [*, n_in]."""
+        *inner, n_out = widths
+        kind, active = _ACTIVATIONS[self.activation], True
+        return MLP(
+            n_in, n_out, num_cells=inner, activation_class=kind, activate_last_layer=active, device=device
         )
-        return self.initialized(AgentGRU(encoder, n_out, n_hidden, device), 1.0)
 
     def initialized(self, network: Network, gain: float) -> Network:
         """Initialise the weights as the setting ``init`` says, with ``gain`` in the last layer."""
@@ -166,12 +165,23 @@ def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
     Discrete actions [*, N] have a categorical distribution over the legal actions. Continuous actions
     [*, N, 2] have a tanh-normal distribution within their bounds.
     """
+    return with_distribution(env, lambda *out: _actor_network(env, config, *out))
+
+
+def with_distribution(env: EnvBase, make_network: Callable[..., TensorDictModule]) -> ProbabilisticActor:
+    """Make a policy of a network that writes the parameters of the actions' distribution.
+
+    Args:
+        env: its specs tell the kind and the number of the actions.
+        make_network: gets the number of outputs for an agent, and the keys under which they are written:
+            logits, or means and scales (half of the outputs each).
+    """
     spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
         masked = keys.ACTION_MASK in env.observation_spec.keys(True, True)
         in_keys = {"logits": keys.LOGITS}
         return ProbabilisticActor(
-            _actor_network(env, config, spec.n, keys.LOGITS),
+            make_network(spec.n, keys.LOGITS),
             in_keys=in_keys | {"mask": keys.ACTION_MASK} if masked else in_keys,  # type: ignore[arg-type]
             out_keys=[keys.ACTION],
             distribution_class=LegalCategorical,
@@ -181,7 +191,7 @@ def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
     bounds = cast(Bounded, spec)
     low, high = (bound.reshape(-1, spec.shape[-1])[0] for bound in (bounds.low, bounds.high))
     return ProbabilisticActor(
-        _actor_network(env, config, 2 * spec.shape[-1], keys.LOC, keys.SCALE),
+        make_network(2 * spec.shape[-1], keys.LOC, keys.SCALE),
         in_keys=[keys.LOC, keys.SCALE],
         out_keys=[keys.ACTION],
         distribution_class=TanhNormal,

@@ -284,7 +284,7 @@ class Server:
         """What the server knows besides the messages after the elapsed steps [*]."""
         return ServerContext(
             now=steps * self.dt,
-            scale=self._scales(messages),
+            scale=self.scales(messages),
             time_scale=self.time_scale,
             battery=self.battery,
             footprints=self._footprints,
@@ -298,7 +298,7 @@ class Server:
             grid=self.grid,
         )
 
-    def _scales(self, messages: Messages) -> Tensor:
+    def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""
         region = self.region_of(messages)
         return self._scale.expand(region.shape) if len(self._scale) == 1 else gather_rows(self._scale, region)

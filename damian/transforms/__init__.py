@@ -11,6 +11,7 @@ from damian.transforms.action_delay import ActionDelay
 from damian.transforms.action_history import ActionHistory
 from damian.transforms.base import StatefulTransform
 from damian.transforms.channel import Channel
+from damian.transforms.message_history import MessageHistory
 from damian.transforms.observation_delay import ObservationDelay
 from damian.transforms.order import check_order
 from damian.transforms.reward_delay import CumulativeReward, RewardDelay
@@ -27,6 +28,7 @@ __all__ = [
     "Belief",
     "Channel",
     "CumulativeReward",
+    "MessageHistory",
     "ObservationDelay",
     "RewardDelay",
     "SampleAndHold",

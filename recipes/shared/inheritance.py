@@ -14,11 +14,13 @@ from .settings import TrainConfig
 def inherited(stored: TrainConfig, overrides: Sequence[str]) -> list[str]:
     """The given overrides, preceded by those of a stored run that they do not replace.
 
-    The policy keeps its action history, because it is part of its observation, even if a file of the stored
-    run's scenario or an option of ``delay`` says otherwise.
+    The policy keeps its histories of actions and messages, because it observes them, even if a file of the
+    stored run's scenario or an option of ``delay`` says otherwise.
     """
     given = [key_of(override) for override in overrides]
     history = [] if {"delay.history", "aware"} & {*given} else [f"delay.history={stored.delay.history}"]
+    messages = stored.delay.messages
+    history += [f"delay.messages={messages}"] if messages and "delay.messages" not in given else []
     replaced = [*given, *map(key_of, history)]
     kept = [old for old in stored.overrides if not any(_replaces(key, key_of(old)) for key in replaced)]
     return [*kept, *history, *overrides]
@@ -57,6 +59,7 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
         "observation.global_features": [] if observation.ctde else [*observation.global_features],
         "observation.age": observation.age,
         "delay.history": config.delay.history,
+        "delay.messages": config.delay.messages,
         "actions.kind": actions.kind,
         "number of actions.distances": discrete and len(actions.distances),
         "number of actions.headings": discrete and len(actions.headings),

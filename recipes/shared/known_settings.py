@@ -22,7 +22,13 @@ SCHEMAS = {
     "compare": "damian.recipes.compare:CompareConfig",
 }
 """Dataclass of all settings of a program, by the name of its file in conf/."""
-CHOICES = {"LearnerConfig": ["damian.learners.mappo:MappoConfig", "damian.learners.sac:SacConfig"]}
+CHOICES = {
+    "LearnerConfig": [
+        "damian.learners.mappo:MappoConfig",
+        "damian.learners.predictive_mappo:PredictiveMappoConfig",
+        "damian.learners.sac:SacConfig",
+    ]
+}
 """Dataclasses that stand for another one, as the settings choose."""
 
 

@@ -19,6 +19,7 @@ from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.bpql import BpqlConfig  # noqa: F401 (registers the learner, and SacConfig)
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
+from damian.learners.predictive_mappo import PredictiveMappoConfig  # noqa: F401 (registers the learner)
 from damian.learners.schedule import SystemClock
 
 MAX_BATCH = 100_000_000

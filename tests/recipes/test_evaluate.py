@@ -123,6 +123,14 @@ def test_a_policy_keeps_its_action_history_under_another_delay_and_the_changes_a
     assert "changed since the training: delay.obs: 1 -> {" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_a_policy_keeps_its_history_of_messages_under_another_delay(fly):
+    words = ["delay.messages=2", "backupdate=true", "learner.prediction_steps=1"]
+    first = fly("learner=predictive_mappo", *words, of=None, folder="first", program=train)
+    config = OmegaConf.load(fly("delay=paper", of=first) / "config.yaml")
+    assert (config.delay.messages, config.delay.obs.law) == (2, "uniform")
+
+
 def test_the_folder_records_versions_machine_commit_and_wall_time(fly, capsys):
     folder = fly()
     record = json.loads((folder / "run.json").read_text())

@@ -16,7 +16,7 @@ from damian.recipes.shared.stored_runs import save_config
     ("overrides", "message"),
     [
         (["agent=3"], "agent: no such key; did you mean agents?"),
-        (["learner=ppo"], "learner: ppo is not one of bpql, mappo, sac"),
+        (["learner=ppo"], "learner: ppo is not one of bpql, mappo, predictive_mappo, sac"),
         (["learner.name=sac"], "learner.name: sac is not the learner of these settings"),
         (["algo=sac"], "algo: no such key; since damian 0.2 it is learner"),
         (["mappo.lr=1"], "mappo: no such key; since damian 0.2 it is learner"),
@@ -44,6 +44,20 @@ from damian.recipes.shared.stored_runs import save_config
         (["clock.skip=true", "model=gru"], "clock.skip: True does not go with model.rnn"),
         (["clock.skip=true", "clock.skip_discount=0.5"], "clock.skip_discount: 0.5 is set to learner.gamma"),
         (["observation.own=true", "clock.server=2s", "clock.agents=2s"], "observation.own: True does not go"),
+        (
+            ["learner=predictive_mappo", "delay=paper"],
+            "learner: predictive_mappo needs backupdate=true and a",
+        ),
+        (
+            ["learner=predictive_mappo", "delay=paper", "aware=backupdate"],
+            "learner: predictive_mappo reads no messages: set delay.messages",
+        ),
+        (
+            ["learner=predictive_mappo", "delay=paper", "aware=backupdate", "model=gru"],
+            "model.rnn: gru does not go with learner=predictive_mappo",
+        ),
+        (["learner=predictive_mappo", "learner.heads=0"], "learner.heads: 0 is not between 1 and 1024"),
+        (["delay.messages=4", "links=matrix"], "delay.messages: 4 does not go with links=matrix"),
         (["learner=sac", "learner.warm_up=300000"], "learner.warm_up: 300000 is not between 0 and 200000"),
         (["learner=sac", "learner.warmup=1"], "learner.warmup: no such key; did you mean learner.warm_up?"),
         (["learner.lrr=1"], "learner.lrr: no such key; did you mean learner.lr?"),
@@ -103,7 +117,7 @@ from damian.recipes.shared.stored_runs import save_config
         (["model.hidden=[100000000000]"], "model.hidden: 100000000000 is not between"),
         (["motion.max_speed=1e-300"], "motion.max_speed: 1e-300 m/s is not at least 0.001 m/s"),
         (["reward=3"], "reward: 3 is not one of coverage, energy"),
-        (["learner=null"], "learner: null is not one of bpql, mappo, sac"),
+        (["learner=null"], "learner: null is not one of bpql, mappo, predictive_mappo, sac"),
         (["region.pool=64"], "region.pool: 64 means nothing with region.kind=fir"),
         (["episode.discharged_share=0.5"], "episode.discharged_share: 0.5 needs battery.enabled"),
         (["episode.end_with_source=true"], "episode.end_with_source: True needs source.motion"),

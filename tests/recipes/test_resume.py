@@ -25,6 +25,7 @@ WHOLE = [
 TRIGGERED = ["learner.steps=4", "clock.trigger=2s", "clock.longest=10s", "source.level_db=106", "delay.obs=2"]
 TRIGGERED += ["learner.normalize_value=true", "learner.entropy_coeff_end=0"]
 SLOW_CLOCKS = ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"]
+FEW = ["learner.prediction_steps=2", "learner.prediction_batch=8", "learner.prediction_buffer=64"]
 CASES = {
     "recurrent": ["delay.obs=2", "aware=backupdate", "delay.act=1", "delay.history=2", "model.rnn=gru"],
     "sac": [*SAC, "delay.obs=3", "aware=backupdate", "delay.loss=0.1", "learner.normalize_reward=true"],
@@ -35,6 +36,7 @@ CASES = {
     "skipped": ["clock.skip=true", "motion=polynomial", "scenario=energy"],
     "lags": ["delay=lag", "delay.rew=2", "scenario=coverage", "region=random", "region.pool=2"],
     "matrix": ["links=matrix", "links.delay=2", "scenario=mixed", "actions=continuous"],
+    "predictive": ["learner=predictive_mappo", "delay.messages=4", "delay.obs=2", "aware=backupdate", *FEW],
     "privileged": ["critic=privileged", "source.motion=dynamic", "observation.own=true", "delay.obs=2"],
 }
 QUICK = ("sac", "triggered")
@@ -53,7 +55,7 @@ def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case, monke
         run("resume=other", folder="unused")
     other = run("resume=other", folder="unused").with_name("other")
     check_equal(whole, other)
-    has_memory = case in ("recurrent", "sac", "sac bursts", "everything")
+    has_memory = case in ("recurrent", "sac", "sac bursts", "everything", "predictive")
     assert any(name.startswith("replay/") for name in files(whole)) == has_memory
 
 

@@ -1,0 +1,222 @@
+"""The learnt belief: its attention and loss beside slow twins, what it may know, and that it learns."""
+
+import copy
+from typing import Any, cast
+
+import pytest
+import torch
+from helpers import square, walking
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.modules import set_recurrent_mode
+
+from damian import keys
+from damian.delays.config import DelayConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.keys import next_key
+from damian.learners.belief_head import MessageEncoder, TargetScale, arrived_by_now, prediction_loss
+from damian.learners.networks import ModelConfig
+from damian.learners.predictive_mappo import PredictiveMappo, PredictiveMappoConfig
+from damian.recipes.shared.settings import LoggerConfig, TrainConfig
+from damian.recipes.train import learning_env, make_learner, replay_buffer
+from damian.world.landing import ActionConfig
+
+SMALL = ModelConfig(hidden=[16, 8])
+LATE = {"law": "uniform", "low": 0, "high": 3}
+
+
+def build(kind: str = "discrete", **learner) -> tuple[PredictiveMappo, DelayedEnv, TrainConfig]:
+    """A learner of few prediction steps, and an environment whose messages are up to 3 steps late or lost."""
+    few: dict[str, Any] = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
+    scenario = square(
+        source=walking(), actions=ActionConfig(kind=kind), delay=DelayConfig(obs=LATE, loss=0.1, messages=4)
+    )
+    config = TrainConfig(
+        **vars(scenario),
+        learner=PredictiveMappoConfig(steps=12, epochs=1, minibatches=2, **(few | learner)),
+        model=SMALL,
+        logger=LoggerConfig(tensorboard=False),
+        worlds=4,
+        backupdate=True,
+    )
+    torch.manual_seed(0)
+    env = learning_env(config)
+    return make_learner(config, env, replay_buffer(config, env)), env, config  # type: ignore[return-value]
+
+
+@torch.no_grad()
+def collected(learner: PredictiveMappo, env: DelayedEnv) -> TensorDictBase:
+    """A batch [4, 12] of the learner's actor."""
+    return env.rollout(12, learner.actor, break_when_any_done=False)
+
+
+def example(*batch: int) -> tuple[MessageEncoder, list[Tensor]]:
+    """An encoder, and an observation of 5, a history of 7 messages of 2 + 3, and 3 codes of 4."""
+    torch.manual_seed(1)
+    encoder = MessageEncoder(5, 5, 4, SMALL, heads=2, width=6)
+    inputs = [torch.rand(*batch, *shape) for shape in ((5,), (7, 5), (3, 4))]
+    inputs[1][..., 2] = (inputs[1][..., 2] < 0.6).float()
+    return encoder, inputs
+
+
+def twin(encoder: MessageEncoder, observation: Tensor, history: Tensor, code: Tensor) -> Tensor:
+    """The encoding of one observation [F], history [L, C] and code [K], by loops over heads and messages."""
+    known = [row for row in history if row[2] > 0]
+    reference = known[0][:2] if known else history[0, :2]
+    asked = torch.cat([observation, reference, code])
+    query = encoder.queries(asked).view(2, 6)
+    rows = [encoder.embed(torch.cat([row, row[:2] - reference])) for row in known]
+    found = []
+    for head in range(2):
+        weights = torch.stack([(query[head] @ row) / 6**0.5 for row in rows]).exp()
+        found.append(sum(w * row for w, row in zip(weights / weights.sum(), rows, strict=True)))
+    return encoder.layers(torch.cat([*found, asked]))
+
+
+def test_the_attention_is_that_of_a_loop_over_heads_and_known_messages():
+    encoder, (observation, history, codes) = example(4, 3)
+    history[..., 0, 2] = 1.0
+    encoded = encoder(observation, history, codes)
+    for i in range(4):
+        for j in range(3):
+            for q in range(3):
+                expected = twin(encoder, observation[i, j], history[i, j], codes[i, j, q])
+                torch.testing.assert_close(encoded[i, j, q], expected, atol=1e-5, rtol=1e-4)
+
+
+def test_messages_are_a_set_and_unknown_ones_have_no_influence():
+    encoder, (observation, history, codes) = example(6)
+    history[:, 0, 2] = 1.0
+    encoded = encoder(observation, history, codes)
+    shuffled = history[:, [0, 4, 2, 6, 1, 5, 3]]
+    torch.testing.assert_close(encoder(observation, shuffled, codes), encoded)
+    unknown = history[..., 2:3] == 0
+    assert unknown.any()
+    torch.testing.assert_close(
+        encoder(observation, torch.where(unknown, 0.0, history), codes), encoded, atol=1e-5, rtol=1e-4
+    )
+
+
+def test_the_loss_is_the_mean_over_what_counts_whatever_the_rest_is():
+    torch.manual_seed(2)
+    predicted, target, counts = torch.rand(5, 3, 2, 4), torch.rand(5, 3, 1, 4), torch.rand(5, 3, 1, 1) < 0.5
+    target = target.masked_fill(~counts, torch.nan)
+    errors = [
+        (predicted[i, j, q, g] - target[i, j, 0, g]) ** 2
+        for i, j in counts.view(5, 3).nonzero().tolist()
+        for q in range(2)
+        for g in range(4)
+    ]
+    torch.testing.assert_close(prediction_loss(predicted, target, counts), torch.stack(errors).mean())
+    assert prediction_loss(predicted, target, torch.zeros_like(counts)) == 0
+
+
+def test_the_scale_of_the_targets_does_not_matter_and_those_that_do_not_count_are_left_out():
+    torch.manual_seed(3)
+    scale, far = TargetScale(2), torch.tensor([[3e6, 1e-4]])
+    for _ in range(50):
+        target = far * (5 + torch.randn(200, 2))
+        counts = torch.rand(200, 1) < 0.7
+        scale.update(torch.where(counts, target, 1e9), counts)
+    scale.update(torch.full((9, 2), 1e9), torch.zeros(9, 1, dtype=torch.bool))
+    normal = scale.normalize(far * (5 + torch.randn(5000, 2)))
+    assert normal.mean(0).abs().max() < 0.1
+    assert (normal.std(0) - 1).abs().max() < 0.1
+    assert TargetScale(2).normalize(far).abs().max() == 0
+    constant = TargetScale(1)
+    constant.update(torch.full((4, 1), 0.3), torch.ones(4, 1, dtype=torch.bool))
+    assert constant.normalize(torch.full((4, 1), 0.3)).abs().max() < 1e-3
+
+
+def test_what_has_arrived_by_now_is_counted_as_by_hand():
+    delay = torch.tensor([[[0], [2]], [[3], [-1]], [[1], [2]]])
+    since = torch.tensor([0, 2, 2])
+    expected = [[[True], [False]], [[False], [False]], [[True], [True]]]
+    assert arrived_by_now(delay, since).tolist() == expected
+
+
+def test_targets_use_nothing_that_has_not_arrived_by_now():
+    learner, env, _ = build()
+    learner.learn(collected(learner, env))
+    storage = learner.buffer.storage
+    n_steps = len(storage.latest())
+    steps = storage.steps[:n_steps]
+    late = steps[next_key(keys.DELAY)].squeeze(-1)
+    since = torch.arange(n_steps - 1, -1, -1).view(-1, 1, 1)
+    missing = (late < 0) | (late > since)
+    assert missing[-3:].any()
+    torch.manual_seed(4)
+    before = learner.sample()
+    steps[next_key(keys.MESSAGE)][missing] += 50.0  # in place: a slice of the storage
+    storage.backupdate(n_steps)
+    torch.manual_seed(4)
+    after = learner.sample()
+    assert before[1].equal(after[1])
+    assert before[2].equal(after[2])
+    assert not before[2].all()
+
+
+def test_a_step_counts_if_its_uav_could_choose_and_its_message_has_arrived():
+    learner, env, _ = build(prediction_batch=4000)
+    learner.learn(collected(learner, env))
+    storage, counts = learner.buffer.storage, learner.sample()[2]
+    delay, ready = (storage.steps[key] for key in (next_key(keys.DELAY), keys.READY))
+    held, share = len(storage.latest()), 0.0
+    for t in range(held):
+        for i in range(4):
+            for j in range(3):
+                share += float(0 <= int(delay[t, i, j]) <= held - 1 - t and bool(ready[t, i, j]))
+    assert abs(counts.float().mean().item() - share / (held * 4 * 3)) < 0.02
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_the_gradient_of_the_prediction_reaches_all_of_the_head_and_the_errors_fall(kind):
+    learner, env, _ = build(kind, prediction_lr=1e-2, prediction_batch=64)
+    learner.learn(collected(learner, env))
+    learner.head_optimizer.zero_grad()
+    errors = [learner.learn_prediction() for _ in range(60)]
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in learner.head.parameters())
+    assert torch.stack(errors[-10:]).mean() < 0.8 * torch.stack(errors[:10]).mean()
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+def test_learning_to_predict_does_not_change_what_the_policy_has_done(kind):
+    learner, env, _ = build(kind)
+    batch = collected(learner, env)
+
+    def log_prob() -> Tensor:
+        with set_recurrent_mode(True):
+            return learner.actor.get_dist(batch.clone()).log_prob(batch[keys.ACTION])
+
+    torch.testing.assert_close(log_prob(), batch[keys.ACTION_LOG_PROB])
+    before = log_prob()
+    learner.buffer.extend(batch)
+    for _ in range(5):
+        learner.learn_prediction()
+    assert log_prob().equal(before)
+
+
+def test_a_learner_goes_on_from_its_components_as_if_it_had_not_stopped():
+    learner, env, config = build()
+    batches = [collected(learner, env) for _ in range(2)]
+    learner.learn(batches[0])
+    saved = {name: copy.deepcopy(part.state_dict()) for name, part in learner.components().items()}
+    other = cast(PredictiveMappo, make_learner(config, env, learner.buffer))
+    assert saved.keys() == other.components().keys()
+    for name, part in other.components().items():
+        part.load_state_dict(saved[name])
+    results = []
+    for each in (learner, other):
+        torch.manual_seed(6)
+        results.append([float(each.learn_prediction()) for _ in range(3)])
+    assert results[0] == results[1]
+
+
+def test_an_actor_for_evaluations_predicts_as_the_learner_does():
+    learner, env, config = build()
+    learner.learn(collected(learner, env))
+    actor = config.learner.make_actor(env, config.model)
+    actor.load_state_dict(learner.actor.state_dict())
+    td = env.reset()
+    one, other = (policy(td.clone())[keys.PREDICTION] for policy in (actor, learner.actor))
+    assert one.equal(other)
