@@ -24,6 +24,7 @@ SCHEMAS = {
 """Dataclass of all settings of a program, by the name of its file in conf/."""
 CHOICES = {
     "LearnerConfig": [
+        "damian.learners.bpql:BpqlConfig",
         "damian.learners.mappo:MappoConfig",
         "damian.learners.predictive_mappo:PredictiveMappoConfig",
         "damian.learners.sac:SacConfig",
@@ -122,9 +123,12 @@ def _any_of(classes: Sequence[Sequence[str]], path: str) -> dict[str, Setting]:
     for key in dict.fromkeys(key for settings in found.values() for key in settings):
         having = {name: settings[key] for name, settings in found.items() if key in settings}
         first = next(iter(having.values()))
-        defaults = {name: setting.default for name, setting in having.items() if setting.default}
-        agree = len(having) == len(found) and len({*defaults.values()}) <= 1
-        owned = " or ".join(f"{default} ({name})" for name, default in defaults.items())
+        owners: dict[str, list[str]] = {}
+        for name, setting in having.items():
+            if setting.default:
+                owners.setdefault(setting.default, []).append(name)
+        agree = len(having) == len(found) and len(owners) <= 1
+        owned = " or ".join(f"{default} ({', '.join(names)})" for default, names in owners.items())
         text = next((setting.text for setting in having.values() if setting.text), "")
         merged[key] = Setting(first.kind, first.default if agree else owned, text)
     return merged

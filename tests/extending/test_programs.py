@@ -134,6 +134,24 @@ def run_resumed(run, name: str) -> None:
     run(f"resume={name}", "frames=256", name="unused")
 
 
+def test_a_student_imitates_a_teacher_without_delay(run, capsys):
+    run(*TINY, name="teacher")
+    words = [*TINY, "delay.obs=2", "delay.history=3", "learner=distillation:DistillationConfig"]
+    words += ["learner.minibatches=4", "frames=512"]
+    student = run(*words, "learner.teacher=teacher", name="student")
+    with (student / "metrics.csv").open(newline="") as file:
+        first, *_, last = (float(row["divergence"]) for row in csv.DictReader(file))
+    assert 0 < last < first
+    for folder, message in (
+        ("student", "learner.teacher: student was trained with delayed messages"),
+        ("nowhere", "learner.teacher: nowhere holds no config.yaml"),
+    ):
+        refused = [*words, f"learner.teacher={folder}"]
+        check_refused(lambda refused=refused: run(*refused, name="refused"), message, capsys)
+    wide = ["learner.teacher=teacher", "observation.global_features=[coverage]"]
+    check_refused(lambda: run(*words, *wide, name="refused"), "but the critic of this run", capsys)
+
+
 def test_a_learner_gets_what_it_reads_and_what_was_held_before_and_after_back_updating(run, folder):
     (folder / "reader.py").write_text(READER)
     metrics = last_metrics(run(*TINY, "learner=reader:ReaderConfig", "delay.obs=3", "aware=backupdate"))

@@ -50,7 +50,10 @@ def test_the_settings_read_from_the_source_are_those_of_the_dataclasses():
     assert set(known_settings("train")) == set().union(*map(keys_of, configs))
     assert set(known_settings("compare")) > set(OmegaConf.structured(CompareConfig))
     assert known_settings("train")["agents"].default == "3"
-    assert known_settings("train")["learner.lr"].default == "0.0003 (mappo) or 0.001 (sac)"
+    assert (
+        known_settings("train")["learner.lr"].default
+        == "0.001 (bpql, sac) or 0.0003 (mappo, predictive_mappo)"
+    )
     assert all(setting.text for key, setting in known_settings("train").items() if setting.default), (
         "undocumented"
     )
@@ -254,8 +257,11 @@ def test_help_may_stand_anywhere_and_explains_groups_and_experiments(capsys):
     assert scenarios.startswith("choose one with scenario=OPTION: coverage, ")
     assert "[spotting]" in scenarios
     learner = printed("train", "--help", "learner")
-    assert "choose one with learner=OPTION: bpql, [mappo], sac\n" in learner
-    assert "learner.name: str = 'mappo' (mappo) or 'sac' (sac)\n" in learner
+    assert "choose one with learner=OPTION: bpql, [mappo], predictive_mappo, sac\n" in learner
+    assert (
+        "= 'bpql' (bpql) or 'mappo' (mappo) or 'predictive_mappo' (predictive_mappo) or 'sac' (sac)\n"
+        in learner
+    )
     assert "learner.gamma: float = 0.95\n" in learner
     experiment = printed("compare", "--help", "experiment")
     assert "choose one with experiment=OPTION: delaybench, " in experiment
