@@ -187,7 +187,7 @@ def test_actions_are_drawn_from_the_policy_while_it_learns(monkeypatch):
 
 @pytest.mark.slow
 def test_delay_lowers_the_return_and_the_action_history_restores_it():
-    undelayed = learn(delay=0, history=0, steps=6_000)
+    undelayed = learn(delay=0, history=0, steps=9_000)
     returns = {delay: evaluate_under(delay, 0, undelayed, 20) for delay in (0, 6)}
     assert returns[0] > -300
     assert returns[6] < returns[0] - 300
