@@ -194,9 +194,7 @@ def _filter(grid: SourceGrid, window: Window, lag: int, at: Tensor, region: Tens
     here, before, region = (each.index_select(0, chosen) for each in (at[lag], at[lag + 1], region))
     reports = repeated(grid, _known(grid, window, here, lag), _known(grid, window, before, lag + 1))
     new = predict(grid, _read(window.belief, before), region.unsqueeze(-1).expand(reports.shape[:-1]))
-    unknown = devices.data_dependent(reports.device) and bool((reports == grid.no_report).all())
-    if not unknown:
-        new = weigh(grid, new, evidence(grid, reports))
+    new = weigh(grid, new, evidence(grid, reports))
     _write(window.belief, at[lag], new, worlds, chosen)
 
 
