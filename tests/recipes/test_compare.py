@@ -1,4 +1,4 @@
-"""The comparison recipe, run by its command line: its runs, its refusals of wrong input, its statistics."""
+"""The comparison recipe, run by its command line: its runs, and its refusals of wrong input."""
 
 import csv
 import re
@@ -6,24 +6,11 @@ import shlex
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from helpers import check_refused
 
-from damian.evaluation.comparison import (
-    ALL_MESSAGES,
-    CEILING,
-    GREEDY,
-    MODE,
-    RANDOM,
-    SAMPLED,
-    Arm,
-    Comparison,
-    regime,
-)
-from damian.evaluation.report import markdown, plot_curves, plot_norms
+from damian.evaluation.comparison import CEILING, SAMPLED
 from damian.evaluation.run_lock import locked
-from damian.evaluation.statistics import interquartile_mean
 from damian.recipes.compare import main
 from damian.recipes.evaluate import fly
 from damian.recipes.shared.known_settings import CONF
@@ -47,12 +34,6 @@ def listed(*words: str) -> str:
 
 
 TWO = ["experiment=usecase2", "seeds=2", "arms=[undelayed,unaware]", listed(*SMALL)]
-ARMS = {
-    "best": Arm(delayed=False),
-    "blind": Arm(naive=True),
-    "flown": Arm(naive=True, policy_of="best"),
-    "aware": Arm(),
-}
 
 
 @pytest.fixture
@@ -237,150 +218,6 @@ def test_a_mistake_in_an_experiment_of_ones_own_is_one_line(compare, capsys, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
 
-def test_the_regime_of_an_arm_follows_from_its_delays_unless_it_is_given():
-    arms = ARMS | {
-        "truth": Arm(regime="R1"),
-        "of truth": Arm(policy_of="truth"),
-        "given": Arm(policy_of="best", regime="R0"),
-    }
-    expected = {"best": "R3", "blind": "R0", "flown": "R2", "aware": "R0"}
-    expected |= {"truth": "R1", "of truth": "R1", "given": "R0"}
-    assert {name: regime(arms, name) for name in arms} == expected
-
-
-def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = SAMPLED) -> dict:
-    """A row of results in which every measure has the same value."""
-    labels = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
-    names = ("true_return", "true_success_rate", "true_steps", "episode_return", "success_rate", "steps")
-    return labels | dict.fromkeys((*names, "age", "late", "lost", "backupdated", "episodes"), value)
-
-
-def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
-    """Rows of every arm, seed and policy, from the values of the arms by seed."""
-    return [
-        row(task, "none" if arm == "best" else delay, arm, seed, x, policy)
-        for arm, values in scores.items()
-        for seed, value in enumerate(values)
-        for policy, x in ((SAMPLED, value), (MODE, value), (RANDOM, random))
-    ]
-
-
-THREE = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3], "flown": [5.0, 3, 4], "aware": [6.0, 9, 7]}
-SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware": [6.0, 9.0]}
-
-
-def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
-    compared = Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
-    seeds, norm, recovery, improvement, _ = compared["aware"]
-    assert seeds == [0, 1]
-    assert norm.value == 7.5 / 10
-    assert recovery.value == (7.5 - 4) / (10 - 4)
-    assert improvement.value == 1
-    assert np.isnan([norm.low, recovery.low, recovery.high]).all()  # two seeds give no interval
-    assert compared["blind"].j_norm.value == 3 / 10
-    for naive in ("blind", "flown"):
-        assert np.isnan([compared[naive].recovery.value, compared[naive].improvement.value]).all()
-
-
-def test_the_probability_of_improvement_is_over_the_naive_arm_with_the_higher_mean():
-    scores = {"best": [9.0, 9, 9], "blind": [6.0, 0, 0], "flown": [5.0, 4, 3], "aware": [4.0, 6, 7]}
-    improvement = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"].improvement
-    assert improvement.value == (1.5 + 3 + 3) / 9  # against 5, 4, 3
-    assert improvement.low < improvement.value
-
-
-def test_recovery_is_left_out_if_the_delay_costs_nothing():
-    scores = SCORES | {"blind": [9.0, 9.5]}
-    _, norm, recovery, *_ = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
-    assert norm.value == 0.75
-    assert str(recovery) == "-"
-
-
-def test_fewer_steps_give_a_higher_score():
-    steps = {arm: [20 - x for x in values] for arm, values in THREE.items()}
-    by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "true_steps").compared("t", "late")
-    by_return = Comparison(rows_of("t", "late", THREE), ARMS).compared("t", "late")
-    for arm, expected in by_return.items():
-        np.testing.assert_allclose(by_steps[arm][1:], expected[1:])
-
-
-def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
-    rows = rows_of("t", "late", THREE)
-    alone = Comparison(rows, ARMS).compared("t", "late")
-    unfinished = [row for row in rows if (row["arm"], row["seed"]) != ("aware", 2)]
-    compared = Comparison(unfinished, ARMS).compared("t", "late")
-    assert compared["aware"].seeds == [0, 1]
-    assert repr(compared["blind"]) == repr(alone["blind"])  # an unfinished arm changes no other one
-    unfinished = [row for row in rows if (row["arm"], row["seed"]) != ("blind", 0)]
-    compared = Comparison(unfinished, ARMS).compared("t", "late")
-    assert [compared[arm].seeds for arm in ("blind", "flown", "aware")] == [[1, 2]] * 3
-
-
-def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
-    rows, norms = [], []
-    for task, best in (("t", [9.0, 11.0, 10.0]), ("u", [3.0, 5.0, 7.0])):
-        for delay, aware in (("late", [6.0, 1.0, 2.0]), ("later", [2.0, 0.0, 1.0])):
-            rows += rows_of(task, delay, {"blind": [0.0] * 3, "aware": aware})
-            norms += [x / np.mean(best) for x in aware]
-        rows += rows_of(task, "none", {"best": best})
-    overall = Comparison(rows, ARMS).overall()
-    n_seeds, norm = overall["aware"]
-    assert n_seeds == 3
-    assert norm.value == pytest.approx(interquartile_mean(np.array(norms)), abs=1e-12)
-    assert norm.low < norm.value < norm.high
-    assert overall["blind"][1].value == 0
-    assert Comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")], ARMS).overall()
-    held_out = rows_of("t@other", "late", {"best": [1.0] * 3, "aware": [9.0] * 3})
-    assert repr(Comparison(rows + held_out, ARMS).overall()) == repr(overall)
-    one = Comparison(rows_of("t", "late", SCORES), ARMS)
-    assert one.overall() == {}
-
-
-def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
-    lines = Comparison(rows_of("t", "late", THREE), ARMS).lines
-    labels = [(line.delay, line.arm, line.policy) for line in lines]
-    assert labels == [
-        ("none", "best", SAMPLED),
-        ("none", "best", MODE),
-        ("none", RANDOM, RANDOM),
-        *[("late", arm, policy) for arm in ("blind", "flown", "aware") for policy in (SAMPLED, MODE)],
-        ("late", RANDOM, RANDOM),
-    ]
-    cells = lines[7].cells()
-    assert [cells[name] for name in ("arm", "regime", "policy")] == ["aware", "R0", SAMPLED]
-    assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
-    value, low, high = (cells[f"true_return{end}"] for end in ("", "_low", "_high"))
-    assert value == pytest.approx(22 / 3)
-    assert low < value < high
-    assert cells["J_norm"] == pytest.approx(22 / 30)
-    assert cells["recovery"] == pytest.approx((22 / 3 - 4) / 6)
-    assert cells["improvement"] == 1
-    assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
-
-
-def test_the_table_lists_the_greedy_policy_where_it_was_evaluated():
-    rows = rows_of("t", "late", SCORES)
-    greedy = [row("t", delay, arm, 0, 7.0, GREEDY) for delay, arm in (("none", "best"), ("late", "blind"))]
-    table = markdown(Comparison(rows + greedy, ARMS), [], {"t": "long"}, never=set())
-    cells = [line.split(" |")[:5] for line in table.splitlines() if "greedy" in line]
-    names = ("greedy (undelayed)", "greedy")
-    assert cells == [[f"| {name}", " ", " greedy", " 1", " 7.000"] for name in names]
-
-
-def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
-    arms = ARMS | {"script": Arm(ceiling=True)}
-    rows = rows_of("t", "late", THREE)
-    for known, value in (("its own messages", 8.0), (ALL_MESSAGES, 10.0)):
-        rows += [row("t", "late", "script", seed, value, known) for seed in range(3)]
-    comparison = Comparison(rows, arms)
-    compared = comparison.compared("t", "late")
-    assert set(compared) == {"blind", "flown", "aware"}
-    assert compared["aware"].of_ceiling.value == pytest.approx((22 / 3) / 10)
-    script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
-    assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
-    assert comparison.compared("t", "late")["aware"].recovery.value == pytest.approx((22 / 3 - 4) / 6)
-
-
 def test_a_comparison_flies_policies_in_held_out_tasks_and_the_script_that_knows_ever_more(compare, tmp_path):
     (tmp_path / "mine/experiment").mkdir(parents=True)
     (tmp_path / "mine/experiment/script.yaml").write_text(
@@ -404,27 +241,6 @@ held_out: {two: {overrides: [agents=2], tasks: [follow]}}
         assert re.search(f"checkpoint: .*/follow/{delay}/{arm}/seed_0", config)
         assert "agents: 2" in config
         assert not (flown / "metrics.csv").exists()
-
-
-def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
-    rows = rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES)
-    text = markdown(Comparison(rows, ARMS), ["a note"], {"t": "long", "u": "short"}, never={"u"})
-    first, second, overall = text.split("##")[1:]
-    aware = "| aware | R0 | trained, sampled | 2 | 7.500 |"
-    assert aware + " 7.500" in first
-    assert aware + " - |" in second
-    assert "| 2 | 0.750 | 0.583 | 1.000 | - |" in first
-    assert "| aware | 2 | 0.750 |" in overall
-
-
-def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finished_episode(tmp_path):
-    comparison = Comparison(rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES), ARMS)
-    curve = [{"episodes": n, "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in range(5)]
-    unfinished = [dict.fromkeys(curve[0], np.nan) | {"episodes": 0.0}]
-    curves = {("t", "none", "best"): [curve, curve[1:]], ("t", "late", "blind"): [unfinished, unfinished]}
-    plot_curves(comparison, curves, {"steps": 1.0}, {"u"}, tmp_path / "curves.png")
-    plot_norms(comparison, tmp_path / "norms.png")
-    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("curves.png", "norms.png"))
 
 
 @pytest.mark.parametrize("name", [path.stem for path in sorted((Path(CONF) / "experiment").iterdir())])
