@@ -39,11 +39,20 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
     Raises:
         InputError: no checkpoint is given, or its actor has other observations, actions or layers.
     """
-    written = checkpoint_of(config)
+    checkpoint_of(config)  # a missing one is refused before an environment is made
     env = make_eval_env(config)
+    return env, stored_actor(config, env)
+
+
+def stored_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
+    """The actor of ``config.checkpoint``, for an environment.
+
+    Raises:
+        InputError: no checkpoint is given, or its actor has other observations, actions or layers.
+    """
     actor = config.learner.make_actor(env, config.model)
-    load_networks(written, "checkpoint", {"actor": actor})
-    return env, actor
+    load_networks(checkpoint_of(config), "checkpoint", {"actor": actor})
+    return actor
 
 
 def checkpoint_of(config: TrainConfig) -> Path:

@@ -29,13 +29,14 @@ from damian.common import checks
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
+from damian.envs.uav_env import EXTRAS
 from damian.evaluation.belief_figure import plot_beliefs
 from damian.evaluation.episode import Episode, record
 from damian.evaluation.film import save_film
 from damian.evaluation.geojson import origin_of, save_geojson
-from damian.evaluation.training_state import load_networks
 from damian.learners.recurrent import add_recurrent_state
 
+from .evaluate import stored_actor
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
 from .shared.settings import TrainConfig
@@ -96,8 +97,7 @@ ConfigStore.instance().store(name="fly_schema", node=FlyConfig)
 
 def fly(config: FlyConfig) -> list[Episode]:
     """Fly ``eval_episodes`` episodes."""
-    extras = ["message", "state", "reward_terms"]
-    env = make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, extras)
+    env = make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, EXTRAS)
     mode = ExplorationType.DETERMINISTIC if config.flown == "mode" else ExplorationType.RANDOM
     policy = make_policy(config, env)
     with set_exploration_type(mode):
@@ -114,8 +114,7 @@ def make_policy(config: FlyConfig, env: DelayedEnv) -> TensorDictModuleBase:
     """
     if not config.learnt:
         return greedy_policy(env) if config.flown == "greedy" else random_policy(env)
-    actor = config.learner.make_actor(env, config.model)
-    load_networks(Path(str(config.checkpoint)), "checkpoint", {"actor": actor})
+    actor = stored_actor(config, env)
     add_recurrent_state(env, actor)
     return actor
 

@@ -52,9 +52,7 @@ from damian.transforms import ActionHistory, ObservationDelay
 from .shared.command_line import Parser, exits_with_one_line
 from .shared.outside_runs import (
     add_options,
-    check_results,
     chosen_runs,
-    make_folder,
     read_result,
     run_all,
     save_result,
@@ -248,9 +246,7 @@ def main(words: Sequence[str] | None = None) -> None:
     """Train, evaluate and print the table; wrong input ends with one line on stderr and exit code 2."""
     with exits_with_one_line():
         runs, folder, jobs = parse(words)
-        make_folder(folder)
-        check_results(runs, folder, is_good)
-        run_all(runs, folder, jobs, run_arm)
+        run_all(runs, folder, jobs, run_arm, is_good)
     print(f"{table(runs, folder)}\nresults: {folder}")
 
 

@@ -68,15 +68,27 @@ def make_folder(folder: Path) -> None:
         raise InputError(f"--out: {folder}: {getattr(error, 'strerror', error)}") from None
 
 
-def run_all(runs: Sequence[Any], folder: Path, jobs: int, run_arm: Callable[[Any, Path, int], None]) -> None:
+def run_all(
+    runs: Sequence[Any],
+    folder: Path,
+    jobs: int,
+    run_arm: Callable[[Any, Path, int], None],
+    is_good: Callable[[Any], bool],
+) -> None:
     """Carry out the runs without a result, in ``jobs`` processes.
 
     Args:
         runs: each an ``OutsideRun``.
-        folder: the run folder.
+        folder: the run folder; it is made.
         jobs: number of processes.
         run_arm: carries out one run; its last argument is the line of its progress bar. Importable by name.
+        is_good: whether something can be the returns of a run.
+
+    Raises:
+        InputError: the folder cannot be written to, or holds something else than results of these runs.
     """
+    make_folder(folder)
+    check_results(runs, folder, is_good)
     todo = [run for run in runs if not file_of(run, folder).exists()]
     work = [(run, folder, place) for place, run in enumerate(todo)]
     if jobs == 1:

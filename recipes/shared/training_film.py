@@ -8,6 +8,7 @@ from torchrl.modules import ProbabilisticActor
 
 from damian.common.atomic_files import writing
 from damian.envs.pipeline import make_env
+from damian.envs.uav_env import EXTRAS
 from damian.evaluation.episode import record
 from damian.evaluation.film import save_film
 from damian.learners.recurrent import add_recurrent_state
@@ -33,8 +34,7 @@ def film_policy(config: TrainConfig, actor: ProbabilisticActor, frames: int, fol
     path = folder / FOLDER / f"{frames:09d}.gif"
     with writing(path):
         path.parent.mkdir(exist_ok=True)
-    extras = ["message", "state", "reward_terms"]
-    env = make_env(config.eval_scenario, 1, config.eval_seed, config.device, extras)
+    env = make_env(config.eval_scenario, 1, config.eval_seed, config.device, EXTRAS)
     add_recurrent_state(env, actor)
     with torch.random.fork_rng(), set_exploration_type(ExplorationType.RANDOM):
         rollout = env.rollout(config.horizon, actor)
