@@ -2,10 +2,8 @@
 
 import importlib.util
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
@@ -23,7 +21,7 @@ from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 
 from .bench_training import vmas_actor
-from .shared.known_settings import CONF
+from .shared.launch import composed_config
 from .shared.settings import TrainConfig
 
 RIVAL, LIMITED = "VMAS discovery, episodes never end", "VMAS discovery, episodes of 100 steps"
@@ -51,7 +49,7 @@ def scenarios() -> Scenarios:
 
 def believing() -> Scenarios:
     """The tracking task of delaybench without a belief, with the server's, and with that of each UAV too."""
-    plain = _composed("scenario=delaybench/tracking")
+    plain = composed_config("scenario=delaybench/tracking")
     features = {"belief": ["belief_gain", "belief_moments"]}
     changes = {
         NO_BELIEF: {},
@@ -65,12 +63,7 @@ def believing() -> Scenarios:
 
 
 def _paper() -> TrainConfig:
-    return _composed("scenario=paper/usecase2", "model.hidden=[64,64]")
-
-
-def _composed(*overrides: str) -> TrainConfig:
-    with initialize_config_dir(CONF, version_base=None):
-        return cast(TrainConfig, OmegaConf.to_object(compose("train", overrides=[*overrides])))
+    return composed_config("scenario=paper/usecase2", "model.hidden=[64,64]")
 
 
 def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import NamedTuple, cast
 
 import torch
-from hydra import compose, initialize_config_dir
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -29,8 +28,7 @@ from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.schedule import SystemClock
 
 from .shared.collecting import make_collector, ticks
-from .shared.known_settings import CONF
-from .shared.launch import checked
+from .shared.launch import composed_config
 from .shared.settings import TrainConfig
 from .train import learning_env, make_learner, replay_buffer
 
@@ -99,8 +97,7 @@ def arm_config(words: str, worlds: int, steps: int) -> TrainConfig:
         steps: T of a batch.
     """
     batch = [f"worlds={worlds}", f"learner.steps={steps}", "learner.epochs=4", "learner.minibatches=4"]
-    with initialize_config_dir(CONF, version_base=None):
-        return checked(compose("train", overrides=[*words.split(), *batch]))
+    return composed_config(*words.split(), *batch)
 
 
 def damian(config: TrainConfig) -> Iterator[Seconds]:

@@ -16,7 +16,8 @@ os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and `
 
 import numpy as np
 import torch
-from hydra import compose
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -32,7 +33,7 @@ from damian.evaluation.run_record import timed
 from .command_line import parsed, prepared, remember_words
 from .composition_errors import COMPOSITION_ERRORS, foreign_cause, one_line
 from .inheritance import changes, check_policy_fits, inherited
-from .known_settings import SCHEMAS
+from .known_settings import CONF, SCHEMAS
 from .leftovers import drop_empty, drop_sweep, drop_unused, remember_folders, sweep_folder
 from .misspelt import no_such_key
 from .settings import TrainConfig
@@ -92,6 +93,23 @@ def composed_with(config_name: str, overrides: Sequence[str]) -> DictConfig:
         return compose(config_name, list(overrides))
     except COMPOSITION_ERRORS as error:
         raise InputError(one_line(error)) from error
+
+
+def composed_config(*overrides: str) -> TrainConfig:
+    """The checked settings of ``damian train`` with these overrides, in a program that need not be Hydra's.
+
+    Raises:
+        InputError: an override is misspelt, or its value is impossible.
+    """
+    running = GlobalHydra.instance().hydra  # of a Hydra application that calls this
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(CONF, version_base=None):
+            return checked(composed_with("train", overrides))
+    except OmegaConfBaseException as error:
+        raise InputError(one_line(error)) from error
+    finally:
+        GlobalHydra.instance().hydra = running
 
 
 def perform(config: TrainConfig, folder: Path, program: Program) -> None:

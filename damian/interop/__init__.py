@@ -1,0 +1,35 @@
+"""The environments for users of Gymnasium and PettingZoo; docs/interop.md has examples.
+
+Importing this package registers the tasks with Gymnasium, such as ``damian/Spotting-v0``.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+if TYPE_CHECKING:
+    from damian.interop.pettingzoo import UavParallelEnv
+    from damian.interop.single import UavGymEnv
+    from damian.interop.vector import UavVectorEnv
+
+__all__ = ["UavGymEnv", "UavParallelEnv", "UavVectorEnv"]
+
+TASKS = ("spotting", "tracking", "coverage", "energy", "mixed")
+"""Scenarios of conf/scenario that are registered, each as ``damian/NAME-v0``."""
+_MODULES = {"UavGymEnv": "single", "UavParallelEnv": "pettingzoo", "UavVectorEnv": "vector"}
+
+for _task in TASKS:
+    gymnasium.register(
+        f"damian/{_task.capitalize()}-v0",
+        entry_point="damian.recipes.environments:gymnasium_env",
+        vector_entry_point="damian.recipes.environments:gymnasium_vector_env",
+        kwargs={"task": _task},
+    )
+
+
+def __getattr__(name: str) -> Any:
+    """Load a class when it is first used: PettingZoo need not be installed."""
+    if name not in _MODULES:
+        raise AttributeError(f"module damian.interop has no attribute {name}")
+    return getattr(import_module(f"damian.interop.{_MODULES[name]}"), name)

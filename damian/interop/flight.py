@@ -1,0 +1,161 @@
+"""What the wrappers share: a scenario's environment whose entries are NumPy arrays, and its spaces."""
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Discrete, Space
+from numpy.typing import NDArray
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Categorical
+from torchrl.envs.utils import step_mdp
+
+from damian import keys
+from damian.common import checks
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import EXTRAS
+from damian.evaluation.pixels import LiveFilm
+
+RENDER_MODES = ("rgb_array",)
+METADATA: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 4}
+Array = NDArray[Any]
+
+
+class Instant(NamedTuple):
+    """What B worlds with N UAVs output after a step or a reset; rewards and flags are 0 after a reset."""
+
+    observation: Array
+    """What the actors observe, float32, [B, N, F]."""
+    reward: Array
+    """Rewards as the server perceives them, float32, [B, N]."""
+    terminated: Array
+    """Whether the episode has ended by its task, [B] bool."""
+    truncated: Array
+    """Whether it has reached its time limit, [B] bool."""
+    infos: dict[str, Array]
+    """``ready``: may a UAV choose an action now, [B, N] bool; ``is_success``: is the task accomplished as far
+    as the server knows, [B] bool; with masked discrete actions ``action_mask`` [B, N, A], 0 or 1, int8."""
+
+
+class Flight:
+    """The environment of a scenario, with its delays, stepped with NumPy arrays.
+
+    Args:
+        scenario: all settings, delays included.
+        num_worlds: number of parallel worlds, B.
+        seed: of the regions and initial conditions that are drawn now.
+        render_mode: ``rgb_array``, for one world, or None.
+        view: of the pictures: ``2d``, from above, or ``3d``.
+
+    Raises:
+        InputError: the scenario asks for something impossible, or a render mode or view is unknown.
+    """
+
+    def __init__(
+        self,
+        scenario: ScenarioConfig,
+        num_worlds: int,
+        seed: int,
+        render_mode: str | None = None,
+        view: str = "2d",
+    ) -> None:
+        if render_mode is not None:
+            checks.one_of("render_mode", render_mode, RENDER_MODES)
+        self.env = make_env(scenario, num_worlds, seed, extras=EXTRAS if render_mode else ())
+        self.film = LiveFilm(self.env.uav_env, view) if render_mode else None
+        self._now: TensorDictBase | None = None
+
+    def observation_space(self, agent: int) -> Box:
+        """What an agent observes, [F]."""
+        return self._box(keys.OBSERVATION, agent)
+
+    def action_space(self) -> Space[Any]:
+        """What an agent chooses: one of A actions, or a distance and a heading in [0, 1]."""
+        spec = self.env.full_action_spec[keys.ACTION]
+        return Discrete(spec.space.n) if isinstance(spec, Categorical) else Box(0.0, 1.0, (2,), np.float32)
+
+    @torch.no_grad()
+    def reset(self, seed: int | None) -> Instant:
+        """Begin a new episode in every world; with a seed, world number i draws from ``seed + i``."""
+        if seed is not None:
+            self.env.seed_worlds(seed + torch.arange(self.env.batch_size[0]))
+        self._now = self.env.reset()
+        if self.film:
+            self.film.begin(self._now)
+        return _instant(self._now)
+
+    @torch.no_grad()
+    def step(self, action: Array, *, reset: bool = False) -> tuple[Instant, Instant]:
+        """Take a step.
+
+        Args:
+            action: [B, N], or [B, N, 2] if actions are continuous.
+            reset: begin a new episode in each world whose episode the step ends.
+
+        Returns:
+            What the step outputs, and what the next step begins with.
+        """
+        if self._now is None:
+            raise RuntimeError("call reset before step")
+        self._now[keys.ACTION] = torch.as_tensor(action)
+        if reset:
+            stepped, self._now = self.env.step_and_maybe_reset(self._now)
+        else:
+            stepped = self.env.step(self._now)
+            self._now = cast(TensorDictBase, step_mdp(stepped))
+        after = cast(TensorDictBase, stepped["next"])
+        if self.film:
+            self.film.add(after)
+        return _instant(after), _instant(self._now)
+
+    def render(self) -> Array | None:
+        """A picture of this instant, [height, width, 3] uint8; None without a render mode."""
+        return self.film.picture() if self.film else None
+
+    def state(self) -> Array:
+        """What a central critic observes of the first world, from the messages at the server, [N G]."""
+        if self._now is None:
+            raise RuntimeError("call reset before state")
+        return cast(Tensor, self._now[keys.GLOBAL_OBSERVATION])[0].flatten().numpy().copy()
+
+    def state_space(self) -> Box:
+        """The space of ``state``."""
+        return self._box(keys.GLOBAL_OBSERVATION, slice(None))
+
+    def _box(self, key: NestedKey, agents: int | slice) -> Box:
+        """The bounds of an entry [B, N, F] of one agent, or of several, as one row."""
+        limits = cast(Any, self.env.full_observation_spec[key]).space
+        low, high = (limit[0, agents].flatten().numpy() for limit in (limits.low, limits.high))
+        return Box(low, high, dtype=np.float32)
+
+
+def _instant(outputs: TensorDictBase) -> Instant:
+    """The outputs of a step or a reset as arrays of their own."""
+
+    def array(key: NestedKey) -> Array:
+        return cast(Tensor, outputs[key]).numpy().copy()
+
+    observation = array(keys.OBSERVATION)
+    infos = {"ready": array(keys.READY), "is_success": array(keys.SUCCESS)[:, 0]}
+    if keys.ACTION_MASK in outputs.keys(True, True):
+        infos["action_mask"] = array(keys.ACTION_MASK).astype(np.int8)
+    reward = outputs.get(keys.REWARD, None)
+    rewards = np.zeros(observation.shape[:2], np.float32) if reward is None else reward[..., 0].numpy().copy()
+    return Instant(observation, rewards, array(keys.TERMINATED)[:, 0], array(keys.TRUNCATED)[:, 0], infos)
+
+
+def one_uav(scenario: ScenarioConfig) -> None:
+    """Refuse a scenario of several UAVs.
+
+    Raises:
+        InputError: a Gymnasium environment has one agent.
+    """
+    should = "is not 1: a Gymnasium environment has one agent; take damian.interop.UavParallelEnv"
+    checks.require(scenario.agents == 1, "agents", scenario.agents, should)
+
+
+def row(infos: dict[str, Array], world: int, agent: int) -> dict[str, Any]:
+    """The infos of one UAV."""
+    return {name: each[world] if name == "is_success" else each[world, agent] for name, each in infos.items()}

@@ -1,0 +1,95 @@
+"""A PettingZoo environment of several UAVs."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Space
+
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.envs.scenario import ScenarioConfig
+from damian.interop.flight import METADATA, Array, Flight, row
+
+try:
+    from pettingzoo import ParallelEnv
+except ImportError as error:
+    raise InputError("pettingzoo: it is not installed; pip install damian[interop]") from error
+
+ByAgent = dict[str, Any]
+
+
+class UavParallelEnv(ParallelEnv[str, Array, Any]):
+    """The UAVs of a scenario, with its delays, as a PettingZoo ``ParallelEnv``.
+
+    Agents are ``uav_0``, ``uav_1`` and so on; all of their episodes end together. Observations are float32
+    [F], rewards those that the server perceives; infos are those of ``UavGymEnv``. ``state()`` is what a
+    central critic may know: the observations that the server makes of the messages it holds, of all UAVs.
+
+    Args:
+        scenario: all settings.
+        seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides the rest.
+        render_mode: ``rgb_array``, or None.
+        view: of the pictures: ``2d``, from above, or ``3d``.
+
+    Raises:
+        InputError: the scenario asks for something impossible.
+    """
+
+    def __init__(
+        self, scenario: ScenarioConfig, seed: int = 0, render_mode: str | None = None, view: str = "2d"
+    ) -> None:
+        self.metadata = {**METADATA, "name": "damian_v0", "is_parallelizable": True}
+        self.flight, self.render_mode = Flight(scenario, 1, seed, render_mode, view), render_mode
+        self.possible_agents = [f"uav_{number}" for number in range(scenario.agents)]
+        self.agents: list[str] = []
+        self.observation_spaces = {
+            name: self.flight.observation_space(i) for i, name in enumerate(self.possible_agents)
+        }
+        self.action_spaces = {name: self.flight.action_space() for name in self.possible_agents}
+        self.state_space: Space[Any] = self.flight.state_space()
+
+    def observation_space(self, agent: str) -> Space[Any]:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Space[Any]:
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[ByAgent, ByAgent]:
+        instant = self.flight.reset(seed)
+        self.agents = [*self.possible_agents]
+        return self._by_agent(instant.observation[0]), self._infos(instant.infos)
+
+    def step(self, actions: ByAgent) -> tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]:
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        for agent in self.agents:
+            checks.require(agent in actions, "actions", sorted(actions), f"lack one for {agent}")
+            space, action = self.action_spaces[agent], actions[agent]
+            checks.require(space.contains(action), f"action of {agent}", action, f"is not in {space}")
+        instant, _ = self.flight.step(np.stack([np.asarray(actions[agent]) for agent in self.agents])[None])
+        n_agents, infos = len(self.agents), self._infos(instant.infos)
+        terminated, truncated = bool(instant.terminated[0]), bool(instant.truncated[0])
+        results = (
+            self._by_agent(instant.observation[0]),
+            self._by_agent(instant.reward[0].tolist()),
+            self._by_agent([terminated] * n_agents),
+            self._by_agent([truncated] * n_agents),
+        )
+        if terminated or truncated:
+            self.agents = []
+        return *results, infos
+
+    def render(self) -> Any:
+        return self.flight.render()
+
+    def state(self) -> Array:
+        return self.flight.state()
+
+    def _by_agent(self, values: Any) -> ByAgent:
+        """Values [N] by agent."""
+        return dict(zip(self.possible_agents, values, strict=True))
+
+    def _infos(self, infos: dict[str, Array]) -> ByAgent:
+        return {name: row(infos, 0, number) for number, name in enumerate(self.possible_agents)}

@@ -1,0 +1,48 @@
+"""The environments of the command line, for Python programs, notebooks and ``gymnasium.make``.
+
+from damian.recipes.environments import compose_scenario
+env = damian.make_env(compose_scenario("scenario=tracking", "delay=paper"), num_worlds=64)
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from damian.envs.scenario import ScenarioConfig
+from damian.interop.single import UavGymEnv
+from damian.interop.vector import UavVectorEnv
+
+from .shared.launch import composed_config
+
+
+def compose_scenario(*overrides: str) -> ScenarioConfig:
+    """The scenario that ``damian train`` with these overrides flies in.
+
+    Args:
+        overrides: as on the command line, such as ``scenario=tracking``, ``delay=paper`` or ``agents=5``.
+
+    Raises:
+        InputError: an override is misspelt, or its value is impossible.
+    """
+    return composed_config(*overrides).eval_scenario
+
+
+def gymnasium_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavGymEnv:
+    """One UAV in a task, for ``gymnasium.make("damian/Spotting-v0", overrides=["delay.obs=3"])``.
+
+    Args:
+        task: a scenario in conf/scenario.
+        overrides: as on the command line.
+        options: ``seed``, ``render_mode`` and ``view`` of ``UavGymEnv``.
+    """
+    return UavGymEnv(compose_scenario(f"scenario={task}", "agents=1", *overrides), **options)
+
+
+def gymnasium_vector_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavVectorEnv:
+    """Many worlds of a task with one UAV, for ``gymnasium.make_vec("damian/Spotting-v0", num_envs=1024)``.
+
+    Args:
+        task: a scenario in conf/scenario.
+        overrides: as on the command line.
+        options: ``num_envs`` and ``seed`` of ``UavVectorEnv``.
+    """
+    return UavVectorEnv(compose_scenario(f"scenario={task}", "agents=1", *overrides), **options)
