@@ -18,7 +18,7 @@ test: $(VENV)/test
 test-deep: $(VENV)/test
 	$(PY) -m pytest -n 2 -m "property and not slow" --hypothesis-profile=deep $(ARGS)
 
-test-slow: $(VENV)/test
+test-slow: $(VENV)/slow
 	$(PY) -m pytest -m slow $(ARGS)
 
 bench: $(VENV)/bench
@@ -53,6 +53,10 @@ $(VENV)/base: pyproject.toml
 
 $(VENV)/test: $(VENV)/base
 	$(PIP) -e ".[test]" "$(TORCH)"
+	touch $@
+
+$(VENV)/slow: $(VENV)/test
+	$(PIP) -e ".[slow]" "$(TORCH)"
 	touch $@
 
 $(VENV)/dev: $(VENV)/test

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from damian.envs.scenario import ScenarioConfig
     from damian.envs.uav_env import UavEnv
     from damian.learners.base import LearnerConfig, LearningSetup
+    from damian.recipes.shared.environments import compose_scenario  # type: ignore[import-not-found]
     from damian.replay.backupdate import BackupdateStorage
     from damian.server.features import feature
     from damian.server.reward_terms import reward_term
@@ -46,6 +47,7 @@ _MODULES = {
     "damian.envs.scenario": ["ScenarioConfig"],
     "damian.envs.uav_env": ["UavEnv"],
     "damian.learners.base": ["LearnerConfig", "LearningSetup"],
+    "damian.recipes.shared.environments": ["compose_scenario"],
     "damian.replay.backupdate": ["BackupdateStorage"],
     "damian.server.features": ["feature"],
     "damian.server.reward_terms": ["reward_term"],
@@ -92,6 +94,7 @@ __all__ = [
     "Trace",
     "UavEnv",
     "Uniform",
+    "compose_scenario",
     "delay_trajectories",
     "feature",
     "make_env",

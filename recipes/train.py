@@ -16,10 +16,11 @@ and the evaluation as result.csv and result.md (docs/runs.md).
 import sys
 from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import hydra
 import torch
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
@@ -51,6 +52,7 @@ from damian.replay.time_storage import TimeStorage
 from damian.transforms.episode_totals import EpisodeTotals
 
 from .shared.collecting import make_collector, ticks
+from .shared.inheritance import settings_by_key
 from .shared.known_settings import CONF
 from .shared.launch import interrupted, launch, perform, prepare, reported
 from .shared.settings import TrainConfig
@@ -135,7 +137,8 @@ def train(config: TrainConfig, folder: Path) -> None:
     begin(config, state)
     print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
     loggers, log_to = make_loggers(config.logger.custom, folder), config.logger
-    log = MetricsLog(folder, log_to.tensorboard, log_to.csv, state.progress.frames, loggers)
+    frames, settings = state.progress.frames, dict(settings_by_key(config))
+    log = MetricsLog(folder, log_to.tensorboard, log_to.csv, frames, loggers, settings)
     bar = progress_bar(config, state)
     with closing(log), closing(bar), Interrupt() as interrupt:
         for batch in ticks(collector, clock) if not enough(config, state) else ():
@@ -195,6 +198,8 @@ def update(
         raise
     means = {"episodes": float(episodes.finished), **episodes.means()}
     log.add(progress.frames, {**means, **mean_terms(batch), **losses})
+    for name, values in distributions(batch).items():
+        log.add_histogram(progress.frames, name, values)
     check_convergence(config, state, losses)
     if config.logger.film_every and progress.updates % config.logger.film_every == 0:
         log.add_film(progress.frames, film_policy(config, learner.actor, progress.frames, state.folder))
@@ -248,6 +253,17 @@ def mean_terms(batch: TensorDictBase) -> dict[str, float]:
     """Mean of each weighted reward term (eq. 5-8) over the steps, worlds and UAVs of a batch [B, T]."""
     terms = cast(TensorDictBase, batch[next_key(keys.REWARD_TERMS)])
     return {f"reward/{name}": term.mean().item() for name, term in terms.items()}
+
+
+def distributions(batch: TensorDictBase) -> dict[str, NDArray[Any]]:
+    """The actions of a batch [B, T], and the ages [steps] of the messages at the server, if it has them."""
+    action = cast(torch.Tensor, batch[keys.ACTION])
+    found = {"action": action}
+    if action.is_floating_point():
+        found = {"action/distance": action[..., 0], "action/heading": action[..., 1]}
+    if (age := batch.get(next_key(keys.AGE), None)) is not None:
+        found["age"] = cast(torch.Tensor, age)
+    return {name: values.flatten().float().cpu().numpy() for name, values in found.items()}
 
 
 def make_eval_env(config: TrainConfig) -> DelayedEnv:

@@ -8,9 +8,17 @@ from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry, check_parameters
 
+BINS = 64
+"""Bins of a histogram."""
+
 
 class Logger(Protocol):
-    """Receives numbers, as TorchRL's loggers do; if it has a method ``close()``, it is called at the end."""
+    """Receives numbers, as TorchRL's loggers do.
+
+    Further methods are called if it has them: ``log_hparams(settings)`` at the beginning, with every setting
+    by its dotted key; ``log_histogram(name, values, step)`` with the actions and ages [steps] of an update;
+    ``close()`` at the end.
+    """
 
     def log_scalar(self, name: str, value: float, step: int) -> None:
         """Log a number.

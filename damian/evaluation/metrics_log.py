@@ -6,16 +6,20 @@ import math
 import os
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog  # type: ignore[attr-defined]
 from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
 from tensorboard.summary.writer.record_writer import RecordWriter
+from torch.utils.tensorboard import summary
 
 from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError, naming_errors
-from damian.evaluation.loggers import Logger
+from damian.evaluation.loggers import BINS, Logger
 
 METRICS = "metrics.csv"
 _FIRST_COLUMN = "frames"
@@ -36,6 +40,7 @@ class MetricsLog:
         frames: environment steps, over all worlds, at the checkpoint from which the run resumes; rows of
             later steps are dropped.
         loggers: further loggers, which get every number.
+        settings: all settings by dotted key; hyperparameters for TensorBoard and the other loggers.
 
     Raises:
         InputError: the rows of the run cannot be read.
@@ -49,8 +54,9 @@ class MetricsLog:
         to_csv: bool,
         frames: int = 0,
         loggers: Sequence[Logger] = (),
+        settings: Mapping[str, Any] | None = None,
     ) -> None:
-        self._loggers = loggers
+        self._loggers, self._settings = loggers, settings or {}
         self._path = folder / METRICS if to_csv else None
         self.rows = [row for row in read_metrics(folder) if row["frames"] <= frames]
         if self._path and self.rows:
@@ -59,6 +65,9 @@ class MetricsLog:
             with writing(self._path):
                 self._path.unlink(missing_ok=True)
         self._events = EventFile(folder, frames) if tensorboard else None
+        for logger, log_hparams in self._methods("log_hparams"):
+            with naming_errors(f"logger {type(logger).__name__}"):
+                log_hparams(self._settings)
 
     def add(self, frames: int, numbers: dict[str, float]) -> None:
         """Log numbers by name, after so many environment steps over all worlds.
@@ -71,6 +80,9 @@ class MetricsLog:
                 with naming_errors(f"logger {type(logger).__name__}"):
                     logger.log_scalar(name, number, frames)
         if self._events:
+            if self._settings:  # TensorBoard's table of runs needs the names of the numbers
+                self._events.add_hparams(self._settings, numbers)
+                self._settings = {}
             self._events.add(frames, numbers)
         known = dict.fromkeys(self.rows[0], math.nan) if self.rows else {}
         row = {**known, _FIRST_COLUMN: float(frames), **numbers}
@@ -83,6 +95,14 @@ class MetricsLog:
         if self._path:
             with writing(self._path), self._path.open("a", newline="") as file:
                 file.write((_line(row) if file.tell() == 0 else "") + _values(row))
+
+    def add_histogram(self, frames: int, name: str, values: NDArray[np.floating]) -> None:
+        """Log a distribution of values [K], after so many environment steps over all worlds."""
+        if self._events:
+            self._events.add_histogram(frames, name, values)
+        for logger, log_histogram in self._methods("log_histogram"):
+            with naming_errors(f"logger {type(logger).__name__}"):
+                log_histogram(name, values, frames)
 
     def add_film(self, frames: int, path: Path) -> None:
         """Show a film, a GIF, in TensorBoard, after so many environment steps."""
@@ -99,9 +119,13 @@ class MetricsLog:
         """Close all files, and all loggers that can be closed."""
         if self._events:
             self._events.close()
-        for logger in self._loggers:
+        for logger, close in self._methods("close"):
             with naming_errors(f"logger {type(logger).__name__}"):
-                getattr(logger, "close", lambda: None)()
+                close()
+
+    def _methods(self, name: str) -> Iterator[tuple[Logger, Any]]:
+        """The loggers that have a method of this name, with the method."""
+        return ((logger, getattr(logger, name)) for logger in self._loggers if hasattr(logger, name))
 
 
 class EventFile:
@@ -134,6 +158,18 @@ class EventFile:
         image = Summary.Image(colorspace=3, encoded_image_string=gif)
         summary = Summary(value=[Summary.Value(tag=name, image=image)])
         self._write(Event(step=frames, summary=summary))
+
+    def add_histogram(self, frames: int, name: str, values: NDArray[np.floating]) -> None:
+        """Write a distribution of values [K] under a name, after so many environment steps."""
+        self._write(Event(step=frames, summary=summary.histogram(name, values, bins=BINS)))
+
+    def add_hparams(self, settings: Mapping[str, Any], names: Collection[str]) -> None:
+        """Write settings by dotted key, and the names of the numbers by which runs are compared."""
+        plain = {
+            key: each if isinstance(each, bool | int | float) else str(each) for key, each in settings.items()
+        }
+        for each in summary.hparams(plain, dict.fromkeys(names, 0.0)):
+            self._write(Event(summary=each))
 
     def close(self) -> None:
         with writing(self._path):

@@ -22,8 +22,8 @@ _MODULES = {"UavGymEnv": "single", "UavParallelEnv": "pettingzoo", "UavVectorEnv
 for _task in TASKS:
     gymnasium.register(
         f"damian/{_task.capitalize()}-v0",
-        entry_point="damian.recipes.environments:gymnasium_env",
-        vector_entry_point="damian.recipes.environments:gymnasium_vector_env",
+        entry_point="damian.recipes.shared.environments:gymnasium_env",
+        vector_entry_point="damian.recipes.shared.environments:gymnasium_vector_env",
         kwargs={"task": _task},
     )
 

@@ -70,16 +70,18 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
 def changes(config: TrainConfig, stored: TrainConfig) -> str:
     """The settings of the scenario that differ between a stored run and a new one, on one line."""
     names = {field.name for field in fields(ScenarioConfig)}
-    old, new = ({k: v for k, v in _settings(each) if k.split(".")[0] in names} for each in (stored, config))
+    old, new = (
+        {k: v for k, v in settings_by_key(each) if k.split(".")[0] in names} for each in (stored, config)
+    )
     differ = [key for key in new if old[key] != new[key]]
     return ", ".join(f"{key}: {show(old[key])} -> {show(new[key])}" for key in differ)
 
 
-def _settings(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def settings_by_key(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Every setting of nested dataclasses by its dotted key."""
     for field in fields(config):
         value = getattr(config, field.name)
         if is_dataclass(value):
-            yield from _settings(value, f"{path}{field.name}.")
+            yield from settings_by_key(value, f"{path}{field.name}.")
         else:
             yield f"{path}{field.name}", value

@@ -12,11 +12,10 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3 import PPO
 
 import damian.interop
-from damian import keys
+from damian import compose_scenario, keys
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.interop import UavGymEnv, UavVectorEnv
-from damian.recipes.environments import compose_scenario
 
 DELAYS = ["delay=none", "delay=paper", "delay.act=2", "delay.rew=1", "delay.history=3"]
 KINDS = [
@@ -169,7 +168,7 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
 HYDRA_PROGRAM = """
 import hydra
 from hydra import compose
-from damian.recipes.environments import compose_scenario
+from damian import compose_scenario
 
 @hydra.main(version_base=None, config_path=None)
 def main(config):

@@ -10,11 +10,10 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 from torchrl.envs.utils import check_env_specs
 
-from damian import ObservationDelay, keys
+from damian import ObservationDelay, compose_scenario, keys
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.interop import TASKS, UavParallelEnv
-from damian.recipes.environments import compose_scenario
 
 DELAYS = ["delay=none", "delay=paper", "delay.act=2", "delay.rew=1", "links=matrix"]
 KINDS = [

@@ -9,6 +9,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch import Tensor
 
 from damian.envs.pipeline import make_env
@@ -95,6 +96,23 @@ def test_films_show_the_policy_while_it_learns_and_change_nothing(run):
     assert [image.step for image in shown] == [128, 256]
     assert [image.encoded_image_string for image in shown] == [film.read_bytes() for film in films]
     assert not (plain / "films").exists()
+
+
+def test_tensorboard_shows_settings_and_distributions(run):
+    folder = run(*TINY, "delay=paper", "aware=backupdate")
+    events = EventAccumulator(str(folder), {"histograms": 0, "scalars": 0}).Reload()
+    for name, highest in (("action", 200), ("age", 20)):
+        histograms = events.Histograms(name)
+        assert [each.step for each in histograms] == [128, 256]
+        assert all(each.histogram_value.num == 128 * 3 for each in histograms)
+        assert 0 <= histograms[-1].histogram_value.min <= histograms[-1].histogram_value.max < highest
+    plugin = events.summary_metadata["_hparams_/session_start_info"].plugin_data
+    settings = HParamsPluginData.FromString(plugin.content).session_start_info.hparams
+    assert settings["seed"].number_value == 0
+    assert settings["delay.obs"].string_value.startswith("{'law': 'uniform'")
+    plugin = events.summary_metadata["_hparams_/experiment"].plugin_data
+    named = {each.name.tag for each in HParamsPluginData.FromString(plugin.content).experiment.metric_infos}
+    assert named == {*events.Tags()["scalars"]}
 
 
 @both_learners

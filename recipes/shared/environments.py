@@ -1,7 +1,6 @@
 """The environments of the command line, for Python programs, notebooks and ``gymnasium.make``.
 
-from damian.recipes.environments import compose_scenario
-env = damian.make_env(compose_scenario("scenario=tracking", "delay=paper"), num_worlds=64)
+env = damian.make_env(damian.compose_scenario("scenario=tracking", "delay=paper"), num_worlds=64)
 """
 
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from damian.envs.scenario import ScenarioConfig
 from damian.interop.single import UavGymEnv
 from damian.interop.vector import UavVectorEnv
 
-from .shared.launch import composed_config
+from .launch import composed_config
 
 
 def compose_scenario(*overrides: str) -> ScenarioConfig:
