@@ -1,4 +1,4 @@
-# make train | test | test-deep | test-slow | bench | bench-quick | pictures | check | format        (each sets up what it needs)
+# make train | test | test-deep | test-slow | bench | bench-quick | pictures | docs | check | format        (each sets up what it needs)
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -6,7 +6,7 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-deep test-slow bench bench-quick pictures check format clean
+.PHONY: train test test-deep test-slow bench bench-quick pictures docs check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
@@ -35,6 +35,10 @@ pictures: $(VENV)/base
 	cp build/flight/episode_0.gif docs/images/flight.gif
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
 
+# The documentation site, in build/site.
+docs: $(VENV)/docs
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet
+
 check: $(VENV)/dev
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
@@ -57,6 +61,10 @@ $(VENV)/test: $(VENV)/base
 
 $(VENV)/slow: $(VENV)/test
 	$(PIP) -e ".[slow]" "$(TORCH)"
+	touch $@
+
+$(VENV)/docs: $(VENV)/base
+	$(PIP) -e ".[docs]" "$(TORCH)"
 	touch $@
 
 $(VENV)/dev: $(VENV)/test

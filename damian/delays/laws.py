@@ -260,7 +260,7 @@ class Distance(Law):
     message is received with probability Q(10 n log10(d / range) / sigma), where Q is the tail of the standard
     normal distribution (Rappaport, Wireless Communications, 2nd ed., 2002, section 4.9).
 
-    The law reads the sender's ``position``, and ``receiver_position`` where it is given, [M, 2] [m].
+    The law reads the sender's ``position``, and ``receiver_position`` where it is given, [m], [M, 2].
     """
 
     base: Delay = 0

@@ -14,8 +14,8 @@ from damian.common.text_files import show
 class MessageContext(NamedTuple):
     """Circumstances of M messages at the instant at which they are sent; nothing in it lies in the future.
 
-    Fields: ``sender``, ``receiver`` and ``n_sending`` [M] long, ``time`` [M] [s], ``uniform`` [M] in [0, 1),
-    ``dt`` [s], and ``entries``, a dict of what the law reads, such as ``position`` [M, 2] [m].
+    Fields: ``sender``, ``receiver`` and ``n_sending`` [M] long, ``time`` [s], [M], ``uniform`` [M] in [0, 1),
+    ``dt`` [s], and ``entries``, a dict of what the law reads, such as ``position`` [m], [M, 2].
     """
 
     sender: Tensor

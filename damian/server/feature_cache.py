@@ -18,8 +18,8 @@ from damian.world.messages import Messages
 class ServerContext(NamedTuple):
     """What the server knows besides the messages.
 
-    Fields for features: ``now`` [*] [s], ``scale`` [*] [m], ``time_scale`` and ``age_scale`` [s], and
-    ``points`` [R*L, 2] [m].
+    Fields for features: ``now`` [s] and ``scale`` [m], [*], ``time_scale`` and ``age_scale`` [s], and
+    ``points`` [m], [R*L, 2].
     """
 
     now: Tensor

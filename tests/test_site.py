@@ -1,0 +1,42 @@
+"""The documentation site: it is built without a warning, and has every setting, public name and example."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import damian
+from damian.recipes.command import PROGRAMS
+from damian.recipes.shared.known_settings import SCHEMAS, known_settings
+
+ROOT = Path(damian.__file__).parents[1]
+pytestmark = pytest.mark.slow
+pytest.importorskip("mkdocs")
+
+
+def test_the_site_is_built_without_a_warning_and_is_complete(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+    def page(name):
+        return (tmp_path / name / "index.html").read_text()
+
+    for program in SCHEMAS:
+        text = page(f"commands/{program}")
+        keys = {*known_settings(program)} - ({*known_settings("train")} if program == "fly" else set())
+        deep = [key for key in keys if not any(other.startswith(f"{key}.") for other in keys)]
+        assert not [key for key in deep if f"<code>{key}</code>" not in text]
+    assert all(f"damian {name}" in page("commands") for name in PROGRAMS)
+    assert all(name in page("api") for name in damian.__all__)
+    assert "ActionHistory" in page("api/transforms")
+    for example in (ROOT / "examples").rglob("*.py"):
+        assert example.stem in page(f"examples/{example.relative_to(ROOT / 'examples').as_posix()}")
+    for picture in ("images/flight.gif", "results/delays/figure.png"):
+        assert (tmp_path / picture).stat().st_size > 10_000
+        assert picture in (tmp_path / "index.html").read_text()
+    loaded = [each for each in (tmp_path / "index.html").read_text().split('"') if each.startswith("http")]
+    assert not [each for each in loaded if each.endswith((".js", ".css", ".woff2"))]
