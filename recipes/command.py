@@ -23,6 +23,7 @@ PROGRAMS = {
     "compare": "train and evaluate several arms with several seeds, and compare them with intervals",
     "oracle": "evaluate a policy that knows some messages on time: which delay costs how much",
     "ceiling": "fly a script with ever more known on time: what a delay leaves to be won",
+    "tune": "search for better settings of a learner with Optuna",
     "fly": "fly episodes and keep them as files, films and figures of what is true and what is believed",
     "pendulum": "apply the delay transforms to another environment: SAC on Pendulum-v1",
     "spread": "compare with a published table: MAPPO in simple_spread_v3 with late observations",
@@ -33,6 +34,7 @@ SETTINGS = {
     **dict.fromkeys(("train", "evaluate", "oracle", "ceiling"), "train"),
     "compare": "compare",
     "fly": "fly",
+    "tune": "tune",
 }
 """Programs with settings of the form KEY=VALUE, and whose settings these are."""
 
@@ -55,7 +57,11 @@ def main(words: Sequence[str] | None = None) -> None:
     if name in SETTINGS and _answered(name, words):
         return
     sys.argv = [f"damian {name}", *words]
-    import_module(f".{name}", __package__).run()
+    try:
+        program = import_module(f".{name}", __package__)
+    except InputError as error:  # it needs a package that is not installed
+        sys.exit(_refuse(str(error)))
+    program.run()
 
 
 def _answered(name: str, words: Sequence[str]) -> bool:

@@ -14,6 +14,7 @@ and the evaluation as result.csv and result.md (docs/runs.md).
 """
 
 import sys
+from collections.abc import Callable
 from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Any, cast
@@ -121,7 +122,11 @@ def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer
     return ReplayBuffer(storage=storage)
 
 
-def train(config: TrainConfig, folder: Path) -> None:
+Watch = Callable[[int, dict[str, float]], None]
+"""Gets the environment steps so far and the numbers of each update; what it raises stops the training."""
+
+
+def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None:
     """Train, evaluate, and fill the run folder.
 
     Raises:
@@ -142,7 +147,9 @@ def train(config: TrainConfig, folder: Path) -> None:
     bar = progress_bar(config, state)
     with closing(log), closing(bar), Interrupt() as interrupt:
         for batch in ticks(collector, clock) if not enough(config, state) else ():
-            update(config, learner, state, log, batch)
+            numbers = update(config, learner, state, log, batch)
+            if watch:
+                watch(state.progress.frames, numbers)
             show(bar, config, state)
             finished, asked = enough(config, state), interrupt.asked
             if finished or state.progress.updates % config.checkpoint_every == 0:
@@ -180,7 +187,7 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
 
 def update(
     config: TrainConfig, learner: Learner, state: TrainingState, log: MetricsLog, batch: TensorDictBase
-) -> None:
+) -> dict[str, float]:
     """Make one update from a batch [B, T], and log its numbers.
 
     Raises:
@@ -197,12 +204,14 @@ def update(
         check_convergence(config, state, {})
         raise
     means = {"episodes": float(episodes.finished), **episodes.means()}
-    log.add(progress.frames, {**means, **mean_terms(batch), **losses})
+    numbers = {**means, **mean_terms(batch), **losses}
+    log.add(progress.frames, numbers)
     for name, values in distributions(batch).items():
         log.add_histogram(progress.frames, name, values)
     check_convergence(config, state, losses)
     if config.logger.film_every and progress.updates % config.logger.film_every == 0:
         log.add_film(progress.frames, film_policy(config, learner.actor, progress.frames, state.folder))
+    return numbers
 
 
 def check_convergence(config: TrainConfig, state: TrainingState, losses: dict[str, float]) -> None:

@@ -41,6 +41,11 @@ from .stored_runs import resumed_config, say_if_trained, stored_run
 
 Program = Callable[[TrainConfig, Path], None]
 """The work of a recipe: takes a checked configuration and the run folder to fill."""
+ALREADY_MANY = {
+    "compare": "a comparison runs all of its arms and seeds",
+    "tune": "a search runs all of its trials",
+}
+"""Programs that carry out many runs by themselves."""
 RUN_ERROR = 3
 """Exit code of a run that could not go on: a full disk, or a learner that has diverged."""
 
@@ -229,8 +234,8 @@ def launch(main: Callable[[], Any], program: str = "train") -> None:
     try:
         sys.argv[1:] = prepared(sys.argv[1:])
         remember_folders(sys.argv[1:])
-        if program == "compare" and parsed(sys.argv[1:]).multirun:
-            raise InputError("-m: a comparison runs all of its arms and seeds anyway; leave it out")
+        if program in ALREADY_MANY and parsed(sys.argv[1:]).multirun:
+            raise InputError(f"-m: {ALREADY_MANY[program]} anyway; leave it out")
         main()
     except (*COMPOSITION_ERRORS, KeyboardInterrupt) as error:
         if isinstance(error, KeyboardInterrupt) or is_interrupt(error):  # before a run began

@@ -8,10 +8,12 @@ import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
+from itertools import islice
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
@@ -140,18 +142,30 @@ def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> l
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
     """
     todo, failed = [run for run in runs if not run.finished], []
-    ended = _in_turn(todo) if processes == 1 else _at_once(todo, processes)
-    with (
-        _sigterm_as_ctrl_c(),
-        tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar,
-    ):
-        for run, error in ended:
-            bar.update()
-            if error:
-                failed.append(run)
-            else:
-                bar.set_postfix_str(f"{run.name}: {run.score(*told):.3g}")
+    with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
+        for trains in (True, False):  # two pools, because a pool whose worker was killed accepts no more runs
+            for run, error in perform_each([run for run in todo if run.trains == trains], processes):
+                bar.update()
+                if error:
+                    failed.append(run)
+                else:
+                    bar.set_postfix_str(f"{run.name}: {run.score(*told):.3g}")
     return failed
+
+
+def perform_each(runs: Iterable[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
+    """Carry out runs; yields each, when it has ended, with its error, or None.
+
+    Args:
+        runs: taken from an iterator one by one, as processes become free.
+        processes: number of runs at the same time; a single one is this process.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
+    """
+    _stop.clear()
+    with _sigterm_as_ctrl_c():
+        yield from _in_turn(runs) if processes == 1 else _in_pool(runs, processes)
 
 
 @contextmanager
@@ -164,8 +178,8 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _in_turn(runs: Sequence[Run]) -> Iterator[tuple[Run, BaseException | None]]:
-    """Carry out runs in this process, one after the other; yields each with its error, or None."""
+def _in_turn(runs: Iterable[Run]) -> Iterator[tuple[Run, BaseException | None]]:
+    """Carry out runs in this process, one after the other."""
     for run in runs:
         try:
             _perform(run)
@@ -175,24 +189,17 @@ def _in_turn(runs: Sequence[Run]) -> Iterator[tuple[Run, BaseException | None]]:
             yield run, None
 
 
-def _at_once(runs: Sequence[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
-    """Carry out runs in worker processes; yields each, when it has ended, with its error, or None."""
-    _stop.clear()
-    for trains in (True, False):  # two pools, because a pool whose worker was killed accepts no more runs
-        group = [run for run in runs if run.trains == trains]
-        if group:
-            yield from _in_pool(group, processes)
-
-
-def _in_pool(runs: Sequence[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
+def _in_pool(runs: Iterable[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
+    """Carry out runs in worker processes."""
+    waiting, futures = iter(runs), dict[Future[None], Run]()
     with ProcessPoolExecutor(processes, _SPAWN, _begin, (_stop,)) as pool:
         try:
-            futures = _submit(pool, runs)
-            for future in as_completed(futures):
-                error = future.exception()
-                if isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the worker first
-                    raise error
-                yield futures[future], error
+            while futures := futures | _submit(pool, islice(waiting, processes - len(futures))):
+                for future in wait(futures, return_when=FIRST_COMPLETED).done:
+                    error = future.exception()
+                    if isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the worker first
+                        raise error
+                    yield futures.pop(future), error
         except KeyboardInterrupt:
             _stop.set()
             # Ctrl-C in a terminal reaches the workers, but a signal sent to this process alone does not.
@@ -202,13 +209,23 @@ def _in_pool(runs: Sequence[Run], processes: int) -> Iterator[tuple[Run, BaseExc
             raise
 
 
-def _submit(pool: ProcessPoolExecutor, runs: Sequence[Run]) -> dict[Future[None], Run]:
+def _submit(pool: ProcessPoolExecutor, runs: Iterable[Run]) -> dict[Future[None], Run]:
     """Submit runs to workers that start with Ctrl-C ignored: only a training run handles it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        return {pool.submit(_perform, run): run for run in runs}
+        return {_submitted(pool, run): run for run in runs}
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _submitted(pool: ProcessPoolExecutor, run: Run) -> Future[None]:
+    """What becomes of a run; an error if a worker of the pool was killed before it could begin."""
+    try:
+        return pool.submit(_perform, run)
+    except BrokenProcessPool as error:
+        broken: Future[None] = Future()
+        broken.set_exception(error)
+        return broken
 
 
 def _begin(stop: Event) -> None:

@@ -1,0 +1,313 @@
+"""Search for better settings of a learner with Optuna.
+
+    damian tune scenario=delaybench/tracking delay=paper aware=belief trials=30 processes=2
+    damian tune learner=sac trials=100 frames=100000 hydra.run.dir=runs/tune_sac
+    damian tune aware=both "search.learner.gamma.choices=[0.9,0.99]" "+search.delay.history={low: 1, high: 8}"
+
+Every override of damian train may be given, except resume. Each trial is a training with other settings, in
+RUN/trial_N; its value is what the evaluation after it measures (score and policy). A trial whose return is
+below the median of the earlier trials, at the same number of frames, is pruned. After Ctrl-C or a kill the
+same command continues, from the checkpoints of the trials that were being trained. The run folder,
+runs/tune unless hydra.run.dir names another one, gets search.db (Optuna's storage, for its dashboard),
+trials.csv, table.md, and the figures history.png, slices.png and importances.png.
+
+All trials have the same seed and are compared in the same episodes: what was searched for must be shown with
+other seeds (damian compare).
+"""
+
+import csv
+import functools
+import math
+import shlex
+import sys
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+from hydra import compose
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from damian.common import checks
+from damian.common.errors import InputError, RunError
+from damian.common.markdown import markdown_table
+from damian.evaluation.comparison import SCORES
+from damian.evaluation.interrupt import exit_code
+
+from .compare import POLICIES
+from .shared.command_line import command, typed_words
+from .shared.composition_errors import COMPOSITION_ERRORS, one_line
+from .shared.known_settings import CONF
+from .shared.launch import checked, launch, reported, shown
+from .shared.parallel import Run, perform_each
+from .shared.search_space import read_space
+from .shared.settings import TrainConfig
+from .train import train
+
+try:
+    import optuna
+    from optuna.trial import FrozenTrial, Trial, TrialState
+    from optuna.visualization import matplotlib as figures
+except ImportError as error:
+    raise InputError("damian tune: optuna is not installed; pip install damian[tune]") from error
+
+STORAGE, TRIALS, TABLE = "search.db", "trials.csv", "table.md"
+FOLDER, CHOSEN, OVERRIDES = "folder", "chosen", "overrides"
+"""What is stored with a trial: its folder, and the settings that it varies; with a search: its overrides."""
+SHOWN = 10
+"""Trials in the table."""
+WARM_UP = 5
+"""Trials before one may be pruned."""
+
+
+@dataclass
+class TuneConfig(TrainConfig):
+    """All settings of ``damian tune``: those of ``damian train``, and how to search."""
+
+    search: dict[str, Any] = field(default_factory=dict)
+    """What to vary: settings of ``damian train``, each as ``{low: 1, high: 8}``, with ``log: true`` or
+    ``step``, or as ``{choices: [...]}``; conf/search has a file for each learner."""
+    trials: int = 30
+    """Number of trainings, pruned ones included."""
+    processes: int = 1
+    """Number of trainings at the same time; each has one thread unless ``threads`` says otherwise."""
+    prune: bool = True
+    """Whether to stop trainings that are worse than the median."""
+    score: str = "true_return"
+    """The measure of the evaluation that is maximised."""
+    policy: str = "sampled"
+    """The policy that is evaluated: actions ``sampled`` from it, or its ``mode``."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.whole("trials", self.trials, 1, 1_000_000)
+        checks.whole("processes", self.processes, 1, 1024)
+        checks.one_of("score", self.score, SCORES)
+        checks.one_of("policy", self.policy, POLICIES)
+
+
+OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields(TrainConfig)}
+"""Settings that a training does not have."""
+ConfigStore.instance().store(name="tune_schema", node=TuneConfig)
+
+
+class Search:
+    """A search for settings, whose trials are trainings.
+
+    Args:
+        config: all settings.
+        overrides: of ``damian train``, for every trial.
+        folder: the run folder.
+
+    Raises:
+        InputError: the settings cannot be varied so, or the folder holds a search with other settings.
+    """
+
+    def __init__(self, config: TuneConfig, overrides: list[str], folder: Path) -> None:
+        self.config, self.overrides, self.folder = config, overrides, folder
+        self.space = read_space(config.search)
+        self.storage = f"sqlite:///{(folder / STORAGE).resolve()}"
+        median = optuna.pruners.MedianPruner(WARM_UP, n_warmup_steps=config.frames // 4)
+        self.pruner = median if config.prune else optuna.pruners.NopPruner()
+        self.study = optuna.create_study(
+            study_name="damian",
+            storage=self.storage,
+            sampler=optuna.samplers.TPESampler(seed=config.seed),
+            pruner=self.pruner,
+            direction="maximize",
+            load_if_exists=True,
+        )
+        stored, asked = self.study.user_attrs.get(OVERRIDES), [*overrides, f"search={config.search}"]
+        should = f"is not {stored}, with which {folder} was begun; choose another folder with hydra.run.dir"
+        checks.require(stored in (None, asked), OVERRIDES, asked, should)
+        self.study.set_user_attr(OVERRIDES, asked)
+        self.trials: dict[Path, Trial] = {}
+
+    def continue_interrupted(self) -> None:
+        """Ask for the trials again that were being trained when the search was stopped."""
+        for trial in self.study.get_trials(states=(TrialState.RUNNING,)):
+            self.study.tell(trial.number, state=TrialState.FAIL)
+            self.study.enqueue_trial(trial.params, {FOLDER: trial.user_attrs.get(FOLDER)})
+
+    @property
+    def n_finished(self) -> int:
+        """Number of trainings that have ended, pruned ones included."""
+        return len(self.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED)))
+
+    def runs(self) -> Iterator[Run]:
+        """The trainings that are still to be done, each asked for when the ones before have been told."""
+        for _ in range(self.config.trials - self.n_finished):
+            trial = self.study.ask()
+            folder = trial.user_attrs.get(FOLDER) or f"trial_{trial.number}"
+            trial.set_user_attr(FOLDER, folder)
+            chosen = {key: values.suggest(trial, key) for key, values in self.space.items()}
+            trial.set_user_attr(CHOSEN, chosen)
+            try:
+                run = self.run(folder, self.words(chosen), trial._trial_id)
+            except InputError as error:
+                print(f"failed: {error}", file=sys.stderr)
+                self.study.tell(trial, state=TrialState.FAIL)
+                continue
+            self.trials[run.folder] = trial
+            yield run
+
+    def words(self, chosen: dict[str, str]) -> list[str]:
+        """The overrides of a trial that has chosen these settings."""
+        others = [word for word in self.overrides if word.partition("=")[0].lstrip("+") not in chosen]
+        return [*others, *(f"{key}={value}" for key, value in chosen.items())]
+
+    def run(self, name: str, overrides: list[str], trial: int) -> Run:
+        """The training of a trial."""
+        words = ["logger=csv", "threads=1", *overrides]
+        try:
+            config = checked(compose("train", words))
+        except COMPOSITION_ERRORS as error:
+            raise InputError(f"{name}: {one_line(error)}") from error
+        config.overrides = words
+        program = functools.partial(train_watched, storage=self.storage, trial=trial, pruner=self.pruner)
+        return Run("tune", "", "", config, self.folder / name, program)
+
+    def tell(self, run: Run, error: BaseException | None) -> float | None:
+        """Store the end of a trial.
+
+        Returns:
+            its value; None if it was pruned, or failed.
+        """
+        trial = self.trials.pop(run.folder)
+        if error is not None:
+            self.study.tell(trial, state=TrialState.FAIL)
+            return None
+        if not run.finished:
+            self.study.tell(trial, state=TrialState.PRUNED)
+            return None
+        value = run.score(POLICIES[self.config.policy], self.config.score)
+        self.study.tell(trial, value)
+        return value
+
+
+def train_watched(
+    config: TrainConfig, folder: Path, storage: str, trial: int, pruner: optuna.pruners.BasePruner
+) -> None:
+    """Train for a trial, and stop when it is pruned.
+
+    Args:
+        config: settings of the training.
+        folder: its run folder.
+        storage: Optuna's storage.
+        trial: the trial's id in it.
+        pruner: decides whether to stop.
+    """
+    watched = Trial(optuna.load_study(study_name="damian", storage=storage, pruner=pruner), trial)
+
+    def watch(frames: int, numbers: dict[str, float]) -> None:
+        value = numbers.get("episode_return", math.nan)
+        if not math.isnan(value):
+            watched.report(value, frames)
+            if watched.should_prune():
+                raise optuna.TrialPruned
+
+    try:
+        train(config, folder, watch)
+    except optuna.TrialPruned:
+        print("pruned")
+
+
+def search(config: TuneConfig, overrides: list[str], folder: Path) -> None:
+    """Carry out the trials that are missing, and report on all of them."""
+    found = Search(config, overrides, folder)
+    found.continue_interrupted()
+    done, best = found.n_finished, math.nan
+    with tqdm(total=config.trials, initial=done, unit=" trials", disable=done >= config.trials) as bar:
+        for run, error in perform_each(found.runs(), config.processes):
+            value = found.tell(run, error)
+            best = max(best, value) if value is not None and not math.isnan(best) else (value or best)
+            bar.set_postfix({config.score: "-" if value is None else f"{value:.3g}", "best": f"{best:.3g}"})
+            bar.update()
+            if error is not None:
+                print(f"failed: {run.folder}: {one_line(error)}", file=sys.stderr)
+    report(found)
+
+
+def report(found: Search) -> None:
+    """Write the table and the figures, and print how to train with the best settings.
+
+    Raises:
+        RunError: no trial has been finished.
+    """
+    trials = found.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL))
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    if not complete:
+        raise RunError(f"no trial of {found.folder} has a value: see the log.txt of each")
+    complete.sort(key=lambda trial: -(trial.value or 0.0))
+    head = ["trial", "state", found.config.score, *found.space]
+    with (found.folder / TRIALS).open("w", newline="") as file:
+        csv.writer(file).writerows([head, *(row(found, trial) for trial in trials)])
+    lines = [
+        f"`{command(typed_words())}`",
+        f"{len(trials)} trials: {len(complete)} with a value, "
+        f"{sum(trial.state == TrialState.PRUNED for trial in trials)} pruned, "
+        f"{sum(trial.state == TrialState.FAIL for trial in trials)} failed or interrupted. All have the seed "
+        f"{found.config.seed}, and the value of the best is flattered by having been chosen.",
+        markdown_table(head, [row(found, trial) for trial in complete[:SHOWN]]),
+        f"The best: `damian train {shlex.join(found.words(complete[0].user_attrs[CHOSEN]))}`",
+    ]
+    text = "\n\n".join(lines) + "\n"
+    (found.folder / TABLE).write_text(text)
+    plot(found)
+    print(text)
+
+
+def row(found: Search, trial: FrozenTrial) -> list[str]:
+    """A trial in the tables."""
+    value = "" if trial.state != TrialState.COMPLETE else f"{trial.value:.4g}"
+    return [str(trial.number), trial.state.name.lower(), value, *trial.user_attrs[CHOSEN].values()]
+
+
+def plot(found: Search) -> None:
+    """Draw Optuna's figures."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Optuna says that its figures are experimental
+        drawn = {
+            "history": figures.plot_optimization_history(found.study),
+            "slices": figures.plot_slice(found.study, params=[*found.space]),
+        }
+        if found.n_finished > 1 and len(found.space) > 1:
+            judge = optuna.importance.PedAnovaImportanceEvaluator()
+            drawn["importances"] = figures.plot_param_importances(found.study, evaluator=judge)
+        for name, axes in drawn.items():
+            figure = np.atleast_1d(axes).ravel()[0].figure
+            figure.savefig(found.folder / f"{name}.png", dpi=120, bbox_inches="tight")
+
+
+@hydra.main(version_base=None, config_path=CONF, config_name="tune")
+@reported
+def main(composed: DictConfig) -> None:
+    if composed.resume is not None:
+        raise InputError("resume: the same command in the same folder continues a search")
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    config: TuneConfig = checked(composed, "tune")
+    config.check_learning()
+    folder, words = shown(Path(HydraConfig.get().runtime.output_dir)), HydraConfig.get().overrides.task
+    overrides = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] not in OWN]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        search(config, overrides, folder)
+    except KeyboardInterrupt:
+        print("interrupted; run the same command again to continue", file=sys.stderr)
+        sys.exit(exit_code(2))
+    print(f"results: {folder}")
+
+
+def run() -> None:
+    """Run the program with the words of the command line."""
+    launch(main, "tune")
+
+
+if __name__ == "__main__":
+    run()
