@@ -35,6 +35,16 @@ pictures: $(VENV)/base
 	cp build/flight/episode_0.gif docs/images/flight.gif
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
 
+# The libraries of the replay page, in one file that is committed; only a change of their versions or of what is taken needs it.
+PAGE := damian/evaluation/page
+page-libraries:
+	npm install --prefix $(PAGE)/libraries --no-package-lock --no-audit --no-fund --silent
+	cd $(PAGE)/libraries && node_modules/.bin/esbuild libraries.js --bundle --minify --format=esm \
+	  --legal-comments=none --target=es2022 --outfile=../libraries.min.js
+	cp $(PAGE)/libraries/node_modules/uplot/dist/uPlot.min.css $(PAGE)/uplot.css
+	(printf 'three.js\n========\n\n'; cat $(PAGE)/libraries/node_modules/three/LICENSE; \
+	 printf '\n\nuPlot\n=====\n\n'; cat $(PAGE)/libraries/node_modules/uplot/LICENSE) > $(PAGE)/LICENSES.txt
+
 check: $(VENV)/dev
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .

@@ -128,11 +128,15 @@ class Episode:
         return np.flatnonzero(self.belief[step] > LIKELY * self.belief[step].max())
 
     def save(self, path: Path) -> None:
-        """Write the episode as JSON, with numbers of ``DIGITS`` significant digits.
+        """Write the episode as JSON.
 
         Raises:
             RunError: the file cannot be written.
         """
+        write_atomically(path, json.dumps(self.document(), separators=(",", ":")))
+
+    def document(self) -> dict[str, Any]:
+        """What a file holds of the episode, with numbers of ``DIGITS`` significant digits."""
         fixed = {
             "region": json.loads(shapely.to_geojson(self.region)),
             "origin": self.origin,
@@ -143,7 +147,7 @@ class Episode:
         }
         columns = {name: _listed(getattr(self, name)) for name in COLUMNS}
         head = {"schema": SCHEMA, "version": VERSION, "about": self.about, "meaning": COLUMNS}
-        write_atomically(path, json.dumps({**head, **fixed, **columns}, separators=(",", ":")))
+        return {**head, **fixed, **columns}
 
     @classmethod
     def load(cls, path: Path) -> "Episode":

@@ -1,0 +1,216 @@
+/** The region and the space above it, by three.js; marks are drawn on top, as on the map. */
+
+import * as three from "libraries";
+import { Frame, length, roundLength } from "page/geography";
+import { Ground } from "page/ground";
+import { DART, label } from "page/marks";
+import { drawMarks } from "page/overlay";
+
+/** Heights are enlarged until the highest one is this share of the region's size, as in films. */
+const SHARE = 0.3;
+/** Pixels of the ground's picture, in its larger direction. */
+const PIXELS = 1536;
+/** Length of a UAV as a share of the region's size. */
+const UAV = 0.022;
+/** Cameras look from the south, from this direction: east, south and up, as shares of the region's size. */
+const BEGIN = [0.22, 1.05, 0.82];
+
+/** Where the cameras of all views are, in sizes of their regions: they move together. */
+const shared = { position: BEGIN, target: [0, 0, 0], moves: new Set() };
+
+export class SpaceView {
+  /**
+   * @param {HTMLCanvasElement} canvas for the space
+   * @param {HTMLCanvasElement} marks on top of it, for the marks
+   * @param {import("page/episode").Episode} episode
+   * @param {number} likely see Ground
+   * @param {function(): void} changed to be called when the camera has moved
+   * @throws {Error} without WebGL
+   */
+  constructor(canvas, marks, episode, likely, changed) {
+    Object.assign(this, { canvas, marks, episode });
+    this.renderer = new three.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    const [west, south, east, north] = episode.limits;
+    this.middle = [(west + east) / 2, (south + north) / 2];
+    this.size = Math.max(east - west, north - south);
+    this.enlarged = Math.max(1, (SHARE * this.size) / Math.max(episode.highest, 1e-9));
+    if (episode.highest === 0) this.enlarged = 1;
+    this.scene = new three.Scene();
+    const sun = new three.DirectionalLight("#ffffff", 2.2);
+    sun.position.set(-1, 2, 1);
+    this.scene.add(new three.AmbientLight("#ffffff", 1.4), sun);
+    this.#addGround(likely, east - west, north - south);
+    this.uavs = episode.position[0].map(() => this.#addUav());
+    this.#addCamera(changed);
+  }
+
+  /** A place [m] in the scene, in sizes of the region: east is x, up is y, south is z. */
+  point([east, north, up = 0]) {
+    const [x, z] = [(east - this.middle[0]) / this.size, (this.middle[1] - north) / this.size];
+    return [x, (up * this.enlarged) / this.size, z];
+  }
+
+  /** Draw what there is at a time. */
+  draw(now, layers, theme) {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (!width || !height) return;
+    this.#resize(width, height);
+    if (this.ground.paint(this.groundFrame, now.step, layers, theme)) this.texture.needsUpdate = true;
+    this.uavs.forEach((parts, uav) => this.#move(parts, uav, now, layers, theme));
+    this.renderer.render(this.scene, this.camera);
+    this.marks.width = Math.round(width * devicePixelRatio);
+    this.marks.height = Math.round(height * devicePixelRatio);
+    const context = this.marks.getContext("2d");
+    context.scale(devicePixelRatio, devicePixelRatio);
+    const view = { pixel: (place) => this.pixel(place), darts: false, rise: (0.35 * this.size) / this.enlarged };
+    drawMarks(context, this.episode, now, layers, theme, view);
+    this.#words(context, theme);
+  }
+
+  /** Pixel of a place east, north, up [m]. */
+  pixel(place) {
+    const projected = new three.Vector3(...this.point(place)).project(this.camera);
+    return [((projected.x + 1) / 2) * this.canvas.clientWidth, ((1 - projected.y) / 2) * this.canvas.clientHeight];
+  }
+
+  /** Place [m] on the ground that a pixel shows, or undefined for the sky. */
+  place(x, y) {
+    const screen = new three.Vector2((2 * x) / this.canvas.clientWidth - 1, 1 - (2 * y) / this.canvas.clientHeight);
+    const ray = new three.Raycaster();
+    ray.setFromCamera(screen, this.camera);
+    const hit = ray.ray.intersectPlane(new three.Plane(new three.Vector3(0, 1, 0)), new three.Vector3());
+    return hit ? [hit.x * this.size + this.middle[0], this.middle[1] - hit.z * this.size] : undefined;
+  }
+
+  #addGround(likely, width, height) {
+    const pixels = PIXELS / this.size;
+    this.ground = new Ground(this.episode, likely);
+    this.groundFrame = new Frame(this.episode.limits, Math.round(width * pixels), Math.round(height * pixels));
+    this.ground.canvas.width = this.groundFrame.width;
+    this.ground.canvas.height = this.groundFrame.height;
+    this.texture = new three.CanvasTexture(this.ground.canvas);
+    this.texture.colorSpace = three.SRGBColorSpace;
+    this.texture.anisotropy = 8;
+    const material = new three.MeshBasicMaterial({ map: this.texture, transparent: true, depthWrite: false });
+    const plane = new three.Mesh(new three.PlaneGeometry(width / this.size, height / this.size), material);
+    plane.rotation.x = -Math.PI / 2;
+    this.scene.add(plane);
+  }
+
+  /** The parts of a UAV: its body, its footprint, the edge of that, and its trail with what it stands above. */
+  #addUav() {
+    const shape = new three.Shape(DART.map(([east, north]) => new three.Vector2(east * UAV, north * UAV)));
+    const solid = { depth: 0.3 * UAV, bevelEnabled: true, bevelSize: 0.08 * UAV, bevelThickness: 0.08 * UAV, bevelSegments: 2 };
+    const form = new three.ExtrudeGeometry(shape, solid).rotateX(-Math.PI / 2);
+    const body = new three.Mesh(form, new three.MeshLambertMaterial());
+    const flat = new three.CircleGeometry(this.episode.radius / this.size, 64).rotateX(-Math.PI / 2);
+    const disc = new three.MeshBasicMaterial({ transparent: true, depthWrite: false });
+    const parts = { body, footprint: new three.Mesh(flat, disc), edge: this.#lines(1.4), trail: this.#lines(2.6) };
+    this.scene.add(...Object.values(parts));
+    parts.footprint.renderOrder = 1;
+    return parts;
+  }
+
+  #lines(linewidth) {
+    const material = new three.LineMaterial({ linewidth, vertexColors: true, transparent: true, depthWrite: false });
+    const lines = new three.LineSegments2(new three.LineSegmentsGeometry(), material);
+    lines.frustumCulled = false;
+    lines.renderOrder = 2;
+    return lines;
+  }
+
+  #move({ body, footprint, edge, trail }, uav, now, layers, theme) {
+    for (const part of [body, footprint, edge, trail]) part.visible = layers.has("truth");
+    const place = this.episode.place(uav, now);
+    const spotted = this.episode.spotted[now.step][uav];
+    const colour = new three.Color(theme.uav(uav));
+    body.material.color = colour;
+    body.position.set(...this.point(place));
+    body.rotation.y = -this.episode.heading(uav, now);
+    footprint.material.color = colour;
+    footprint.material.opacity = spotted ? 0.3 : 0.09;
+    footprint.position.set(...this.point([place[0], place[1], 0]));
+    const land = new three.Color(theme.land);
+    const around = circle(place, this.episode.radius).map((corner) => this.point(corner));
+    draw(edge, pairs(around), () => colour.clone().lerp(land, spotted ? 0 : 0.5));
+    const path = this.episode.trail(uav, now).map((each) => this.point(each));
+    const stem = [this.point(place), this.point([place[0], place[1], 0])];
+    const faded = (part) => colour.clone().lerp(land, part < path.length - 1 ? 0.8 * (1 - part / path.length) : 0.35);
+    draw(trail, [...pairs(path), stem], faded);
+  }
+
+  #addCamera(changed) {
+    this.camera = new three.PerspectiveCamera(38, 1, 0.01, 20);
+    this.controls = new three.OrbitControls(this.camera, this.marks);
+    this.controls.maxPolarAngle = 0.49 * Math.PI;
+    this.controls.minDistance = 0.15;
+    this.controls.maxDistance = 4;
+    this.controls.zoomToCursor = true;
+    this.#follow();
+    shared.moves.add(() => this.#follow());
+    this.controls.addEventListener("change", () => {
+      if (this.following) return;
+      shared.position = this.camera.position.toArray();
+      shared.target = this.controls.target.toArray();
+      for (const move of shared.moves) move();
+      changed();
+    });
+  }
+
+  /** Look from where all cameras are. */
+  #follow() {
+    this.following = true;
+    this.camera.position.fromArray(shared.position === BEGIN ? [BEGIN[0], BEGIN[2], BEGIN[1]] : shared.position);
+    this.controls.target.fromArray(shared.target);
+    this.controls.update();
+    this.following = false;
+  }
+
+  #resize(width, height) {
+    this.renderer.setPixelRatio(devicePixelRatio);
+    const size = this.renderer.getSize(new three.Vector2());
+    if (size.x !== width || size.y !== height) this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+  }
+
+  /** A length on the ground, the north, and how much heights are enlarged. */
+  #words(context, theme) {
+    const [west, south, east, north] = this.episode.limits;
+    const metres = roundLength(0.3 * (east - west));
+    const ends = [[west, south, 0], [west + metres, south, 0]].map((place) => this.pixel(place));
+    context.strokeStyle = theme.muted;
+    context.lineWidth = 1.5;
+    context.beginPath();
+    context.moveTo(...ends[0]);
+    context.lineTo(...ends[1]);
+    context.stroke();
+    const [x, y] = [(ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2];
+    context.textAlign = "center";
+    label(context, [x, y + 11], length(metres), theme.muted, theme);
+    label(context, this.pixel([(west + east) / 2, north, 0]), "N", theme.muted, theme);
+    context.textAlign = "left";
+    const times = this.enlarged > 1 ? `heights ${this.enlarged.toPrecision(2).replace("e+", "e")} times as large` : "";
+    label(context, [12, this.canvas.clientHeight - 14], times, theme.muted, theme);
+  }
+}
+
+/** Corners of a circle on the ground about a place [m]. */
+function circle([east, north], radius) {
+  return Array.from({ length: 65 }, (_, i) => {
+    const angle = (i * Math.PI) / 32;
+    return [east + radius * Math.cos(angle), north + radius * Math.sin(angle), 0];
+  });
+}
+
+function pairs(points) {
+  return points.slice(1).map((point, i) => [points[i], point]);
+}
+
+/** Give lines their ends [[from, to], ...], and each the colour that a function has for its number. */
+function draw(lines, ends, colourOf) {
+  lines.geometry.dispose();
+  lines.geometry = new three.LineSegmentsGeometry();
+  lines.geometry.setPositions(ends.flat(2));
+  lines.geometry.setColors(ends.flatMap((_, part) => [...colourOf(part).toArray(), ...colourOf(part).toArray()]));
+}
