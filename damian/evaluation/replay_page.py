@@ -7,6 +7,7 @@ data URL, so that each stays an ordinary module.
 
 import html
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from string import Template
@@ -24,8 +25,10 @@ _PAGE = Path(__file__).parent / "page"
 _LIBRARIES = "libraries.min.js"
 _PLAIN = " !$&'()*+,-./:;<=>?@[]^_`{|}~\\\""
 """Characters that a data URL may hold as they are."""
-_NO_PART_OF_THE_FLIGHT = ("hydra", "formats", "views", "keep", "eval_episodes", "seed", "policy", "checkpoint")
-"""Settings that say nothing about how an episode was flown, or that its ``about`` repeats."""
+_TOLD = ("policy", "checkpoint", "seed", "world")
+"""What an episode's ``about`` tells of its flight, beside the overrides."""
+_NOT_FLOWN = (*_TOLD, "hydra", "formats", "views", "keep", "eval_episodes")
+"""Overrides that say nothing of how an episode was flown, or that ``about`` repeats."""
 
 
 def save_page(episodes: Sequence[Episode], path: Path) -> None:
@@ -45,11 +48,11 @@ def page(episodes: Sequence[Episode]) -> str:
         InputError: there are no episodes, or more than ``MOST``.
     """
     checks.in_range("episodes", len(episodes), 1, MOST)
-    names = titles(episodes)
+    shared, names = titles(episodes)
     shown = [{"title": name, **episode.document()} for name, episode in zip(names, episodes, strict=True)]
-    replay = {"colours": COLOURS, "likely": LIKELY, "episodes": shown}
+    replay = {"colours": COLOURS, "likely": LIKELY, "shared": shared, "episodes": shown}
     return Template((_PAGE / "index.html").read_text()).substitute(
-        title=html.escape(" | ".join(names)),
+        title=html.escape(" | ".join([shared, *names])),
         licences=(_PAGE / "LICENSES.txt").read_text(),
         style="\n".join((_PAGE / name).read_text() for name in ("uplot.css", "style.css")),
         modules=_in_script({"imports": _modules()}),
@@ -57,23 +60,24 @@ def page(episodes: Sequence[Episode]) -> str:
     )
 
 
-def titles(episodes: Sequence[Episode]) -> list[str]:
-    """What tells each episode from the others: the settings that not all of them share."""
+def titles(episodes: Sequence[Episode]) -> tuple[str, list[str]]:
+    """The settings that all episodes share, and those that tell each from the others; one has all of them."""
     settings = [_settings(episode) for episode in episodes]
-    shared = set.intersection(*map(set, settings))
-    own = [" ".join(each for each in words if each not in shared) for words in settings]
+    if len(settings) == 1:
+        return "", [" ".join(settings[0])]
+    shared = [word for word in settings[0] if all(word in words for words in settings)]
+    own = [" ".join(word for word in words if word not in shared) for words in settings]
     if len({*own}) < len(own):  # they tell nothing, or not all
-        return [f"episode {number} {words}".strip() for number, words in enumerate(own, 1)]
-    return [words or "other settings by default" for words in own]
+        own = [f"episode {number} {words}".strip() for number, words in enumerate(own, 1)]
+    return " ".join(shared), [words or "other settings by default" for words in own]
 
 
 def _settings(episode: Episode) -> list[str]:
     """How an episode was flown, as words KEY=VALUE."""
     about = episode.about
-    words = [str(word) for word in about.get("overrides") or []]
-    own = [word for word in words if word.lstrip("+").partition("=")[0].partition(".")[0] not in _NO_PART_OF_THE_FLIGHT]
-    named = [f"{key}={about[key]}" for key in ("policy", "checkpoint", "seed", "world") if about.get(key) is not None]
-    return [*own, *named]
+    words = [str(word).lstrip("+") for word in about.get("overrides") or []]
+    flown = [word for word in words if re.split(r"[.=]", word)[0] not in _NOT_FLOWN]
+    return flown + [f"{key}={about[key]}" for key in _TOLD if about.get(key) is not None]
 
 
 def _modules() -> dict[str, str]:

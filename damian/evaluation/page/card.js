@@ -17,10 +17,11 @@ export class Card {
     Object.assign(this, { episode, player, theme, likely });
     this.element = make(parent, "article", "card");
     this.element.setAttribute("aria-label", episode.title);
-    const head = make(this.element, "div", "head");
+    const body = make(this.element, "div", "body");
+    const head = make(body, "div", "head");
     make(head, "h2").textContent = episode.title;
     this.line = make(head, "p", "line");
-    this.view = make(this.element, "div", "view");
+    this.view = make(body, "div", "view");
     const [west, south, east, north] = episode.limits;
     this.view.style.setProperty("--aspect", Math.min(Math.max((east - west) / (north - south), 0.8), 2));
     this.layers = ["map", "space", "marks"].map((name) => make(this.view, "canvas", name));
@@ -30,12 +31,12 @@ export class Card {
     this.hint = make(this.view, "p", "hint");
     this.map = new MapView(this.layers[0], episode, likely);
     this.#followPointer();
-    const rows = make(this.element, "canvas", "lanes");
+    const rows = make(body, "canvas", "lanes");
     describe(rows, "messages over time: a row for each UAV; dots arrive at once, bars are late, crosses are lost");
     this.lanes = new Lanes(rows, episode, player);
-    this.figures = make(this.element, "div", "charts");
+    this.figures = make(body, "div", "charts");
     this.charts = [];
-    const table = make(make(this.element, "div", "numbers"), "table");
+    const table = make(make(body, "div", "numbers"), "table");
     table.createCaption().textContent = "UAVs at this instant";
     this.readout = new Readout(this.line, table, episode);
   }
@@ -44,9 +45,10 @@ export class Card {
   addCharts(charts, ranges) {
     this.charts = charts.map((chart) => {
       const figure = make(this.figures, "figure");
-      make(figure, "figcaption").textContent = chart.title;
+      const caption = make(figure, "figcaption");
+      make(caption, "span").textContent = chart.title;
       figure.dataset.chart = chart.key;
-      return new ChartView(figure, this.episode, chart, ranges.get(chart.key), this.player, this.theme);
+      return new ChartView(figure, caption, this.episode, chart, ranges.get(chart.key), this.player, this.theme);
     });
   }
 

@@ -4,7 +4,6 @@ import { uPlot } from "libraries";
 
 /** Width of the axis beside a chart, and the margin on its other side [px]. */
 export const [GUTTER, MARGIN] = [52, 14];
-const HEIGHT = 132;
 /** Largest number of UAVs that a legend names. */
 const NAMED = 6;
 const FONT = "11px system-ui, sans-serif";
@@ -46,14 +45,15 @@ export function rangeOf(charts) {
 export class ChartView {
   /**
    * @param {HTMLElement} parent
+   * @param {HTMLElement} caption gets the legend
    * @param {import("page/episode").Episode} episode
    * @param {Chart} chart
    * @param {number[]} range of its values
    * @param {import("page/player").Player} player
    * @param {import("page/theme").Theme} theme
    */
-  constructor(parent, episode, chart, range, player, theme) {
-    Object.assign(this, { parent, episode, chart });
+  constructor(parent, caption, episode, chart, range, player, theme) {
+    Object.assign(this, { parent, caption, episode, chart });
     const data = [episode.time, ...chart.lines.map((line) => line.values)];
     this.plot = new uPlot(this.#options(range, player, theme), data, parent);
     this.future = document.createElement("div");
@@ -76,8 +76,14 @@ export class ChartView {
   /** Draw again in the present width and colours. */
   resize() {
     const width = this.parent.clientWidth;
-    if (width && width !== this.plot.width) this.plot.setSize({ width, height: HEIGHT });
+    const height = this.#height();
+    if (width && (width !== this.plot.width || height !== this.plot.height)) this.plot.setSize({ width, height });
     else this.plot.redraw(false);
+  }
+
+  /** Height of a chart [px], which the style decides. */
+  #height() {
+    return Number(getComputedStyle(this.parent).getPropertyValue("--chart-height"));
   }
 
   #options(range, player, theme) {
@@ -94,13 +100,17 @@ export class ChartView {
     }));
     return {
       width: this.parent.clientWidth || 300,
-      height: HEIGHT,
+      height: this.#height(),
       padding: [6, MARGIN, 0, 0],
-      legend: { show: this.chart.lines.length <= NAMED, live: true, markers: { width: 0, fill: (_, i) => this.chart.lines[i - 1]?.colour() } },
+      legend: {
+        show: this.chart.lines.length <= NAMED,
+        mount: (_, legend) => this.caption.append(legend),
+        markers: { width: 0, fill: (_, i) => this.chart.lines[i - 1]?.colour() },
+      },
       cursor: { sync: { key: "time" }, drag: { x: false, y: false }, points: { size: 5 }, y: false },
       scales: { x: { time: false, range: [0, Math.max(player.end, this.episode.dt)] }, y: { range } },
       axes: [
-        { ...axis, grid: { ...grid, show: false }, size: 22, gap: 2, values: (_, ticks) => ticks.map((tick) => `${tick} s`) },
+        { ...axis, grid: { ...grid, show: false }, size: 26, gap: 6, values: (_, ticks) => ticks.map((tick) => `${tick} s`) },
         { ...axis, grid, size: GUTTER, gap: 4, space: 26 },
       ],
       series: [{ label: "time", value: (_, time) => (time == null ? "" : `${time} s`) }, ...series],

@@ -12,6 +12,16 @@ export const LAYERS = [
   ["belief", "■", "Belief"],
 ];
 
+/** Outlines of the buttons of the time, in a square of 16. */
+const ICONS = {
+  play: "M4 2.5v11l9.5-5.5z",
+  pause: "M3.5 2.5h3.2v11H3.5zM9.3 2.5h3.2v11H9.3z",
+  back: "M11 3v10L4.5 8z",
+  on: "M5 3v10l6.5-5z",
+  first: "M3 3h2v10H3zM13 3v10L6 8z",
+  last: "M11 3h2v10h-2zM3 3v10l7-5z",
+};
+
 /**
  * What the tools set.
  * @typedef {{layers: Set<string>, view: "2d" | "3d"}} Settings
@@ -53,12 +63,12 @@ export function addTools(parent, settings, hasBelief, changed) {
 
 /** The buttons and the slider of the time. */
 export function addTransport(parent, player) {
-  const first = button(parent, "⏮", () => player.seek(0), "first instant (Home)");
-  const back = button(parent, "◀", () => player.step(-1), "one instant back (←)");
-  const play = button(parent, "▶", () => player.toggle());
+  const first = sign(parent, ICONS.first, () => player.seek(0), "first instant (Home)");
+  const back = sign(parent, ICONS.back, () => player.step(-1), "one instant back (←)");
+  const play = sign(parent, ICONS.play, () => player.toggle(), "play (Space)");
   play.classList.add("play");
-  const on = button(parent, "▶", () => player.step(1), "one instant on (→)");
-  const last = button(parent, "⏭", () => player.seek(player.end), "last instant (End)");
+  const on = sign(parent, ICONS.on, () => player.step(1), "one instant on (→)");
+  const last = sign(parent, ICONS.last, () => player.seek(player.end), "last instant (End)");
   const buttons = document.createElement("div");
   buttons.className = "buttons";
   buttons.append(first, back, play, on, last);
@@ -76,9 +86,8 @@ export function addTransport(parent, player) {
   });
   parent.append(buttons, slider, time, speed);
   player.onChange(() => {
-    play.classList.toggle("playing", player.playing);
     play.setAttribute("aria-label", player.playing ? "pause (Space)" : "play (Space)");
-    play.textContent = player.playing ? "⏸" : "▶";
+    play.querySelector("path").setAttribute("d", player.playing ? ICONS.pause : ICONS.play);
     slider.value = player.time;
     slider.style.setProperty("--share", player.end ? player.time / player.end : 1);
     const shown = player.instants.findLast((instant) => instant <= player.time);
@@ -115,6 +124,19 @@ function group(parent, name) {
   made.setAttribute("role", "group");
   made.setAttribute("aria-label", name);
   parent.append(made);
+  return made;
+}
+
+/** A button with an icon. */
+function sign(parent, outline, press, name) {
+  const made = button(parent, "", press, name);
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  svg.setAttribute("viewBox", "0 0 16 16");
+  svg.setAttribute("aria-hidden", "true");
+  const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+  path.setAttribute("d", outline);
+  svg.append(path);
+  made.append(svg);
   return made;
 }
 

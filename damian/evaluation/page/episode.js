@@ -46,14 +46,18 @@ export class Episode {
     return this.region.type === "Polygon" ? [this.region.coordinates] : this.region.coordinates;
   }
 
-  /** What a view shows at least: west, south, east and north border [m]. */
-  get limits() {
+  /** West, south, east and north border of the region [m]. */
+  get borders() {
     const corners = this.polygons.flat(2);
     const [east, north] = [corners.map((corner) => corner[0]), corners.map((corner) => corner[1])];
-    const border = [Math.min(...east), Math.min(...north), Math.max(...east), Math.max(...north)];
-    const size = Math.max(border[2] - border[0], border[3] - border[1]);
-    const margin = Math.max(0.06 * size, 0.5 * this.radius);
-    return border.map((value, side) => value + (side < 2 ? -margin : margin));
+    return [Math.min(...east), Math.min(...north), Math.max(...east), Math.max(...north)];
+  }
+
+  /** West, south, east and north border of what a view shows [m]: as in films. */
+  get limits() {
+    const [west, south, east, north] = this.borders;
+    const margin = Math.max(0.06 * Math.max(east - west, north - south), 0.5 * this.radius);
+    return this.borders.map((value, side) => value + (side < 2 ? -margin : margin));
   }
 
   /** @param {number} time [s] @returns {Now} */

@@ -47,7 +47,7 @@ export class Ground {
     context.restore();
     this.#outline(context, frame);
     context.strokeStyle = theme.edge;
-    context.lineWidth = Math.max(1.4, frame.width / 700);
+    context.lineWidth = Math.max(1.4, frame.width / 600);
     context.stroke();
     return true;
   }

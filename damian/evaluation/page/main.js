@@ -27,6 +27,7 @@ listen(player, keys);
 player.onChange(() => cards.forEach((card) => card.draw(settings)));
 new ResizeObserver(redraw).observe(parent);
 theme.onChange(redraw);
+document.getElementById("shared").textContent = replay.shared;
 document.getElementById("motion").textContent = episodes.some((episode) => episode.instant)
   ? "In these tasks a UAV reaches its target by the end of the step; between instants it is drawn on the straight way."
   : "Between instants UAVs are drawn on the straight way.";

@@ -124,7 +124,7 @@ export function label(context, [x, y], text, colour, theme) {
   context.fillText(text, x, y);
 }
 
-/** A number with at most one decimal, if it has any. */
-export function plain(value) {
-  return String(Math.round(value * 10) / 10);
+/** A number with at most one decimal; with none from a size on. */
+export function plain(value, large = Number.POSITIVE_INFINITY) {
+  return String(value >= large ? Math.round(value) : Math.round(value * 10) / 10);
 }

@@ -3,7 +3,8 @@
 import { plain } from "page/marks";
 
 const [HOLLOW, FILLED] = ["–", "●"];
-const COLUMNS = ["UAV", "east", "north", "up", "age", "battery", "spots"];
+/** Units of the columns, by name. */
+const UNITS = { east: "m", north: "m", up: "m", age: "s", battery: "%" };
 
 export class Readout {
   /**
@@ -13,16 +14,16 @@ export class Readout {
    */
   constructor(line, table, episode) {
     Object.assign(this, { line, episode });
-    const units = { east: "m", north: "m", up: "m", age: "s", battery: "%" };
+    this.columns = [...Object.keys(UNITS), "spots"].filter((name) => name !== "up" || episode.highest > 0);
     const head = table.createTHead().insertRow();
-    for (const name of COLUMNS) {
+    for (const name of ["UAV", ...this.columns]) {
       const cell = document.createElement("th");
       cell.scope = "col";
-      cell.textContent = units[name] ? `${name} [${units[name]}]` : name;
+      cell.textContent = UNITS[name] ? `${name} [${UNITS[name]}]` : name;
       head.append(cell);
     }
     const body = table.createTBody();
-    this.rows = episode.position[0].map((_, uav) => row(body, uav));
+    this.rows = episode.position[0].map((_, uav) => row(body, uav, this.columns));
   }
 
   /** Show the numbers of the instant before a time. */
@@ -44,22 +45,33 @@ export class Readout {
     }));
     this.rows.forEach((cells, uav) => {
       const [east, north, up] = episode.position[step][uav];
-      const numbers = [east, north, up, episode.age[step][uav], episode.battery[step][uav]].map((value) => value.toFixed(1));
-      numbers.forEach((text, i) => (cells[i + 1].textContent = text.replace("-", "−")));
-      cells[6].textContent = episode.spotted[step][uav] ? FILLED : HOLLOW;
-      cells[6].setAttribute("aria-label", episode.spotted[step][uav] ? "yes" : "no");
-      cells[0].style.setProperty("--uav", theme.uav(uav));
-      cells[0].parentElement.classList.toggle("old", episode.age[step][uav] > 0);
+      const numbers = { east, north, up, age: episode.age[step][uav], battery: episode.battery[step][uav] };
+      for (const [name, cell] of cells) if (name in numbers) cell.textContent = written(numbers[name]);
+      const spots = episode.spotted[step][uav];
+      cells.get("spots").textContent = spots ? FILLED : HOLLOW;
+      cells.get("spots").setAttribute("aria-label", spots ? "yes" : "no");
+      cells.get("UAV").style.setProperty("--uav", theme.uav(uav));
+      cells.get("age").classList.toggle("old", numbers.age > 0);
     });
   }
 }
 
-/** A row of the table; returns its cells. */
-function row(body, uav) {
+/** A number with one decimal, and a minus sign that is as wide as a digit. */
+function written(value) {
+  return value.toFixed(1).replace(/^-0\.0$/, "0.0").replace("-", "−");
+}
+
+/** A row of the table; returns its cells by name. */
+function row(body, uav, columns) {
   const line = body.insertRow();
   const head = document.createElement("th");
   head.scope = "row";
   head.textContent = uav;
   line.append(head);
-  return [head, ...COLUMNS.slice(1).map(() => line.insertCell())];
+  const cells = columns.map((name) => {
+    const cell = line.insertCell();
+    cell.dataset.shown = name;
+    return [name, cell];
+  });
+  return new Map([["UAV", head], ...cells]);
 }

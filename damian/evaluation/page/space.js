@@ -3,17 +3,21 @@
 import * as three from "libraries";
 import { Frame, length, roundLength } from "page/geography";
 import { Ground } from "page/ground";
-import { DART, label } from "page/marks";
+import { DART, label, plain } from "page/marks";
 import { drawMarks } from "page/overlay";
 
 /** Heights are enlarged until the highest one is this share of the region's size, as in films. */
 const SHARE = 0.3;
+/** Height to which messages rise, as a share of the region's size. */
+const RISE = 0.25;
 /** Pixels of the ground's picture, in its larger direction. */
 const PIXELS = 1536;
 /** Length of a UAV as a share of the region's size. */
 const UAV = 0.022;
 /** Cameras look from the south, from this direction: east, south and up, as shares of the region's size. */
-const BEGIN = [0.22, 1.05, 0.82];
+const BEGIN = [0.14, 0.86, 0.92];
+/** Angles that the camera sees, at least: in height and in width [deg]. */
+const [SEEN_HIGH, SEEN_WIDE] = [38, 48];
 
 /** Where the cameras of all views are, in sizes of their regions: they move together. */
 const shared = { position: BEGIN, target: [0, 0, 0], moves: new Set() };
@@ -62,7 +66,7 @@ export class SpaceView {
     this.marks.height = Math.round(height * devicePixelRatio);
     const context = this.marks.getContext("2d");
     context.scale(devicePixelRatio, devicePixelRatio);
-    const view = { pixel: (place) => this.pixel(place), darts: false, rise: (0.35 * this.size) / this.enlarged };
+    const view = { pixel: (place) => this.pixel(place), darts: false, rise: (RISE * this.size) / this.enlarged };
     drawMarks(context, this.episode, now, layers, theme, view);
     this.#words(context, theme);
   }
@@ -140,7 +144,7 @@ export class SpaceView {
   }
 
   #addCamera(changed) {
-    this.camera = new three.PerspectiveCamera(38, 1, 0.01, 20);
+    this.camera = new three.PerspectiveCamera(SEEN_HIGH, 1, 0.01, 20);
     this.controls = new three.OrbitControls(this.camera, this.marks);
     this.controls.maxPolarAngle = 0.49 * Math.PI;
     this.controls.minDistance = 0.15;
@@ -171,14 +175,18 @@ export class SpaceView {
     const size = this.renderer.getSize(new three.Vector2());
     if (size.x !== width || size.y !== height) this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
+    const half = Math.tan((SEEN_WIDE * Math.PI) / 360) / this.camera.aspect;
+    this.camera.fov = Math.max(SEEN_HIGH, (Math.atan(half) * 360) / Math.PI);
     this.camera.updateProjectionMatrix();
   }
 
   /** A length on the ground, the north, and how much heights are enlarged. */
   #words(context, theme) {
-    const [west, south, east, north] = this.episode.limits;
+    const [west, south, east, north] = this.episode.borders;
     const metres = roundLength(0.3 * (east - west));
-    const ends = [[west, south, 0], [west + metres, south, 0]].map((place) => this.pixel(place));
+    const middle = (west + east) / 2;
+    const below = south - 0.05 * this.size;
+    const ends = [-metres / 2, metres / 2].map((shift) => this.pixel([middle + shift, below, 0]));
     context.strokeStyle = theme.muted;
     context.lineWidth = 1.5;
     context.beginPath();
@@ -188,9 +196,9 @@ export class SpaceView {
     const [x, y] = [(ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2];
     context.textAlign = "center";
     label(context, [x, y + 11], length(metres), theme.muted, theme);
-    label(context, this.pixel([(west + east) / 2, north, 0]), "N", theme.muted, theme);
+    label(context, this.pixel([middle, north + 0.03 * this.size, 0]), "N", theme.muted, theme);
     context.textAlign = "left";
-    const times = this.enlarged > 1 ? `heights ${this.enlarged.toPrecision(2).replace("e+", "e")} times as large` : "";
+    const times = this.enlarged > 1 ? `heights ${plain(this.enlarged, 10)} times as large` : "";
     label(context, [12, this.canvas.clientHeight - 14], times, theme.muted, theme);
   }
 }
