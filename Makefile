@@ -1,4 +1,5 @@
-# make train | test | test-deep | test-slow | bench | bench-quick | pictures | check | format        (each sets up what it needs)
+# make train | test | test-deep | test-slow | test-browser | bench | bench-quick | pictures | page-libraries | check | format
+# (each sets up what it needs)
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -6,7 +7,7 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-deep test-slow bench bench-quick pictures check format clean
+.PHONY: train test test-deep test-slow test-browser bench bench-quick pictures page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
@@ -20,6 +21,11 @@ test-deep: $(VENV)/test
 
 test-slow: $(VENV)/test
 	$(PY) -m pytest -m slow $(ARGS)
+
+# The replay page in Chromium, which Debian and Ubuntu bring as these packages.
+test-browser: $(VENV)/browser
+	command -v chromium && command -v chromedriver || (apt-get update && apt-get install -y chromium chromium-driver)
+	$(PY) -m pytest -m browser tests/evaluation/test_replay_browser.py $(ARGS)
 
 bench: $(VENV)/bench
 	$(VENV)/bin/damian bench $(ARGS)
@@ -67,6 +73,10 @@ $(VENV)/test: $(VENV)/base
 
 $(VENV)/dev: $(VENV)/test
 	$(PIP) -e ".[dev]" "$(TORCH)"
+	touch $@
+
+$(VENV)/browser: $(VENV)/test
+	$(PIP) -e ".[browser]" "$(TORCH)"
 	touch $@
 
 $(VENV)/bench: $(VENV)/base

@@ -51,10 +51,10 @@ def page(episodes: Sequence[Episode]) -> str:
     shared, names = titles(episodes)
     shown = [{"title": name, **episode.document()} for name, episode in zip(names, episodes, strict=True)]
     replay = {"colours": COLOURS, "likely": LIKELY, "shared": shared, "episodes": shown}
-    return Template((_PAGE / "index.html").read_text()).substitute(
-        title=html.escape(" | ".join([shared, *names])),
-        licences=(_PAGE / "LICENSES.txt").read_text(),
-        style="\n".join((_PAGE / name).read_text() for name in ("uplot.css", "style.css")),
+    return Template(_text("index.html")).substitute(
+        title=_title([shared, *names]),
+        licences=_text("LICENSES.txt"),
+        style="\n".join(map(_text, ("uplot.css", "style.css"))),
         modules=_in_script({"imports": _modules()}),
         replay=_in_script(replay),
     )
@@ -64,12 +64,13 @@ def titles(episodes: Sequence[Episode]) -> tuple[str, list[str]]:
     """The settings that all episodes share, and those that tell each from the others; one has all of them."""
     settings = [_settings(episode) for episode in episodes]
     if len(settings) == 1:
-        return "", [" ".join(settings[0])]
+        return "", [" ".join(settings[0]) or "episode"]
     shared = [word for word in settings[0] if all(word in words for words in settings)]
     own = [" ".join(word for word in words if word not in shared) for words in settings]
     if len({*own}) < len(own):  # they tell nothing, or not all
         own = [f"episode {number} {words}".strip() for number, words in enumerate(own, 1)]
-    return " ".join(shared), [words or "other settings by default" for words in own]
+    others = " ".join(dict.fromkeys(word for words in own for word in words.split()))
+    return " ".join(shared), [words or f"without {others}" for words in own]
 
 
 def _settings(episode: Episode) -> list[str]:
@@ -84,13 +85,21 @@ def _modules() -> dict[str, str]:
     """The page's modules as data URLs, by the names by which they import each other."""
     files = sorted(_PAGE.glob("*.js"))
     names = {file: "libraries" if file.name == _LIBRARIES else f"page/{file.stem}" for file in files}
-    return {name: f"data:text/javascript;charset=utf-8,{_encoded(file)}" for file, name in names.items()}
+    return {
+        name: f"data:text/javascript;charset=utf-8,{quote(_text(file.name), safe=_PLAIN)}"
+        for file, name in names.items()
+    }
 
 
-def _encoded(file: Path) -> str:
-    return quote(file.read_text().strip(), safe=_PLAIN)
+def _text(name: str) -> str:
+    return (_PAGE / name).read_text(encoding="utf-8").strip()
+
+
+def _title(parts: Sequence[str]) -> str:
+    """The page's title as HTML; lone surrogates, which JSON may hold, have no other form."""
+    return html.escape(" | ".join(filter(None, parts))).encode("ascii", "xmlcharrefreplace").decode()
 
 
 def _in_script(values: Any) -> str:
     """JSON that no HTML parser can take for the end of its script."""
-    return json.dumps(values, separators=(",", ":")).replace("<", "\\u003c")
+    return json.dumps(values, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

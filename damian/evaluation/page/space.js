@@ -20,7 +20,7 @@ const BEGIN = [0.14, 0.86, 0.92];
 const [SEEN_HIGH, SEEN_WIDE] = [38, 48];
 
 /** Where the cameras of all views are, in sizes of their regions: they move together. */
-const shared = { position: BEGIN, target: [0, 0, 0], moves: new Set() };
+const shared = { position: BEGIN, target: [0, 0, 0.06], moves: new Set() };
 
 export class SpaceView {
   /**
@@ -139,7 +139,7 @@ export class SpaceView {
     draw(edge, pairs(around), () => colour.clone().lerp(land, spotted ? 0 : 0.5));
     const path = this.episode.trail(uav, now).map((each) => this.point(each));
     const stem = [this.point(place), this.point([place[0], place[1], 0])];
-    const faded = (part) => colour.clone().lerp(land, part < path.length - 1 ? 0.8 * (1 - part / path.length) : 0.35);
+    const faded = (part) => colour.clone().lerp(land, part < path.length - 1 ? 0.7 * (1 - part / path.length) : 0.35);
     draw(trail, [...pairs(path), stem], faded);
   }
 
