@@ -9,10 +9,12 @@ const NAMED = 6;
 const FONT = "11px system-ui, sans-serif";
 
 /**
- * What a chart shows.
+ * What a chart shows. The value of an instant is that of the step before it (rewards), or holds until the next
+ * one (ages); others change evenly.
  * @typedef {{key: string, title: string, lines: {name: string, values: number[], colour: Function}[],
- *   stepped: boolean, digits: number}} Chart
+ *   held: "before" | "after" | "no", digits: number}} Chart
  */
+const ALIGN = { before: -1, after: 1 };
 
 /** The charts of an episode. @returns {Chart[]} */
 export function chartsOf(episode, theme, showsBattery) {
@@ -23,13 +25,13 @@ export function chartsOf(episode, theme, showsBattery) {
     ({ name: name.replaceAll("_", " "), values, colour: () => theme.term(i) }));
   const all = { name: "all terms", values: episode.meanReward, colour: ink };
   const charts = [
-    { key: "return", title: "return so far", digits: 2, stepped: false,
+    { key: "return", title: "return so far", digits: 2, held: "no",
       lines: [{ name: "return", values: episode.returns, colour: ink }] },
-    { key: "reward", title: "reward of each step, by term", digits: 3, stepped: true,
+    { key: "reward", title: "reward of each step, by term", digits: 3, held: "before",
       lines: terms.length ? terms : [all] },
-    { key: "age", title: "age of information [s]", digits: 1, stepped: true, lines: byUav(episode.age) },
+    { key: "age", title: "age of information [s]", digits: 1, held: "after", lines: byUav(episode.age) },
   ];
-  const battery = { key: "battery", title: "battery [%]", digits: 1, stepped: false, lines: byUav(episode.battery) };
+  const battery = { key: "battery", title: "battery [%]", digits: 1, held: "no", lines: byUav(episode.battery) };
   return showsBattery ? [...charts, battery] : charts;
 }
 
@@ -90,13 +92,14 @@ export class ChartView {
     const axis = { stroke: () => theme.muted, font: FONT, ticks: { show: false } };
     const grid = { stroke: () => theme.line, width: 1 };
     const value = (_, number) => (number == null ? "" : number.toFixed(this.chart.digits));
+    const align = ALIGN[this.chart.held];
     const series = this.chart.lines.map((line) => ({
       label: line.name,
       stroke: line.colour,
       width: 1.6,
       value,
       points: { show: false },
-      paths: this.chart.stepped ? uPlot.paths.stepped({ align: 1 }) : uPlot.paths.linear(),
+      paths: align ? uPlot.paths.stepped({ align }) : uPlot.paths.linear(),
     }));
     return {
       width: this.parent.clientWidth || 300,

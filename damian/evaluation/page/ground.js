@@ -2,8 +2,8 @@
 
 import { faint } from "page/theme";
 
-/** Strongest colour of the belief, and the power that shows weaker cells, as in films. */
-const [OPACITY, POWER] = [0.75, 0.7];
+/** Strongest colour of the belief, and the power that shows weaker cells. */
+const [OPACITY, POWER] = [0.62, 0.7];
 
 /** Paints the ground into a canvas of its own, again only when it changes. */
 export class Ground {

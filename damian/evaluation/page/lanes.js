@@ -1,11 +1,14 @@
 /** Messages over time: a row for each UAV. Dots arrive at once, bars are late, crosses are lost. */
 
+import { fitted } from "page/canvas";
 import { GUTTER, MARGIN } from "page/charts";
 import * as marks from "page/marks";
 import { faint } from "page/theme";
 
 /** Height of a row, at most, and of all rows together, at most [px]. */
 const [ROW, HIGHEST] = [20, 168];
+/** Opacity of what is to come. */
+const PALE = 0.25;
 
 export class Lanes {
   /**
@@ -15,6 +18,7 @@ export class Lanes {
    */
   constructor(canvas, episode, player) {
     Object.assign(this, { canvas, episode, player });
+    this.picture = document.createElement("canvas");
     this.row = Math.min(ROW, HIGHEST / episode.nAgents);
     canvas.style.height = `${Math.ceil(this.row * episode.nAgents) + 8}px`;
     canvas.addEventListener("click", (event) => {
@@ -27,51 +31,47 @@ export class Lanes {
   draw(now, theme) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (!width) return;
-    this.canvas.width = Math.round(width * devicePixelRatio);
-    this.canvas.height = Math.round(height * devicePixelRatio);
-    const context = this.canvas.getContext("2d");
-    context.scale(devicePixelRatio, devicePixelRatio);
     const span = (width - GUTTER - MARGIN) / Math.max(this.player.end, this.episode.dt);
     const x = (time) => GUTTER + Math.min(time, this.player.end) * span;
     const y = (uav) => 4 + (uav + 0.5) * this.row;
-    this.#names(context, y, theme);
-    for (const message of this.episode.messages) {
-      const bright = message.sent <= now.time;
-      context.globalAlpha = bright ? 1 : 0.22;
-      this.#message(context, message, now, x, y, theme);
-    }
+    this.#paint(width, height, x, y, theme);
+    const context = fitted(this.canvas, width, height);
+    context.globalAlpha = PALE;
+    context.drawImage(this.picture, 0, 0, width, height);
     context.globalAlpha = 1;
-    context.strokeStyle = theme.ink;
-    context.lineWidth = 1;
+    context.save();
     context.beginPath();
-    context.moveTo(x(now.time), 0);
-    context.lineTo(x(now.time), height);
-    context.stroke();
+    context.rect(GUTTER - 6, 0, x(now.time) - GUTTER + 6 + (now.ended ? MARGIN : 2), height);
+    context.clip();
+    context.clearRect(0, 0, width, height);
+    context.drawImage(this.picture, 0, 0, width, height);
+    context.restore();
+    this.#names(context, y, theme);
+    context.fillStyle = theme.ink;
+    context.fillRect(x(now.time) - 0.5, 0, 1, height);
   }
 
-  /** A message; of one under way, the part of its way that is still to come is pale. */
-  #message(context, { uav, sent, arrives, lost }, now, x, y, theme) {
+  /** Paint all messages into a picture, again only in another size or other colours. */
+  #paint(width, height, x, y, theme) {
+    const key = [width, height, devicePixelRatio, theme.dark].join();
+    if (key === this.painted) return;
+    this.painted = key;
+    const context = fitted(this.picture, width, height);
+    for (const message of this.episode.messages) this.#message(context, message, x, y, theme);
+  }
+
+  #message(context, { uav, sent, arrives, lost }, x, y, theme) {
     const [colour, height] = [theme.uav(uav), y(uav)];
     const size = Math.min(this.row / 4.5, 4);
-    if (lost) return marks.cross(context, [x(sent), height], theme.ink, 0.8 * size);
-    if (arrives === sent) return marks.dot(context, [x(sent), height], size / 2, colour);
-    const reached = Math.min(Math.max(now.time, sent), arrives);
-    context.lineWidth = Math.max(0.75 * size, 1);
-    context.lineCap = "butt";
-    for (const [from, to, opacity] of [[sent, reached, 0.75], [reached, arrives, 0.25]]) {
-      context.strokeStyle = faint(colour, opacity);
-      context.beginPath();
-      context.moveTo(x(from), height);
-      context.lineTo(x(to), height);
-      context.stroke();
+    if (lost) {
+      marks.cross(context, [x(sent), height], theme.ink, 0.8 * size);
+    } else if (arrives === sent) {
+      marks.dot(context, [x(sent), height], size / 2, colour);
+    } else {
+      context.fillStyle = faint(colour, 0.6);
+      context.fillRect(x(sent), height - 0.375 * size, x(arrives) - x(sent), Math.max(0.75 * size, 1));
+      if (arrives <= this.player.end) marks.arrow(context, [x(arrives), height], size, colour);
     }
-    if (arrives > this.player.end) return undefined;
-    context.fillStyle = faint(colour, reached >= arrives ? 1 : 0.4);
-    context.beginPath();
-    context.moveTo(x(arrives) + size, height);
-    context.lineTo(x(arrives) - size, height - size);
-    context.lineTo(x(arrives) - size, height + size);
-    return context.fill();
   }
 
   #names(context, y, theme) {

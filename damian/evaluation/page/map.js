@@ -1,5 +1,6 @@
 /** The view from above. */
 
+import { fitted } from "page/canvas";
 import { Frame, length, roundLength } from "page/geography";
 import { Ground } from "page/ground";
 import { label } from "page/marks";
@@ -22,14 +23,10 @@ export class MapView {
   draw(now, layers, theme) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (!width || !height) return;
-    const density = devicePixelRatio;
-    this.canvas.width = Math.round(width * density);
-    this.canvas.height = Math.round(height * density);
-    this.ground.paint(
-      new Frame(this.episode.limits, this.canvas.width, this.canvas.height), now.step, layers, theme);
-    const context = this.canvas.getContext("2d");
-    context.drawImage(this.ground.canvas, 0, 0);
-    context.scale(density, density);
+    const context = fitted(this.canvas, width, height);
+    const pixels = new Frame(this.episode.limits, this.canvas.width, this.canvas.height);
+    this.ground.paint(pixels, now.step, layers, theme);
+    context.drawImage(this.ground.canvas, 0, 0, width, height);
     this.frame = new Frame(this.episode.limits, width, height);
     if (layers.has("truth")) this.#footprintsAndTrails(context, now, theme);
     const view = { pixel: (place) => this.frame.pixel(place), darts: true, rise: 0 };

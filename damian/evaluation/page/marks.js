@@ -85,6 +85,16 @@ export function dot(context, [x, y], radius, colour) {
   context.fill();
 }
 
+/** Where a late message arrives. */
+export function arrow(context, [x, y], size, colour) {
+  context.fillStyle = colour;
+  context.beginPath();
+  context.moveTo(x + size, y);
+  context.lineTo(x - size, y - size);
+  context.lineTo(x - size, y + size);
+  context.fill();
+}
+
 /** A lost message. */
 export function cross(context, [x, y], colour, size = 4.5) {
   context.strokeStyle = colour;

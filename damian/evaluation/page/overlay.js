@@ -24,6 +24,9 @@ export function drawMarks(context, episode, now, layers, theme, view) {
   for (const uav of uavs) {
     const pixel = view.pixel(episode.place(uav, now));
     if (view.darts) marks.dart(context, pixel, episode.heading(uav, now), theme.uav(uav), theme);
+    if (uavs.length > theme.uavs.length) {
+      marks.label(context, [pixel[0] + 9, pixel[1] + 9], String(uav), theme.uav(uav), theme);
+    }
     if (episode.usesBattery) marks.battery(context, pixel, episode.battery[now.step][uav], theme.uav(uav), theme);
   }
 }

@@ -29,6 +29,9 @@ export class Readout {
   /** Show the numbers of the instant before a time. */
   draw({ step, ended }, theme) {
     const { episode } = this;
+    const key = [step, ended, theme.dark].join();
+    if (key === this.shown) return;
+    this.shown = key;
     const spots = episode.spotters(step).length;
     const parts = [
       ["time", `${plain(episode.time[step])} s`],

@@ -1,6 +1,7 @@
 /** The region and the space above it, by three.js; marks are drawn on top, as on the map. */
 
 import * as three from "libraries";
+import { fitted } from "page/canvas";
 import { Frame, length, roundLength } from "page/geography";
 import { Ground } from "page/ground";
 import { DART, label, plain } from "page/marks";
@@ -14,13 +15,13 @@ const RISE = 0.25;
 const PIXELS = 1536;
 /** Length of a UAV as a share of the region's size. */
 const UAV = 0.022;
-/** Cameras look from the south, from this direction: east, south and up, as shares of the region's size. */
-const BEGIN = [0.14, 0.86, 0.92];
+/** Where cameras begin, in the scene: east, up and south, so that they look to the north. */
+const BEGIN = [0.14, 0.92, 0.86];
 /** Angles that the camera sees, at least: in height and in width [deg]. */
-const [SEEN_HIGH, SEEN_WIDE] = [38, 48];
+const [SEEN_HIGH, SEEN_WIDE] = [42, 48];
 
 /** Where the cameras of all views are, in sizes of their regions: they move together. */
-const shared = { position: BEGIN, target: [0, 0, 0.06], moves: new Set() };
+const shared = { position: BEGIN, target: [0, 0.02, 0.05], moves: new Set() };
 
 export class SpaceView {
   /**
@@ -62,10 +63,7 @@ export class SpaceView {
     if (this.ground.paint(this.groundFrame, now.step, layers, theme)) this.texture.needsUpdate = true;
     this.uavs.forEach((parts, uav) => this.#move(parts, uav, now, layers, theme));
     this.renderer.render(this.scene, this.camera);
-    this.marks.width = Math.round(width * devicePixelRatio);
-    this.marks.height = Math.round(height * devicePixelRatio);
-    const context = this.marks.getContext("2d");
-    context.scale(devicePixelRatio, devicePixelRatio);
+    const context = fitted(this.marks, width, height);
     const view = { pixel: (place) => this.pixel(place), darts: false, rise: (RISE * this.size) / this.enlarged };
     drawMarks(context, this.episode, now, layers, theme, view);
     this.#words(context, theme);
@@ -110,6 +108,8 @@ export class SpaceView {
     const flat = new three.CircleGeometry(this.episode.radius / this.size, 64).rotateX(-Math.PI / 2);
     const disc = new three.MeshBasicMaterial({ transparent: true, depthWrite: false });
     const parts = { body, footprint: new three.Mesh(flat, disc), edge: this.#lines(1.4), trail: this.#lines(2.6) };
+    const radius = this.episode.radius / this.size;
+    draw(parts.edge, pairs(circle(radius)), () => new three.Color("#ffffff"));
     this.scene.add(...Object.values(parts));
     parts.footprint.renderOrder = 1;
     return parts;
@@ -135,8 +135,8 @@ export class SpaceView {
     footprint.material.opacity = spotted ? 0.3 : 0.09;
     footprint.position.set(...this.point([place[0], place[1], 0]));
     const land = new three.Color(theme.land);
-    const around = circle(place, this.episode.radius).map((corner) => this.point(corner));
-    draw(edge, pairs(around), () => colour.clone().lerp(land, spotted ? 0 : 0.5));
+    edge.material.color = colour.clone().lerp(land, spotted ? 0 : 0.5);
+    edge.position.copy(footprint.position);
     const path = this.episode.trail(uav, now).map((each) => this.point(each));
     const stem = [this.point(place), this.point([place[0], place[1], 0])];
     const faded = (part) => colour.clone().lerp(land, part < path.length - 1 ? 0.7 * (1 - part / path.length) : 0.35);
@@ -164,7 +164,7 @@ export class SpaceView {
   /** Look from where all cameras are. */
   #follow() {
     this.following = true;
-    this.camera.position.fromArray(shared.position === BEGIN ? [BEGIN[0], BEGIN[2], BEGIN[1]] : shared.position);
+    this.camera.position.fromArray(shared.position);
     this.controls.target.fromArray(shared.target);
     this.controls.update();
     this.following = false;
@@ -185,7 +185,7 @@ export class SpaceView {
     const [west, south, east, north] = this.episode.borders;
     const metres = roundLength(0.3 * (east - west));
     const middle = (west + east) / 2;
-    const below = south - 0.05 * this.size;
+    const below = south - 0.035 * this.size;
     const ends = [-metres / 2, metres / 2].map((shift) => this.pixel([middle + shift, below, 0]));
     context.strokeStyle = theme.muted;
     context.lineWidth = 1.5;
@@ -203,12 +203,10 @@ export class SpaceView {
   }
 }
 
-/** Corners of a circle on the ground about a place [m]. */
-function circle([east, north], radius) {
-  return Array.from({ length: 65 }, (_, i) => {
-    const angle = (i * Math.PI) / 32;
-    return [east + radius * Math.cos(angle), north + radius * Math.sin(angle), 0];
-  });
+/** Corners of a circle on the ground, in the scene. */
+function circle(radius) {
+  const angles = Array.from({ length: 65 }, (_, i) => (i * Math.PI) / 32);
+  return angles.map((angle) => [radius * Math.cos(angle), 0, radius * Math.sin(angle)]);
 }
 
 function pairs(points) {
