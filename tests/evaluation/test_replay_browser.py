@@ -285,6 +285,33 @@ def test_the_pointer_tells_latitude_and_longitude_of_a_real_region(opened):
         assert -float(west[:-1]) == pytest.approx(float(longitude), abs=3e-5)
 
 
+def test_one_can_come_nearer_to_the_map_and_see_all_of_it_again(opened):
+    def places():
+        found = []
+        for shift in (0, 120):
+            page.actions().move_to_element_with_offset(page.one(".view"), shift, 0).perform()
+            page.settle()
+            east, north = page.one(".hint").text.replace("\u2212", "-").split(", ")
+            found.append([float(east.split()[1]), float(north.split()[1])])
+        return np.array(found)
+
+    with opened(late_flight()) as page:
+        before, picture = places(), page.map()
+        page.press("+")
+        nearer = places()
+        np.testing.assert_allclose(nearer[0], before[0], atol=2)
+        np.testing.assert_allclose(2 * (nearer[1] - nearer[0]), before[1] - before[0], atol=3)
+        page.actions().move_to_element(page.one(".view")).click_and_hold().move_by_offset(60, 0).perform()
+        page.actions().release().perform()
+        page.settle()
+        moved = places()
+        np.testing.assert_allclose(2 * (nearer[0] - moved[0]), nearer[1] - nearer[0], atol=3)
+        assert page.map() != picture
+        page.actions().double_click(page.one(".view")).perform()
+        page.settle()
+        assert page.map() == picture
+
+
 def test_on_a_telephone_nothing_is_wider_than_the_screen(opened):
     with opened(late_flight(2), late_flight(), width=390, height=844) as page:
         for view in ("2d", "3d"):

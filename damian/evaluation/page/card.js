@@ -6,14 +6,15 @@ import { Lanes } from "page/lanes";
 import { MapView } from "page/map";
 import { Readout } from "page/readout";
 import { SpaceView } from "page/space";
+import { listenToZoom } from "page/zoom";
 
 export class Card {
   /**
    * @param {HTMLElement} parent
    * @param {import("page/episode").Episode} episode
-   * @param {{player: object, theme: object, likely: number}} page
+   * @param {{player: object, theme: object, zoom: object, likely: number}} page
    */
-  constructor(parent, episode, { player, theme, likely }) {
+  constructor(parent, episode, { player, theme, zoom, likely }) {
     Object.assign(this, { episode, player, theme, likely });
     this.element = make(parent, "article", "card");
     this.element.setAttribute("aria-label", episode.title);
@@ -29,7 +30,8 @@ export class Card {
     for (const canvas of this.layers.slice(0, 2)) describe(canvas, described);
     this.layers[2].setAttribute("aria-hidden", "true");
     this.hint = make(this.view, "p", "hint");
-    this.map = new MapView(this.layers[0], episode, likely);
+    this.map = new MapView(this.layers[0], episode, likely, zoom);
+    listenToZoom(this.layers[0], zoom, episode, (x, y) => this.map.place(x, y), () => player.changed());
     this.#followPointer();
     const rows = make(body, "canvas", "lanes");
     describe(rows, "messages over time: a row for each UAV; dots arrive at once, bars are late, crosses are lost");

@@ -38,7 +38,8 @@ export function chartsOf(episode, theme, showsBattery) {
 /** Smallest and largest value of the charts with the same key, with some room. */
 export function rangeOf(charts) {
   const values = charts.flatMap((chart) => chart.lines.flatMap((line) => line.values));
-  const [low, high] = [Math.min(...values, 0), Math.max(...values)];
+  const low = values.reduce((least, value) => Math.min(least, value), 0);
+  const high = values.reduce((most, value) => Math.max(most, value), low);
   const full = charts[0].key === "battery" ? [0, 100] : [low, high > low ? high : low + 1];
   const room = 0.06 * (full[1] - full[0]);
   return [full[0] < 0 ? full[0] - room : full[0] - room / 3, full[1] + room];

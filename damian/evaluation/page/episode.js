@@ -29,8 +29,14 @@ export class Episode {
     this.last = this.time.length - 1;
     this.end = this.time[this.last];
     this.dt = this.last ? this.time[1] - this.time[0] : 1;
+    /** Outlines of the region: polygons, each a list of rings [[east, north], ...]. */
+    this.polygons = this.region.type === "Polygon" ? [this.region.coordinates] : this.region.coordinates;
+    /** West, south, east and north border of the region [m]. */
+    this.borders = bordersOf(this.polygons.flat(2));
+    /** West, south, east and north border of what a view shows [m]: footprints are not cut, unless they are large. */
+    this.limits = withMargin(this.borders, this.radius);
     this.usesBattery = this.battery.some((row) => row.some((level, uav) => level !== this.battery[0][uav]));
-    this.highest = Math.max(...this.position.flat().map((place) => place[2]));
+    this.highest = this.position.flat().reduce((most, place) => Math.max(most, place[2]), 0);
     this.messages = this.#messages();
     const mean = (row) => row.reduce((sum, each) => sum + each, 0) / row.length;
     this.meanReward = this.reward.map(mean);
@@ -39,25 +45,6 @@ export class Episode {
     this.meanTerms = new Map(terms.filter(([, values]) => values.some((value) => value !== 0)));
     let sum = 0;
     this.returns = this.meanReward.map((reward) => (sum += reward));
-  }
-
-  /** Outlines of the region: polygons, each a list of rings [[east, north], ...]. */
-  get polygons() {
-    return this.region.type === "Polygon" ? [this.region.coordinates] : this.region.coordinates;
-  }
-
-  /** West, south, east and north border of the region [m]. */
-  get borders() {
-    const corners = this.polygons.flat(2);
-    const [east, north] = [corners.map((corner) => corner[0]), corners.map((corner) => corner[1])];
-    return [Math.min(...east), Math.min(...north), Math.max(...east), Math.max(...north)];
-  }
-
-  /** West, south, east and north border of what a view shows [m]: as in films. */
-  get limits() {
-    const [west, south, east, north] = this.borders;
-    const margin = Math.max(0.06 * Math.max(east - west, north - south), 0.5 * this.radius);
-    return this.borders.map((value, side) => value + (side < 2 ? -margin : margin));
   }
 
   /** @param {number} time [s] @returns {Now} */
@@ -127,6 +114,18 @@ export class Episode {
       return sent ? [{ uav, step, sent: time, arrives: time + delay * this.dt, lost: delay < 0 }] : [];
     }));
   }
+}
+
+function bordersOf(corners) {
+  const [east, north] = [corners.map((corner) => corner[0]), corners.map((corner) => corner[1])];
+  const [least, most] = [(values) => values.reduce((a, b) => Math.min(a, b)), (values) => values.reduce((a, b) => Math.max(a, b))];
+  return [least(east), least(north), most(east), most(north)];
+}
+
+function withMargin([west, south, east, north], radius) {
+  const size = Math.max(east - west, north - south);
+  const margin = Math.min(Math.max(0.06 * size, radius), 0.15 * size);
+  return [west - margin, south - margin, east + margin, north + margin];
 }
 
 /** A row of a column between two instants; of one UAV if it is given. */

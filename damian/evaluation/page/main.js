@@ -6,11 +6,13 @@ import { addTools, addTransport, listen } from "page/controls";
 import { Episode } from "page/episode";
 import { Player } from "page/player";
 import { Theme } from "page/theme";
+import { Zoom } from "page/zoom";
 
 const replay = JSON.parse(document.getElementById("replay").textContent);
 const episodes = replay.episodes.map((file) => new Episode(file));
 const theme = new Theme(replay.colours);
 const player = new Player(episodes);
+const zoom = new Zoom();
 const hasBelief = episodes.some((episode) => episode.belief !== null);
 const settings = {
   view: "2d",
@@ -19,11 +21,11 @@ const settings = {
 
 const parent = document.getElementById("episodes");
 parent.style.setProperty("--cards", episodes.length);
-const cards = episodes.map((episode) => new Card(parent, episode, { player, theme, likely: replay.likely }));
+const cards = episodes.map((episode) => new Card(parent, episode, { player, theme, zoom, likely: replay.likely }));
 addCharts();
 addTransport(document.getElementById("transport"), player);
 const keys = addTools(document.getElementById("tools"), settings, hasBelief, () => player.changed());
-listen(player, keys);
+listen(player, { ...keys, ...zoomKeys() });
 player.onChange(() => cards.forEach((card) => card.draw(settings)));
 new ResizeObserver(redraw).observe(parent);
 theme.onChange(redraw);
@@ -40,6 +42,11 @@ function addCharts() {
   const kinds = Map.groupBy(all.flat(), (chart) => chart.key);
   const ranges = new Map([...kinds].map(([key, charts]) => [key, rangeOf(charts)]));
   cards.forEach((card, i) => card.addCharts(all[i], ranges));
+}
+
+function zoomKeys() {
+  const keys = Object.entries(zoom.keys);
+  return Object.fromEntries(keys.map(([key, press]) => [key, () => (press(), player.changed())]));
 }
 
 function redraw() {

@@ -12,10 +12,10 @@ export class MapView {
    * @param {HTMLCanvasElement} canvas
    * @param {import("page/episode").Episode} episode
    * @param {number} likely see Ground
+   * @param {import("page/zoom").Zoom} zoom
    */
-  constructor(canvas, episode, likely) {
-    this.canvas = canvas;
-    this.episode = episode;
+  constructor(canvas, episode, likely, zoom) {
+    Object.assign(this, { canvas, episode, zoom });
     this.ground = new Ground(episode, likely);
   }
 
@@ -24,10 +24,12 @@ export class MapView {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (!width || !height) return;
     const context = fitted(this.canvas, width, height);
-    const pixels = new Frame(this.episode.limits, this.canvas.width, this.canvas.height);
+    this.canvas.classList.toggle("near", this.zoom.factor > 1);
+    const limits = this.zoom.limits(this.episode.limits);
+    const pixels = new Frame(limits, this.canvas.width, this.canvas.height);
     this.ground.paint(pixels, now.step, layers, theme);
     context.drawImage(this.ground.canvas, 0, 0, width, height);
-    this.frame = new Frame(this.episode.limits, width, height);
+    this.frame = new Frame(limits, width, height);
     if (layers.has("truth")) this.#footprintsAndTrails(context, now, theme);
     const view = { pixel: (place) => this.frame.pixel(place), darts: true, rise: 0 };
     drawMarks(context, this.episode, now, layers, theme, view);

@@ -150,6 +150,8 @@ export class SpaceView {
     this.controls.minDistance = 0.15;
     this.controls.maxDistance = 4;
     this.controls.zoomToCursor = true;
+    const zoomed = (event) => (this.controls.enableZoom = event.type !== "wheel" || event.ctrlKey || event.metaKey);
+    for (const name of ["wheel", "pointerdown"]) this.marks.addEventListener(name, zoomed, { capture: true });
     this.#follow();
     shared.moves.add(() => this.#follow());
     this.controls.addEventListener("change", () => {
