@@ -26,15 +26,18 @@ export class Card {
     const [west, south, east, north] = episode.limits;
     this.view.style.setProperty("--aspect", Math.min(Math.max((east - west) / (north - south), 0.8), 2));
     this.layers = ["map", "space", "marks"].map((name) => make(this.view, "canvas", name));
-    const described = `where the UAVs and the source are in ${episode.title}; the table below has the numbers`;
+    const described = `where UAVs and source are in ${episode.title}; the table below has the numbers`;
     for (const canvas of this.layers.slice(0, 2)) describe(canvas, described);
     this.layers[2].setAttribute("aria-hidden", "true");
     this.hint = make(this.view, "p", "hint");
     this.map = new MapView(this.layers[0], episode, likely, zoom);
-    listenToZoom(this.layers[0], zoom, episode, (x, y) => this.map.place(x, y), () => player.changed());
+    listenToZoom(this.map, zoom, () => player.changed());
     this.#followPointer();
     const rows = make(body, "canvas", "lanes");
-    describe(rows, "messages over time: a row for each UAV; dots arrive at once, bars are late, crosses are lost");
+    describe(
+      rows,
+      "messages over time: for each UAV dots that arrive at once, bars that are late, crosses that are lost",
+    );
     this.lanes = new Lanes(rows, episode, player);
     this.figures = make(body, "div", "charts");
     this.charts = [];
@@ -45,13 +48,9 @@ export class Card {
 
   /** Add the charts, with the ranges of their values by key. */
   addCharts(charts, ranges) {
-    this.charts = charts.map((chart) => {
-      const figure = make(this.figures, "figure");
-      const caption = make(figure, "figcaption");
-      make(caption, "span").textContent = chart.title;
-      figure.dataset.chart = chart.key;
-      return new ChartView(figure, caption, this.episode, chart, ranges.get(chart.key), this.player, this.theme);
-    });
+    const page = { player: this.player, theme: this.theme };
+    const made = (chart) => new ChartView(this.figures, this.episode, chart, ranges.get(chart.key), page);
+    this.charts = charts.map(made);
   }
 
   /** Draw the time of the page. */
@@ -77,8 +76,7 @@ export class Card {
       this.space = new SpaceView(space, marks, this.episode, this.likely, () => this.player.changed());
     } catch (problem) {
       this.space = null;
-      this.hint.textContent = "3D needs WebGL, which this browser does not offer";
-      this.hint.classList.add("problem");
+      make(this.view, "p", "problem").textContent = "3D needs WebGL, which this browser does not offer";
       console.warn(problem.message);
     }
     return this.space;
@@ -87,15 +85,12 @@ export class Card {
   /** Say which place is under the pointer. */
   #followPointer() {
     this.view.addEventListener("pointermove", (event) => {
-      if (this.space === null) return;
       const border = this.view.getBoundingClientRect();
       const view = this.view.dataset.view === "3d" ? this.space : this.map;
       const place = view?.place(event.clientX - border.left, event.clientY - border.top);
       this.hint.textContent = place ? spoken(place, this.episode.origin) : "";
     });
-    this.view.addEventListener("pointerleave", () => {
-      if (this.space !== null) this.hint.textContent = "";
-    });
+    this.view.addEventListener("pointerleave", () => (this.hint.textContent = ""));
   }
 }
 

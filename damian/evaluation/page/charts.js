@@ -9,8 +9,8 @@ const NAMED = 6;
 const FONT = "11px system-ui, sans-serif";
 
 /**
- * What a chart shows. The value of an instant is that of the step before it (rewards), or holds until the next
- * one (ages); others change evenly.
+ * What a chart shows. The value of an instant is that of the step before it (rewards), or holds until the
+ * next one (ages); others change evenly.
  * @typedef {{key: string, title: string, lines: {name: string, values: number[], colour: Function}[],
  *   held: "before" | "after" | "no", digits: number}} Chart
  */
@@ -19,19 +19,42 @@ const ALIGN = { before: -1, after: 1 };
 /** The charts of an episode. @returns {Chart[]} */
 export function chartsOf(episode, theme, showsBattery) {
   const ink = () => theme.ink;
-  const byUav = (rows) => rows[0].map((_, uav) =>
-    ({ name: `UAV ${uav}`, values: rows.map((row) => row[uav]), colour: () => theme.uav(uav) }));
-  const terms = [...episode.meanTerms].map(([name, values], i) =>
-    ({ name: name.replaceAll("_", " "), values, colour: () => theme.term(i) }));
+  const byUav = (rows) =>
+    rows[0].map((_, uav) => ({
+      name: `UAV ${uav}`,
+      values: rows.map((row) => row[uav]),
+      colour: () => theme.uav(uav),
+    }));
+  const terms = [...episode.meanTerms].map(([name, values], i) => ({
+    name: name.replaceAll("_", " "),
+    values,
+    colour: () => theme.term(i),
+  }));
   const all = { name: "all terms", values: episode.meanReward, colour: ink };
   const charts = [
-    { key: "return", title: "return so far", digits: 2, held: "no",
-      lines: [{ name: "return", values: episode.returns, colour: ink }] },
-    { key: "reward", title: "reward of each step, by term", digits: 3, held: "before",
-      lines: terms.length ? terms : [all] },
+    {
+      key: "return",
+      title: "return so far",
+      digits: 2,
+      held: "no",
+      lines: [{ name: "return", values: episode.returns, colour: ink }],
+    },
+    {
+      key: "reward",
+      title: "reward of each step, by term",
+      digits: 3,
+      held: "before",
+      lines: terms.length ? terms : [all],
+    },
     { key: "age", title: "age of information [s]", digits: 1, held: "after", lines: byUav(episode.age) },
   ];
-  const battery = { key: "battery", title: "battery [%]", digits: 1, held: "no", lines: byUav(episode.battery) };
+  const battery = {
+    key: "battery",
+    title: "battery [%]",
+    digits: 1,
+    held: "no",
+    lines: byUav(episode.battery),
+  };
   return showsBattery ? [...charts, battery] : charts;
 }
 
@@ -47,18 +70,22 @@ export function rangeOf(charts) {
 
 export class ChartView {
   /**
-   * @param {HTMLElement} parent
-   * @param {HTMLElement} caption gets the legend
+   * @param {HTMLElement} parent gets a figure, with the title and the legend as its caption
    * @param {import("page/episode").Episode} episode
    * @param {Chart} chart
    * @param {number[]} range of its values
-   * @param {import("page/player").Player} player
-   * @param {import("page/theme").Theme} theme
+   * @param {{player: import("page/player").Player, theme: import("page/theme").Theme}} page
    */
-  constructor(parent, caption, episode, chart, range, player, theme) {
-    Object.assign(this, { parent, caption, episode, chart });
+  constructor(parent, episode, chart, range, { player, theme }) {
+    this.figure = document.createElement("figure");
+    this.caption = document.createElement("figcaption");
+    this.caption.append(chart.title);
+    this.figure.dataset.chart = chart.key;
+    this.figure.append(this.caption);
+    parent.append(this.figure);
+    Object.assign(this, { episode, chart });
     const data = [episode.time, ...chart.lines.map((line) => line.values)];
-    this.plot = new uPlot(this.#options(range, player, theme), data, parent);
+    this.plot = new uPlot(this.#options(range, player, theme), data, this.figure);
     this.future = document.createElement("div");
     this.future.className = "future";
     this.plot.over.append(this.future);
@@ -78,15 +105,16 @@ export class ChartView {
 
   /** Draw again in the present width and colours. */
   resize() {
-    const width = this.parent.clientWidth;
+    const width = this.figure.clientWidth;
     const height = this.#height();
-    if (width && (width !== this.plot.width || height !== this.plot.height)) this.plot.setSize({ width, height });
+    if (width && (width !== this.plot.width || height !== this.plot.height))
+      this.plot.setSize({ width, height });
     else this.plot.redraw(false);
   }
 
   /** Height of a chart [px], which the style decides. */
   #height() {
-    return Number(getComputedStyle(this.parent).getPropertyValue("--chart-height"));
+    return Number(getComputedStyle(this.figure).getPropertyValue("--chart-height"));
   }
 
   #options(range, player, theme) {
@@ -103,7 +131,7 @@ export class ChartView {
       paths: align ? uPlot.paths.stepped({ align }) : uPlot.paths.linear(),
     }));
     return {
-      width: this.parent.clientWidth || 300,
+      width: this.figure.clientWidth || 300,
       height: this.#height(),
       padding: [6, MARGIN, 0, 0],
       legend: {
@@ -114,7 +142,13 @@ export class ChartView {
       cursor: { sync: { key: "time" }, drag: { x: false, y: false }, points: { size: 5 }, y: false },
       scales: { x: { time: false, range: [0, Math.max(player.end, this.episode.dt)] }, y: { range } },
       axes: [
-        { ...axis, grid: { ...grid, show: false }, size: 26, gap: 6, values: (_, ticks) => ticks.map((tick) => `${tick} s`) },
+        {
+          ...axis,
+          grid: { ...grid, show: false },
+          size: 26,
+          gap: 6,
+          values: (_, ticks) => ticks.map((tick) => `${tick} s`),
+        },
         { ...axis, grid, size: GUTTER, gap: 4, space: 26 },
       ],
       series: [{ label: "time", value: (_, time) => (time == null ? "" : `${time} s`) }, ...series],

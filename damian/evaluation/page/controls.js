@@ -45,12 +45,22 @@ export function addTools(parent, settings, hasBelief, changed) {
     return made;
   };
   for (const view of ["2d", "3d"]) {
-    add(views, view.toUpperCase(), () => settings.view === view, () => (settings.view = view)).dataset.view = view;
+    add(
+      views,
+      view.toUpperCase(),
+      () => settings.view === view,
+      () => (settings.view = view),
+    ).dataset.view = view;
   }
   const toggle = (name) => settings.layers[settings.layers.has(name) ? "delete" : "add"](name);
   const keys = { v: () => (settings.view = settings.view === "2d" ? "3d" : "2d") };
   LAYERS.forEach(([name, sign, text], i) => {
-    const made = add(layers, text, () => settings.layers.has(name), () => toggle(name));
+    const made = add(
+      layers,
+      text,
+      () => settings.layers.has(name),
+      () => toggle(name),
+    );
     made.dataset.layer = name;
     made.dataset.sign = sign;
     made.title = `${text} (key ${i + 1})`;
@@ -111,7 +121,8 @@ export function listen(player, keys) {
   };
   addEventListener("keydown", (event) => {
     const press = presses[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    const writes = event.target.matches("select") || (event.key === " " && event.target.matches("button, summary"));
+    const writes =
+      event.target.matches("select") || (event.key === " " && event.target.matches("button, summary"));
     if (!press || writes || event.ctrlKey || event.altKey || event.metaKey) return;
     event.preventDefault();
     press(event);

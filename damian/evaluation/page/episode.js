@@ -33,7 +33,7 @@ export class Episode {
     this.polygons = this.region.type === "Polygon" ? [this.region.coordinates] : this.region.coordinates;
     /** West, south, east and north border of the region [m]. */
     this.borders = bordersOf(this.polygons.flat(2));
-    /** West, south, east and north border of what a view shows [m]: footprints are not cut, unless they are large. */
+    /** Borders of what a view shows [m]: footprints are not cut, unless they are large. */
     this.limits = withMargin(this.borders, this.radius);
     this.usesBattery = this.battery.some((row) => row.some((level, uav) => level !== this.battery[0][uav]));
     this.highest = this.position.flat().reduce((most, place) => Math.max(most, place[2]), 0);
@@ -84,14 +84,18 @@ export class Episode {
 
   /** The latest places of a UAV, the oldest first, up to where it is: [[east, north, up], ...]. */
   trail(uav, now) {
-    const path = this.position.slice(Math.max(now.step - TRAIL, 0), now.step + 1).map((places) => places[uav]);
+    const path = this.position
+      .slice(Math.max(now.step - TRAIL, 0), now.step + 1)
+      .map((places) => places[uav]);
     return [...path, this.place(uav, now)];
   }
 
   /** Messages that are under way at a time, or were lost shortly before. @returns {Message[]} */
   underWay({ time }) {
-    return this.messages.filter((message) =>
-      message.sent <= time && time < (message.lost ? message.sent + MOURNED * this.dt : message.arrives));
+    return this.messages.filter(
+      (message) =>
+        message.sent <= time && time < (message.lost ? message.sent + MOURNED * this.dt : message.arrives),
+    );
   }
 
   /** Numbers of the UAVs that spot the source at an instant. */
@@ -101,24 +105,29 @@ export class Episode {
 
   /** Edge of the belief's square cells [m]. */
   get cellEdge() {
-    const east = [...new Set(this.cells.map((cell) => Math.round(cell[0] * 1000) / 1000))].sort((a, b) => a - b);
+    const east = [...new Set(this.cells.map((cell) => Math.round(cell[0] * 1000) / 1000))].sort(
+      (a, b) => a - b,
+    );
     const gaps = east.slice(1).map((value, i) => value - east[i]);
     return gaps.length ? Math.min(...gaps) : 1;
   }
 
   /** Every message that is late or lost or arrives at once, in the order of sending. @returns {Message[]} */
   #messages() {
-    return this.sent.flatMap((row, step) => row.flatMap((sent, uav) => {
-      const delay = this.delay[step][uav];
-      const time = this.time[step];
-      return sent ? [{ uav, step, sent: time, arrives: time + delay * this.dt, lost: delay < 0 }] : [];
-    }));
+    return this.sent.flatMap((row, step) =>
+      row.flatMap((sent, uav) => {
+        const delay = this.delay[step][uav];
+        const time = this.time[step];
+        return sent ? [{ uav, step, sent: time, arrives: time + delay * this.dt, lost: delay < 0 }] : [];
+      }),
+    );
   }
 }
 
 function bordersOf(corners) {
   const [east, north] = [corners.map((corner) => corner[0]), corners.map((corner) => corner[1])];
-  const [least, most] = [(values) => values.reduce((a, b) => Math.min(a, b)), (values) => values.reduce((a, b) => Math.max(a, b))];
+  const least = (values) => values.reduce((one, other) => Math.min(one, other));
+  const most = (values) => values.reduce((one, other) => Math.max(one, other));
   return [least(east), least(north), most(east), most(north)];
 }
 

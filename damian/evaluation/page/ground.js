@@ -1,4 +1,4 @@
-/** What lies on the ground: the region, its landing points, what is covered, and the belief about the source. */
+/** What lies on the ground: the region, its landing points, what is covered, the belief about the source. */
 
 import { faint } from "page/theme";
 

@@ -21,7 +21,9 @@ const settings = {
 
 const parent = document.getElementById("episodes");
 parent.style.setProperty("--cards", episodes.length);
-const cards = episodes.map((episode) => new Card(parent, episode, { player, theme, zoom, likely: replay.likely }));
+const cards = episodes.map(
+  (episode) => new Card(parent, episode, { player, theme, zoom, likely: replay.likely }),
+);
 addCharts();
 addTransport(document.getElementById("transport"), player);
 const keys = addTools(document.getElementById("tools"), settings, hasBelief, () => player.changed());
@@ -31,7 +33,7 @@ new ResizeObserver(redraw).observe(parent);
 theme.onChange(redraw);
 document.getElementById("shared").textContent = replay.shared;
 document.getElementById("motion").textContent = episodes.some((episode) => episode.instant)
-  ? "In these tasks a UAV reaches its target by the end of the step; between instants it is drawn on the straight way."
+  ? "A UAV reaches its target by the end of the step; between instants it is drawn on the straight way."
   : "Between instants UAVs are drawn on the straight way.";
 document.documentElement.dataset.ready = "true";
 
@@ -39,8 +41,8 @@ document.documentElement.dataset.ready = "true";
 function addCharts() {
   const battery = episodes.some((episode) => episode.usesBattery);
   const all = episodes.map((episode) => chartsOf(episode, theme, battery));
-  const kinds = Map.groupBy(all.flat(), (chart) => chart.key);
-  const ranges = new Map([...kinds].map(([key, charts]) => [key, rangeOf(charts)]));
+  const same = (key) => all.flat().filter((chart) => chart.key === key);
+  const ranges = new Map(all[0].map(({ key }) => [key, rangeOf(same(key))]));
   cards.forEach((card, i) => card.addCharts(all[i], ranges));
 }
 

@@ -31,8 +31,8 @@ export class MapView {
     context.drawImage(this.ground.canvas, 0, 0, width, height);
     this.frame = new Frame(limits, width, height);
     if (layers.has("truth")) this.#footprintsAndTrails(context, now, theme);
-    const view = { pixel: (place) => this.frame.pixel(place), darts: true, rise: 0 };
-    drawMarks(context, this.episode, now, layers, theme, view);
+    const pixel = (place) => this.frame.pixel(place);
+    drawMarks({ context, episode: this.episode, now, layers, theme, pixel, darts: true, rise: 0 });
     this.#scaleBar(context, theme);
   }
 

@@ -3,7 +3,12 @@
 import { faint } from "page/theme";
 
 /** Outline of a UAV that flies to the north, as in films: east, north. */
-export const DART = [[0, 1], [0.62, -0.8], [0, -0.42], [-0.62, -0.8]];
+export const DART = [
+  [0, 1],
+  [0.62, -0.8],
+  [0, -0.42],
+  [-0.62, -0.8],
+];
 
 /** A UAV, turned to its heading [rad, clockwise from north]. */
 export function dart(context, [x, y], heading, colour, theme, size = 10) {

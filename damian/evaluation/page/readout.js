@@ -40,12 +40,16 @@ export class Readout {
       ["age", `mean age ${episode.meanAge[step].toFixed(1)} s`],
       ["ended", ended ? (episode.success ? "ended with success" : "ended") : ""],
     ];
-    this.line.replaceChildren(...parts.filter(([, text]) => text).map(([name, text]) => {
-      const part = document.createElement("span");
-      part.dataset.shown = name;
-      part.textContent = text;
-      return part;
-    }));
+    this.line.replaceChildren(
+      ...parts
+        .filter(([, text]) => text)
+        .map(([name, text]) => {
+          const part = document.createElement("span");
+          part.dataset.shown = name;
+          part.textContent = text;
+          return part;
+        }),
+    );
     this.rows.forEach((cells, uav) => {
       const [east, north, up] = episode.position[step][uav];
       const numbers = { east, north, up, age: episode.age[step][uav], battery: episode.battery[step][uav] };
@@ -61,7 +65,10 @@ export class Readout {
 
 /** A number with one decimal, and a minus sign that is as wide as a digit. */
 function written(value) {
-  return value.toFixed(1).replace(/^-0\.0$/, "0.0").replace("-", "−");
+  return value
+    .toFixed(1)
+    .replace(/^-0\.0$/, "0.0")
+    .replace("-", "−");
 }
 
 /** A row of the table; returns its cells by name. */

@@ -4,8 +4,9 @@ import * as three from "libraries";
 import { fitted } from "page/canvas";
 import { Frame, length, roundLength } from "page/geography";
 import { Ground } from "page/ground";
-import { DART, label, plain } from "page/marks";
+import { label, plain } from "page/marks";
 import { drawMarks } from "page/overlay";
+import { SpaceUav } from "page/space_uav";
 
 /** Heights are enlarged until the highest one is this share of the region's size, as in films. */
 const SHARE = 0.3;
@@ -13,15 +14,13 @@ const SHARE = 0.3;
 const RISE = 0.25;
 /** Pixels of the ground's picture, in its larger direction. */
 const PIXELS = 1536;
-/** Length of a UAV as a share of the region's size. */
-const UAV = 0.022;
 /** Where cameras begin, in the scene: east, up and south, so that they look to the north. */
 const BEGIN = [0.14, 0.92, 0.86];
 /** Angles that the camera sees, at least: in height and in width [deg]. */
-const [SEEN_HIGH, SEEN_WIDE] = [42, 48];
+const [SEEN_HIGH, SEEN_WIDE] = [46, 53];
 
 /** Where the cameras of all views are, in sizes of their regions: they move together. */
-const shared = { position: BEGIN, target: [0, 0.02, 0.05], moves: new Set() };
+const shared = { position: BEGIN, target: [0, -0.02, 0.08], moves: new Set() };
 
 export class SpaceView {
   /**
@@ -35,17 +34,16 @@ export class SpaceView {
   constructor(canvas, marks, episode, likely, changed) {
     Object.assign(this, { canvas, marks, episode });
     this.renderer = new three.WebGLRenderer({ canvas, antialias: true, alpha: true });
-    const [west, south, east, north] = episode.limits;
+    const [west, south, east, north] = episode.borders;
     this.middle = [(west + east) / 2, (south + north) / 2];
     this.size = Math.max(east - west, north - south);
-    this.enlarged = Math.max(1, (SHARE * this.size) / Math.max(episode.highest, 1e-9));
-    if (episode.highest === 0) this.enlarged = 1;
+    this.enlarged = episode.highest ? Math.max(1, (SHARE * this.size) / episode.highest) : 1;
     this.scene = new three.Scene();
     const sun = new three.DirectionalLight("#ffffff", 2.2);
     sun.position.set(-1, 2, 1);
     this.scene.add(new three.AmbientLight("#ffffff", 1.4), sun);
-    this.#addGround(likely, east - west, north - south);
-    this.uavs = episode.position[0].map(() => this.#addUav());
+    this.#addGround(likely);
+    this.uavs = episode.position[0].map((_, uav) => new SpaceUav(this, uav));
     this.#addCamera(changed);
   }
 
@@ -61,35 +59,39 @@ export class SpaceView {
     if (!width || !height) return;
     this.#resize(width, height);
     if (this.ground.paint(this.groundFrame, now.step, layers, theme)) this.texture.needsUpdate = true;
-    this.uavs.forEach((parts, uav) => this.#move(parts, uav, now, layers, theme));
+    for (const uav of this.uavs) uav.move(now, layers.has("truth"), theme);
     this.renderer.render(this.scene, this.camera);
     const context = fitted(this.marks, width, height);
-    const view = { pixel: (place) => this.pixel(place), darts: false, rise: (RISE * this.size) / this.enlarged };
-    drawMarks(context, this.episode, now, layers, theme, view);
+    const pixel = (place) => this.pixel(place);
+    const rise = (RISE * this.size) / this.enlarged;
+    drawMarks({ context, episode: this.episode, now, layers, theme, pixel, darts: false, rise });
     this.#words(context, theme);
   }
 
-  /** Pixel of a place east, north, up [m]. */
+  /** Pixel of a place east, north, up [m]; far outside for what is behind the camera. */
   pixel(place) {
-    const projected = new three.Vector3(...this.point(place)).project(this.camera);
-    return [((projected.x + 1) / 2) * this.canvas.clientWidth, ((1 - projected.y) / 2) * this.canvas.clientHeight];
+    const { x, y, z } = new three.Vector3(...this.point(place)).project(this.camera);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    return z > 1 ? [-10 * width, -10 * height] : [((x + 1) / 2) * width, ((1 - y) / 2) * height];
   }
 
   /** Place [m] on the ground that a pixel shows, or undefined for the sky. */
   place(x, y) {
-    const screen = new three.Vector2((2 * x) / this.canvas.clientWidth - 1, 1 - (2 * y) / this.canvas.clientHeight);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const screen = new three.Vector2((2 * x) / width - 1, 1 - (2 * y) / height);
     const ray = new three.Raycaster();
     ray.setFromCamera(screen, this.camera);
     const hit = ray.ray.intersectPlane(new three.Plane(new three.Vector3(0, 1, 0)), new three.Vector3());
     return hit ? [hit.x * this.size + this.middle[0], this.middle[1] - hit.z * this.size] : undefined;
   }
 
-  #addGround(likely, width, height) {
-    const pixels = PIXELS / this.size;
+  #addGround(likely) {
+    const [west, south, east, north] = this.episode.limits;
+    const [width, height] = [east - west, north - south];
+    const [columns, rows] = [width, height].map((length) => Math.round((length * PIXELS) / this.size));
+    this.groundFrame = new Frame(this.episode.limits, columns, rows);
     this.ground = new Ground(this.episode, likely);
-    this.groundFrame = new Frame(this.episode.limits, Math.round(width * pixels), Math.round(height * pixels));
-    this.ground.canvas.width = this.groundFrame.width;
-    this.ground.canvas.height = this.groundFrame.height;
+    Object.assign(this.ground.canvas, { width: columns, height: rows });
     this.texture = new three.CanvasTexture(this.ground.canvas);
     this.texture.colorSpace = three.SRGBColorSpace;
     this.texture.anisotropy = 8;
@@ -99,50 +101,6 @@ export class SpaceView {
     this.scene.add(plane);
   }
 
-  /** The parts of a UAV: its body, its footprint, the edge of that, and its trail with what it stands above. */
-  #addUav() {
-    const shape = new three.Shape(DART.map(([east, north]) => new three.Vector2(east * UAV, north * UAV)));
-    const solid = { depth: 0.3 * UAV, bevelEnabled: true, bevelSize: 0.08 * UAV, bevelThickness: 0.08 * UAV, bevelSegments: 2 };
-    const form = new three.ExtrudeGeometry(shape, solid).rotateX(-Math.PI / 2);
-    const body = new three.Mesh(form, new three.MeshLambertMaterial());
-    const flat = new three.CircleGeometry(this.episode.radius / this.size, 64).rotateX(-Math.PI / 2);
-    const disc = new three.MeshBasicMaterial({ transparent: true, depthWrite: false });
-    const parts = { body, footprint: new three.Mesh(flat, disc), edge: this.#lines(1.4), trail: this.#lines(2.6) };
-    const radius = this.episode.radius / this.size;
-    draw(parts.edge, pairs(circle(radius)), () => new three.Color("#ffffff"));
-    this.scene.add(...Object.values(parts));
-    parts.footprint.renderOrder = 1;
-    return parts;
-  }
-
-  #lines(linewidth) {
-    const material = new three.LineMaterial({ linewidth, vertexColors: true, transparent: true, depthWrite: false });
-    const lines = new three.LineSegments2(new three.LineSegmentsGeometry(), material);
-    lines.frustumCulled = false;
-    lines.renderOrder = 2;
-    return lines;
-  }
-
-  #move({ body, footprint, edge, trail }, uav, now, layers, theme) {
-    for (const part of [body, footprint, edge, trail]) part.visible = layers.has("truth");
-    const place = this.episode.place(uav, now);
-    const spotted = this.episode.spotted[now.step][uav];
-    const colour = new three.Color(theme.uav(uav));
-    body.material.color = colour;
-    body.position.set(...this.point(place));
-    body.rotation.y = -this.episode.heading(uav, now);
-    footprint.material.color = colour;
-    footprint.material.opacity = spotted ? 0.3 : 0.09;
-    footprint.position.set(...this.point([place[0], place[1], 0]));
-    const land = new three.Color(theme.land);
-    edge.material.color = colour.clone().lerp(land, spotted ? 0 : 0.5);
-    edge.position.copy(footprint.position);
-    const path = this.episode.trail(uav, now).map((each) => this.point(each));
-    const stem = [this.point(place), this.point([place[0], place[1], 0])];
-    const faded = (part) => colour.clone().lerp(land, part < path.length - 1 ? 0.7 * (1 - part / path.length) : 0.35);
-    draw(trail, [...pairs(path), stem], faded);
-  }
-
   #addCamera(changed) {
     this.camera = new three.PerspectiveCamera(SEEN_HIGH, 1, 0.01, 20);
     this.controls = new three.OrbitControls(this.camera, this.marks);
@@ -150,7 +108,8 @@ export class SpaceView {
     this.controls.minDistance = 0.15;
     this.controls.maxDistance = 4;
     this.controls.zoomToCursor = true;
-    const zoomed = (event) => (this.controls.enableZoom = event.type !== "wheel" || event.ctrlKey || event.metaKey);
+    const zoomed = (event) =>
+      (this.controls.enableZoom = event.type !== "wheel" || event.ctrlKey || event.metaKey);
     for (const name of ["wheel", "pointerdown"]) this.marks.addEventListener(name, zoomed, { capture: true });
     this.#follow();
     shared.moves.add(() => this.#follow());
@@ -201,24 +160,6 @@ export class SpaceView {
     label(context, this.pixel([middle, north + 0.03 * this.size, 0]), "N", theme.muted, theme);
     context.textAlign = "left";
     const times = this.enlarged > 1 ? `heights ${plain(this.enlarged, 10)} times as large` : "";
-    label(context, [12, this.canvas.clientHeight - 14], times, theme.muted, theme);
+    label(context, [12, 14], times, theme.muted, theme);
   }
-}
-
-/** Corners of a circle on the ground, in the scene. */
-function circle(radius) {
-  const angles = Array.from({ length: 65 }, (_, i) => (i * Math.PI) / 32);
-  return angles.map((angle) => [radius * Math.cos(angle), 0, radius * Math.sin(angle)]);
-}
-
-function pairs(points) {
-  return points.slice(1).map((point, i) => [points[i], point]);
-}
-
-/** Give lines their ends [[from, to], ...], and each the colour that a function has for its number. */
-function draw(lines, ends, colourOf) {
-  lines.geometry.dispose();
-  lines.geometry = new three.LineSegmentsGeometry();
-  lines.geometry.setPositions(ends.flat(2));
-  lines.geometry.setColors(ends.flatMap((_, part) => [...colourOf(part).toArray(), ...colourOf(part).toArray()]));
 }

@@ -31,7 +31,18 @@ export class Theme {
   #read() {
     const style = getComputedStyle(document.documentElement);
     const value = (name) => style.getPropertyValue(`--${name}`).trim();
-    for (const name of ["paper", "land", "edge", "point", "ink", "muted", "line", "belief", "covered", "alarm"]) {
+    for (const name of [
+      "paper",
+      "land",
+      "edge",
+      "point",
+      "ink",
+      "muted",
+      "line",
+      "belief",
+      "covered",
+      "alarm",
+    ]) {
       this[name] = value(name);
     }
     this.dark = DARK.matches;

@@ -17,7 +17,7 @@ export class Zoom {
     return [middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1]];
   }
 
-  /** Come nearer by a factor, so that a place stays where it is; `place` from the whole map's middle, in sizes. */
+  /** Come nearer by a factor; a place stays where it is, given from the region's middle, in sizes. */
   by(factor, place = this.shift) {
     const before = this.factor;
     this.factor = Math.min(Math.max(before * factor, 1), NEAREST);
@@ -49,30 +49,36 @@ export class Zoom {
 }
 
 /**
- * Zoom a map with the wheel (while Ctrl or Cmd is held, so that the page can scroll), two fingers, or a double
- * click, and move it by dragging.
- * @param {HTMLCanvasElement} canvas
+ * Zoom a map with the wheel (while Ctrl or Cmd is held, so that the page can scroll), with two fingers, or by a
+ * double click, and move it by dragging.
+ * @param {import("page/map").MapView} map
  * @param {Zoom} zoom
- * @param {{limits: number[]}} episode
- * @param {function(number, number): number[] | undefined} placeAt place [m] of a pixel of the canvas
  * @param {function(): void} changed
  */
-export function listenToZoom(canvas, zoom, episode, placeAt, changed) {
-  const [west, south, east, north] = episode.limits;
+export function listenToZoom(map, zoom, changed) {
+  const { canvas } = map;
+  const [west, south, east, north] = map.episode.limits;
   const size = Math.max(east - west, north - south);
-  const relative = ([x, y]) => [(x - (west + east) / 2) / size, (y - (south + north) / 2) / size];
+  const relative = (pixel) => {
+    const [x, y] = map.place(...pixel);
+    return [(x - (west + east) / 2) / size, (y - (south + north) / 2) / size];
+  };
   const fingers = new Map();
   const pixel = (event) => [event.offsetX, event.offsetY];
   const act = (action) => {
     action();
     changed();
   };
-  canvas.addEventListener("wheel", (event) => {
-    if (!event.ctrlKey && !event.metaKey) return;
-    event.preventDefault();
-    act(() => zoom.by(Math.exp(-0.004 * event.deltaY), relative(placeAt(...pixel(event)))));
-  }, { passive: false });
-  canvas.addEventListener("dblclick", (event) => act(() => zoom.toggle(relative(placeAt(...pixel(event))))));
+  canvas.addEventListener(
+    "wheel",
+    (event) => {
+      if (!event.ctrlKey && !event.metaKey) return;
+      event.preventDefault();
+      act(() => zoom.by(Math.exp(-0.004 * event.deltaY), relative(pixel(event))));
+    },
+    { passive: false },
+  );
+  canvas.addEventListener("dblclick", (event) => act(() => zoom.toggle(relative(pixel(event)))));
   canvas.addEventListener("pointerdown", (event) => fingers.set(event.pointerId, pixel(event)));
   for (const name of ["pointerup", "pointercancel", "pointerleave"]) {
     canvas.addEventListener(name, (event) => fingers.delete(event.pointerId));
@@ -82,10 +88,10 @@ export function listenToZoom(canvas, zoom, episode, placeAt, changed) {
     if (!before) return;
     const other = [...fingers].find(([finger]) => finger !== event.pointerId)?.[1];
     const after = pixel(event);
-    const [from, to] = [relative(placeAt(...before)), relative(placeAt(...after))];
+    const [from, to] = [relative(before), relative(after)];
     fingers.set(event.pointerId, after);
     if (other) {
-      act(() => zoom.by(distance(after, other) / Math.max(distance(before, other), 1), relative(placeAt(...other))));
+      act(() => zoom.by(distance(after, other) / Math.max(distance(before, other), 1), relative(other)));
     } else if (zoom.factor > 1) {
       act(() => zoom.move(from[0] - to[0], from[1] - to[1]));
     }
