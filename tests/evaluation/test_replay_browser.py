@@ -6,6 +6,7 @@ Run by `make test-browser`. Selenium is imported where it is used, so that the o
 import io
 from contextlib import contextmanager
 from importlib import import_module
+from shutil import which
 
 import numpy as np
 import pytest
@@ -63,7 +64,7 @@ def browser():
     for flag in FLAGS:
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService("/usr/bin/chromedriver"))
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(which("chromedriver")))
     yield driver
     driver.quit()
 
