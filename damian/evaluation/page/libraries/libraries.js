@@ -1,14 +1,11 @@
 // What the replay page takes from three.js and uPlot, for `make page-libraries`; esbuild leaves out the rest.
 export {
   AmbientLight,
-  BufferGeometry,
   CanvasTexture,
   CircleGeometry,
   Color,
   DirectionalLight,
-  DoubleSide,
   ExtrudeGeometry,
-  Group,
   Mesh,
   MeshBasicMaterial,
   MeshLambertMaterial,
