@@ -1,4 +1,5 @@
-# make train | test | test-deep | test-slow | bench | bench-quick | pictures | docs | check | format        (each sets up what it needs)
+# make train | test | test-deep | test-slow | test-browser | bench | bench-quick | pictures | docs | page-libraries | check | format
+# (each sets up what it needs)
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -6,7 +7,7 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-deep test-slow bench bench-quick pictures docs check format clean
+.PHONY: train test test-deep test-slow test-browser bench bench-quick pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
@@ -20,6 +21,11 @@ test-deep: $(VENV)/test
 
 test-slow: $(VENV)/slow
 	$(PY) -m pytest -m slow $(ARGS)
+
+# The replay page in Chromium, which Debian and Ubuntu bring as these packages.
+test-browser: $(VENV)/browser
+	command -v chromium && command -v chromedriver || (apt-get update && apt-get install -y chromium chromium-driver)
+	$(PY) -m pytest -m browser tests/evaluation/test_replay_browser.py $(ARGS)
 
 bench: $(VENV)/bench
 	$(VENV)/bin/damian bench $(ARGS)
@@ -38,6 +44,16 @@ pictures: $(VENV)/base
 # The documentation site, in build/site.
 docs: $(VENV)/docs
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet
+
+# The libraries of the replay page, in one file that is committed; only a change of their versions or of what is taken needs it.
+PAGE := damian/evaluation/page
+page-libraries:
+	npm install --prefix $(PAGE)/libraries --no-package-lock --no-audit --no-fund --silent
+	cd $(PAGE)/libraries && node_modules/.bin/esbuild libraries.js --bundle --minify --format=esm \
+	  --legal-comments=none --target=es2022 --outfile=../libraries.min.js
+	cp $(PAGE)/libraries/node_modules/uplot/dist/uPlot.min.css $(PAGE)/uplot.css
+	(printf 'three.js\n========\n\n'; cat $(PAGE)/libraries/node_modules/three/LICENSE; \
+	 printf '\n\nuPlot\n=====\n\n'; cat $(PAGE)/libraries/node_modules/uplot/LICENSE) > $(PAGE)/LICENSES.txt
 
 check: $(VENV)/dev
 	$(VENV)/bin/ruff format --check .
@@ -69,6 +85,10 @@ $(VENV)/docs: $(VENV)/base
 
 $(VENV)/dev: $(VENV)/test
 	$(PIP) -e ".[dev]" "$(TORCH)"
+	touch $@
+
+$(VENV)/browser: $(VENV)/test
+	$(PIP) -e ".[browser]" "$(TORCH)"
 	touch $@
 
 $(VENV)/bench: $(VENV)/base

@@ -1,4 +1,4 @@
-"""Fly episodes and keep each as a file, a film and a figure: what is true, and what the server believes.
+"""Fly episodes and keep each as file, film, figure or page: what is true, and what the server believes.
 
     damian fly checkpoint=runs/first
     damian fly scenario=delaybench/tracking delay=paper aware=belief policy=greedy
@@ -7,7 +7,8 @@
 Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
 The run folder gets config.yaml, and for each episode that is kept episode_N.json (docs/episodes.md explains
 it), the film episode_N.gif (and episode_N_3d.gif), and episode_N.png: a map, the positions over time, and the
-age of information.
+age of information. "formats=[html]" makes episode_N.html, which plays the episode; damian replay makes such a
+page of several.
 """
 
 from dataclasses import dataclass, field
@@ -34,6 +35,7 @@ from damian.evaluation.belief_figure import plot_beliefs
 from damian.evaluation.episode import Episode, record
 from damian.evaluation.film import save_film
 from damian.evaluation.geojson import origin_of, save_geojson
+from damian.evaluation.replay_page import save_page
 from damian.learners.recurrent import add_recurrent_state
 
 from .evaluate import stored_actor
@@ -44,7 +46,7 @@ from .shared.stored_runs import save_config
 
 POLICIES = ("sampled", "mode", "greedy", "random")
 KEPT = ("all", "extremes")
-FORMATS, VIEWS = ("gif", "mp4", "png", "geojson"), ("2d", "3d")
+FORMATS, VIEWS = ("gif", "mp4", "png", "html", "geojson"), ("2d", "3d")
 FILMS = FORMATS[:2]
 
 
@@ -60,8 +62,8 @@ class FlyConfig(TrainConfig):
     keep: str = "all"
     """Which episodes to keep: ``all``, or the ``extremes``: the best, the median and the worst by return."""
     formats: list[str] = field(default_factory=lambda: ["gif", "png"])
-    """What to make of each: films as ``gif`` or ``mp4`` (which needs ffmpeg), the figure ``png``, and
-    ``geojson`` for map tools, over a real region."""
+    """What to make of each: films as ``gif`` or ``mp4`` (which needs ffmpeg), the figure ``png``, ``html``, a
+    page that plays it in any browser, and ``geojson`` for map tools, over a real region."""
     views: list[str] = field(default_factory=lambda: ["2d"])
     """Views of the films: ``2d``, from above, and ``3d``, with the space above the region."""
 
@@ -142,6 +144,8 @@ def show(config: FlyConfig, folder: Path) -> None:
         episode.save(folder / f"{name}.json")
         if "png" in config.formats:
             plot_beliefs(episode, folder / f"{name}.png")
+        if "html" in config.formats:
+            save_page([episode], folder / f"{name}.html")
         if "geojson" in config.formats:
             save_geojson(episode, folder / f"{name}.geojson")
         for kind, view in product([kind for kind in config.formats if kind in FILMS], config.views):

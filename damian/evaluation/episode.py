@@ -13,14 +13,16 @@ import numpy as np
 import shapely
 import torch
 from numpy.typing import NDArray
+from shapely.errors import ShapelyError
 from tensordict import TensorDictBase
 from torch import Tensor
 
 import damian
 from damian import keys
 from damian.common.atomic_files import write_atomically
+from damian.common.checks import HUGE
 from damian.common.errors import InputError
-from damian.common.text_files import one_line
+from damian.common.text_files import one_line, read_text
 from damian.envs.uav_env import UavEnv
 
 SCHEMA, VERSION = "damian-episode", 1
@@ -128,11 +130,15 @@ class Episode:
         return np.flatnonzero(self.belief[step] > LIKELY * self.belief[step].max())
 
     def save(self, path: Path) -> None:
-        """Write the episode as JSON, with numbers of ``DIGITS`` significant digits.
+        """Write the episode as JSON.
 
         Raises:
             RunError: the file cannot be written.
         """
+        write_atomically(path, json.dumps(self.document(), separators=(",", ":")))
+
+    def document(self) -> dict[str, Any]:
+        """What a file holds of the episode, with numbers of ``DIGITS`` significant digits."""
         fixed = {
             "region": json.loads(shapely.to_geojson(self.region)),
             "origin": self.origin,
@@ -143,17 +149,17 @@ class Episode:
         }
         columns = {name: _listed(getattr(self, name)) for name in COLUMNS}
         head = {"schema": SCHEMA, "version": VERSION, "about": self.about, "meaning": COLUMNS}
-        write_atomically(path, json.dumps({**head, **fixed, **columns}, separators=(",", ":")))
+        return {**head, **fixed, **columns}
 
     @classmethod
     def load(cls, path: Path) -> "Episode":
         """Read an episode from its file.
 
         Raises:
-            InputError: the file does not hold an episode of this version.
+            InputError: the file does not hold an episode of this version, or its columns do not fit together.
         """
         try:
-            found = json.loads(path.read_text())
+            found = json.loads(read_text(path))
             if (found["schema"], found["version"]) != (SCHEMA, VERSION):
                 raise ValueError(f"it is {found['schema']} of version {found['version']}")
             fixed = {f.name: found[f.name] for f in fields(cls) if f.name not in COLUMNS}
@@ -161,9 +167,11 @@ class Episode:
             fixed["origin"] = found["origin"] and tuple(found["origin"])
             fixed["landing_points"] = np.asarray(found["landing_points"], float)
             columns = {name: _array(found[name]) for name in COLUMNS}
+            _check_fixed(fixed)
+            _check_columns(columns)
             columns |= {name: columns[name].astype(bool) for name in ("spotted", "emits", "sent")}
             return cls(**fixed, **columns)
-        except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+        except (OSError, LookupError, TypeError, ValueError, RecursionError, ShapelyError) as error:
             raise InputError(
                 f"{path}: it is no episode of version {VERSION}: {one_line(str(error))}"
             ) from error
@@ -276,3 +284,52 @@ def _array(values: Any) -> Any:
     if isinstance(values, dict):
         return {name: _array(each) for name, each in values.items()}
     return None if values is None else np.asarray(values)
+
+
+def _check_columns(columns: Mapping[str, Any]) -> None:
+    """Check that columns have the shapes that their meanings say, and hold numbers.
+
+    Raises:
+        ValueError: one does not, or time does not increase.
+    """
+    (instants,), (_, agents, _) = columns["time"].shape, columns["position"].shape
+    sizes = {"T + 1": instants, "N": agents, "K": 0 if columns["cells"] is None else len(columns["cells"])}
+    for name, meaning in COLUMNS.items():
+        letters = meaning[meaning.rindex("[") + 1 : -1]
+        shape = tuple(sizes[each] if each in sizes else int(each) for each in letters.split(", "))
+        values = columns[name]
+        if values is None and name in ("cells", "belief") and columns["cells"] is columns["belief"]:
+            continue
+        for each in values.values() if isinstance(values, Mapping) else [values]:
+            if each is None or each.shape != shape or 0 in shape:
+                raise ValueError(
+                    f"{name} has not the shape [{letters}]: {each if each is None else each.shape}"
+                )
+            if not (np.abs(each) <= HUGE).all():
+                raise ValueError(f"{name} holds something else than numbers up to {HUGE:g}")
+    if (np.diff(columns["time"]) <= 0).any() or columns["delay"].dtype.kind != "i":
+        raise ValueError("time does not increase, or delay is not in whole steps")
+
+
+def _check_fixed(fixed: Mapping[str, Any]) -> None:
+    """Check what an episode has beside its columns.
+
+    Raises:
+        ValueError: the region has no area, or something is not of the kind that it should be.
+    """
+    points, place = fixed["landing_points"], fixed["origin"] or (0.0, 0.0)
+    if (
+        not isinstance(fixed["region"], shapely.Polygon | shapely.MultiPolygon)
+        or not fixed["region"].area > 0
+    ):
+        raise ValueError("region is no polygon with an area")
+    corners = shapely.get_coordinates(fixed["region"])
+    if points.shape != (len(points), 2) or not all(
+        (np.abs(each) <= HUGE).all() for each in (points, corners)
+    ):
+        raise ValueError("landing_points or region are not of places east and north [m]")
+    numbers = np.array([*place, fixed["radius"]], float)
+    if len(place) != 2 or not (np.abs(numbers) <= HUGE).all() or fixed["radius"] < 0:
+        raise ValueError("origin is not latitude and longitude [deg], or radius no length [m]")
+    if not isinstance(fixed["about"], dict) or not isinstance(fixed["about"].get("overrides") or [], list):
+        raise ValueError("about is not what damian fly writes")

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from episodes import flight
 
 from damian import keys
 from damian.baselines.random import random_policy
@@ -101,6 +102,38 @@ def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, text, pro
     assert problem in str(refused.value)
     with pytest.raises(InputError, match="no episode"):
         Episode.load(tmp_path / "missing.json")
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"age": [[0.0, 0.0]]}, "age has not the shape [T + 1, N]: (1, 2)"),
+        ({"age": [["old", "x"]] * 4}, "ufunc"),
+        ({"battery": [[1.0], [1.0, 2.0]] * 2}, "inhomogeneous"),
+        ({"cells": [[0.0, 0.0]], "belief": [[0.5, 0.5]] * 4}, "belief has not the shape [T + 1, K]: (4, 2)"),
+        ({"belief": [[1.0]] * 4}, "cells has not the shape [K, 2]: None"),
+        ({"reward_terms": {"near": [[1.0, 2.0]]}}, "reward_terms has not the shape"),
+        ({"track": None}, "track has not the shape [T + 1, N]: None"),
+        ({"source": [[0.0, 1e300]] * 4}, "source holds something else than numbers up to 1e+09"),
+        ({"source": [[0.0, float("nan")]] * 4}, "source holds something else than numbers"),
+        ({"time": [0.0, 1.0, 1.0, 2.0]}, "time does not increase"),
+        ({"time": []}, "has not the shape"),
+        ({"delay": [[0.5, 0.5]] * 4}, "delay is not in whole steps"),
+        ({"region": {"type": "Point", "coordinates": [0, 0]}}, "region is no polygon with an area"),
+        ({"region": {"type": "Polygon"}}, "ParseException"),
+        ({"landing_points": [[1.0, 2.0, 3.0]]}, "landing_points or region"),
+        ({"origin": [1.0]}, "origin is not latitude and longitude"),
+        ({"radius": -1.0}, "radius no length"),
+        ({"about": []}, "about is not what damian fly writes"),
+    ],
+)
+def test_a_file_whose_columns_do_not_fit_is_refused_in_one_line(tmp_path, changes, problem):
+    path = tmp_path / "episode.json"
+    path.write_text(json.dumps({**flight().document(), **changes}))
+    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1: ") as refused:
+        Episode.load(path)
+    assert problem in str(refused.value)
+    assert str(refused.value).isprintable()
 
 
 def test_an_episode_without_optional_columns_survives_its_file(flown, tmp_path):

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
 import pytest
+from episodes import flight
 from fuzzing import LONGEST_LINE, NUMBERS, SMALL, WORDS, examples, fly, refusal, words
 from helpers import SQUARE
 from hypothesis import example, given
@@ -52,6 +53,7 @@ VALID = {
             "returns": {"6": -200.0},
         }
     ),
+    "episode.json": json.dumps(flight().document()),
 }
 """A valid file for each reader."""
 READERS = {
@@ -238,6 +240,12 @@ def test_a_stored_result_of_any_content_is_refused_in_one_line_or_read(content):
         answer(name, ["--out", ".", "--seeds", "0"], write("seed0_naive.json", content))
 
 
+@examples(20, 1000)
+@given(contents("episode.json"))
+def test_an_episode_of_any_content_is_refused_in_one_line_or_shown(content):
+    answer("replay", ["episode.json"], write("episode.json", content))
+
+
 @examples(8, 500)
 @given(st.sampled_from(["train", "train", "fly", "evaluate", "oracle"]), words("train"))
 def test_any_words_end_a_program_in_one_line_or_start_it(name, given_words):
@@ -326,6 +334,8 @@ def test_a_refused_sweep_leaves_no_folder(name, given_words):
         ("pendulum", ["--hidden", "10000000"], "--hidden: 10000000 is not between 1 and 16384"),
         ("pendulum", ["--out", "/dev/null/x"], "--out: /dev/null/x: Not a directory"),
         ("pendulum", ["--out", "x" * 5000], "File name too long"),
+        ("replay", ["x.json"], "x.json: it is no episode of version 1: no such file"),
+        ("replay", [], "the following arguments are required: EPISODE.json"),
         ("train", ["hydra.run.dir="], "hydra.run.dir: it is empty"),
         ("train", ["resume=" + "x" * 5000], "resume: "),
         ("train", ["checkpoint=" + "x" * 5000], "checkpoint: "),

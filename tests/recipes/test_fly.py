@@ -55,9 +55,9 @@ def printed_line(capsys) -> str:
     ],
 )
 def test_a_run_folder_holds_configuration_episode_film_and_figure(run, capsys, overrides):
-    folder = run(*overrides, "episode.max_steps=4", "formats=[gif,png,geojson]", "views=[2d,3d]")
+    folder = run(*overrides, "episode.max_steps=4", "formats=[gif,png,html,geojson]", "views=[2d,3d]")
     files = {"config.yaml", "run.json", "episode_0.json", "episode_0.geojson"}
-    files |= {"episode_0.gif", "episode_0_3d.gif", "episode_0.png"}
+    files |= {"episode_0.gif", "episode_0_3d.gif", "episode_0.png", "episode_0.html"}
     assert {path.name for path in folder.iterdir()} == files
     assert "4 steps" in printed_line(capsys)
     picture = imread(folder / "episode_0.png")
@@ -174,7 +174,7 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
         (["policy=mode"], "policy: mode needs checkpoint"),
         (["keep=last"], "keep: last is not one of all, extremes"),
         (["views=[4d]"], "views: 4d is not one of 2d, 3d"),
-        (["formats=[avi]"], "formats: avi is not one of gif, mp4, png, geojson"),
+        (["formats=[avi]"], "formats: avi is not one of gif, mp4, png, html, geojson"),
         (["formats=[geojson]", "region=usecase"], "geojson: its region has no latitude and longitude"),
         (["region.id=Nope"], "Nope"),
     ],

@@ -1,0 +1,117 @@
+/** What lies on the ground: the region, its landing points, what is covered, the belief about the source. */
+
+import { faint } from "page/theme";
+
+/** Strongest colour of the belief, and the power that shows weaker cells. */
+const [OPACITY, POWER] = [0.62, 0.7];
+
+/** Paints the ground into a canvas of its own, again only when it changes. */
+export class Ground {
+  #painted = "";
+  #covered = { key: "", step: -1 };
+
+  /**
+   * @param {import("page/episode").Episode} episode
+   * @param {number} likely smallest probability of a cell worth showing, as a share of the largest one
+   */
+  constructor(episode, likely) {
+    this.episode = episode;
+    this.likely = likely;
+    this.edge = episode.cells ? episode.cellEdge : 0;
+    this.canvas = document.createElement("canvas");
+    this.mask = document.createElement("canvas");
+  }
+
+  /**
+   * The ground at an instant; true if the canvas was painted again.
+   * @param {import("page/geography").Frame} frame
+   * @param {number} step
+   * @param {Set<string>} layers
+   * @param {import("page/theme").Theme} theme
+   */
+  paint(frame, step, layers, theme) {
+    const place = [frame.width, frame.height, frame.left, frame.top, frame.scale].join();
+    const [covered, belief] = [layers.has("covered"), layers.has("belief") && this.episode.belief !== null];
+    const key = [place, theme.dark, covered, belief, covered || belief ? step : ""].join();
+    if (key === this.#painted) return false;
+    this.#painted = key;
+    const context = sized(this.canvas, frame);
+    this.#outline(context, frame);
+    context.fillStyle = theme.land;
+    context.fill("evenodd");
+    context.save();
+    context.clip("evenodd");
+    this.#points(context, frame, theme);
+    if (covered) this.#coverage(context, frame, step, theme, place);
+    if (belief) this.#belief(context, frame, step, theme);
+    context.restore();
+    this.#outline(context, frame);
+    context.strokeStyle = theme.edge;
+    context.lineWidth = Math.max(1.4, frame.width / 600);
+    context.stroke();
+    return true;
+  }
+
+  #outline(context, frame) {
+    context.beginPath();
+    for (const ring of this.episode.polygons.flat()) {
+      ring.forEach((corner, i) => context[i ? "lineTo" : "moveTo"](...frame.pixel(corner)));
+      context.closePath();
+    }
+  }
+
+  #points(context, frame, theme) {
+    const size = Math.min(Math.max(frame.width / 500, 1), 2);
+    context.fillStyle = theme.point;
+    context.beginPath();
+    for (const point of this.episode.landing_points) {
+      const [x, y] = frame.pixel(point);
+      context.moveTo(x + size, y);
+      context.arc(x, y, size, 0, 2 * Math.PI);
+    }
+    context.fill();
+  }
+
+  /** Footprints at all instants so far; those that were painted before stay in the mask. */
+  #coverage(context, frame, step, theme, place) {
+    const key = place + theme.dark;
+    let mask = this.mask.getContext("2d");
+    if (this.#covered.key !== key || this.#covered.step > step) {
+      mask = sized(this.mask, frame);
+      this.#covered = { key, step: -1 };
+    }
+    mask.fillStyle = theme.covered;
+    for (let instant = this.#covered.step + 1; instant <= step; instant++) {
+      for (const at of this.episode.position[instant]) {
+        mask.beginPath();
+        mask.arc(...frame.pixel(at), this.episode.radius * frame.scale, 0, 2 * Math.PI);
+        mask.fill();
+      }
+    }
+    this.#covered.step = step;
+    context.globalAlpha = 0.3;
+    context.drawImage(this.mask, 0, 0);
+    context.globalAlpha = 1;
+  }
+
+  #belief(context, frame, step, theme) {
+    const row = this.episode.belief[step];
+    const largest = Math.max(...row, 1e-9);
+    const size = this.edge * frame.scale;
+    row.forEach((probability, cell) => {
+      if (probability <= this.likely * largest) return;
+      const [x, y] = frame.pixel(this.episode.cells[cell]);
+      const [left, top] = [Math.round(x - size / 2), Math.round(y - size / 2)];
+      const [right, bottom] = [Math.round(x + size / 2), Math.round(y + size / 2)];
+      context.fillStyle = faint(theme.belief, (OPACITY * (probability / largest) ** POWER).toFixed(3));
+      context.fillRect(left, top, right - left, bottom - top);
+    });
+  }
+}
+
+/** The empty context of a canvas that has the size of a frame. */
+function sized(canvas, frame) {
+  canvas.width = frame.width;
+  canvas.height = frame.height;
+  return canvas.getContext("2d");
+}

@@ -1,0 +1,57 @@
+/** The page: a card for each episode, one time line, and tools for all of them. */
+
+import { Card } from "page/card";
+import { chartsOf, rangeOf } from "page/charts";
+import { addTools, addTransport, listen } from "page/controls";
+import { Episode } from "page/episode";
+import { Player } from "page/player";
+import { Theme } from "page/theme";
+import { Zoom } from "page/zoom";
+
+const replay = JSON.parse(document.getElementById("replay").textContent);
+const episodes = replay.episodes.map((file) => new Episode(file));
+const theme = new Theme(replay.colours);
+const player = new Player(episodes);
+const zoom = new Zoom();
+const hasBelief = episodes.some((episode) => episode.belief !== null);
+const settings = {
+  view: "2d",
+  layers: new Set(["truth", "believed", "messages", hasBelief ? "belief" : "covered"]),
+};
+
+const parent = document.getElementById("episodes");
+parent.style.setProperty("--cards", episodes.length);
+const cards = episodes.map(
+  (episode) => new Card(parent, episode, { player, theme, zoom, likely: replay.likely }),
+);
+addCharts();
+addTransport(document.getElementById("transport"), player);
+const keys = addTools(document.getElementById("tools"), settings, hasBelief, () => player.changed());
+listen(player, { ...keys, ...zoomKeys() });
+player.onChange(() => cards.forEach((card) => card.draw(settings)));
+new ResizeObserver(redraw).observe(parent);
+theme.onChange(redraw);
+document.getElementById("shared").textContent = replay.shared;
+document.getElementById("motion").textContent = episodes.some((episode) => episode.instant)
+  ? "A UAV reaches its target by the end of the step; between instants it is drawn on the straight way."
+  : "Between instants UAVs are drawn on the straight way.";
+document.documentElement.dataset.ready = "true";
+
+/** Charts of the same kind have the same range in all episodes, so that they can be compared. */
+function addCharts() {
+  const battery = episodes.some((episode) => episode.usesBattery);
+  const all = episodes.map((episode) => chartsOf(episode, theme, battery));
+  const same = (key) => all.flat().filter((chart) => chart.key === key);
+  const ranges = new Map(all[0].map(({ key }) => [key, rangeOf(same(key))]));
+  cards.forEach((card, i) => card.addCharts(all[i], ranges));
+}
+
+function zoomKeys() {
+  const keys = Object.entries(zoom.keys);
+  return Object.fromEntries(keys.map(([key, press]) => [key, () => (press(), player.changed())]));
+}
+
+function redraw() {
+  for (const card of cards) card.resize();
+  player.changed();
+}

@@ -1,0 +1,87 @@
+/** The numbers of an instant as text: a line about the episode, and a table of its UAVs. */
+
+import { plain } from "page/marks";
+
+const [HOLLOW, FILLED] = ["–", "●"];
+/** Units of the columns, by name. */
+const UNITS = { east: "m", north: "m", up: "m", age: "s", battery: "%" };
+
+export class Readout {
+  /**
+   * @param {HTMLElement} line for the line about the episode
+   * @param {HTMLTableElement} table
+   * @param {import("page/episode").Episode} episode
+   */
+  constructor(line, table, episode) {
+    Object.assign(this, { line, episode });
+    this.columns = [...Object.keys(UNITS), "spots"].filter((name) => name !== "up" || episode.highest > 0);
+    const head = table.createTHead().insertRow();
+    for (const name of ["UAV", ...this.columns]) {
+      const cell = document.createElement("th");
+      cell.scope = "col";
+      cell.textContent = UNITS[name] ? `${name} [${UNITS[name]}]` : name;
+      head.append(cell);
+    }
+    const body = table.createTBody();
+    this.rows = episode.position[0].map((_, uav) => row(body, uav, this.columns));
+  }
+
+  /** Show the numbers of the instant before a time. */
+  draw({ step, ended }, theme) {
+    const { episode } = this;
+    const key = [step, ended, theme.dark].join();
+    if (key === this.shown) return;
+    this.shown = key;
+    const spots = episode.spotters(step).length;
+    const parts = [
+      ["time", `${plain(episode.time[step])} s`],
+      ["return", `return ${episode.returns[step].toFixed(2)}`],
+      ["spots", `${spots} of ${episode.nAgents} spot the source`],
+      ["age", `mean age ${episode.meanAge[step].toFixed(1)} s`],
+      ["ended", ended ? (episode.success ? "ended with success" : "ended") : ""],
+    ];
+    this.line.replaceChildren(
+      ...parts
+        .filter(([, text]) => text)
+        .map(([name, text]) => {
+          const part = document.createElement("span");
+          part.dataset.shown = name;
+          part.textContent = text;
+          return part;
+        }),
+    );
+    this.rows.forEach((cells, uav) => {
+      const [east, north, up] = episode.position[step][uav];
+      const numbers = { east, north, up, age: episode.age[step][uav], battery: episode.battery[step][uav] };
+      for (const [name, cell] of cells) if (name in numbers) cell.textContent = written(numbers[name]);
+      const spots = episode.spotted[step][uav];
+      cells.get("spots").textContent = spots ? FILLED : HOLLOW;
+      cells.get("spots").setAttribute("aria-label", spots ? "yes" : "no");
+      cells.get("UAV").style.setProperty("--uav", theme.uav(uav));
+      cells.get("age").classList.toggle("old", numbers.age > 0);
+    });
+  }
+}
+
+/** A number with one decimal, and a minus sign that is as wide as a digit. */
+function written(value) {
+  return value
+    .toFixed(1)
+    .replace(/^-0\.0$/, "0.0")
+    .replace("-", "−");
+}
+
+/** A row of the table; returns its cells by name. */
+function row(body, uav, columns) {
+  const line = body.insertRow();
+  const head = document.createElement("th");
+  head.scope = "row";
+  head.textContent = uav;
+  line.append(head);
+  const cells = columns.map((name) => {
+    const cell = line.insertCell();
+    cell.dataset.shown = name;
+    return [name, cell];
+  });
+  return new Map([["UAV", head], ...cells]);
+}

@@ -1,0 +1,27 @@
+"""Episodes made by hand, whose every column a test chooses."""
+
+import numpy as np
+import shapely
+
+from damian.evaluation.episode import Episode
+
+SQUARE = shapely.box(-200.0, -200.0, 200.0, 200.0)
+
+
+def flight(n_steps: int = 3, **changes) -> Episode:
+    """An episode of two UAVs that stand still, of which the server knows the places; the source is silent."""
+    t, position = n_steps + 1, np.array([[-100.0, 100.0, 0.0], [100.0, 100.0, 0.0]])
+    uavs, flags = np.zeros((t, 2)), np.zeros((t, 2), bool)
+    columns = {
+        "time": np.arange(t) * 2.0,
+        "position": np.tile(position, (t, 1, 1)),
+        "target": np.tile(position[:, :2], (t, 1, 1)),
+        "battery": uavs + 100,
+        "source": np.tile([0.0, -120.0], (t, 1)),
+        "believed": np.tile(position[:, :2], (t, 1, 1)),
+        **dict.fromkeys(("track", "age", "reward"), uavs),
+        **{"spotted": flags, "sent": flags, "delay": uavs.astype(int), "emits": flags[:, 0]},
+    }
+    fixed = {"about": {}, "region": SQUARE, "origin": None, "landing_points": np.array([[150.0, -190.0]])}
+    fixed |= {"radius": 50.0, "instant": True, "success": False}
+    return Episode(**{**fixed, **columns, **changes})
