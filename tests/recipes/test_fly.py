@@ -1,5 +1,6 @@
 """The program that flies episodes, run by its command line: its files, and its refusals of wrong input."""
 
+import csv
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -80,6 +81,22 @@ def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run,
     assert all(episode.about["policy"] == "mode" for episode in episodes)
     returns = [episode.perceived_return for episode in episodes]
     assert returns == sorted(returns)
+
+
+def test_the_episodes_are_those_in_which_a_training_evaluates_its_policy(run, monkeypatch):
+    flown = ["agents=2", "scenario=tracking", "delay=paper", "actions.distances=[0,30,60]", "eval_episodes=6"]
+    words = ["frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "hydra.run.dir=trained"]
+    monkeypatch.setattr(sys, "argv", ["train.py", *flown, *words, "episode.max_steps=20"])
+    launch(train)
+    with Path("trained", "result.csv").open(newline="") as file:
+        measured = {row["policy"]: float(row["episode_return"]) for row in csv.DictReader(file)}
+    for policy, words in (("mode", ["checkpoint=trained"]), ("greedy", flown)):
+        words = [*words, f"policy={policy}", "eval_episodes=6", "episode.max_steps=20"]
+        folder = run(*words, folder=policy)
+        returns = [Episode.load(folder / f"episode_{i}.json").perceived_return for i in range(6)]
+        name = "trained, mode" if policy == "mode" else policy
+        assert np.mean(returns) == pytest.approx(measured[name], rel=1e-3)
+    assert measured["greedy"] > 0
 
 
 def test_the_extremes_are_the_worst_the_median_and_the_best_episode(flown):
