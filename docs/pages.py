@@ -5,6 +5,7 @@ MkDocs calls the functions that begin with ``on_``.
 
 import ast
 import html
+import json
 import posixpath
 import re
 from pathlib import Path
@@ -21,10 +22,11 @@ ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
 TEXTS |= {"CHANGELOG.md": "CHANGELOG.md", "CITATION.cff": "CITATION.cff"}
 """Files beside docs/, and what they are called in the site."""
-SHOWN = ("train", "fly", "compare")
+SHOWN = ("train", "fly", "tune", "compare")
 """Programs whose settings have a page."""
 PACKAGES = ("transforms", "delays", "envs", "replay", "learners", "server", "world", "evaluation", "interop")
 """Packages with a page of the API, the most used first."""
+NOTEBOOKS = sorted(ROOT.glob("docs/notebooks/*.ipynb"))
 
 
 def on_config(config: Any) -> Any:
@@ -32,6 +34,7 @@ def on_config(config: Any) -> Any:
     config.nav += [
         {"Commands": ["commands/index.md", *[{f"damian {name}": f"commands/{name}.md"} for name in SHOWN]]},
         {"API": ["api/index.md", *[{f"damian.{name}": f"api/{name}.md"} for name in PACKAGES]]},
+        {"Notebooks": [f"notebooks/{path.stem}.md" for path in NOTEBOOKS]},
         {"Examples": [{path: f"examples/{path}.md"} for path in examples()]},
         {"Project": [{"Contributing": "CONTRIBUTING.md"}, {"Changes": "CHANGELOG.md"}]},
     ]
@@ -44,6 +47,7 @@ def on_files(files: Files, config: Any) -> Files:
     pages |= {"commands/index.md": commands(), **{f"commands/{name}.md": settings(name) for name in SHOWN}}
     pages |= {"api/index.md": public_names(), **{f"api/{name}.md": package(name) for name in PACKAGES}}
     pages |= {f"examples/{path}.md": example(path) for path in examples()}
+    pages |= {f"notebooks/{path.stem}.md": notebook(path) for path in NOTEBOOKS}
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
     return files
@@ -52,7 +56,7 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Lead the links of the project's texts, which lead to its files, to pages of the site."""
     page_name = page.file.src_uri
-    if page_name.startswith(("api/", "commands/", "examples/")):
+    if page_name.startswith(("api/", "commands/", "examples/", "notebooks/")):
         return markdown
     folder = "" if page_name in TEXTS.values() else "docs"
 
@@ -82,7 +86,7 @@ def settings(program: str) -> str:
     parts = [f"# Settings of damian {program}"]
     if program == "train":
         parts += ["## Groups", table(("group", "options"), group_rows(program))]
-    elif program == "fly":
+    elif program != "compare":
         parts.append("Those of [damian train](train.md) may be given too.")
         everything = {key: each for key, each in everything.items() if key not in known_settings("train")}
     sections: dict[str, list[tuple[str, ...]]] = {}
@@ -147,6 +151,15 @@ def examples() -> list[str]:
 def example(path: str) -> str:
     """The page of an example."""
     return f"# {path}\n\n```python\n{(ROOT / 'examples' / path).read_text()}```\n"
+
+
+def notebook(path: Path) -> str:
+    """The page of a notebook, without the outputs."""
+    cells = json.loads(path.read_text())["cells"]
+    texts = [("".join(cell["source"]), cell["cell_type"] == "code") for cell in cells]
+    link = f"[{path.name}]({path.name}) runs in Jupyter."
+    parts = [f"```python\n{text}\n```" if is_code else text for text, is_code in texts]
+    return "\n\n".join([parts[0], link, *parts[1:]])
 
 
 def docstring(path: Path) -> str:

@@ -27,7 +27,9 @@ def test_the_site_is_built_without_a_warning_and_is_complete(tmp_path):
 
     for program in SCHEMAS:
         text = page(f"commands/{program}")
-        keys = {*known_settings(program)} - ({*known_settings("train")} if program == "fly" else set())
+        keys = {*known_settings(program)} - (
+            {*known_settings("train")} if program in ("fly", "tune") else set()
+        )
         deep = [key for key in keys if not any(other.startswith(f"{key}.") for other in keys)]
         assert not [key for key in deep if f"<code>{key}</code>" not in text]
     assert all(f"damian {name}" in page("commands") for name in PROGRAMS)

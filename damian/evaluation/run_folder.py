@@ -6,13 +6,9 @@ import math
 from dataclasses import asdict, fields
 from pathlib import Path
 
-import matplotlib
-
 from damian.common.atomic_files import write_atomically
 from damian.common.markdown import markdown_table
 from damian.evaluation.metrics import Evaluation
-
-matplotlib.use("Agg")
 
 FIGURE = "learning_curve.png"
 CHECKPOINT = "checkpoint.pt"
@@ -25,13 +21,14 @@ TABLE = "result.md"
 
 def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: Path, title: str) -> None:
     """Draw return and success rate over environment steps, with the random policy as a dashed line."""
-    from matplotlib import pyplot as plt  # noqa: PLC0415 (slow to import, needed once)
+    from matplotlib.figure import Figure  # noqa: PLC0415 (slow to import, needed once)
     from matplotlib.ticker import EngFormatter  # noqa: PLC0415
 
     panels = [("episode_return", "return", random.episode_return)]
     if any(row["success_rate"] > 0 for row in rows):
         panels.append(("success_rate", "success rate", random.success_rate))
-    figure, axes = plt.subplots(1, len(panels), figsize=(5 * len(panels), 3.4), squeeze=False)
+    figure = Figure(figsize=(5 * len(panels), 3.4))
+    axes = figure.subplots(1, len(panels), squeeze=False)
     for axis, (name, label, level) in zip(axes[0], panels, strict=True):
         points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
         mark = "o" if len(points) == 1 else ""  # a line of one point would be invisible
@@ -46,7 +43,6 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
     figure.tight_layout()
     image = io.BytesIO()
     figure.savefig(image, dpi=120)
-    plt.close(figure)
     write_atomically(path, image.getvalue())
 
 

@@ -90,8 +90,8 @@ def test_the_episodes_are_those_in_which_a_training_evaluates_its_policy(run, mo
     launch(train)
     with Path("trained", "result.csv").open(newline="") as file:
         measured = {row["policy"]: float(row["episode_return"]) for row in csv.DictReader(file)}
-    for policy, words in (("mode", ["checkpoint=trained"]), ("greedy", flown)):
-        words = [*words, f"policy={policy}", "eval_episodes=6", "episode.max_steps=20"]
+    for policy, own in (("mode", ["checkpoint=trained"]), ("greedy", flown)):
+        words = [*own, f"policy={policy}", "eval_episodes=6", "episode.max_steps=20"]
         folder = run(*words, folder=policy)
         returns = [Episode.load(folder / f"episode_{i}.json").perceived_return for i in range(6)]
         name = "trained, mode" if policy == "mode" else policy

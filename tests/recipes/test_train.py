@@ -3,6 +3,8 @@
 import csv
 import json
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -331,3 +333,10 @@ def test_where_nothing_is_won_by_the_source_a_belief_is_left_out(spotted, succes
     )
     assert bool(config.observation.belief) is config.model.skip is kept
     assert config.observation.own
+
+
+def test_a_notebook_that_imports_damian_keeps_its_own_figures():
+    code = "import matplotlib; matplotlib.use('svg'); import damian; damian.compose_scenario()\n"
+    code += "import damian.evaluation.film, damian.recipes.train; print(matplotlib.get_backend())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "svg"
