@@ -6,6 +6,7 @@ were generated, and count from the step in which they came in. The age of a mess
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,8 @@ SILENT_STEPS = 1000
 """Steps without any report after which beliefs stand still."""
 GRACE = 60.0
 """A landing point stays booked for so long after the expected arrival [s], unless the UAV reports to be there."""
+TOLD = 64
+"""Decisions of a UAV that are kept: a late report in flight was of one of them."""
 _ROUNDING = 1e-3
 """Share of a step by which times may be rounded."""
 
@@ -93,7 +96,7 @@ class Fleet:
         """When step 0 began [s]; None until every UAV has reported."""
         self.step, self.clock = 0, 0.0
         self.held: list[Known] = []
-        self.decisions: list[Decision | None] = [None] * len(self.uavs)
+        self.told: list[deque[Decision]] = [deque(maxlen=TOLD) for _ in self.uavs]
         self.pending: list[tuple[int, int, Known]] = []  # step from which it counts, UAV, report
         self.arrived: list[tuple[int, Known]] = []  # those that count from this step on
         self.before: Memories | None = None
@@ -150,7 +153,7 @@ class Fleet:
         late = newest is not None and report.time < newest.report.time
         log.late += late
         if self.start is None:
-            log.add(report, 0, None, None)
+            log.add(report, 0, None)
             if all(each.known for each in self.logs):
                 self._begin(received)
             return "late" if late else "new"
@@ -158,9 +161,9 @@ class Fleet:
             return "old"
         now = self.step_of(received)
         step = min(self.step_of(report.time), now)
-        decision = self.decisions[uav]
         detected = None if report.detected is None else max(self.step_of(report.detected), 0)
-        known = log.add(report, step, detected, None if decision is None else decision.goal)
+        sent = [each for each in self.told[uav] if each.step < step]
+        known = log.add(report, step, detected, (sent[-1].origin, sent[-1].goal) if sent else None)
         due = max(now, self.step)
         if self.node.scenario.delay.hold == "max":
             due = max(due, step + self.node.law_longest)
@@ -177,7 +180,7 @@ class Fleet:
         for log, report in zip(self.logs, newest, strict=True):
             detected = None if report.detected is None else max(self.step_of(report.detected), 0)
             log.known.clear()
-            log.add(report, min(self.step_of(report.time), self.step), detected, None)
+            log.add(report, min(self.step_of(report.time), self.step), detected)
         self.held = [log.known[-1] for log in self.logs]
 
     def _collect(self) -> None:
@@ -258,7 +261,7 @@ class Fleet:
 
     def _standing(self, uav: int, asks: bool) -> int:
         """Landing point on which a UAV stands, or which is booked for it."""
-        decision, held = self.decisions[uav], self.held[uav]
+        decision, held = self.decision(uav), self.held[uav]
         if decision is None:
             return held.target
         if held.step <= decision.step:
@@ -339,12 +342,16 @@ class Fleet:
         for uav in choosing:
             values = action[0, uav].tolist()
             origin, goal = int(before.goal[0, uav]), int(state.goal[0, uav])
-            self.decisions[uav] = Decision(
-                self.step, self.clock, values, origin, goal, float(duration[0, uav])
+            self.told[uav].append(
+                Decision(self.step, self.clock, values, origin, goal, float(duration[0, uav]))
             )
         self.chosen = self.chosen | valid
         mask = valid.view(*valid.shape, *[1] * (action.dim() - 2))
         self.action = torch.where(mask, action, self.action)
+
+    def decision(self, uav: int) -> Decision | None:
+        """What a UAV was told last."""
+        return self.told[uav][-1] if self.told[uav] else None
 
     def _forget_choices(self) -> None:
         self.action = self.node.env.full_action_spec[keys.ACTION].zero()

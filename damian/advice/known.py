@@ -26,8 +26,8 @@ class Known:
     report: Report
     step: int
     """Step in which it was generated."""
-    bound: int | None
-    """Landing point to which the UAV was last sent when the report came in, if it was."""
+    sent: tuple[int, int] | None
+    """Landing points from which and to which the UAV had last been sent by then, if it had."""
     point: int = 0
     """Landing point where the UAV is; in flight, where it took off."""
     target: int = 0
@@ -88,16 +88,18 @@ class UavLog:
         at = bisect.bisect_left(self.known, time, key=_generated)
         return at < len(self.known) and self.known[at].report.time == time
 
-    def add(self, report: Report, step: int, detected: int | None, bound: int | None) -> Known:
+    def add(
+        self, report: Report, step: int, detected: int | None, sent: tuple[int, int] | None = None
+    ) -> Known:
         """Add a report, in its place by the time when it was generated.
 
         Args:
             report: the report.
             step: in which it was generated.
             detected: the step of the detection that it names.
-            bound: landing point to which the UAV was last sent.
+            sent: landing points from which and to which the UAV had last been sent by then.
         """
-        known = Known(report, step, bound, detected=detected)
+        known = Known(report, step, sent, detected=detected)
         at = bisect.bisect_left(self.known, report.time, key=_generated)
         self.known.insert(at, known)
         for i in range(at, len(self.known)):
@@ -109,12 +111,13 @@ class UavLog:
         """Fill in what a report leaves open."""
         report, near = known.report, self.ground.landing_point
         here = near(report.place)
-        known.point = before.point if report.flies and before else here
-        known.target = known.point
+        known.point = known.target = here
+        if report.flies and known.sent:  # it is on its way, and took off from where it was sent
+            known.point, known.target = known.sent
+        elif report.flies and before:
+            known.point = known.target = before.point
         if report.target is not None:
             known.target = near(report.target)
-        elif report.flies and known.bound is not None:
-            known.target = known.bound
         known.track = before.track if before else 0.0
         if report.track is not None:
             known.track = math.radians(report.track) % (2 * math.pi)
@@ -150,7 +153,7 @@ class UavLog:
         previous: Sequence[int] = before.trail if before else ()
         if known.report.previous is not None:
             trail = [known.point, *map(self.ground.landing_point, known.report.previous)]
-        elif previous and (known.report.flies or previous[0] == known.point):
+        elif previous and previous[0] == known.point:
             trail = [*previous]
         else:
             trail = [known.point, *previous]

@@ -79,6 +79,6 @@ def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task,
         assert torch.equal(fleet.action[0, ready], action[0, ready])
         spotted += sum(known.spotted for known in fleet.held)
         assert all(here.report.time <= fleet.clock for here in fleet.held)
-        moved += sum(d is not None and d.origin != d.goal for d in fleet.decisions)
+        moved += sum(fleet.decision(uav).origin != fleet.decision(uav).goal for uav in ready)
     assert moved > 3
     assert spotted > 0
