@@ -24,6 +24,8 @@ PROGRAMS = {
     "oracle": "evaluate a policy that knows some messages on time: which delay costs how much",
     "ceiling": "fly a script with ever more known on time: what a delay leaves to be won",
     "fly": "fly episodes and keep them as files, films and figures of what is true and what is believed",
+    "advise": "advise real UAVs: from what they report, where each should land next",
+    "fit-delays": "fit a trace law to the delays of real reports, to train with them",
     "pendulum": "apply the delay transforms to another environment: SAC on Pendulum-v1",
     "spread": "compare with a published table: MAPPO in simple_spread_v3 with late observations",
     "bench": "measure the speed of environment and training beside VMAS",
@@ -33,6 +35,7 @@ SETTINGS = {
     **dict.fromkeys(("train", "evaluate", "oracle", "ceiling"), "train"),
     "compare": "compare",
     "fly": "fly",
+    "advise": "advise",
 }
 """Programs with settings of the form KEY=VALUE, and whose settings these are."""
 
@@ -55,7 +58,7 @@ def main(words: Sequence[str] | None = None) -> None:
     if name in SETTINGS and _answered(name, words):
         return
     sys.argv = [f"damian {name}", *words]
-    import_module(f".{name}", __package__).run()
+    import_module(f".{name.replace('-', '_')}", __package__).run()
 
 
 def _answered(name: str, words: Sequence[str]) -> bool:

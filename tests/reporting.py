@@ -1,4 +1,4 @@
-"""UAVs of a simulation that report as real ones would: late, out of order, with losses; and fly as advised."""
+"""UAVs of a simulation that report as real ones would, late, out of order and with losses."""
 
 import json
 from collections.abc import Iterator, Sequence

@@ -1,8 +1,9 @@
 """A fleet of real UAVs: reports come in, advice goes out.
 
-Time is divided into the steps of the training: step k lasts from ``start + k dt`` to ``start + (k + 1) dt``, where
-the start is the instant at which the oldest first report was generated. Messages have the step in which they
-were generated, and count from the step in which they came in. The age of a message is the difference of the two.
+Time is divided into the steps of the training: step k lasts from ``start + k dt`` to ``start + (k + 1) dt``,
+where the start is the instant at which the oldest first report was generated. A message belongs to the step
+in which it was generated, and counts from the step in which it came in; its age is the number of steps since
+the former.
 """
 
 import math
@@ -25,6 +26,7 @@ from damian.common.checks import SECONDS
 from damian.common.errors import InputError
 from damian.common.text_files import listed, show
 from damian.envs.uav_env import Outputs
+from damian.learners.recurrent import AgentGRU
 from damian.world.state import State
 
 FUTURE = 1.0
@@ -32,7 +34,7 @@ FUTURE = 1.0
 SILENT_STEPS = 1000
 """Steps without any report after which beliefs stand still."""
 GRACE = 60.0
-"""A landing point stays booked for so long after the expected arrival [s], unless the UAV reports to be there."""
+"""A landing point stays booked for so long after a late arrival [s], unless the UAV reports to be there."""
 TOLD = 64
 """Decisions of a UAV that are kept: a late report in flight was of one of them."""
 _ROUNDING = 1e-3
@@ -73,7 +75,7 @@ class Fleet:
         node: for as many UAVs; it is used by this fleet only.
         uavs: IDs of the UAVs, in the order in which they book landing points.
         policy: from observations to actions.
-        mode: whether actions are the most likely ones, or drawn.
+        drawn: actions are drawn; if not, the most likely ones are taken.
         seed: of these draws.
     """
 
@@ -82,10 +84,10 @@ class Fleet:
         node: Node,
         uavs: Sequence[str],
         policy: Callable[[TensorDictBase], TensorDictBase],
-        mode: ExplorationType = ExplorationType.DETERMINISTIC,
+        drawn: bool = False,
         seed: int = 0,
     ) -> None:
-        self.node, self.uavs, self.policy, self.mode, self.seed = node, list(uavs), policy, mode, seed
+        self.node, self.uavs, self.policy, self.drawn, self.seed = node, list(uavs), policy, drawn, seed
         self.number = {uav: i for i, uav in enumerate(self.uavs)}
         server, airspace = node.server, node.simulation.airspace
         self.ground = Ground(airspace, 2 * node.scenario.region.lattice_step + 50.0)
@@ -124,9 +126,8 @@ class Fleet:
             raise InputError(f"ID: {show(report.uav)} is no UAV of this fleet: {listed(self.uavs)}")
         for name, time in (("time", report.time), ("source time", report.detected)):
             if time is not None and time > received + FUTURE:
-                raise InputError(
-                    f"{name}: {time:.10g} s is {time - received:.1f} s after it came in: set the clock of the UAV"
-                )
+                ahead = f"{time:.13g} s is {time - received:.1f} s after it came in"
+                raise InputError(f"{name}: {ahead}: set the clock of the UAV")
         if self.start is not None and received - self.start > SECONDS:
             raise InputError(f"time: the fleet began more than {SECONDS:g} s ago: begin a new one")
         self.logs[self.number[report.uav]].check(report)
@@ -205,15 +206,21 @@ class Fleet:
             return
         last = self.step_of(now)
         while self.step < last:
-            self._observe()
-            quiet = self.last_arrival + SILENT_STEPS
-            idle = not self.chosen.any() and self.step >= quiet
-            following = min([last, *(due for due, _, _ in self.pending)]) if idle else self.step + 1
-            self.before = self.node.skip(self.after, following - self.step - 1)
+            if self.before is not None and self._is_idle():
+                following = min([last, *(due for due, _, _ in self.pending)])
+                self.before = self.node.skip(self.before, following - self.step)
+            else:
+                self._observe()
+                following, self.before = self.step + 1, self.after
             self.previous = self.action, self.chosen
             self.hidden, self.step, self.outputs, self.arrived = self.hidden_after, following, None, []
             self._forget_choices()
             self._collect()
+
+    def _is_idle(self) -> bool:
+        """Whether the step changes nothing: there was no report for long, and nobody has chosen."""
+        quiet = self.step >= self.last_arrival + SILENT_STEPS
+        return quiet and not self.chosen.any() and not self.previous[1].any()
 
     def _observe(self) -> Outputs:
         """The outputs of the step, from what has arrived by now."""
@@ -239,7 +246,8 @@ class Fleet:
             age=self.step - steps,
             on_time=torch.tensor([uav in fresh and self.held[uav].step == self.step for uav in range(n)]),
             late=[
-                LateMessage(row, uav, self.step - step) for row, (uav, step) in zip(rows[n:], late, strict=True)
+                LateMessage(row, uav, self.step - step)
+                for row, (uav, step) in zip(rows[n:], late, strict=True)
             ],
         )
 
@@ -275,10 +283,12 @@ class Fleet:
 
         Args:
             now: the time [s].
-            asking: IDs of those that are ready to choose; all that are not known to be in flight, if not given.
+            asking: IDs of those that are ready to choose; if not given, all that are not known to be in
+                flight.
 
         Returns:
-            Numbers of the UAVs that have chosen now; those that have chosen in this step keep what they chose.
+            Numbers of the UAVs that have chosen now; those that have chosen in this step before do not choose
+            again.
 
         Raises:
             InputError: a UAV is of another fleet.
@@ -291,11 +301,10 @@ class Fleet:
             raise Waiting(f"no advice yet: no report of {listed(silent)} has come in")
         if numbers is None:
             numbers = [uav for uav, known in enumerate(self.held) if not known.report.flies]
-        outputs = self._observe()
-        ready = outputs[keys.READY][0]
+        ready = self._observe()[keys.READY][0]
         choosing = [uav for uav in numbers if ready[uav] and not self.chosen[0, uav]]
         if choosing:
-            self.choose(choosing, self._policy_action(outputs, choosing))
+            self.choose(choosing, self.ask_policy(choosing))
         return choosing
 
     def numbers_of(self, asking: Sequence[str] | None) -> list[int] | None:
@@ -316,10 +325,11 @@ class Fleet:
         return tensordict
 
     @torch.no_grad()
-    def _policy_action(self, outputs: Outputs, choosing: Sequence[int]) -> Tensor:
+    def ask_policy(self, choosing: Sequence[int]) -> Tensor:
         """Actions of all UAVs, [1, N, ...], of which those that choose count."""
         read = self.observe(choosing)
-        with torch.random.fork_rng(devices=[]), set_exploration_type(self.mode):
+        mode = ExplorationType.RANDOM if self.drawn else ExplorationType.DETERMINISTIC
+        with torch.random.fork_rng(devices=[]), set_exploration_type(mode):
             torch.manual_seed(hash((self.seed, self.step, *choosing)) % 2**62)
             chosen = self.policy(read)
         if self.hidden is not None:
@@ -361,5 +371,5 @@ class Fleet:
 def _no_hidden(policy: Any, n_uavs: int) -> Tensor | None:
     """Hidden states of a recurrent policy at the beginning, [1, N, H]; None if it is not recurrent."""
     modules = policy.modules() if isinstance(policy, torch.nn.Module) else ()
-    sizes = [each.cell.hidden_size for each in modules if hasattr(each, "cell")]
+    sizes = [each.cell.hidden_size for each in modules if isinstance(each, AgentGRU)]
     return torch.zeros(1, n_uavs, sizes[0]) if sizes else None

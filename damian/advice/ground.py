@@ -45,8 +45,8 @@ class Ground:
         if away > self.reach:
             names, unit = self.columns, "m" if self.region.origin is None else "deg"
             raise InputError(
-                f"{names[0]}, {names[1]}: {first:.10g}, {second:.10g} {unit} is {away:.0f} m away from the nearest "
-                f"landing point of {self.region.name}, more than {self.reach:.0f} m"
+                f"{names[0]}, {names[1]}: {first:.10g}, {second:.10g} {unit} is {away:.0f} m away from the "
+                f"nearest landing point of {self.region.name}, more than {self.reach:.0f} m"
             )
         return point
 

@@ -26,7 +26,7 @@ from damian.transforms.belief import Belief
 from damian.transforms.entries import Memory, drop_keys
 from damian.transforms.message_history import MessageHistory
 from damian.transforms.sample_and_hold import SampleAndHold
-from damian.world.state import PackedState, State
+from damian.world.state import State
 
 REMEMBERED_STEPS = 32
 """Steps that the belief looks back at least: real messages may be later than those of the training."""
@@ -62,7 +62,9 @@ class Reported(NamedTuple):
 
 
 class ReportedEnv(UavEnv):
-    """An environment of a single world whose steps output what was reported, whatever the action.
+    """Regions, landing points, server and specs of a single world, whose messages are reported from outside.
+
+    Nobody steps it; ``Node`` steps the transforms behind it.
 
     Args:
         scenario: all settings; its delays are not simulated.
@@ -70,21 +72,8 @@ class ReportedEnv(UavEnv):
         device: of all tensors.
     """
 
-    reported: Outputs | None = None
-    """What the next step or reset outputs."""
-
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, device: torch.device | str = "cpu") -> None:
         super().__init__(scenario, 1, seed, device, {"message"}, messages_only=True)
-
-    def step_fn(
-        self, worlds: PackedState, action: Tensor, valid: Tensor | None = None
-    ) -> tuple[PackedState, Outputs]:
-        assert self.reported is not None
-        return worlds, dict(self.reported)
-
-    def reset_fn(self, worlds: PackedState, mask: Tensor) -> tuple[PackedState, Outputs]:
-        first = {key: table[:1] for key, table in self._reset_outputs.items()}
-        return worlds, dict(self.reported or first)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
         outputs = super()._outputs_at_reset(initial, features)
@@ -192,16 +181,15 @@ class Node:
         return memories, outputs
 
     def skip(self, memories: Memories, n_steps: int) -> Memories:
-        """The memories after steps in which nothing was reported and nobody chose; beliefs stay as they are."""
-        if not n_steps:
-            return memories
+        """The memories after steps in which nothing was reported and nobody chose; beliefs stay the same."""
         skipped = []
         for transform, memory in zip(self.transforms, memories, strict=True):
+            later = {}
             if isinstance(transform, ServerNode):
-                memory = memory | {"elapsed": memory["elapsed"] + n_steps}
+                later = {"elapsed": memory["elapsed"] + n_steps}
             elif isinstance(transform, SampleAndHold):
-                memory = memory | {"elapsed": (memory["elapsed"] + n_steps) % transform.period}
-            skipped.append(memory)
+                later = {"elapsed": (memory["elapsed"] + n_steps) % transform.period}
+            skipped.append(memory | later)
         return skipped
 
     def to_tensordict(self, outputs: Outputs) -> TensorDict:

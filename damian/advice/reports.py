@@ -1,7 +1,7 @@
 """Reported observations: rows of CSV tables or JSON, each checked column by column.
 
-A row is a mapping from columns to text or numbers. Names of columns may be written in any case, and with ``_``
-for a space. ``NA``, an empty cell and null mean that the value is not known.
+A row is a mapping from columns to text or numbers. Names of columns may be written in any case, and with
+``_`` for a space. ``NA``, an empty cell and null mean that the value is not known.
 """
 
 import csv
@@ -11,11 +11,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from damian.advice.ground import DEGREES, METRES, Place
 from damian.common.errors import InputError
-from damian.common.text_files import near, parse_table, show
+from damian.common.text_files import near, parse_table, read_text, show
 
 UNKNOWN = ("", "na", "nan", "none", "null")
 """Cells that mean that a value is not known."""
@@ -105,6 +106,16 @@ COLUMNS = {
 """Columns of a report, in lower case, and what they mean."""
 
 
+def read_file(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Rows of a file: JSON if its name ends with ``.json`` or ``.jsonl`` (an object on each line), else CSV.
+
+    Raises:
+        InputError: it cannot be read, or is something else.
+    """
+    text, kind = read_text(path), path.suffix.lower()
+    return json_rows(text, kind == ".jsonl") if kind in (".json", ".jsonl") else csv_rows(text)
+
+
 def csv_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
     """Rows of a CSV table, each with its place in the text (``line 2``).
 
@@ -173,15 +184,16 @@ def _report(row: Mapping[str, Any], now: float, file: bool) -> Report:
     received = _time(row, "receive time") if file else None
     if not file and _known(row, "receive time"):
         raise InputError("receive time: only a file may say it; the service looks at its own clock")
-    arrived = now if received is None else received
+    time, age = _time(row, "time"), _number(row, "aoi", 0, LATEST, "s") or 0.0
+    if file and received is None and time is not None:
+        received = time + age
     place = _place(row, "")
     if place is None:
         raise InputError("lat, lon: they are missing: where the UAV is [deg], or x, y [m]")
     spotted = _flag(row, "source spotted")
     altitude = _number(row, "fla", -500, 1e5, "m")
-    time = _time(row, "time")
     if time is None:
-        time = arrived - (_number(row, "aoi", 0, LATEST, "s") or 0.0)
+        time = (now if received is None else received) - age
     return Report(
         uav=_id(row),
         time=time,

@@ -21,6 +21,7 @@ SCHEMAS = {
     "train": "damian.recipes.shared.settings:TrainConfig",
     "compare": "damian.recipes.compare:CompareConfig",
     "fly": "damian.recipes.fly:FlyConfig",
+    "advise": "damian.recipes.advise:AdviseConfig",
 }
 """Dataclass of all settings of a program, by the name of its file in conf/."""
 CHOICES = {
