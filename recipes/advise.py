@@ -1,9 +1,9 @@
 """Advise real UAVs: from what they report, where each should land next, by a trained policy or the script.
 
-    damian advise checkpoint=runs/first reports=table.csv                (one table, one answer)
-    damian advise checkpoint=runs/first folder=inbox "uavs=[A,B,C]"      (every table that comes into a folder)
-    damian advise checkpoint=runs/first port=8000 journal=journals       (several fleets over HTTP)
-    damian advise region=llanbedr policy=greedy reports=table.csv        (the script)
+    damian advise checkpoint=runs/first reports=table.csv            (one table, one answer)
+    damian advise checkpoint=runs/first folder=inbox "uavs=[A,B,C]"  (every table that comes into a folder)
+    damian advise checkpoint=runs/first port=8000 journal=journals   (several fleets over HTTP)
+    damian advise region=llanbedr policy=greedy reports=table.csv    (the script)
 
 Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
 docs/advise.md explains the columns of the reports, the answers, and what is guaranteed. The run folder gets
@@ -12,14 +12,13 @@ another folder. Over HTTP, in a folder and in an answer nothing of the region bu
 the service avoids no obstacles, and somebody else is responsible for safety.
 """
 
-import csv
-import io
 import json
 import secrets
+import socket
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import hydra
@@ -29,6 +28,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from damian.advice.desk import Desk
 from damian.advice.fleet import Fleet, Waiting
+from damian.advice.inbox import read_inbox
 from damian.advice.node import Node, for_uavs, served
 from damian.advice.reports import as_csv, read_file
 from damian.baselines.greedy import greedy_policy
@@ -36,6 +36,7 @@ from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
+from damian.evaluation.run_lock import is_folder
 from damian.evaluation.training_state import load_networks
 
 from .shared.known_settings import CONF
@@ -183,6 +184,69 @@ def advise(config: AdviseConfig, folder: Path) -> None:
     note(config)
     if config.reports is not None:
         answer_table(config, folder)
+        return
+    save_config(config, folder)
+    journals = Path(config.journal) if config.journal else folder / "journals"
+    desk = make_desk(config, journals)
+    if config.port is not None:
+        serve(config, desk)
+    else:
+        watch(config, desk)
+
+
+def serve(config: AdviseConfig, desk: Desk) -> None:
+    """Answer over HTTP until the program is stopped.
+
+    Raises:
+        InputError: the server library is not installed, or the address cannot be used.
+    """
+    try:
+        uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
+    except ImportError as error:
+        missing = f"needs {error.name}, which is not installed: pip install 'damian[advise]'"
+        raise InputError(f"port: {config.port} {missing}") from None
+    token = config.token or secrets.token_urlsafe(24)
+    listener = listening(config)
+    host, port = listener.getsockname()[:2]
+    if config.token is None:
+        print(f"token: {token}")
+    print(f"listening on http://{host}:{port}", flush=True)
+    options = uvicorn.Config(
+        service.make_app(desk, token), log_level="warning", access_log=False, timeout_keep_alive=30, ws="none"
+    )
+    uvicorn.Server(options).run(sockets=[listener])
+
+
+def listening(config: AdviseConfig) -> socket.socket:
+    """A socket that listens to the address of the settings.
+
+    Raises:
+        InputError: the address cannot be used.
+    """
+    try:
+        listener = socket.create_server((config.host, config.port or 0), backlog=1024)
+    except (OSError, UnicodeError) as error:
+        problem = getattr(error, "strerror", None) or "it is no address"
+        raise InputError(f"port: {config.host}:{config.port} cannot be used: {problem}") from None
+    return listener
+
+
+def watch(config: AdviseConfig, desk: Desk) -> None:
+    """Answer every table that comes into a folder, until the program is stopped.
+
+    Raises:
+        InputError: there is no such folder, or no UAVs are given.
+    """
+    inbox = Path(str(config.folder))
+    if not is_folder(inbox):
+        raise InputError(f"folder: {inbox} is not there")
+    uavs = desk.check_new(FLEET, list(config.uavs))
+    desk.create(FLEET, uavs)
+    print(f"watching {inbox}", flush=True)
+    while True:
+        if not read_inbox(desk, FLEET, inbox, time.time()):
+            desk.advance(time.time())
+            time.sleep(0.2)
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="advise")

@@ -301,8 +301,10 @@ class Fleet:
             raise Waiting(f"no advice yet: no report of {listed(silent)} has come in")
         if numbers is None:
             numbers = [uav for uav, known in enumerate(self.held) if not known.report.flies]
-        ready = self._observe()[keys.READY][0]
-        choosing = [uav for uav in numbers if ready[uav] and not self.chosen[0, uav]]
+        choosing = [uav for uav in numbers if not self.chosen[0, uav]]
+        if choosing:  # else what has come in since then need not be looked at yet
+            ready = self._observe()[keys.READY][0]
+            choosing = [uav for uav in choosing if ready[uav]]
         if choosing:
             self.choose(choosing, self.ask_policy(choosing))
         return choosing

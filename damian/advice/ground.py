@@ -11,6 +11,8 @@ Place = tuple[float, float]
 """Latitude and longitude [deg], or over a region without a place on Earth x and y [m]."""
 DEGREES, METRES = ("lat", "lon"), ("x", "y")
 """Columns of a place."""
+REMEMBERED = 10_000
+"""Places whose landing points are remembered, because each is looked up several times."""
 DIGITS = {DEGREES: 8, METRES: 3}
 """Decimals of a place in answers: a millimetre."""
 
@@ -27,6 +29,7 @@ class Ground:
         self.region, self.reach = airspace.regions[0], reach
         self.columns = METRES if self.region.origin is None else DEGREES
         self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
+        self._found: dict[Place, int] = {}
         self._tree = shapely.STRtree(np.asarray(shapely.points(self.points)))
 
     def landing_point(self, place: Place) -> int:
@@ -35,6 +38,8 @@ class Ground:
         Raises:
             InputError: it is farther away than ``reach``.
         """
+        if place in self._found:
+            return self._found[place]
         first, second = place
         if self.region.origin is None:
             x, y = first - self.region.offset[0], second - self.region.offset[1]
@@ -48,6 +53,9 @@ class Ground:
                 f"{names[0]}, {names[1]}: {first:.10g}, {second:.10g} {unit} is {away:.0f} m away from the "
                 f"nearest landing point of {self.region.name}, more than {self.reach:.0f} m"
             )
+        if len(self._found) >= REMEMBERED:
+            self._found.clear()
+        self._found[place] = point
         return point
 
     def place(self, point: int) -> Place:

@@ -16,7 +16,7 @@ from typing import Any
 
 from damian.advice.ground import DEGREES, METRES, Place
 from damian.common.errors import InputError
-from damian.common.text_files import near, parse_table, read_text, show
+from damian.common.text_files import parse_table, read_text, show
 
 UNKNOWN = ("", "na", "nan", "none", "null")
 """Cells that mean that a value is not known."""
@@ -141,12 +141,12 @@ def json_rows(text: str | bytes, lines: bool = False) -> list[tuple[str, dict[st
     if lines:
         parts = text.decode(errors="replace") if isinstance(text, bytes) else text
         found = [
-            (f"line {n}", _parsed(line, f"line {n}"))
+            (f"line {n}", parsed_json(line, f"line {n}"))
             for n, line in enumerate(parts.splitlines(), 1)
             if line.strip()
         ]
     else:
-        parsed = _parsed(text, "JSON")
+        parsed = parsed_json(text, "JSON")
         rows = parsed["rows"] if isinstance(parsed, dict) and "rows" in parsed else parsed
         rows = [rows] if isinstance(rows, dict) else rows
         if not isinstance(rows, list):
@@ -224,7 +224,7 @@ def _named(row: Mapping[Any, Any], where: str) -> dict[str, Any]:
     for name, value in row.items():
         column = _ALIASES.get(plain := str(name).strip().lower().replace("_", " "), plain)
         if column not in COLUMNS:
-            raise InputError(f"{where}: {show(name)} is no column of a report; {near(column, COLUMNS)}")
+            raise InputError(f"{where}: {show(name)} is no column; they are {', '.join(COLUMNS)}")
         if column in named:
             raise InputError(f"{where}: the column {column} appears twice")
         named[column] = value
@@ -348,7 +348,12 @@ def _readings(row: Mapping[str, Any]) -> tuple[float, ...] | None:
     return tuple(number for number in numbers if number is not None)
 
 
-def _parsed(text: str | bytes, where: str) -> Any:
+def parsed_json(text: str | bytes, where: str) -> Any:
+    """Parse JSON.
+
+    Raises:
+        InputError: it is none.
+    """
     try:
         return json.loads(text, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
