@@ -224,7 +224,8 @@ def _named(row: Mapping[Any, Any], where: str) -> dict[str, Any]:
     for name, value in row.items():
         column = _ALIASES.get(plain := str(name).strip().lower().replace("_", " "), plain)
         if column not in COLUMNS:
-            raise InputError(f"{where}: {show(name)} is no column; they are {', '.join(COLUMNS)}")
+            known = ", ".join(COLUMNS)
+            raise InputError(f"{where}: {show(name)} is no column; they are {known}")
         if column in named:
             raise InputError(f"{where}: the column {column} appears twice")
         named[column] = value

@@ -125,7 +125,7 @@ class Simulation:
     # The stages of one step, in order.
 
     def decide(self, state: State, action: Tensor, action_valid: Tensor | None) -> State:
-        """Assign landing points to the UAVs that may choose, and start their flights; arguments of ``step``."""
+        """Assign landing points to the UAVs that may choose, and start their flights, as in ``step``."""
         base = state.region.unsqueeze(-1) * self.airspace.max_points
         standing = state.goal - base
         ranking, row = self.candidates.rank(state.goal, state.region, action)
