@@ -1,10 +1,13 @@
 """UAVs of a simulation that report as real ones would, late, out of order and with losses."""
 
 import json
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 
 from damian import keys
 from damian.advice.fleet import Fleet
@@ -26,13 +29,17 @@ class Reporter:
     """What the UAVs of a simulated world say, as rows of JSON.
 
     Args:
-        env: environment with the extra ``message``, of a single world.
+        env: environment with the extra ``message``.
         ground: landing points of the service.
         fraction: share of a step after its beginning at which messages are generated.
+        start: when the flight begins [s].
+        world: number of the world.
     """
 
-    def __init__(self, env, ground: Ground, fraction: float = 0.0, start: float = START) -> None:
-        self.env, self.ground, self.fraction, self.start = env, ground, fraction, start
+    def __init__(
+        self, env, ground: Ground, fraction: float = 0.0, start: float = START, world: int = 0
+    ) -> None:
+        self.env, self.ground, self.fraction, self.start, self.world = env, ground, fraction, start, world
         self.dt = env.uav_env.scenario.clock.dt
         self.points = env.uav_env.simulation.airspace.points[0]
         self.in_transit: list[tuple[int, int, dict[str, Any]]] = []
@@ -77,10 +84,11 @@ class Reporter:
     def send(self, outputs, step: int, at_once: bool = False) -> None:
         """Send what the UAVs say after a step, with the delays that the simulation has drawn."""
         messages = self.env.server.messages(outputs[keys.MESSAGE])
-        one = type(messages)._make(field[0] for field in messages)
+        one = type(messages)._make(field[self.world] for field in messages)
         for uav in range(one.time.shape[0]):
-            delay = 0 if at_once or keys.DELAY not in outputs.keys(True) else int(outputs[keys.DELAY][0, uav])
-            if delay >= 0 and (at_once or outputs[keys.MESSAGE_SENT][0, uav]):
+            known = at_once or keys.DELAY not in outputs.keys(True)
+            delay = 0 if known else int(outputs[keys.DELAY][self.world, uav])
+            if delay >= 0 and (at_once or outputs[keys.MESSAGE_SENT][self.world, uav]):
                 self.in_transit.append((step + delay, uav, self.row(one, uav, step)))
 
     def arriving(self, step: int) -> list[dict[str, Any]]:
@@ -122,3 +130,69 @@ def flights(
         yield shown, fleet, acted[keys.ACTION], ready, step
         shown = env.step(acted)["next"]
         reporter.send(shown, step + 1)
+
+
+class Client(TensorDictModuleBase):
+    """A policy for ``damian.evaluation.metrics.evaluate`` that asks a service, with a fleet for each world.
+
+    It knows nothing but what the service answers: the places to which it sends the UAVs.
+
+    Args:
+        env: environment of B worlds with continuous actions and the extra ``message``.
+        ground: landing points of the service.
+        http: client of the service, with the token of the service.
+        wait: sets the clock to an instant, or waits until it has come.
+        start: when the flights begin [s].
+    """
+
+    def __init__(self, env, ground: Ground, http, wait: Callable[[float], None], start: float) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = [keys.MESSAGE], [keys.ACTION]
+        self.goals = lambda: env.uav_env.state.goal
+        self.ground, self.http, self.wait, self.start = ground, http, wait, start
+        n_worlds, self.n = env.batch_size[0], env.uav_env.n_agents
+        self.reporters = [Reporter(env, ground, start=start, world=world) for world in range(n_worlds)]
+        for world in range(n_worlds):
+            made = http.put(f"/fleets/f{world}", json={"uavs": names_of(self.n)})
+            assert made.status_code in (200, 201), made.text
+        self.step = 0
+
+    def forward(self, outputs):
+        one = self.reporters[0]
+        self.wait(one.time_of(self.step) + 0.1 * one.dt)
+        actions = [self.advised(reporter, outputs) for reporter in self.reporters]
+        self.step += 1
+        return outputs.set(keys.ACTION, torch.stack(actions))
+
+    def advised(self, reporter: Reporter, outputs) -> torch.Tensor:
+        """Actions of the UAVs of a world, from what the service answers."""
+        reporter.send(outputs, self.step, at_once=self.step == 0)
+        path, rows = f"/fleets/f{reporter.world}", reporter.arriving(self.step)
+        if rows:
+            answer = self.http.post(f"{path}/reports", json=rows)
+            assert answer.status_code == 200, answer.text
+        ready = outputs[keys.READY][reporter.world].nonzero().flatten().tolist()
+        action = torch.zeros(self.n, 2)
+        if not ready:
+            return action
+        asked = "&".join(f"uav={names_of(self.n)[uav]}" for uav in ready)
+        answer = self.http.get(f"{path}/advice?{asked}")
+        assert answer.status_code == 200, answer.text
+        standing = self.goals()[reporter.world] % len(reporter.points)
+        for uav, told in zip(ready, answer.json()["advice"], strict=True):
+            goal = self.ground.landing_point(tuple(told[column] for column in self.ground.columns))
+            way = reporter.points[goal] - reporter.points[standing[uav]]
+            turn = torch.atan2(way[0], way[1]) / (2 * math.pi)
+            action[uav] = torch.stack([way.norm() / FARTHEST, turn % 1.0])
+        return action
+
+
+FARTHEST = 400.0
+"""Longest flight of a UAV of a ``Client`` [m]: farther than any action of the policies leads."""
+
+
+def flown_by_clients(scenario: ScenarioConfig) -> ScenarioConfig:
+    """The scenario for the UAVs of a ``Client``, which fly to any place that they are told."""
+    actions = replace(scenario.actions, kind="continuous", distances=[0.0, FARTHEST])
+    observation = replace(scenario.observation, belief=[])
+    return replace(scenario, actions=actions, observation=observation)

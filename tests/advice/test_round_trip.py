@@ -1,0 +1,58 @@
+"""Simulated UAVs that report to the service, late and with losses, and fly where it sends them."""
+
+import pytest
+import torch
+from reporting import START, Client, flown_by_clients, names_of
+from starlette.testclient import TestClient
+from test_fleet import TASKS, scenario_of
+
+from damian.advice.desk import Desk
+from damian.advice.fleet import Fleet
+from damian.advice.node import Node
+from damian.advice.service import make_app
+from damian.baselines.greedy import greedy_policy
+from damian.envs.pipeline import make_env
+from damian.evaluation.metrics import evaluate
+from damian.learners.mappo import MappoConfig
+from damian.learners.networks import ModelConfig
+from damian.server.rewards import RewardConfig
+
+TOKEN = "a-token-of-the-service"
+REWARD = RewardConfig(spotted=1.0)
+
+
+def network(env):
+    """A policy with random weights, the same for every environment of a scenario."""
+    torch.manual_seed(7)
+    return MappoConfig().make_actor(env, ModelConfig(hidden=[16]))
+
+
+def served(scenario, policy_of, n_worlds: int, horizon: int, drawn: bool = False):
+    """What episodes bring whose UAVs do as a service in this process tells them."""
+    node = Node(scenario, 3)
+    policy = policy_of(node.env)
+    seeds = iter(range(n_worlds))
+    desk = Desk(lambda uavs: Fleet(node, uavs, policy, drawn=drawn, seed=next(seeds)))
+    now = [START]
+    env = make_env(flown_by_clients(scenario), n_worlds, 3, extras=["message"])
+    ground = Fleet(node, names_of(scenario.agents), policy).ground
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    with TestClient(make_app(desk, TOKEN, lambda: now[0]), headers=headers) as http:
+        return evaluate(env, Client(env, ground, http, lambda time: now.__setitem__(0, time), START), horizon)
+
+
+@pytest.mark.parametrize("task", ["late", "belief", "flights"])
+@pytest.mark.parametrize("policy_of", [greedy_policy, network])
+def test_flights_by_the_service_are_those_of_the_simulation(task, policy_of):
+    scenario = scenario_of(**TASKS[task], reward=REWARD)
+    horizon = 40 if task == "flights" else 15
+    simulated = evaluate(
+        make_env(scenario, 3, 3, extras=["message"]), policy_of_env(policy_of, scenario), horizon, False
+    )
+    assert served(scenario, policy_of, 3, horizon) == simulated
+    assert simulated.late > 0
+    assert simulated.age > 0
+
+
+def policy_of_env(policy_of, scenario):
+    return policy_of(make_env(scenario, 1, 3, extras=["message"]))
