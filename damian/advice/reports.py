@@ -182,7 +182,7 @@ def read_rows(rows: Iterable[tuple[str, Mapping[str, Any]]], now: float, file: b
 
 def _report(row: Mapping[str, Any], now: float, file: bool) -> Report:
     received = _time(row, "receive time") if file else None
-    if not file and _known(row, "receive time"):
+    if not file and is_known(row, "receive time"):
         raise InputError("receive time: only a file may say it; the service looks at its own clock")
     time, age = _time(row, "time"), _number(row, "aoi", 0, LATEST, "s") or 0.0
     if file and received is None and time is not None:
@@ -235,20 +235,21 @@ def _named(row: Mapping[Any, Any], where: str) -> dict[str, Any]:
 _ALIASES = {"takeoff landing time": "takeoff-landing time"}
 
 
-def _known(row: Mapping[str, Any], column: str) -> bool:
+def is_known(row: Mapping[str, Any], column: str) -> bool:
+    """Whether a row says anything in a column."""
     value = row.get(column)
     return not (value is None or (isinstance(value, str) and value.strip().lower() in UNKNOWN))
 
 
 def _id(row: Mapping[str, Any]) -> str:
     value = row.get("id")
-    if isinstance(value, bool) or not isinstance(value, str | int) or not _known(row, "id"):
+    if isinstance(value, bool) or not isinstance(value, str | int) or not is_known(row, "id"):
         raise InputError(f"ID: {show(value)} is not the ID of a UAV")
     return str(value).strip()
 
 
 def _number(row: Mapping[str, Any], column: str, low: float, high: float, unit: str) -> float | None:
-    if not _known(row, column):
+    if not is_known(row, column):
         return None
     value, problem = row[column], f"is not a number between {low:g} and {high:g} {unit}"
     try:
@@ -268,7 +269,7 @@ def _whole(row: Mapping[str, Any], column: str) -> int | None:
 
 
 def _flag(row: Mapping[str, Any], column: str) -> bool:
-    if not _known(row, column):
+    if not is_known(row, column):
         return False
     flag = FLAGS.get(str(row[column]).strip().lower().removesuffix(".0"))
     if flag is None:
@@ -278,7 +279,7 @@ def _flag(row: Mapping[str, Any], column: str) -> bool:
 
 def _time(row: Mapping[str, Any], column: str) -> float | None:
     """A time [s]: a number, or ISO 8601, which is UTC if it names no zone."""
-    if not _known(row, column):
+    if not is_known(row, column):
         return None
     value = row[column]
     if isinstance(value, str) and not _is_number(value):
@@ -301,7 +302,7 @@ def _is_number(text: str) -> bool:
 
 def _place(row: Mapping[str, Any], prefix: str) -> Place | None:
     """The place of the columns with this prefix."""
-    written = [columns for columns in (DEGREES, METRES) if any(_known(row, prefix + c) for c in columns)]
+    written = [columns for columns in (DEGREES, METRES) if any(is_known(row, prefix + c) for c in columns)]
     if len(written) > 1:
         raise InputError(f"{prefix}lat, {prefix}x: give either degrees or metres")
     if not written:
@@ -322,9 +323,9 @@ def _pair(values: Sequence[Any], columns: tuple[str, str], prefix: str) -> Place
 
 def _places(row: Mapping[str, Any]) -> tuple[Place, ...] | None:
     """Landing points of the past: a list of pairs, or ``lat lon; lat lon``."""
-    if not _known(row, "previous"):
+    if not is_known(row, "previous"):
         return None
-    value, columns = row["previous"], METRES if _known(row, "x") else DEGREES
+    value, columns = row["previous"], METRES if is_known(row, "x") else DEGREES
     pairs = [part.split() for part in value.split(";")] if isinstance(value, str) else value
     if not isinstance(pairs, list) or len(pairs) > 16 or not all(_is_pair(pair) for pair in pairs):
         problem = "is not a list of at most 16 places such as [[53.1, -4.5]], or 53.1 -4.5; 53.2 -4.5"
@@ -337,7 +338,7 @@ def _is_pair(pair: Any) -> bool:
 
 
 def _readings(row: Mapping[str, Any]) -> tuple[float, ...] | None:
-    if not _known(row, "readings"):
+    if not is_known(row, "readings"):
         return None
     value = row["readings"]
     parts = value.split(";") if isinstance(value, str) else value
