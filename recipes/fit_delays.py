@@ -3,9 +3,9 @@
     damian fit-delays journals/main.jsonl                      (a journal of damian advise)
     damian fit-delays reports.csv --out trace.csv --dt 1
 
-The log is a journal, or a table (CSV, JSON) with the columns ID, lat, lon, time and receive time. The trace is
-a CSV file with a row for each message: its delay, or lost. With --dt delays are whole steps of this length [s],
-as damian advise counts them; without it they are times, which a simulation rounds up to whole steps.
+The log is a journal, or a table (CSV, JSON) with the columns ID, lat, lon, time and receive time. The trace
+is a CSV file with a row for each message: its delay, or lost. With --dt delays are whole steps of this length
+[s], as damian advise counts them; without it they are times, which a simulation rounds up to whole steps.
 """
 
 from collections.abc import Sequence
