@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from damian.advice.journal import SUFFIX, entries
-from damian.advice.reports import Report, is_known, read_file, read_rows
+from damian.advice.reports import Report, read_file, read_rows
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.delays.laws import LOST
@@ -74,7 +74,7 @@ def read_log(path: Path) -> list[Report]:
         with named(path):
             rows = read_file(path)
             for where, row in rows:
-                if not (is_known(row, "time") and (is_known(row, "receive time") or is_known(row, "aoi"))):
+                if "time" not in row or not {"receive time", "aoi"} & row.keys():
                     raise InputError(f"{where}: it needs time and receive time, or time and AoI")
             reports = read_rows(rows, math.nan, file=True)
     if len(reports) < 2:

@@ -30,6 +30,7 @@ class Ground:
         self.columns = METRES if self.region.origin is None else DEGREES
         self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
         self._found: dict[Place, int] = {}
+        self._places: dict[int, Place] = {}
         self._tree = shapely.STRtree(np.asarray(shapely.points(self.points)))
 
     def landing_point(self, place: Place) -> int:
@@ -60,10 +61,13 @@ class Ground:
 
     def place(self, point: int) -> Place:
         """Where a landing point is."""
+        if point in self._places:
+            return self._places[point]
         x, y = self.points[point]
         if self.region.origin is None:
             place = x + self.region.offset[0], y + self.region.offset[1]
         else:
             place = to_latlon(x, y, self.region.origin)
         digits = DIGITS[self.columns]
-        return round(float(place[0]), digits), round(float(place[1]), digits)
+        self._places[point] = round(float(place[0]), digits), round(float(place[1]), digits)
+        return self._places[point]
