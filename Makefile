@@ -1,4 +1,4 @@
-# make train | test | test-deep | test-slow | bench | bench-quick | pictures | check | format        (each sets up what it needs)
+# make train | test | test-deep | test-slow | bench | bench-quick | bench-advise | pictures | check | format        (each sets up what it needs)
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -6,7 +6,7 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-deep test-slow bench bench-quick pictures check format clean
+.PHONY: train test test-deep test-slow bench bench-quick bench-advise pictures check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
@@ -23,6 +23,10 @@ test-slow: $(VENV)/test
 
 bench: $(VENV)/bench
 	$(VENV)/bin/damian bench $(ARGS)
+
+# The service of damian advise over loopback.
+bench-advise: $(VENV)/test
+	$(PY) -m damian.recipes.bench_advise $(ARGS)
 
 bench-quick: $(VENV)/bench
 	$(VENV)/bin/damian bench --quick

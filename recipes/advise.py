@@ -12,6 +12,7 @@ another folder. Over HTTP, in a folder and in an answer nothing of the region bu
 the service avoids no obstacles, and somebody else is responsible for safety.
 """
 
+import gc
 import json
 import secrets
 import socket
@@ -214,6 +215,8 @@ def serve(config: AdviseConfig, desk: Desk) -> None:
     options = uvicorn.Config(
         service.make_app(desk, token), log_level="warning", access_log=False, timeout_keep_alive=30, ws="none"
     )
+    gc.collect()
+    gc.freeze()  # else every full collection looks through all of torch, for a tenth of a second
     uvicorn.Server(options).run(sockets=[listener])
 
 

@@ -168,8 +168,10 @@ def main(words: Sequence[str] | None = None) -> None:
                 Connection(port, range(i % args.fleets, args.fleets, CONNECTIONS)) for i in range(CONNECTIONS)
             ]
             uavs = {"uavs": [f"uav{i}" for i in range(N_UAVS)]}
-            for fleet in range(args.fleets):
+            for fleet in range(args.fleets):  # the steps of real fleets do not begin all at once either
                 connections[0].request("PUT", f"/fleets/f{fleet}", uavs)
+                connections[0].request("POST", f"/fleets/f{fleet}/reports", reports(time.time(), 0))
+                time.sleep(1 / args.fleets)
             load(connections, 1.0, 50.0)  # warms up
             times = [processor_time(process)]
             rated = load(connections, args.seconds, args.rate)

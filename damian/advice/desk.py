@@ -6,19 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from damian import keys
 from damian.advice.answers import Answer, advice_of, status_of
 from damian.advice.fleet import Fleet
-from damian.advice.journal import SUFFIX, Journal, entries, head
-from damian.advice.reports import Report, read_rows
+from damian.advice.journal import SUFFIX, Journal, entries, head, reports_of
+from damian.advice.reports import Report, Rows, read_rows
 from damian.common.errors import InputError
-from damian.common.text_files import show
+from damian.common.text_files import named, show
 
 MAX_FLEETS, MAX_UAVS = 1000, 100
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-
-Rows = Sequence[tuple[str, Mapping[str, Any]]]
 
 
 class NoFleet(InputError):
@@ -137,7 +136,12 @@ class Desk:
             except InputError as error:
                 raise InputError(f"{where}: {error}") from None
         now = max(now, fleet.clock) if not file else now
-        self._write(name, {"received": now, "reports": [report.entries() for report in reports]})
+        kept = [
+            {column: value for column, value in row.items() if column not in ("aoi", "receive time")}
+            | {"time": report.time}
+            for (_, row), report in zip(rows, reports, strict=True)
+        ]
+        self._write(name, {"received": now, "reports": kept})
         return _taken(fleet, reports, now)
 
     def advise(
@@ -191,28 +195,46 @@ class Desk:
             path.unlink()
             return
         first, *others = entries(path)
-        policy, own = first["about"].get("policy"), self.about.get("policy")
-        if policy != own:
-            raise InputError(f"{path}: it is of the policy {show(policy)}, not of {show(own)}")
-        fleet = self._make_fleet(first["uavs"])
-        for entry in others:
-            replay(fleet, entry)
-        self.fleets[first["fleet"]], self._journals[first["fleet"]] = fleet, journal
+        was = {name: (first.get("about") or {}).get(name) for name in ("policy", "checkpoint")}
+        own = {name: self.about.get(name) for name in was}
+        if was != own:
+            raise InputError(f"{path}: it is of {show(was)}, not of {show(own)}: name another journal=FOLDER")
+        name = str(first.get("fleet"))
+        with named(path):
+            fleet = self._make_fleet(self.check_new(name, first.get("uavs")))
+        for number, entry in enumerate(others, 2):
+            with named(f"{path}: line {number}"):
+                replay(fleet, entry)
+        self.fleets[name], self._journals[name] = fleet, journal
 
 
 def replay(fleet: Fleet, entry: Mapping[str, Any]) -> None:
     """Do again what a line of a journal says."""
     if "reports" in entry:
-        _taken(fleet, [Report.of_entries(each) for each in entry["reports"]], entry["received"])
+        received, reports = reports_of(entry)
+        for report in reports:
+            fleet.check(report, received)
+        _taken(fleet, reports, received)
         return
-    fleet.advance(entry["asked"])
-    numbers = [fleet.number[uav] for uav in entry["told"]]
+    asked, told = entry.get("asked"), entry.get("told")
+    if not isinstance(asked, int | float) or not isinstance(told, dict) or fleet.start is None:
+        raise InputError("it is damaged: neither reports nor advice")
+    fleet.advance(asked)
+    numbers = fleet.numbers_of(list(told)) or []
     if fleet.hidden is not None:
         fleet.ask_policy(numbers)  # for its hidden states
     action = fleet.node.env.full_action_spec[keys.ACTION].zero()
-    for number, told in zip(numbers, entry["told"].values(), strict=True):
-        action[0, number] = torch.as_tensor(told)
+    for uav, chosen in told.items():
+        action[0, fleet.number[uav]] = _action(chosen, action[0, 0])
     fleet.choose(numbers, action)
+
+
+def _action(chosen: Any, like: Tensor) -> Tensor:
+    """The action that a journal names, in the type of another one."""
+    try:
+        return torch.as_tensor(chosen).to(like.dtype).view(like.shape)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"it is damaged: {show(chosen)} is no action") from None
 
 
 def _taken(fleet: Fleet, reports: Sequence[Report], now: float) -> list[str]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from damian.advice.journal import SUFFIX, entries
+from damian.advice.journal import SUFFIX, entries, reports_of
 from damian.advice.reports import Report, read_file, read_rows
 from damian.common.errors import InputError
 from damian.common.text_files import named
@@ -64,12 +64,12 @@ def read_log(path: Path) -> list[Report]:
         InputError: the file is something else, or there are fewer than two reports.
     """
     if path.suffix == SUFFIX or path.name.endswith(".ended"):
-        reports = [
-            report if report.received is not None else replace(report, received=entry["received"])
-            for entry in entries(path)
-            if "reports" in entry
-            for report in map(Report.of_entries, entry["reports"])
-        ]
+        reports = []
+        for number, entry in enumerate(entries(path), 1):
+            if "reports" in entry:
+                with named(f"{path}: line {number}"):
+                    received, found = reports_of(entry)
+                reports += [replace(report, received=received) for report in found]
     else:
         with named(path):
             rows = read_file(path)

@@ -27,6 +27,7 @@ from damian.common.errors import InputError
 from damian.common.text_files import listed, show
 from damian.envs.uav_env import Outputs
 from damian.learners.recurrent import AgentGRU
+from damian.world.messages import Messages
 from damian.world.state import State
 
 FUTURE = 1.0
@@ -104,6 +105,7 @@ class Fleet:
         self.before: Memories | None = None
         self.after: Memories = []
         self.outputs: Outputs | None = None
+        self.sent: Messages | None = None
         self.first_step = self.last_arrival = 0
         self.hidden = self.hidden_after = _no_hidden(policy, len(self.uavs))
         self._forget_choices()
@@ -169,6 +171,7 @@ class Fleet:
         if self.node.scenario.delay.hold == "max":
             due = max(due, step + self.node.law_longest)
         self.pending.append((due, uav, known))
+        self.outputs = self.sent = None
         self.last_arrival = max(self.last_arrival, due)
         self._collect()
         return "late" if late else "new"
@@ -190,7 +193,7 @@ class Fleet:
         if not due:
             return
         self.pending = [each for each in self.pending if each[0] > self.step]
-        self.outputs = None
+        self.outputs = self.sent = None
         by_arrival = self.node.scenario.delay.order == "arrival"
         for _, uav, known in sorted(due, key=lambda each: each[2].report.time):
             self.arrived.append((uav, known))
@@ -237,7 +240,10 @@ class Fleet:
         for uav, known in self.arrived:
             if self.first_step < known.step < self.step:
                 late[uav, known.step] = known
-        rows = messages_of([*self.held, *late.values()], self.node.server, self.points, self.node.dt).pack()
+        self.sent = self._messages(self.held)
+        rows = self.sent.pack()
+        if late:
+            rows = torch.cat([rows, self._messages([*late.values()]).pack()])
         steps = torch.tensor([known.step for known in self.held])
         fresh = {uav for uav, known in self.arrived if known.step == self.step}
         n = len(self.uavs)
@@ -251,10 +257,15 @@ class Fleet:
             ],
         )
 
+    def _messages(self, known: Sequence[Known]) -> Messages:
+        return messages_of(known, self.node.server, self.points, self.node.dt)
+
     def _state(self, asking: Sequence[int]) -> State:
         """The state of the world, as far as it is known; the UAVs that ask are ready to choose."""
         state, n = self.node.blank, len(self.uavs)
-        sent = messages_of(self.held, self.node.server, self.points, self.node.dt)
+        if self.sent is None:
+            self.sent = self._messages(self.held)
+        sent = self.sent
         ready = torch.tensor([[uav in asking for uav in range(n)]])
         goal = torch.tensor([[self._standing(uav, uav in asking) for uav in range(n)]])
         return state._replace(
@@ -330,10 +341,13 @@ class Fleet:
     def ask_policy(self, choosing: Sequence[int]) -> Tensor:
         """Actions of all UAVs, [1, N, ...], of which those that choose count."""
         read = self.observe(choosing)
-        mode = ExplorationType.RANDOM if self.drawn else ExplorationType.DETERMINISTIC
-        with torch.random.fork_rng(devices=[]), set_exploration_type(mode):
-            torch.manual_seed(hash((self.seed, self.step, *choosing)) % 2**62)
-            chosen = self.policy(read)
+        if self.drawn:
+            with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
+                torch.default_generator.manual_seed(hash((self.seed, self.step, *choosing)) % 2**62)
+                chosen = self.policy(read)
+        else:
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                chosen = self.policy(read)
         if self.hidden is not None:
             self.hidden_after = chosen[keys.HIDDEN].detach()
         return chosen[keys.ACTION]

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from damian.advice.reports import LATEST, Report, checked_rows, read_rows
 from damian.common.atomic_files import writing
 from damian.common.errors import InputError
 from damian.common.text_files import named, one_line
@@ -88,6 +89,19 @@ def _parsed(line: bytes, number: int) -> dict[str, Any]:
     if not isinstance(entry, dict):
         raise InputError(f"line {number}: it is no object")
     return entry
+
+
+def reports_of(entry: dict[str, Any]) -> tuple[float, list[Report]]:
+    """When the reports of a line came in [s], and the reports.
+
+    Raises:
+        InputError: the line is damaged.
+    """
+    received, found = entry.get("received"), entry.get("reports")
+    if not isinstance(received, int | float) or not isinstance(found, list) or abs(received) > LATEST:
+        raise InputError("it is damaged: no reports, or no time at which they came in")
+    rows = checked_rows([(f"row {n}", row) for n, row in enumerate(found, 1)])
+    return received, read_rows(rows, received, file=False)
 
 
 def head(name: str, uavs: list[str], about: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from damian.advice.ground import Ground
+from damian.advice.ground import DEGREES, Ground
 from damian.advice.reports import Report
 from damian.common.errors import InputError
 from damian.server.server import Server
@@ -76,6 +76,9 @@ class UavLog:
         Raises:
             InputError: a place is far from any landing point, or there is another number of readings.
         """
+        if report.degrees != (self.ground.columns == DEGREES):
+            own, other = ("lat, lon [deg]", "x, y [m]")[:: 1 if self.ground.columns == DEGREES else -1]
+            raise InputError(f"{other}: places in {self.ground.region.name} are {own}")
         for place in (report.place, report.detected_at, report.target, *(report.previous or ())):
             if place is not None:
                 self.ground.landing_point(place)

@@ -8,8 +8,8 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,10 @@ LATEST = 4e9
 """Latest time that is understood [s since 1970]."""
 
 
+Rows = list[tuple[str, dict[str, Any]]]
+"""What rows say, by columns in lower case; each with its place in the text (``line 2``)."""
+
+
 @dataclass(frozen=True)
 class Report:
     """What a UAV reports; None where it does not say."""
@@ -37,6 +41,8 @@ class Report:
     """When the observation was generated [s]; since 1970 (UTC), or since any other instant."""
     place: Place
     """Where the UAV is: latitude and longitude [deg], or x and y [m]."""
+    degrees: bool = True
+    """Whether its places are degrees."""
     spotted: bool = False
     """Whether it spots the source."""
     flies: bool = False
@@ -63,16 +69,6 @@ class Report:
     """Number of the report, which grows by one."""
     received: float | None = None
     """When the report came in [s], if it is read from a file."""
-
-    def entries(self) -> dict[str, Any]:
-        """All that it says, for the journal."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if value not in (None, False)}
-
-    @classmethod
-    def of_entries(cls, entries: Mapping[str, Any]) -> "Report":
-        """The report of ``entries``, also after they have been JSON."""
-        return cls(**{name: _tuples(value) for name, value in entries.items()})
 
 
 COLUMNS = {
@@ -106,7 +102,7 @@ COLUMNS = {
 """Columns of a report, in lower case, and what they mean."""
 
 
-def read_file(path: Path) -> list[tuple[str, dict[str, Any]]]:
+def read_file(path: Path) -> Rows:
     """Rows of a file: JSON if its name ends with ``.json`` or ``.jsonl`` (an object on each line), else CSV.
 
     Raises:
@@ -116,7 +112,7 @@ def read_file(path: Path) -> list[tuple[str, dict[str, Any]]]:
     return json_rows(text, kind == ".jsonl") if kind in (".json", ".jsonl") else csv_rows(text)
 
 
-def csv_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
+def csv_rows(text: str) -> Rows:
     """Rows of a CSV table, each with its place in the text (``line 2``).
 
     Raises:
@@ -128,7 +124,7 @@ def csv_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
     return [(f"line {row.line}", _named(row.cells, f"line {row.line}")) for row in _limited(table)]
 
 
-def json_rows(text: str | bytes, lines: bool = False) -> list[tuple[str, dict[str, Any]]]:
+def json_rows(text: str | bytes, lines: bool = False) -> Rows:
     """Rows of JSON, each with its place: an object, a list of objects, or an object on each line.
 
     Args:
@@ -152,6 +148,18 @@ def json_rows(text: str | bytes, lines: bool = False) -> list[tuple[str, dict[st
         if not isinstance(rows, list):
             raise InputError(f"JSON: {show(rows)} is not a row or a list of rows")
         found = [(f"row {n}", row) for n, row in enumerate(rows, 1)]
+    return checked_rows(found)
+
+
+def checked_rows(found: Sequence[tuple[str, Any]]) -> Rows:
+    """Rows with columns that are known, without what a row leaves open.
+
+    Args:
+        found: rows of JSON, each with its place.
+
+    Raises:
+        InputError: there is none, or one is no object, or has other columns.
+    """
     if not found:
         raise InputError("there is no row")
     for where, row in _limited(found):
@@ -160,7 +168,7 @@ def json_rows(text: str | bytes, lines: bool = False) -> list[tuple[str, dict[st
     return [(where, _named(row, where)) for where, row in found]
 
 
-def read_rows(rows: Iterable[tuple[str, Mapping[str, Any]]], now: float, file: bool) -> list[Report]:
+def read_rows(rows: Rows, now: float, file: bool) -> list[Report]:
     """Check rows.
 
     Args:
@@ -198,6 +206,7 @@ def _report(row: Mapping[str, Any], now: float, file: bool) -> Report:
         uav=_id(row),
         time=time,
         place=place,
+        degrees="lat" in row,
         spotted=spotted,
         flies=altitude is not None and altitude > 0,
         detected=_time(row, "source time"),
@@ -367,10 +376,6 @@ def _limited(rows: Sequence[Any]) -> Sequence[Any]:
     if len(rows) > MAX_ROWS:
         raise InputError(f"{len(rows)} rows are more than the {MAX_ROWS} of a request or file")
     return rows
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(each) for each in value) if isinstance(value, list) else value
 
 
 def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -20,9 +20,9 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from damian.advice.desk import Desk, NoFleet, Rows
+from damian.advice.desk import Desk, NoFleet
 from damian.advice.fleet import Waiting
-from damian.advice.reports import as_csv, csv_rows, json_rows, parsed_json
+from damian.advice.reports import Rows, as_csv, csv_rows, json_rows, parsed_json
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 

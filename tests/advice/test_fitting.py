@@ -104,7 +104,7 @@ def test_what_is_no_log_is_refused(log, name, text, message):
 def test_a_journal_is_a_log(log):
     head = {"journal": "damian-advice", "version": 1, "fleet": "x", "uavs": ["A"], "about": {}}
     reports = [
-        {"received": i + 0.25, "reports": [{"uav": "A", "time": float(i), "place": [53.1, -4.5]}]}
+        {"received": i + 0.25, "reports": [{"id": "A", "time": float(i), "lat": 53.1, "lon": -4.5}]}
         for i in range(4)
     ]
     lines = [head, *reports, {"asked": 5.0, "step": 5, "told": {}, "advice": []}]

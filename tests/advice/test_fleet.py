@@ -62,8 +62,9 @@ TASKS = {
 }
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("fraction", [0.0, 0.7])
+@pytest.mark.parametrize(
+    ("task", "fraction"), [*((task, 0.0) for task in TASKS), ("late", 0.7), ("flights", 0.7)]
+)
 def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task, fraction):
     scenario = scenario_of(**TASKS[task])
     spotted, moved, n_steps = 0, 0, 90 if task == "flights" else 40

@@ -222,7 +222,7 @@ def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_pa
         journal = (tmp_path / "journals" / "north.jsonl").read_text().splitlines()
         reports = [each for line in journal if '"reports"' in line for each in json.loads(line)["reports"]]
         for uav, times in acknowledged.items():
-            there = [each["time"] for each in reports if each["uav"] == uav]
+            there = [each["time"] for each in reports if each["id"] == uav]
             assert {*times} <= {*there}
             assert len(there) <= len(times) + 1 + round_, "at most the one that was not answered is there too"
             acknowledged[uav] = there
