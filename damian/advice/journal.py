@@ -6,7 +6,7 @@ is lost if the process is killed at any time. The first line says which fleet it
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +91,7 @@ def _parsed(line: bytes, number: int) -> dict[str, Any]:
     return entry
 
 
-def reports_of(entry: dict[str, Any]) -> tuple[float, list[Report]]:
+def reports_of(entry: Mapping[str, Any]) -> tuple[float, list[Report]]:
     """When the reports of a line came in [s], and the reports.
 
     Raises:
