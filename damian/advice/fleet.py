@@ -172,7 +172,6 @@ class Fleet:
             due = max(due, step + self.node.law_longest)
         self.pending.append((due, uav, known))
         self.outputs = self.sent = None
-        self.last_arrival = max(self.last_arrival, due)
         self._collect()
         return "late" if late else "new"
 
@@ -193,7 +192,7 @@ class Fleet:
         if not due:
             return
         self.pending = [each for each in self.pending if each[0] > self.step]
-        self.outputs = self.sent = None
+        self.outputs, self.sent, self.last_arrival = None, None, self.step
         by_arrival = self.node.scenario.delay.order == "arrival"
         for _, uav, known in sorted(due, key=lambda each: each[2].report.time):
             self.arrived.append((uav, known))
@@ -213,6 +212,8 @@ class Fleet:
                 following = min([last, *(due for due, _, _ in self.pending)])
                 self.before = self.node.skip(self.before, following - self.step)
             else:
+                if self.hidden is not None and self.hidden_after is self.hidden:
+                    self.ask_policy([])  # hidden states change in every step
                 self._observe()
                 following, self.before = self.step + 1, self.after
             self.previous = self.action, self.chosen

@@ -24,6 +24,7 @@ from damian.envs.pipeline import make_env
 from damian.evaluation.metrics import evaluate
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
+from damian.learners.recurrent import add_recurrent_state
 from damian.recipes.advise import AdviseConfig, make_desk, serve
 from damian.server.rewards import RewardConfig
 
@@ -35,6 +36,14 @@ def network(env):
     """A policy with random weights, the same for every environment of a scenario."""
     torch.manual_seed(7)
     return MappoConfig().make_actor(env, ModelConfig(hidden=[16]))
+
+
+def recurrent(env):
+    """The same with hidden states."""
+    torch.manual_seed(7)
+    actor = MappoConfig().make_actor(env, ModelConfig(hidden=[16], rnn="gru"))
+    add_recurrent_state(env, actor)
+    return actor
 
 
 def served(scenario, policy_of, n_worlds: int, horizon: int, drawn: bool = False):
@@ -51,8 +60,10 @@ def served(scenario, policy_of, n_worlds: int, horizon: int, drawn: bool = False
         return evaluate(env, Client(env, ground, http, lambda time: now.__setitem__(0, time), START), horizon)
 
 
-@pytest.mark.parametrize("task", ["late", "belief", "flights"])
-@pytest.mark.parametrize("policy_of", [greedy_policy, network])
+@pytest.mark.parametrize(
+    ("task", "policy_of"),
+    [("late", greedy_policy), ("flights", greedy_policy), ("belief", network), ("flights", recurrent)],
+)
 def test_flights_by_the_service_are_those_of_the_simulation(task, policy_of):
     scenario = scenario_of(**TASKS[task], reward=REWARD)
     horizon = 40 if task == "flights" else 15
