@@ -145,7 +145,8 @@ class Fleet:
             ``new``, ``late`` (an older one, which is kept in its place), ``duplicate`` (one that was
             generated at the same time came in before), or ``old`` (generated before the fleet began).
         """
-        self.clock = received = max(self.clock, received)
+        self.advance(received)  # what comes in late fills in no earlier step
+        received = self.clock
         uav = self.number[report.uav]
         log = self.logs[uav]
         log.received, log.latest_receipt = log.received + 1, received
@@ -195,8 +196,11 @@ class Fleet:
         self.outputs, self.sent, self.last_arrival = None, None, self.step
         by_arrival = self.node.scenario.delay.order == "arrival"
         for _, uav, known in sorted(due, key=lambda each: each[2].report.time):
+            held = self.held[uav]
+            # Of those that arrive in the same step, the one that was generated last counts as the last.
+            earlier = by_arrival and not any(each is held for _, each in self.arrived)
             self.arrived.append((uav, known))
-            if by_arrival or known.report.time > self.held[uav].report.time:
+            if earlier or known.report.time > held.report.time:
                 self.held[uav] = known
 
     # Steps.

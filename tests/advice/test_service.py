@@ -2,12 +2,12 @@
 
 import json
 import random
-from itertools import count
 
 import pytest
 from starlette.testclient import TestClient
-from test_fleet import LLANBEDR, scenario_of
+from test_fleet import LLANBEDR, TASKS, scenario_of
 
+from damian import keys
 from damian.advice.desk import Desk
 from damian.advice.fleet import Fleet
 from damian.advice.node import Node, for_uavs
@@ -256,19 +256,42 @@ def test_a_wrong_question_for_advice_is_refused(client, fleet, desk):
         assert client.get(f"{fleet}/advice{query}").status_code == 422
 
 
-def test_a_journal_brings_everything_back(client, fleet, desk, clock, parts, tmp_path):
-    numbers = count()
-    for step in range(25):
-        clock.now = NOW + step * 0.7
-        sent = [row(uav, 40 * i + step % 5, desk, time=clock.now - 0.3 * i) for i, uav in enumerate(UAVS)]
-        client.post(f"{fleet}/reports", json=sent[step % 2 :] if step else sent)
-        if step % 3:
-            client.get(f"{fleet}/advice?uav={UAVS[next(numbers) % 3]}")
-    node, policy = parts
-    again = Desk(lambda uavs: Fleet(node, uavs, policy), tmp_path / "journals", {"policy": "greedy"})
-    one, other = desk.fleets["north"], again.fleets["north"]
-    assert (one.step, one.start, one.clock) == (other.step, other.start, other.clock)
-    assert list(map(list, one.told)) == list(map(list, other.told))
+@pytest.mark.parametrize("task", ["history", "belief", "clocks", "flights"])
+def test_a_journal_brings_everything_back(task, tmp_path):
+    """The service is asked about and takes its steps at other times than when it is restored."""
+    node = Node(for_uavs(scenario_of(**TASKS[task]), 3))
+    policy, clock = greedy_policy(node.env), Clock()
+
+    def make_desk() -> Desk:
+        return Desk(lambda uavs: Fleet(node, uavs, policy), tmp_path, {"policy": "greedy"})
+
+    desk, generator = make_desk(), random.Random(5)
+    headers = {"Authorization": f"Bearer {TOKEN}"}
+    with TestClient(make_app(desk, TOKEN, clock), headers=headers) as client:
+        client.put("/fleets/north", json={"uavs": UAVS})
+        client.post("/fleets/north/reports", json=rows(desk))
+        for step in range(60):
+            clock.now = NOW + step * 0.7
+            uav, late = generator.choice(UAVS), generator.choice([0, 0.3, 2.5])
+            sent = row(
+                uav, generator.randrange(200), desk, time=clock.now - late, source_spotted=step % 7 == 0
+            )
+            known = (
+                {"track": 5.0 * step, "battery": 90.0 - step}
+                if generator.random() < 0.5
+                else {"battery": None}
+            )
+            assert client.post("/fleets/north/reports", json=sent | known).status_code == 200
+            if generator.random() < 0.5:
+                desk.advance(clock.now)
+            if generator.random() < 0.5:
+                client.get(f"/fleets/north/advice?uav={generator.choice(UAVS)}")
+    one, other = desk.fleets["north"], make_desk().fleets["north"]
+    assert (one.start, list(map(list, one.told))) == (other.start, list(map(list, other.told)))
     assert [log.known for log in one.logs] == [log.known for log in other.logs]
-    one.advance(NOW + 60), other.advance(NOW + 60)
-    assert one.observe([0])["agents", "observation"].equal(other.observe([0])["agents", "observation"])
+    for fleet in (one, other):
+        fleet.advance(NOW + 60)
+    read = [fleet.observe([0]) for fleet in (one, other)]
+    for key in (keys.OBSERVATION, keys.RECEIVED, keys.HISTORY):
+        if key in read[0].keys(True):
+            assert read[0][key].equal(read[1][key]), key
