@@ -200,3 +200,19 @@ def test_what_no_uav_of_the_fleet_can_say_is_refused(changed, message):
     with pytest.raises(InputError) as error:
         fleet.check(report, START)
     assert str(error.value).startswith(message)
+
+
+def test_what_comes_in_late_fills_in_no_earlier_step_whenever_steps_are_taken():
+    """A fleet that is restored from its journal takes its steps later than it did."""
+    seen = []
+    for steps_at_once in (True, False):
+        fleet = fleet_of(**TASKS["history"])
+        for i, uav in enumerate(fleet.uavs):
+            told(fleet, uav, START, 200 + i, battery=80.0)
+        told(fleet, "a", START + 5, 210)
+        if steps_at_once:
+            fleet.advance(START + 6.5)
+        fleet.report(Report("a", START + 3, fleet.ground.place(205), battery=10.0), START + 6.6)
+        fleet.advance(START + 7)
+        seen.append(fleet.observe([0])[keys.HISTORY])
+    assert torch.equal(*seen)
