@@ -8,12 +8,14 @@
 Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
 docs/advise.md explains the columns of the reports, the answers, and what is guaranteed. The run folder gets
 config.yaml, the answers to a table as advice.csv and advice.json, and the journals unless journal= names
-another folder. Over HTTP, in a folder and in an answer nothing of the region but its landing points is known:
-the service avoids no obstacles, and somebody else is responsible for safety.
+another folder. The program knows the region and its landing points, and nothing else of the world: it avoids
+no obstacles, and somebody else is responsible for safety.
 """
 
+import copy
 import gc
 import json
+import os
 import secrets
 import socket
 import time
@@ -40,6 +42,7 @@ from damian.common.text_files import named
 from damian.evaluation.run_lock import is_folder
 from damian.evaluation.training_state import load_networks
 
+from .shared.command_line import SECRET
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
 from .shared.settings import TrainConfig
@@ -66,7 +69,8 @@ class AdviseConfig(TrainConfig):
     host: str = "127.0.0.1"
     """Address that the service listens to: by default only programs of this machine reach it."""
     token: str | None = None
-    """Password of the service over HTTP; one is made and printed if not given."""
+    """Password of the service over HTTP; if not given, that of the environment variable ``DAMIAN_TOKEN``, or
+    one that is made and printed. No file of the run folder keeps it."""
     uavs: list[str] = field(default_factory=list)
     """IDs of the UAVs of a table or a folder; those of the table, in their order, if not given."""
     journal: str | None = None
@@ -84,10 +88,7 @@ class AdviseConfig(TrainConfig):
             checks.require(bool(self.checkpoint) or not self.learnt, "policy", self.policy, should)
         if self.port is not None:
             checks.whole("port", self.port, 0, 65535)
-        if self.token is not None:
-            good = len(self.token) >= 16 and self.token.isascii() and self.token.isprintable()
-            should = "is not a password of at least 16 printable ASCII characters"
-            checks.require(good and " " not in self.token, "token", "it", should)
+        check_token("token", self.token)
 
     @property
     def flown(self) -> str:
@@ -111,6 +112,21 @@ class AdviseConfig(TrainConfig):
             raise InputError(f"reports: {problem}: give one of reports=FILE, folder=FOLDER, port=NUMBER")
 
 
+def check_token(key: str, token: str | None) -> None:
+    """Require a password that nobody guesses and every header can carry, if there is one."""
+    good = token is None or (
+        len(token) >= 16 and token.isascii() and token.isprintable() and " " not in token
+    )
+    checks.require(good, key, "it", "is not a password of at least 16 printable ASCII characters")
+
+
+def without_token(config: AdviseConfig) -> AdviseConfig:
+    """The settings, as files may keep them."""
+    kept = copy.copy(config)
+    kept.token, kept.overrides = None, [word for word in config.overrides if not word.startswith(SECRET)]
+    return kept
+
+
 ConfigStore.instance().store(name="advise_schema", node=AdviseConfig)
 
 
@@ -125,7 +141,8 @@ def make_desk(config: AdviseConfig, folder: Path | None) -> Desk:
     def make_fleet(uavs: list[str]) -> Fleet:
         return Fleet(*_ordered(parts(len(uavs)), uavs), drawn=config.flown == "sampled", seed=config.seed)
 
-    about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": list(config.overrides)}
+    overrides = without_token(config).overrides
+    about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": overrides}
     return Desk(make_fleet, folder, about, config.durable)
 
 
@@ -166,7 +183,7 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
             answer = desk.advise(FLEET, desk.fleet(FLEET).clock)
         except Waiting as error:
             raise InputError(str(error)) from None
-    save_config(config, folder)
+    save_config(without_token(config), folder)
     write_atomically(folder / "advice.json", json.dumps(answer, indent=1))
     write_atomically(folder / "advice.csv", table := as_csv(answer))
     print(table, end="")
@@ -186,7 +203,7 @@ def advise(config: AdviseConfig, folder: Path) -> None:
     if config.reports is not None:
         answer_table(config, folder)
         return
-    save_config(config, folder)
+    save_config(without_token(config), folder)
     journals = Path(config.journal) if config.journal else folder / "journals"
     desk = make_desk(config, journals)
     if config.port is not None:
@@ -206,10 +223,12 @@ def serve(config: AdviseConfig, desk: Desk) -> None:
     except ImportError as error:
         missing = f"needs {error.name}, which is not installed: pip install 'damian[advise]'"
         raise InputError(f"port: {config.port} {missing}") from None
-    token = config.token or secrets.token_urlsafe(24)
+    given = config.token or os.environ.get("DAMIAN_TOKEN")
+    check_token("DAMIAN_TOKEN", given)
+    token = given or secrets.token_urlsafe(24)
     listener = listening(config)
     host, port = listener.getsockname()[:2]
-    if config.token is None:
+    if given is None:
         print(f"token: {token}")
     print(f"listening on http://{host}:{port}", flush=True)
     options = uvicorn.Config(

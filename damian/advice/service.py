@@ -28,6 +28,8 @@ from damian.common.text_files import one_line
 
 MAX_BODY = 1_000_000
 """Largest body of a request [bytes]."""
+MAX_READ = 50_000_000
+"""Bytes of a body that are read: who still sends does not listen to the answer that it is too large."""
 TICK = 1.0
 """Time between two updates of all fleets [s], so that no request waits for many steps."""
 _CSV, _LINES = "text/csv", "application/x-ndjson"
@@ -167,15 +169,18 @@ def _rows(request: Request, body: bytes) -> Rows:
 
 async def _body(request: Request) -> bytes:
     """The body of a request, unless it is too large."""
-    parts, size = [], 0
+    parts: list[bytes] = []
+    size = 0
     try:
         async for part in request.stream():
             size += len(part)
-            if size > MAX_BODY:
-                raise HTTPException(413, f"the body is larger than {MAX_BODY} bytes", {"Connection": "close"})
-            parts.append(part)
+            parts = [*parts, part] if size <= MAX_BODY else []
+            if size > MAX_READ:
+                break
     except ClientDisconnect:
         raise HTTPException(400, "the connection was closed") from None
+    if size > MAX_BODY:
+        raise HTTPException(413, f"the body is larger than {MAX_BODY} bytes", {"Connection": "close"})
     return b"".join(parts)
 
 

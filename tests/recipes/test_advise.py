@@ -1,10 +1,12 @@
 """The program that advises real UAVs, run by its command line: tables, folders and HTTP, and its refusals."""
 
+import contextlib
 import csv
 import http.client
 import json
 import random
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -234,4 +236,46 @@ def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_pa
 def test_the_program_ends_when_it_is_asked_to(tmp_path):
     program = Program(tmp_path)
     assert program("GET", "/fleets/north", token="wrong-wrong-wrong")[0] == 401
+    host, port = program.url.removeprefix("http://").split(":")
+    for junk in (b"\x00\xff" * 500, b"POST / HTTP/9.9\r\n\r\n", b"GET " + b"x" * 200_000):
+        with socket.create_connection((host, int(port)), timeout=10) as raw:
+            raw.sendall(junk)
+            raw.shutdown(socket.SHUT_WR)
+            with contextlib.suppress(ConnectionError):
+                assert b" 5" not in raw.recv(64)[:12]
+    assert program("PUT", "/fleets/north", {"uavs": ["A"]})[0] == 201
+    assert program("POST", "/fleets/north/reports", "x" * 10_000_000)[0] == 413
+    kept = [path.read_text() for path in tmp_path.rglob("*") if path.is_file()]
+    assert len(kept) >= 3
+    assert not any(TOKEN in text for text in kept), "no file keeps the token"
     assert program.end(signal.SIGTERM) in (0, 143, -signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_the_program_watches_a_folder(inbox, tmp_path):
+    places = desk_of(tmp_path / "other").make(["A"]).ground.place
+    code = "from damian.recipes.command import main; main()"
+    words = [*SCRIPT, f"folder={inbox}", "uavs=[A,B]", f"hydra.run.dir={tmp_path}/run"]
+    with subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", code, "advise", *words], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert any(line.startswith("watching") for line in process.stdout)
+        rows = [f"{uav},{places(i)[0]},{places(i)[1]},{time.time()}" for i, uav in ((3, "A"), (60, "B"))]
+        (inbox / ".new").write_text("\n".join(["ID,lat,lon,time", *rows]))
+        (inbox / ".new").rename(inbox / "1.csv")
+        until = time.time() + 20
+        while not (inbox / "advice.csv").exists() and time.time() < until:
+            time.sleep(0.1)
+        process.terminate()
+    assert [row["ID"] for row in csv.DictReader((inbox / "advice.csv").read_text().splitlines())] == [
+        "A",
+        "B",
+    ]
+    assert (tmp_path / "run" / "journals" / "main.jsonl").read_text().count("\n") == 3
+
+
+def test_without_the_server_library_the_remedy_is_named(run, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    message = "port: 0 needs uvicorn, which is not installed: pip install 'damian[advise]'"
+    check_refused(lambda: run(*SCRIPT, "port=0"), message, capsys)
