@@ -15,7 +15,7 @@ from damian.server.server import Server
 from damian.world.battery import observed
 from damian.world.messages import Messages
 
-KEPT = 2048
+KEPT = 512
 """Reports of a UAV that are kept: a late one changes what newer ones left open."""
 
 
