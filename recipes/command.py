@@ -26,6 +26,8 @@ PROGRAMS = {
     "tune": "search for better settings of a learner with Optuna",
     "fly": "fly episodes and keep them as files, films, figures and pages: what is true, what is believed",
     "replay": "make a page that plays stored episodes side by side, in any browser",
+    "advise": "advise real UAVs: from what they report, where each should land next",
+    "fit-delays": "fit a trace law to the delays of real reports, to train with them",
     "pendulum": "apply the delay transforms to another environment: SAC on Pendulum-v1",
     "spread": "compare with a published table: MAPPO in simple_spread_v3 with late observations",
     "bench": "measure the speed of environment and training beside VMAS",
@@ -36,6 +38,7 @@ SETTINGS = {
     "compare": "compare",
     "fly": "fly",
     "tune": "tune",
+    "advise": "advise",
 }
 """Programs with settings of the form KEY=VALUE, and whose settings these are."""
 
@@ -59,7 +62,7 @@ def main(words: Sequence[str] | None = None) -> None:
         return
     sys.argv = [f"damian {name}", *words]
     try:
-        program = import_module(f".{name}", __package__)
+        program = import_module(f".{name.replace('-', '_')}", __package__)
     except InputError as error:  # it needs a package that is not installed
         sys.exit(_refuse(str(error)))
     program.run()

@@ -23,7 +23,7 @@ FLOORS = [
     {"learners"},
     {"baselines"},
     {"evaluation"},
-    {"interop"},
+    {"interop", "advice"},
 ]
 """Folders and modules of ``damian``; each may import only those on lower floors."""
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

@@ -62,7 +62,21 @@ def read_table(file: Path, columns: Iterable[str]) -> list[Row]:
         InputError: the file is no text, a quote stays open, a column is missing or doubled, or a row has more
             or fewer cells than the header.
     """
-    reader = csv.reader(io.StringIO(read_text(file), newline=""), strict=True)
+    return parse_table(read_text(file), columns)
+
+
+def parse_table(text: str, columns: Iterable[str]) -> list[Row]:
+    """Parse a CSV table with a header; empty rows are left out.
+
+    Args:
+        text: the table.
+        columns: that it must have; it may have others.
+
+    Raises:
+        InputError: a quote stays open, a column is missing or doubled, or a row has more or fewer cells than
+            the header.
+    """
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except csv.Error as error:

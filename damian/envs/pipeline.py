@@ -126,12 +126,7 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
         uplink = uplink_transform(scenario, output_messages, reads_delay=read)
         longest = uplink.sampler.longest
         transforms.append(uplink)
-    if server.grid is not None:
-        belief = Belief(server, longest, delayed=delayed, own=scenario.observation.own)
-        belief.memory_setting = "delay.obs", show(scenario.delay.obs)
-        transforms.append(belief)
-    if scenario.delay.messages:
-        transforms.append(message_history(scenario, server, delayed))
+    transforms += remembering_transforms(scenario, server, longest, delayed)
     held = keys.RECEIVED if delayed else keys.MESSAGE
     written = [*([] if linked else _SENT), *(key for each in transforms for key in each.out_keys)]
     written = [key for key in written if key != keys.HISTORY]
@@ -140,6 +135,27 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
     dropped = [] if output_messages else written
     node = ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras)
     return [*transforms, node]
+
+
+def remembering_transforms(
+    scenario: ScenarioConfig, server: Server, longest: int, delayed: bool
+) -> list[Transform]:
+    """What keeps messages of earlier steps: the belief, and the history of messages.
+
+    Args:
+        scenario: all settings.
+        server: server node.
+        longest: longest delay of a message [steps].
+        delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is delayed.
+    """
+    transforms: list[Transform] = []
+    if server.grid is not None:
+        belief = Belief(server, longest, delayed=delayed, own=scenario.observation.own)
+        belief.memory_setting = "delay.obs", show(scenario.delay.obs)
+        transforms.append(belief)
+    if scenario.delay.messages:
+        transforms.append(message_history(scenario, server, delayed))
+    return transforms
 
 
 def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_delay: bool) -> ObservationDelay:

@@ -82,6 +82,24 @@ class Belief(StatefulTransform):
         slot, belief = advance(self._grid, Window(**memory), report, delay, region, stepped)
         return memory | {"slot": slot}, self._written(belief)
 
+    def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
+        """Note a message whose delay nobody knew when it was sent, before the step in which it arrives.
+
+        Args:
+            memory: of a single world, before the step; it is changed in place.
+            message: the packed message, [M].
+            agent: number of its UAV.
+            lag: the delay, steps from when it was sent to the step that follows; at least 1. One above
+                ``longest`` changes nothing.
+        """
+        if lag <= self.longest:
+            messages = self.server.messages(message.view(1, 1, -1))
+            slot = (memory["slot"] + 1 - lag) % len(memory["report"])
+            every = torch.ones_like(messages.spotted)
+            memory["report"][slot, 0, agent] = report_rows(self._grid, messages, every).view(-1)
+            memory["delay"][slot, 0, agent] = lag
+        return memory
+
     def _written(self, belief: Tensor) -> Entries:
         """The entries to write, from the beliefs of all receivers, [M, V, K]."""
         belief = from_rows(belief, self.rows)

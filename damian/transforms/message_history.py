@@ -126,6 +126,24 @@ class MessageHistory(StatefulTransform):
         memory = self._added(memory, entries[self.row_key], due, sent)
         return memory, self._written(memory)
 
+    def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
+        """Note a message whose delay nobody knew when it was sent, before the step in which it arrives.
+
+        Args:
+            memory: of a single world, before the step.
+            message: the packed message, [...].
+            agent: number of its sender, the row of the memory.
+            lag: the delay, steps from when it was sent to the step that follows; at least 1. One above
+                ``steps`` changes nothing.
+        """
+        if lag > self.steps:
+            return memory
+        row = {"kept": self._encoded(message.view(1, 1, -1)).view(-1), "due": 1, "sent": True}
+        memory = memory | {name: memory[name].clone() for name in row}
+        for name, value in row.items():
+            memory[name][agent, lag - 1] = value
+        return memory
+
     def _added(self, memory: Memory, message: Tensor, due: Tensor, sent: Tensor) -> Memory:
         """The memory with the messages of a step as the newest ones.
 

@@ -102,7 +102,7 @@ class Simulation:
             action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
             action_valid: whether each UAV's action counts, [B, N] bool; all count if not given.
         """
-        state = self._decide(state, action, action_valid)
+        state = self.decide(state, action, action_valid)
         state = self.vehicles.move(state)
         return self._sense(state._replace(steps=state.steps + 1), action_valid)
 
@@ -124,8 +124,8 @@ class Simulation:
 
     # The stages of one step, in order.
 
-    def _decide(self, state: State, action: Tensor, action_valid: Tensor | None) -> State:
-        """Assign landing points to the UAVs that may choose, and start their flights."""
+    def decide(self, state: State, action: Tensor, action_valid: Tensor | None) -> State:
+        """Assign landing points to the UAVs that may choose, and start their flights, as in ``step``."""
         base = state.region.unsqueeze(-1) * self.airspace.max_points
         standing = state.goal - base
         ranking, row = self.candidates.rank(state.goal, state.region, action)

@@ -92,6 +92,10 @@ _typed: list[str] = []
 """The command line as it was typed; empty in a worker process of a comparison."""
 
 
+SECRET = "token="
+"""Begin of a word that sets a password."""
+
+
 def remember_words() -> None:
     """Remember the command line as it was typed, before it is prepared for Hydra."""
     _typed[:] = sys.argv
@@ -103,8 +107,8 @@ def typed_words() -> list[str]:
 
 
 def typed_command() -> str:
-    """The command line as it was typed."""
-    return command(typed_words())
+    """The command line as it was typed, without the password of a service, which no file should keep."""
+    return command([f"{SECRET}..." if word.startswith(SECRET) else word for word in typed_words()])
 
 
 def command(words: Sequence[str]) -> str:

@@ -22,6 +22,7 @@ SCHEMAS = {
     "compare": "damian.recipes.compare:CompareConfig",
     "fly": "damian.recipes.fly:FlyConfig",
     "tune": "damian.recipes.tune:TuneConfig",
+    "advise": "damian.recipes.advise:AdviseConfig",
 }
 """Dataclass of all settings of a program, by the name of its file in conf/."""
 CHOICES = {

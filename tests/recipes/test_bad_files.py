@@ -5,6 +5,7 @@ The programs really start, compose and check; only the training, the flights and
 
 import io
 import json
+import math
 import os
 from contextlib import ExitStack, chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -19,6 +20,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
+from damian.advice.reports import read_file, read_rows
+from damian.common.errors import InputError
+from damian.recipes import advise as advise_program
 from damian.recipes import bench, compare, evaluate, oracle, pendulum, spread, train
 from damian.recipes import fly as fly_program
 from damian.recipes.command import main
@@ -42,6 +46,13 @@ VALID = {
     ),
     "own/scenario/mine.yaml": "# @package _global_\nagents: 2\nreward:\n  spotted: 0.5\nregion: {pool: 1}\n",
     "run/config.yaml": OmegaConf.to_yaml(OmegaConf.structured(RUN)),
+    "reports.csv": "ID,time,receive time,lat,lon,battery,source spotted,previous,sequence\n"
+    + "".join(f"A,{i},{i + 0.5},53.1,-4.5,NA,1,53.1 -4.5; 53.2 -4.5,{i}\n" for i in range(4)),
+    "journal.jsonl": '{"journal":"damian-advice","version":1,"fleet":"x","uavs":["A"],"about":{}}\n'
+    + "".join(
+        f'{{"received":{i + 0.5},"reports":[{{"id":"A","time":{i}.0,"lat":53.1,"lon":-4.5}}]}}\n'
+        for i in range(4)
+    ),
     "seed0_naive.json": json.dumps(
         {
             "arm": "naive",
@@ -56,6 +67,7 @@ VALID = {
     "episode.json": json.dumps(flight().document()),
 }
 """A valid file for each reader."""
+LOGS = ["reports.csv", "journal.jsonl"]
 READERS = {
     "fir.csv": ["region.kind=fir", "region.path=fir.csv", "region.id=A", "region.vertices=[]"],
     "trace.csv": ["delay.obs={law: trace, path: trace.csv}"],
@@ -132,6 +144,7 @@ def answer(name, given_words, made=nothing):
         cut_off = [
             (train, "train", build),
             (fly_program, "show", nothing),
+            (advise_program, "advise", nothing),
             (evaluate, "report", nothing),
             (oracle, "evaluate", nothing),
             (compare, "perform_all", lambda *_: []),
@@ -246,8 +259,30 @@ def test_an_episode_of_any_content_is_refused_in_one_line_or_shown(content):
     answer("replay", ["episode.json"], write("episode.json", content))
 
 
+@examples(30, 1000)
+@given(st.sampled_from(LOGS).flatmap(lambda file: st.tuples(st.just(file), contents(file))))
+def test_a_log_of_any_content_is_refused_in_one_line_or_fitted(case):
+    file, content = case
+    answer("fit-delays", [file, "--out", "trace.csv"], write(file, content))
+
+
+@examples(60, 3000)
+@given(st.sampled_from(LOGS).flatmap(contents), st.sampled_from(["csv", "json", "jsonl"]))
+def test_reports_of_any_content_are_refused_in_one_line_or_read(content, kind):
+    with TemporaryDirectory() as folder:
+        path = Path(folder, f"reports.{kind}")
+        path.write_bytes(content)
+        line, reports = None, []
+        try:
+            reports = read_rows(read_file(path), 1e9, file=True)
+        except InputError as error:
+            line = str(error)
+    assert reports or (line and len(line) <= LONGEST_LINE)
+    assert all(math.isfinite(number) for report in reports for number in (report.time, *report.place))
+
+
 @examples(8, 500)
-@given(st.sampled_from(["train", "train", "fly", "evaluate", "oracle"]), words("train"))
+@given(st.sampled_from(["train", "train", "fly", "advise", "evaluate", "oracle"]), words("train"))
 def test_any_words_end_a_program_in_one_line_or_start_it(name, given_words):
     answer(name, given_words)
 
@@ -313,6 +348,14 @@ def test_a_refused_sweep_leaves_no_folder(name, given_words):
     ("name", "given_words", "message"),
     [
         ("fly", ["resume=x"], "resume: nothing is trained"),
+        ("advise", ["resume=x"], "resume: nothing is trained"),
+        ("advise", ["policy=random"], "policy: random is not one of mode, sampled, greedy"),
+        ("advise", ["token=short"], "token: it is not a password"),
+        ("fit-delays", [], "the following arguments are required: log"),
+        ("fit-delays", ["nothing.csv"], "nothing.csv: no such file"),
+        ("fit-delays", ["nothing.jsonl"], "nothing.jsonl: it cannot be read"),
+        ("fit-delays", ["x", "--dt", "0"], "--dt: 0.0 s is not above 0 s"),
+        ("fit-delays", ["x", "--out", "/"], "--out: / is there already"),
         ("ceiling", ["delay=paper", "checkpoint=x"], "checkpoint: the script flies"),
         ("ceiling", ["delay=none"], "delay.obs: no message is late or lost"),
         ("ceiling", ["scenario=coverage", "delay=paper"], "reward: nothing is won by finding the source"),

@@ -1,0 +1,180 @@
+"""The delays of real reports, and those that never came in, as a trace that simulations can replay."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from damian.advice.journal import SUFFIX, entries, reports_of
+from damian.advice.reports import Report, read_file, read_rows
+from damian.common.errors import InputError
+from damian.common.text_files import named
+from damian.delays.laws import LOST
+from damian.delays.times import LONGEST
+
+REGULAR = 0.2
+"""Share of a period by which the time between two reports may differ from whole periods."""
+MOST = 0.8
+"""Share of the times between reports that must be whole periods, for the reports to count as regular."""
+LONGEST_GAP = 1000
+"""Most messages that are taken as lost between two that came in: longer gaps are pauses."""
+_ROUNDING = 1e-3
+
+
+class Message(NamedTuple):
+    """A message of a UAV."""
+
+    uav: str
+    """ID of the UAV."""
+    time: float
+    """When it was generated [s]; estimated for one that never came in."""
+    received: float | None
+    """When it came in first [s]; None if it never did."""
+
+
+class Fit(NamedTuple):
+    """Delays of messages."""
+
+    messages: list[Message]
+    """Those of one UAV after those of another, each in the order of their generation."""
+    losses: str
+    """How lost messages were found."""
+    ahead: int
+    """Messages that came in before they were generated, by the clocks; their delay counts as 0."""
+
+    @property
+    def delays(self) -> np.ndarray:
+        """Delays of the messages that came in [s]."""
+        return np.array([max(m.received - m.time, 0.0) for m in self.messages if m.received is not None])
+
+    @property
+    def n_lost(self) -> int:
+        """Number of messages that never came in."""
+        return sum(message.received is None for message in self.messages)
+
+
+def read_log(path: Path) -> list[Report]:
+    """The reports of a journal, or of a table with a column ``receive time``; each says when it came in.
+
+    Raises:
+        InputError: the file is something else, or there are fewer than two reports.
+    """
+    if path.suffix == SUFFIX or path.name.endswith(".ended"):
+        reports = []
+        for number, entry in enumerate(entries(path), 1):
+            if "reports" in entry:
+                with named(f"{path}: line {number}"):
+                    received, found = reports_of(entry)
+                reports += [replace(report, received=received) for report in found]
+    else:
+        with named(path):
+            rows = read_file(path)
+            for where, row in rows:
+                if "time" not in row or not {"receive time", "aoi"} & row.keys():
+                    raise InputError(f"{where}: it needs time and receive time, or time and AoI")
+            reports = read_rows(rows, math.nan, file=True)
+    if len(reports) < 2:
+        raise InputError(f"{path}: {len(reports)} reports are too few to tell how late they are")
+    return reports
+
+
+def fit(reports: Iterable[Report]) -> Fit:
+    """Delays of reports, and which are missing between them.
+
+    Where reports of a UAV are numbered (``sequence``), a missing number is a lost message. Where they are
+    not, but most come in whole periods, a gap of several periods has lost messages in it. Else no loss can be
+    seen.
+
+    Args:
+        reports: which say when they came in.
+    """
+    found: list[Message] = []
+    kinds: set[str] = set()
+    by_uav = sorted(reports, key=lambda report: (report.uav, report.time, report.received))
+    for uav, own in groupby(by_uav, lambda report: report.uav):
+        first_copies = [next(copies) for _, copies in groupby(own, lambda report: report.time)]
+        gaps, kind = _gaps(first_copies)
+        kinds.add(kind)
+        for report, n_lost, after in zip(first_copies, [0, *gaps], [None, *first_copies], strict=False):
+            for i in range(n_lost):
+                share = (i + 1) / (n_lost + 1)
+                found.append(Message(uav, after.time + share * (report.time - after.time), None))  # type: ignore[union-attr]
+            found.append(Message(uav, report.time, report.received))
+    ahead = sum(m.received is not None and m.received < m.time for m in found)
+    return Fit(found, " and ".join(sorted(kinds)), ahead)
+
+
+def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
+    """Number of messages that are missing between each report and the next one, and how this was found."""
+    numbers = [report.sequence for report in reports]
+    if len(numbers) > 1 and all(number is not None for number in numbers):
+        steps = [int(after) - int(before) for before, after in pairwise(numbers)]  # type: ignore[arg-type]
+        # A UAV that starts anew counts from the beginning.
+        return [step - 1 if 0 < step <= LONGEST_GAP else 0 for step in steps], "by their numbers"
+    between = np.diff([report.time for report in reports])
+    if len(between) >= 2:
+        period = float(np.median(between))
+        periods = between / period
+        regular = np.abs(periods - periods.round()) <= REGULAR
+        if (regular & (periods.round() >= 1)).mean() >= MOST:
+            missing = (periods.round().astype(int) - 1).clip(min=0)
+            missing[missing >= LONGEST_GAP] = 0
+            return missing.tolist(), f"by their period of {period:.3g} s"
+    return [0] * len(between), "not to be seen (no numbers, no period)"
+
+
+def trace_rows(fitted: Fit, dt: float | None = None) -> list[str]:
+    """The column ``delay`` of a trace, a row for each message.
+
+    Args:
+        fitted: the messages.
+        dt: length of a step [s]: delays are whole steps, as ``damian advise`` counts them: from the step in
+            which a message was generated to that in which it came in. None: delays are times, which a
+            simulation rounds up to whole steps.
+
+    Raises:
+        InputError: a delay is longer than any that can be simulated.
+    """
+    start = min(message.time for message in fitted.messages)
+    rows = []
+    for message in fitted.messages:
+        if message.received is None:
+            rows.append(LOST)
+            continue
+        delay = max(message.received - message.time, 0.0)
+        if dt is None:
+            rows.append(f"{delay:.6f}s" if delay >= 1e-6 else "0")
+            continue
+        generated, came_in = (
+            math.floor((time - start) / dt + _ROUNDING) for time in (message.time, message.received)
+        )
+        steps = max(came_in - generated, 0)
+        if steps > LONGEST:
+            raise InputError(f"--dt: a delay of {delay:.6g} s is {steps} steps, more than {LONGEST}")
+        rows.append(str(steps))
+    return rows
+
+
+def summary(fitted: Fit) -> str:
+    """What was found, on two or three lines."""
+    delays, n = fitted.delays, len(fitted.messages)
+    uavs = {message.uav for message in fitted.messages}
+    times = [message.time for message in fitted.messages]
+    quantiles = ", ".join(
+        f"{name} {value:.3f}"
+        for name, value in zip(("median", "90 %", "99 %"), np.quantile(delays, [0.5, 0.9, 0.99]), strict=True)
+    )
+    lines = [
+        f"{n} messages of {len(uavs)} UAVs over {max(times) - min(times):.0f} s; lost: {fitted.n_lost} "
+        f"({fitted.n_lost / n:.1%}), {fitted.losses}",
+        f"delay [s]: mean {delays.mean():.3f}, {quantiles}, longest {delays.max():.3f}",
+    ]
+    if fitted.ahead:
+        lines.append(
+            f"{fitted.ahead} came in before they were generated: clocks differ; their delay counts as 0"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,63 @@
+"""A folder as a source of reports: every table that is put into it is read once, and answered there."""
+
+import json
+from pathlib import Path
+
+from damian.advice.desk import Desk
+from damian.advice.fleet import Waiting
+from damian.advice.reports import as_csv, read_file
+from damian.common.atomic_files import write_atomically, writing
+from damian.common.errors import InputError
+
+TABLES = (".csv", ".json", ".jsonl")
+ANSWERS = ("advice.csv", "advice.json")
+DONE, REFUSED = ".done", ".refused"
+"""Added to the name of a table that was read, or refused; a file ``*.refused.txt`` says why."""
+
+
+def read_inbox(desk: Desk, name: str, folder: Path, now: float) -> bool:
+    """Read the tables that have come into a folder, in the order of their names, and answer them.
+
+    A table must appear complete: write it under another name, such as one that begins with a dot, and rename
+    it. The answer is ``advice.csv`` and ``advice.json`` in the folder. A table that is wrong changes nothing.
+
+    Args:
+        desk: the fleets.
+        name: of the fleet.
+        folder: the folder.
+        now: the time [s].
+
+    Returns:
+        Whether there was any table.
+
+    Raises:
+        RunError: an answer cannot be written.
+    """
+    paths = sorted(path for path in folder.iterdir() if _is_table(path))
+    taken = [_read(desk, name, path, now) for path in paths]
+    if any(taken):
+        try:
+            answer = desk.advise(name, now)
+        except Waiting:
+            return True
+        write_atomically(folder / "advice.json", json.dumps(answer, indent=1))
+        write_atomically(folder / "advice.csv", as_csv(answer))
+    return bool(paths)
+
+
+def _is_table(path: Path) -> bool:
+    hidden = path.name.startswith(".") or path.name in ANSWERS
+    return not hidden and path.suffix.lower() in TABLES and path.is_file()
+
+
+def _read(desk: Desk, name: str, path: Path, now: float) -> bool:
+    """Give a table to the desk; returns whether it was taken."""
+    try:
+        desk.report(name, read_file(path), now)
+        end = DONE
+    except InputError as error:
+        end = REFUSED
+        write_atomically(path.with_name(f"{path.name}{REFUSED}.txt"), f"{error}\n")
+    with writing(path):
+        path.rename(path.with_name(path.name + end))
+    return end == DONE

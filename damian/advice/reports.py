@@ -1,0 +1,387 @@
+"""Reported observations: rows of CSV tables or JSON, each checked column by column.
+
+A row is a mapping from columns to text or numbers. Names of columns may be written in any case, and with
+``_`` for a space. ``NA``, an empty cell and null mean that the value is not known.
+"""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from damian.advice.ground import DEGREES, METRES, Place
+from damian.common.errors import InputError
+from damian.common.text_files import parse_table, read_text, show
+
+UNKNOWN = ("", "na", "nan", "none", "null")
+"""Cells that mean that a value is not known."""
+FLAGS = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
+MAX_ROWS = 10_000
+"""Most rows of a request or a file in the folder."""
+LATEST = 4e9
+"""Latest time that is understood [s since 1970]."""
+
+
+Rows = list[tuple[str, dict[str, Any]]]
+"""What rows say, by columns in lower case; each with its place in the text (``line 2``)."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a UAV reports; None where it does not say."""
+
+    uav: str
+    """Its ID."""
+    time: float
+    """When the observation was generated [s]; since 1970 (UTC), or since any other instant."""
+    place: Place
+    """Where the UAV is: latitude and longitude [deg], or x and y [m]."""
+    degrees: bool = True
+    """Whether its places are degrees."""
+    spotted: bool = False
+    """Whether it spots the source."""
+    flies: bool = False
+    """Whether it is in the air."""
+    detected: float | None = None
+    """When it detected the source last [s]."""
+    detected_at: Place | None = None
+    """Where it was then."""
+    target: Place | None = None
+    """The landing point that it is bound for."""
+    track: float | None = None
+    """Heading of its latest flight, clockwise from north [deg]."""
+    battery: float | None = None
+    """Battery level [%]."""
+    moved: float | None = None
+    """When it took off or landed last [s]."""
+    previous: tuple[Place, ...] | None = None
+    """Landing points where it was before, newest first."""
+    motions: int | None = None
+    """Decisions (holding included) since it last detected the source before."""
+    readings: tuple[float, ...] | None = None
+    """Readings of its sensors of one's own."""
+    sequence: int | None = None
+    """Number of the report, which grows by one."""
+    received: float | None = None
+    """When the report came in [s], if it is read from a file."""
+
+
+COLUMNS = {
+    "id": "ID of the UAV",
+    "time": "when the observation was generated",
+    "aoi": "age of the observation when it came in [s], if there is no time",
+    "lat": "latitude [deg]",
+    "lon": "longitude [deg]",
+    "x": "east [m], over a region without a place on Earth",
+    "y": "north [m]",
+    "source spotted": "whether the UAV spots the source: 1 or 0",
+    "source time": "when it detected the source last",
+    "source lat": "where it was then",
+    "source lon": "",
+    "source x": "",
+    "source y": "",
+    "track": "heading of its latest flight, clockwise from north [deg]",
+    "takeoff-landing time": "when it took off or landed last",
+    "battery": "battery level [%]",
+    "fla": "flight altitude [m]: above 0 in flight",
+    "target lat": "landing point that it is bound for",
+    "target lon": "",
+    "target x": "",
+    "target y": "",
+    "previous": "landing points where it was before, newest first",
+    "motions": "decisions since its latest detection",
+    "readings": "readings of sensors of one's own",
+    "sequence": "number of the report",
+    "receive time": "when it came in; only in files",
+}
+"""Columns of a report, in lower case, and what they mean."""
+
+
+def read_file(path: Path) -> Rows:
+    """Rows of a file: JSON if its name ends with ``.json`` or ``.jsonl`` (an object on each line), else CSV.
+
+    Raises:
+        InputError: it cannot be read, or is something else.
+    """
+    text, kind = read_text(path), path.suffix.lower()
+    return json_rows(text, kind == ".jsonl") if kind in (".json", ".jsonl") else csv_rows(text)
+
+
+def csv_rows(text: str) -> Rows:
+    """Rows of a CSV table, each with its place in the text (``line 2``).
+
+    Raises:
+        InputError: it is no table, or has a column that is not known.
+    """
+    table = parse_table(text, [])
+    if not table:
+        raise InputError("line 2: there is no row under the header")
+    return [(f"line {row.line}", _named(row.cells, f"line {row.line}")) for row in _limited(table)]
+
+
+def json_rows(text: str | bytes, lines: bool = False) -> Rows:
+    """Rows of JSON, each with its place: an object, a list of objects, or an object on each line.
+
+    Args:
+        text: the JSON.
+        lines: it has an object on each line.
+
+    Raises:
+        InputError: it is something else.
+    """
+    if lines:
+        parts = text.decode(errors="replace") if isinstance(text, bytes) else text
+        found = [
+            (f"line {n}", parsed_json(line, f"line {n}"))
+            for n, line in enumerate(parts.splitlines(), 1)
+            if line.strip()
+        ]
+    else:
+        parsed = parsed_json(text, "JSON")
+        rows = parsed["rows"] if isinstance(parsed, dict) and "rows" in parsed else parsed
+        rows = [rows] if isinstance(rows, dict) else rows
+        if not isinstance(rows, list):
+            raise InputError(f"JSON: {show(rows)} is not a row or a list of rows")
+        found = [(f"row {n}", row) for n, row in enumerate(rows, 1)]
+    return checked_rows(found)
+
+
+def checked_rows(found: Sequence[tuple[str, Any]]) -> Rows:
+    """Rows with columns that are known, without what a row leaves open.
+
+    Args:
+        found: rows of JSON, each with its place.
+
+    Raises:
+        InputError: there is none, or one is no object, or has other columns.
+    """
+    if not found:
+        raise InputError("there is no row")
+    for where, row in _limited(found):
+        if not isinstance(row, dict):
+            raise InputError(f"{where}: {show(row)} is not an object with the columns of a report")
+    return [(where, _named(row, where)) for where, row in found]
+
+
+def read_rows(rows: Rows, now: float, file: bool) -> list[Report]:
+    """Check rows.
+
+    Args:
+        rows: each with its place in the text.
+        now: when they came in [s].
+        file: they are from a file, whose ``receive time`` counts.
+
+    Raises:
+        InputError: a value is missing or wrong; the line names its place, column, value and unit.
+    """
+    reports = []
+    for where, row in rows:
+        try:
+            reports.append(_report(row, now, file))
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+    return reports
+
+
+def _report(row: Mapping[str, Any], now: float, file: bool) -> Report:
+    received = _time(row, "receive time") if file else None
+    if not file and "receive time" in row:
+        raise InputError("receive time: only a file may say it; the service looks at its own clock")
+    time, age = _time(row, "time"), _number(row, "aoi", 0, LATEST, "s") or 0.0
+    if file and received is None and time is not None:
+        received = time + age
+    place = _place(row, "")
+    if place is None:
+        raise InputError("lat, lon: they are missing: where the UAV is [deg], or x, y [m]")
+    spotted = _flag(row, "source spotted")
+    altitude = _number(row, "fla", -500, 1e5, "m")
+    if time is None:
+        time = (now if received is None else received) - age
+    return Report(
+        uav=_id(row),
+        time=time,
+        place=place,
+        degrees="lat" in row,
+        spotted=spotted,
+        flies=altitude is not None and altitude > 0,
+        detected=_time(row, "source time"),
+        detected_at=_place(row, "source "),
+        target=_place(row, "target "),
+        track=_number(row, "track", -360, 360, "deg"),
+        battery=_number(row, "battery", 0, 100, "%"),
+        moved=_time(row, "takeoff-landing time"),
+        previous=_places(row),
+        motions=_whole(row, "motions"),
+        readings=_readings(row),
+        sequence=_whole(row, "sequence"),
+        received=received,
+    )
+
+
+def _named(row: Mapping[Any, Any], where: str) -> dict[str, Any]:
+    """What a row says, by its columns in lower case.
+
+    Raises:
+        InputError: a column is not known, or appears twice.
+    """
+    named: dict[str, Any] = {}
+    for name, value in row.items():
+        column = _ALIASES.get(plain := str(name).strip().lower().replace("_", " "), plain)
+        if column not in COLUMNS:
+            known = ", ".join(COLUMNS)
+            raise InputError(f"{where}: {show(name)} is no column; they are {known}")
+        if column in named:
+            raise InputError(f"{where}: the column {column} appears twice")
+        named[column] = value
+    return {column: value for column, value in named.items() if not _is_unknown(value)}
+
+
+_ALIASES = {"takeoff landing time": "takeoff-landing time"}
+
+
+def _is_unknown(value: Any) -> bool:
+    return value is None or (isinstance(value, str) and value.strip().lower() in UNKNOWN)
+
+
+def _id(row: Mapping[str, Any]) -> str:
+    value = row.get("id")
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise InputError(f"ID: {show(value)} is not the ID of a UAV")
+    return str(value).strip()
+
+
+def _number(row: Mapping[str, Any], column: str, low: float, high: float, unit: str) -> float | None:
+    if column not in row:
+        return None
+    value, problem = row[column], f"is not a number between {low:g} and {high:g} {unit}"
+    try:
+        number = float(value) if isinstance(value, str | int | float) else math.nan
+    except (ValueError, OverflowError):
+        number = math.nan
+    if isinstance(value, bool) or not low <= number <= high:
+        raise InputError(f"{column}: {show(value)} {problem}")
+    return number
+
+
+def _whole(row: Mapping[str, Any], column: str) -> int | None:
+    number = _number(row, column, 0, 2**31, "")
+    if number is not None and number != int(number):
+        raise InputError(f"{column}: {show(row[column])} is not a whole number")
+    return None if number is None else int(number)
+
+
+def _flag(row: Mapping[str, Any], column: str) -> bool:
+    if column not in row:
+        return False
+    flag = FLAGS.get(str(row[column]).strip().lower().removesuffix(".0"))
+    if flag is None:
+        raise InputError(f"{column}: {show(row[column])} is not 1 or 0, true or false")
+    return flag
+
+
+def _time(row: Mapping[str, Any], column: str) -> float | None:
+    """A time [s]: a number, or ISO 8601, which is UTC if it names no zone."""
+    if column not in row:
+        return None
+    value = row[column]
+    if isinstance(value, str) and not _is_number(value):
+        try:
+            parsed = datetime.fromisoformat(value.strip())
+            value = (parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)).timestamp()
+        except (ValueError, OverflowError):
+            problem = "is neither seconds nor a time such as 2026-05-01T12:00:00Z"
+            raise InputError(f"{column}: {show(value)} {problem}") from None
+    return _number({column: value}, column, 0, LATEST, "s")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _place(row: Mapping[str, Any], prefix: str) -> Place | None:
+    """The place of the columns with this prefix."""
+    written = [columns for columns in (DEGREES, METRES) if any(prefix + c in row for c in columns)]
+    if len(written) > 1:
+        raise InputError(f"{prefix}lat, {prefix}x: give either degrees or metres")
+    if not written:
+        return None
+    return _pair([row.get(prefix + column) for column in written[0]], written[0], prefix)
+
+
+def _pair(values: Sequence[Any], columns: tuple[str, str], prefix: str) -> Place:
+    limits = (90.0, 180.0, "deg") if columns == DEGREES else (2e7, 2e7, "m")
+    numbers = []
+    for column, value, limit in zip(columns, values, limits[:2], strict=True):
+        found = {} if value is None else {prefix + column: value}
+        number = _number(found, prefix + column, -limit, limit, limits[2])
+        if number is None:
+            raise InputError(f"{prefix}{column}: it is missing [{limits[2]}]")
+        numbers.append(number)
+    return numbers[0], numbers[1]
+
+
+def _places(row: Mapping[str, Any]) -> tuple[Place, ...] | None:
+    """Landing points of the past: a list of pairs, or ``lat lon; lat lon``."""
+    if "previous" not in row:
+        return None
+    value, columns = row["previous"], METRES if "x" in row else DEGREES
+    pairs = [part.split() for part in value.split(";")] if isinstance(value, str) else value
+    if not isinstance(pairs, list) or len(pairs) > 16 or not all(_is_pair(pair) for pair in pairs):
+        problem = "is not a list of at most 16 places such as [[53.1, -4.5]], or 53.1 -4.5; 53.2 -4.5"
+        raise InputError(f"previous: {show(value)} {problem}")
+    return tuple(_pair(pair, columns, "previous ") for pair in pairs)
+
+
+def _is_pair(pair: Any) -> bool:
+    return isinstance(pair, list) and len(pair) == 2
+
+
+def _readings(row: Mapping[str, Any]) -> tuple[float, ...] | None:
+    if "readings" not in row:
+        return None
+    value = row["readings"]
+    parts = value.split(";") if isinstance(value, str) else value
+    if not isinstance(parts, list) or len(parts) > 1000:
+        raise InputError(f"readings: {show(value)} is not a list of numbers")
+    numbers = [_number({"readings": part}, "readings", -1e9, 1e9, "") for part in parts]
+    return tuple(number for number in numbers if number is not None)
+
+
+def parsed_json(text: str | bytes, where: str) -> Any:
+    """Parse JSON.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        return json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: it is not JSON: {str(error)[:200]}") from None
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(f"{name} is not a number of JSON; write null for what is not known")
+
+
+def _limited(rows: Sequence[Any]) -> Sequence[Any]:
+    if len(rows) > MAX_ROWS:
+        raise InputError(f"{len(rows)} rows are more than the {MAX_ROWS} of a request or file")
+    return rows
+
+
+def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A CSV table of rows with the same columns; what is not known is ``NA``."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]) if rows else ["ID"], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "NA" if value is None else value for name, value in row.items()} for row in rows)
+    return text.getvalue()

@@ -1,0 +1,289 @@
+"""Advise real UAVs: from what they report, where each should land next, by a trained policy or the script.
+
+    damian advise checkpoint=runs/first reports=table.csv            (one table, one answer)
+    damian advise checkpoint=runs/first folder=inbox "uavs=[A,B,C]"  (every table that comes into a folder)
+    damian advise checkpoint=runs/first port=8000 journal=journals   (several fleets over HTTP)
+    damian advise region=llanbedr policy=greedy reports=table.csv    (the script)
+
+Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
+docs/advise.md explains the columns of the reports, the answers, and what is guaranteed. The run folder gets
+config.yaml, the answers to a table as advice.csv and advice.json, and the journals unless journal= names
+another folder. The program knows the region and its landing points, and nothing else of the world: it avoids
+no obstacles, and somebody else is responsible for safety.
+"""
+
+import copy
+import gc
+import json
+import os
+import secrets
+import socket
+import time
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
+
+from damian.advice.desk import Desk
+from damian.advice.fleet import Fleet, Waiting
+from damian.advice.inbox import read_inbox
+from damian.advice.node import Node, for_uavs, served
+from damian.advice.reports import as_csv, read_file
+from damian.baselines.greedy import greedy_policy
+from damian.common import checks
+from damian.common.atomic_files import write_atomically
+from damian.common.errors import InputError
+from damian.common.text_files import named
+from damian.evaluation.run_lock import is_folder
+from damian.evaluation.training_state import load_networks
+
+from .shared.command_line import SECRET
+from .shared.known_settings import CONF
+from .shared.launch import launch, perform, prepare, reported
+from .shared.settings import TrainConfig
+from .shared.stored_runs import save_config
+
+POLICIES = ("mode", "sampled", "greedy")
+FLEET = "main"
+"""Name of the only fleet of a table or a folder."""
+
+
+@dataclass
+class AdviseConfig(TrainConfig):
+    """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
+
+    policy: str | None = None
+    """``mode`` or ``sampled``: the policy of ``checkpoint``; ``greedy``: the script. If it is not given:
+    ``mode`` with a checkpoint, ``greedy`` without."""
+    reports: str | None = None
+    """Table of reports to answer once, CSV or JSON."""
+    folder: str | None = None
+    """Folder to watch for tables of reports; each is answered in ``advice.csv`` and ``advice.json`` there."""
+    port: int | None = None
+    """Port of the service over HTTP; 0: a free one."""
+    host: str = "127.0.0.1"
+    """Address that the service listens to: by default only programs of this machine reach it."""
+    token: str | None = None
+    """Password of the service over HTTP; if not given, that of the environment variable ``DAMIAN_TOKEN``, or
+    one that is made and printed. No file of the run folder keeps it."""
+    uavs: list[str] = field(default_factory=list)
+    """IDs of the UAVs of a table or a folder; those of the table, in their order, if not given."""
+    journal: str | None = None
+    """Folder of the journals, which are restored from it at the start; in the run folder if not given."""
+    durable: bool = False
+    """Make every line of a journal last even if the machine stops; it takes milliseconds."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.policy is not None:
+            checks.one_of("policy", self.policy, POLICIES)
+            should = "flies no checkpoint: choose policy=mode|sampled, or leave out checkpoint"
+            checks.require(self.learnt or not self.checkpoint, "policy", self.policy, should)
+            should = "needs checkpoint: the run folder with the policy to fly"
+            checks.require(bool(self.checkpoint) or not self.learnt, "policy", self.policy, should)
+        if self.port is not None:
+            checks.whole("port", self.port, 0, 65535)
+        check_token("token", self.token)
+
+    @property
+    def flown(self) -> str:
+        """The policy that flies, one of ``POLICIES``."""
+        return self.policy or ("mode" if self.checkpoint else "greedy")
+
+    @property
+    def learnt(self) -> bool:
+        """Is it that of a checkpoint?"""
+        return self.flown != "greedy"
+
+    def check_source(self) -> None:
+        """Require exactly one source of reports.
+
+        Raises:
+            InputError: there is none, or more than one.
+        """
+        given = [name for name in ("reports", "folder", "port") if getattr(self, name) is not None]
+        if len(given) != 1:
+            problem = f"{' and '.join(given)} are given" if given else "is missing"
+            raise InputError(f"reports: {problem}: give one of reports=FILE, folder=FOLDER, port=NUMBER")
+
+
+def check_token(key: str, token: str | None) -> None:
+    """Require a password that nobody guesses and every header can carry, if there is one."""
+    good = token is None or (
+        len(token) >= 16 and token.isascii() and token.isprintable() and " " not in token
+    )
+    checks.require(good, key, "it", "is not a password of at least 16 printable ASCII characters")
+
+
+def without_token(config: AdviseConfig) -> AdviseConfig:
+    """The settings, as files may keep them."""
+    kept = copy.copy(config)
+    kept.token, kept.overrides = None, [word for word in config.overrides if not word.startswith(SECRET)]
+    return kept
+
+
+ConfigStore.instance().store(name="advise_schema", node=AdviseConfig)
+
+
+def make_desk(config: AdviseConfig, folder: Path | None) -> Desk:
+    """The desk of the policy that the settings name; journals lie in a folder, if there is one."""
+
+    @cache
+    def parts(n_uavs: int) -> tuple[Node, TensorDictModuleBase]:
+        node = Node(for_uavs(config.eval_scenario, n_uavs), config.seed)
+        return node, make_policy(config, node)
+
+    def make_fleet(uavs: list[str]) -> Fleet:
+        return Fleet(*_ordered(parts(len(uavs)), uavs), drawn=config.flown == "sampled", seed=config.seed)
+
+    overrides = without_token(config).overrides
+    about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": overrides}
+    return Desk(make_fleet, folder, about, config.durable)
+
+
+def _ordered(
+    parts: tuple[Node, TensorDictModuleBase], uavs: list[str]
+) -> tuple[Node, list[str], TensorDictModuleBase]:
+    return parts[0], uavs, parts[1]
+
+
+def make_policy(config: AdviseConfig, node: Node) -> TensorDictModuleBase:
+    """The policy that flies.
+
+    Raises:
+        InputError: the checkpoint cannot be loaded, or the script does not suit the environment.
+    """
+    if not config.learnt:
+        return greedy_policy(node.env)
+    actor = config.learner.make_actor(node.env, config.model)
+    load_networks(Path(str(config.checkpoint)), "checkpoint", {"actor": actor})
+    return actor
+
+
+def answer_table(config: AdviseConfig, folder: Path) -> None:
+    """Answer one table of reports: print the advice, and write it into the run folder.
+
+    Raises:
+        InputError: the table is wrong, or does not have every UAV.
+    """
+    path = Path(str(config.reports))
+    now = time.time()
+    with named(path):
+        rows = read_file(path)
+        uavs = config.uavs or list(dict.fromkeys(str(row.get("id")).strip() for _, row in rows))
+        desk = make_desk(config, None)
+        desk.create(FLEET, desk.check_new(FLEET, uavs))
+        desk.report(FLEET, rows, now, file=True)
+        try:
+            answer = desk.advise(FLEET, desk.fleet(FLEET).clock)
+        except Waiting as error:
+            raise InputError(str(error)) from None
+    save_config(without_token(config), folder)
+    write_atomically(folder / "advice.json", json.dumps(answer, indent=1))
+    write_atomically(folder / "advice.csv", table := as_csv(answer))
+    print(table, end="")
+
+
+def note(config: AdviseConfig) -> None:
+    """Say where the service knows less than the policy did in its training."""
+    if config.observation.own and config.learnt:
+        print("note: the policy knew a UAV's own messages at once; the service knows them when they arrive")
+
+
+def advise(config: AdviseConfig, folder: Path) -> None:
+    """Answer reports from where the settings say."""
+    config.check_source()
+    served(config.eval_scenario)
+    note(config)
+    if config.reports is not None:
+        answer_table(config, folder)
+        return
+    save_config(without_token(config), folder)
+    journals = Path(config.journal) if config.journal else folder / "journals"
+    desk = make_desk(config, journals)
+    if config.port is not None:
+        serve(config, desk)
+    else:
+        watch(config, desk)
+
+
+def serve(config: AdviseConfig, desk: Desk) -> None:
+    """Answer over HTTP until the program is stopped.
+
+    Raises:
+        InputError: the server library is not installed, or the address cannot be used.
+    """
+    try:
+        uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
+    except ImportError as error:
+        missing = f"needs {error.name}, which is not installed: pip install 'damian[advise]'"
+        raise InputError(f"port: {config.port} {missing}") from None
+    given = config.token or os.environ.get("DAMIAN_TOKEN")
+    check_token("DAMIAN_TOKEN", given)
+    token = given or secrets.token_urlsafe(24)
+    listener = listening(config)
+    host, port = listener.getsockname()[:2]
+    if given is None:
+        print(f"token: {token}")
+    print(f"listening on http://{host}:{port}", flush=True)
+    options = uvicorn.Config(
+        service.make_app(desk, token), log_level="warning", access_log=False, timeout_keep_alive=30, ws="none"
+    )
+    gc.collect()
+    gc.freeze()  # else every full collection looks through all of torch, for a tenth of a second
+    uvicorn.Server(options).run(sockets=[listener])
+
+
+def listening(config: AdviseConfig) -> socket.socket:
+    """A socket that listens to the address of the settings.
+
+    Raises:
+        InputError: the address cannot be used.
+    """
+    try:
+        listener = socket.create_server((config.host, config.port or 0), backlog=1024)
+    except (OSError, UnicodeError) as error:
+        problem = getattr(error, "strerror", None) or "it is no address"
+        raise InputError(f"port: {config.host}:{config.port} cannot be used: {problem}") from None
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # or an answer in two parts takes 40 ms
+    return listener
+
+
+def watch(config: AdviseConfig, desk: Desk) -> None:
+    """Answer every table that comes into a folder, until the program is stopped.
+
+    Raises:
+        InputError: there is no such folder, or no UAVs are given.
+    """
+    inbox = Path(str(config.folder))
+    if not is_folder(inbox):
+        raise InputError(f"folder: {inbox} is not there")
+    uavs = desk.check_new(FLEET, list(config.uavs))
+    desk.create(FLEET, uavs)
+    print(f"watching {inbox}", flush=True)
+    while True:
+        if not read_inbox(desk, FLEET, inbox, time.time()):
+            desk.advance(time.time())
+            time.sleep(0.2)
+
+
+@hydra.main(version_base=None, config_path=CONF, config_name="advise")
+@reported
+def main(composed: DictConfig) -> None:
+    if composed.resume is not None:
+        raise InputError("resume: nothing is trained; give the run folder as checkpoint")
+    perform(*prepare(composed), advise)  # type: ignore[arg-type]
+
+
+def run() -> None:
+    """Run the program with the words of the command line."""
+    launch(main, "advise")
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,201 @@
+"""Measure ``damian advise`` over loopback: requests per second, and how long each takes.
+
+    python -m damian.recipes.bench_advise          (make bench-advise)
+    python -m damian.recipes.bench_advise --rate 500 --seconds 20 --fleets 5
+
+The service runs in a process of its own, on one core if the system lets it. Connections that stay open send
+the reports of 10 UAVs and a question for their advice, in turn; first at a fixed rate, then as fast as it
+goes. Where other programs use the cores too, the processor time of a request tells more than the latencies.
+"""
+
+import http.client
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from damian.common import checks
+from damian.common.markdown import markdown_table
+
+from .shared.command_line import Parser, exits_with_one_line
+
+TOKEN = "a-token-for-the-bench"
+N_UAVS = 10
+CONNECTIONS = 4
+PLACE, SPREAD = (52.8128, -4.1288), 0.0015
+"""Middle of the UAVs' places in the region of the bench, and their distance from each other [deg]."""
+
+
+class Sample(NamedTuple):
+    """A request: when it was due [s], how long its answer took from then on [s], and its status."""
+
+    due: float
+    took: float
+    status: int
+
+
+def start(folder: Path, words: Sequence[str]) -> tuple[subprocess.Popen, int]:
+    """Start the service; returns its process and port."""
+    code = "from damian.recipes.command import main; main()"
+    given = [*words, "port=0", f"token={TOKEN}", f"hydra.run.dir={folder}/run"]
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", code, "advise", *given], stdout=subprocess.PIPE, text=True
+    )
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(process.pid, {sorted(os.sched_getaffinity(0))[0]})
+    assert process.stdout is not None
+    line = next((line for line in process.stdout if line.startswith("listening")), None)
+    if line is None:
+        sys.exit(process.wait())
+    return process, int(line.rpartition(":")[2])
+
+
+class Connection:
+    """A connection that stays open, for some fleets."""
+
+    def __init__(self, port: int, fleets: Sequence[int]) -> None:
+        self.http = http.client.HTTPConnection("127.0.0.1", port)
+        self.fleets, self.n = fleets, 0
+        self.headers = {"Authorization": f"Bearer {TOKEN}", "Content-Type": "application/json"}
+
+    def request(self, method: str, path: str, body: object = None) -> int:
+        """Send a request; returns the status of its answer."""
+        self.http.request(method, path, None if body is None else json.dumps(body), self.headers)
+        answer = self.http.getresponse()
+        answer.read()
+        return answer.status
+
+    def next(self) -> int:
+        """Send the next request: reports, then a question for advice, of one fleet after the other."""
+        fleet = self.fleets[self.n // 2 % len(self.fleets)]
+        self.n += 1
+        if self.n % 2:
+            return self.request("POST", f"/fleets/f{fleet}/reports", reports(time.time(), self.n))
+        return self.request("GET", f"/fleets/f{fleet}/advice")
+
+
+def reports(now: float, number: int) -> list[dict]:
+    """What 10 UAVs say."""
+    shift = SPREAD * 0.1 * (number % 7)
+    return [
+        {
+            "ID": f"uav{i}",
+            "time": now - 0.01 * i,
+            "lat": PLACE[0] + SPREAD * (i % 3 - 1) + shift,
+            "lon": PLACE[1] + SPREAD * (i // 3 - 1.5),
+            "source spotted": 0,
+            "track": 36.0 * i,
+            "battery": 80.0,
+            "sequence": number,
+        }
+        for i in range(N_UAVS)
+    ]
+
+
+def load(connections: Sequence[Connection], seconds: float, rate: float | None) -> list[Sample]:
+    """Send requests for some time, at a rate [1/s] or as fast as it goes."""
+    samples: list[Sample] = []
+
+    def work(connection: Connection, phase: int) -> None:
+        period = len(connections) / rate if rate else 0.0
+        first, end = time.perf_counter() + 0.1, time.perf_counter() + 0.1 + seconds
+        due = first + period * phase / len(connections)
+        while due < end:
+            time.sleep(max(due - time.perf_counter(), 0.0))
+            status = connection.next()
+            done = time.perf_counter()
+            samples.append(Sample(due - first, done - due, status))
+            due = due + period if rate else done
+
+    threads = [threading.Thread(target=work, args=(each, i)) for i, each in enumerate(connections)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return samples
+
+
+def processor_time(process: subprocess.Popen) -> float:
+    """Processor time that a process has used [s]; nan where the system does not tell."""
+    path = Path(f"/proc/{process.pid}/stat")
+    if not path.exists():
+        return math.nan
+    return sum(map(int, path.read_text().rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
+def row(name: str, samples: Sequence[Sample], seconds: float, used: float) -> list[str]:
+    """A row of the table."""
+    took = np.array([sample.took for sample in samples]) * 1000
+    p50, p99 = np.quantile(took, [0.5, 0.99])
+    good = sum(sample.status == 200 for sample in samples)
+    answered = max([seconds, *(sample.due + sample.took for sample in samples)])
+    return [
+        name,
+        f"{len(samples) / answered:.0f}",
+        f"{p50:.1f}",
+        f"{p99:.1f}",
+        f"{took.max():.1f}",
+        f"{1000 * used / len(samples):.2f}",
+        f"{good} of {len(samples)}",
+    ]
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Measure and print the table."""
+    with exits_with_one_line():
+        parser = Parser(description="Speed of damian advise over loopback.")
+        parser.add_argument("--rate", type=float, default=500.0, help="requests per second")
+        parser.add_argument("--seconds", type=float, default=10.0, help="time of each measurement")
+        parser.add_argument("--fleets", type=int, default=4, help="number of fleets of 10 UAVs")
+        parser.add_argument("settings", nargs="*", help="settings of damian advise")
+        args = parser.parse_args(words)
+        checks.in_range("--rate", args.rate, 1, 1e5)
+        checks.in_range("--seconds", args.seconds, 0.1, 3600, "s")
+        checks.in_range("--fleets", args.fleets, 1, 100)
+    with tempfile.TemporaryDirectory() as folder:
+        process, port = start(Path(folder), args.settings or ["policy=greedy", "delay=paper"])
+        try:
+            connections = [
+                Connection(port, range(i % args.fleets, args.fleets, CONNECTIONS)) for i in range(CONNECTIONS)
+            ]
+            uavs = {"uavs": [f"uav{i}" for i in range(N_UAVS)]}
+            for fleet in range(args.fleets):  # the steps of real fleets do not begin all at once either
+                connections[0].request("PUT", f"/fleets/f{fleet}", uavs)
+                connections[0].request("POST", f"/fleets/f{fleet}/reports", reports(time.time(), 0))
+                time.sleep(1 / args.fleets)
+            load(connections, 1.0, 50.0)  # warms up
+            times = [processor_time(process)]
+            rated = load(connections, args.seconds, args.rate)
+            times.append(processor_time(process))
+            fastest = load(connections, args.seconds, None)
+            times.append(processor_time(process))
+        finally:
+            process.terminate()
+            process.wait()
+    head = [
+        "requests of 10 UAVs",
+        "answered [1/s]",
+        "p50 [ms]",
+        "p99 [ms]",
+        "longest [ms]",
+        "CPU each [ms]",
+        "status 200",
+    ]
+    rows = [
+        row(f"{args.rate:g} per second", rated, args.seconds, times[1] - times[0]),
+        row("as fast as it goes", fastest, args.seconds, times[2] - times[1]),
+    ]
+    print(markdown_table(head, rows))
+
+
+if __name__ == "__main__":
+    main()

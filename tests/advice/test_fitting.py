@@ -1,0 +1,112 @@
+"""Delays of real reports become the trace that made them."""
+
+import json
+import random
+
+import pytest
+
+from damian.advice.fitting import fit, read_log, summary, trace_rows
+from damian.common.errors import InputError
+from damian.delays.laws import Trace
+from damian.recipes.command import main
+
+DELAYS = [0.0, 2.3, None, 0.1, 1.0, None, None, 4.0, 0.7, 0.2, 0.3]
+"""Of the messages of a UAV [s]; None: lost."""
+
+
+def table(numbered: bool, period: float = 1.0, uavs: int = 2, start: float = 1.7e9) -> str:
+    """A table of reports in the order in which they came in, one of them twice."""
+    rows = []
+    for uav in range(uavs):
+        for i, delay in enumerate(DELAYS):
+            if delay is not None:
+                time = start + i * period
+                rows.append((time + delay, f"u{uav}", time, i if numbered else "NA"))
+    rows.append(rows[3])
+    lines = [f"{uav},{time},{received},53.1,-4.5,{number}" for received, uav, time, number in sorted(rows)]
+    return "\n".join(["ID,time,receive time,lat,lon,sequence", *lines])
+
+
+@pytest.fixture
+def log(tmp_path):
+    def written(text: str, name: str = "reports.csv"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return written
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+@pytest.mark.parametrize("period", [1.0, 0.25])
+def test_a_trace_has_the_delays_and_the_losses_of_the_reports(log, numbered, period):
+    fitted = fit(read_log(log(table(numbered, period))))
+    rows = trace_rows(fitted)
+    found = [None if row == "lost" else float(row.removesuffix("s")) for row in rows]
+    assert found == [None if d is None else pytest.approx(d, abs=1e-6) for d in DELAYS * 2]
+    assert fitted.losses == ("by their numbers" if numbered else f"by their period of {period:.3g} s")
+    assert summary(fitted).startswith(f"22 messages of 2 UAVs over {10 * period:.0f} s; lost: 6 (27.3%)")
+
+
+def test_steps_are_those_of_the_service(log):
+    rows = trace_rows(fit(read_log(log(table(True, uavs=1)))), dt=1.0)
+    assert rows == ["0", "2", "lost", "0", "1", "lost", "lost", "4", "0", "0", "0"]
+    assert trace_rows(fit(read_log(log(table(True, uavs=1)))), dt=2.0)[1] == "1"
+
+
+def test_a_law_reads_the_trace(log, tmp_path, capsys):
+    out = tmp_path / "trace.csv"
+    main(["fit-delays", str(log(table(True))), "--out", str(out), "--dt", "1"])
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-1].endswith(f'train with "delay.obs={{law: trace, path: {out}}}"')
+    sampler = Trace(str(out)).sampler()
+    assert sampler.longest == 4
+    assert sampler.loses
+
+
+def test_irregular_reports_show_no_losses(log):
+    generator = random.Random(0)
+    times = sorted(generator.uniform(0, 100) for _ in range(50))
+    lines = "\n".join(f"A,{time},{time + 0.5},53.1,-4.5" for time in times)
+    fitted = fit(read_log(log(f"ID,time,receive time,lat,lon\n{lines}")))
+    assert (fitted.n_lost, fitted.losses) == (0, "not to be seen (no numbers, no period)")
+
+
+def test_a_uav_that_starts_anew_loses_nothing(log):
+    lines = "\n".join(f"A,{i},{i + 0.5},53.1,-4.5,{i % 5}" for i in range(10))
+    assert fit(read_log(log(f"ID,time,receive time,lat,lon,sequence\n{lines}"))).n_lost == 0
+
+
+def test_clocks_that_differ_are_told(log):
+    lines = "\n".join(f"A,{i + 0.5},{i},53.1,-4.5" for i in range(10))
+    fitted = fit(read_log(log(f"ID,time,receive time,lat,lon\n{lines}")))
+    assert fitted.ahead == 10
+    assert fitted.delays.max() == 0
+    assert "clocks differ" in summary(fitted)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("x.jsonl", "", "it is empty"),
+        ("x.jsonl", "{}\n", "line 1: it is no journal of damian advise of version 1"),
+        ("x.jsonl", "nonsense\n", "line 1: it is damaged"),
+        ("x.csv", "ID,lat,lon\nA,1,2\nB,1,2", "line 2: it needs time and receive time, or time and AoI"),
+        ("x.csv", "ID,time,AoI,lat,lon\nA,1,1,1,2", "1 reports are too few to tell how late they are"),
+    ],
+)
+def test_what_is_no_log_is_refused(log, name, text, message):
+    with pytest.raises(InputError) as error:
+        read_log(log(text, name))
+    assert message in str(error.value)
+
+
+def test_a_journal_is_a_log(log):
+    head = {"journal": "damian-advice", "version": 1, "fleet": "x", "uavs": ["A"], "about": {}}
+    reports = [
+        {"received": i + 0.25, "reports": [{"id": "A", "time": float(i), "lat": 53.1, "lon": -4.5}]}
+        for i in range(4)
+    ]
+    lines = [head, *reports, {"asked": 5.0, "step": 5, "told": {}, "advice": []}]
+    path = log("".join(f"{json.dumps(line)}\n" for line in lines) + '{"cut', "x.jsonl")
+    assert trace_rows(fit(read_log(path))) == ["0.250000s"] * 4

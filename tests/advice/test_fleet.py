@@ -1,0 +1,218 @@
+"""The server node outside the simulation observes what the one inside does, from what the UAVs report."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from reporting import START, flights
+
+from damian import keys
+from damian.advice.fleet import GRACE, Fleet
+from damian.advice.node import Node
+from damian.advice.reports import Report
+from damian.baselines.greedy import greedy_policy
+from damian.common.errors import InputError
+from damian.delays.config import DelayConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.scenario import ScenarioConfig
+from damian.server.features import ObservationConfig
+from damian.server.termination import EpisodeConfig
+from damian.world.landing import ActionConfig
+from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
+from damian.world.signal_source import SourceConfig
+
+LLANBEDR = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
+"""With a single initial condition, whose table of first observations rounds as that of a single fleet."""
+LATE = {"law": "uniform", "low": 0, "high": 4}
+BELIEF = ["belief_gain", "belief_moments"]
+WALK = SourceConfig(motion="dynamic", level_db=143.0, emission="per_step", emission_probability=0.6)
+
+
+def scenario_of(**changed) -> ScenarioConfig:
+    endless = {"episode": EpisodeConfig(max_steps=None), "region": LLANBEDR, "source": WALK}
+    return ScenarioConfig(**{**endless, "agents": 3, **changed})
+
+
+FEATURES = ["source_distance", "source_bearing", "source_time", "source_drift", "agent_distances", "coverage"]
+SEEN = ObservationConfig(global_features=FEATURES, local_features=["spotted", "battery"], age=True)
+TASKS = {
+    "on time": {"observation": SEEN},
+    "late": {"delay": DelayConfig(obs=LATE, loss=0.2), "observation": SEEN},
+    "the last to arrive": {"delay": DelayConfig(obs=LATE, loss=0.2, order="arrival"), "observation": SEEN},
+    "held back": {"delay": DelayConfig(obs=LATE, hold="max"), "observation": SEEN},
+    "history": {"delay": DelayConfig(obs=LATE, loss=0.2, history=3, messages=5), "observation": SEEN},
+    "belief": {"delay": DelayConfig(obs=LATE, loss=0.2), "observation": replace(SEEN, belief=BELIEF)},
+    "clocks": {
+        "delay": DelayConfig(obs=LATE, history=2),
+        "observation": SEEN,
+        "clock": ClockConfig(agents="2s", server="4s"),
+    },
+    "flights": {
+        "delay": DelayConfig(obs=LATE, loss=0.2, history=2),
+        "observation": replace(SEEN, belief=BELIEF),
+        "motion": MotionConfig(kind="polynomial", max_speed=20.0, max_acceleration=10.0, sensing_time=2.0),
+    },
+    "continuous": {
+        "delay": DelayConfig(obs=LATE, loss=0.2),
+        "observation": SEEN,
+        "actions": ActionConfig(kind="continuous"),
+    },
+    "a region of metres": {
+        "delay": DelayConfig(obs=LATE),
+        "observation": SEEN,
+        "region": RegionConfig(initial_conditions=1),
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("task", "fraction"), [*((task, 0.0) for task in TASKS), ("late", 0.7), ("flights", 0.7)]
+)
+def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task, fraction):
+    scenario = scenario_of(**TASKS[task])
+    spotted, moved, n_steps = 0, 0, 90 if task == "flights" else 40
+    for shown, fleet, action, ready, step in flights(scenario, greedy_policy, n_steps, fraction=fraction):
+        read = fleet.observe(ready)
+        for key in (keys.OBSERVATION, keys.ACTION_MASK, keys.HISTORY):
+            if key in shown.keys(True):
+                assert torch.equal(read[key], shown[key]), (step, key)
+        held = shown.get(keys.RECEIVED, shown[keys.MESSAGE])
+        assert torch.equal(read[keys.RECEIVED], held), step
+        chosen = fleet.advise(fleet.clock, [fleet.uavs[uav] for uav in ready])
+        assert chosen == ready
+        assert torch.equal(fleet.action[0, ready], action[0, ready])
+        spotted += sum(known.spotted for known in fleet.held)
+        assert all(here.report.time <= fleet.clock for here in fleet.held)
+        moved += sum(fleet.decision(uav).origin != fleet.decision(uav).goal for uav in ready)
+    assert moved > 3
+    assert spotted > 0
+
+
+SILENT = 40
+
+
+def fleet_of(policy=greedy_policy, **changed) -> Fleet:
+    node = Node(scenario_of(**changed), 3)
+    return Fleet(node, ["a", "b", "c"], policy(node.env))
+
+
+def told(fleet: Fleet, uav: str, time: float, point: int, **changed) -> str:
+    report = Report(uav=uav, time=time, place=fleet.ground.place(point), **changed)
+    fleet.check(report, time + 0.1)
+    return fleet.report(report, time + 0.1)
+
+
+@pytest.mark.parametrize("task", ["belief", "clocks"])
+def test_after_a_long_silence_it_does_not_matter_when_somebody_asked(task, monkeypatch):
+    """One fleet takes every step when it comes, another one many at once."""
+    monkeypatch.setattr("damian.advice.fleet.SILENT_STEPS", SILENT)
+    fleets = [fleet_of(**TASKS[task]) for _ in range(2)]
+    for fleet in fleets:
+        for i, uav in enumerate(fleet.uavs):
+            told(fleet, uav, START, 30 * i, spotted=i == 1)
+    for step in range(0, 3 * SILENT, 7):
+        fleets[0].advance(START + step)
+    for fleet in fleets:
+        told(fleet, "a", START + 3 * SILENT + 5.5, 17, spotted=True)
+        fleet.advance(START + 3 * SILENT + 9)
+    one, other = (fleet.observe([0, 1, 2]) for fleet in fleets)
+    assert torch.equal(one[keys.OBSERVATION], other[keys.OBSERVATION])
+    assert fleets[0].step == fleets[1].step == 3 * SILENT + 9
+
+
+def test_a_missing_uav_keeps_its_last_message_and_grows_old():
+    fleet = fleet_of(observation=replace(SEEN, age_scale=100.0))
+    for i, uav in enumerate(fleet.uavs):
+        told(fleet, uav, START, 30 * i)
+    for step in range(1, 30):
+        told(fleet, "a", START + step, 0)
+        fleet.advise(START + step + 0.2, ["a"])
+    ages = fleet.observe([0])[keys.OBSERVATION][0, :, -1]
+    assert ages.tolist() == [0.0, pytest.approx(0.29), pytest.approx(0.29)]
+    assert fleet.held[1].point == 30
+
+
+def test_a_landing_point_that_somebody_was_sent_to_is_not_given_away():
+    """The UAV does not report any more; after a while it is believed where it was last."""
+    fleet = fleet_of(actions=ActionConfig(distances=[0.0, 60.0], headings=[0.0, 90.0, 180.0, 270.0]))
+    for i, uav in enumerate(fleet.uavs):
+        told(fleet, uav, START, 200 + i)
+    fleet.advise(START + 1, ["a"])
+    decision = fleet.decision(0)
+    assert decision.goal != decision.origin
+    told(fleet, "a", START + 3, decision.origin)
+    for second in (4.0, decision.duration, 2 * decision.duration + GRACE - 1):
+        fleet.advance(START + second)
+        assert fleet._standing(0, asks=False) == decision.goal
+        assert fleet._standing(0, asks=True) == decision.origin
+    fleet.advance(START + 2 * decision.duration + GRACE + 2)
+    assert fleet._standing(0, asks=False) == decision.origin
+
+
+def test_a_uav_in_flight_is_not_asked_and_took_off_from_where_it_was_sent():
+    fleet = fleet_of()
+    for i, uav in enumerate(fleet.uavs):
+        told(fleet, uav, START, 200 + i)
+    fleet.advise(START + 1)
+    decision = fleet.decision(0)
+    told(fleet, "a", START + 2, 300, flies=True, spotted=True)
+    assert fleet.advise(START + 3) == [1, 2]
+    held = fleet.held[0]
+    assert (held.point, held.target, held.spotted) == (decision.origin, decision.goal, False)
+
+
+def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
+    fleet = fleet_of()
+    for i, uav in enumerate(fleet.uavs):
+        told(fleet, uav, START, 200 + i)
+    assert told(fleet, "a", START + 5, 210) == "new"
+    assert fleet.report(Report("a", START + 3, fleet.ground.place(205), spotted=True), START + 6) == "late"
+    fleet.advance(START + 7)
+    assert (fleet.held[0].point, fleet.held[0].detected, fleet.held[0].detected_at) == (210, 3, 205)
+
+
+def test_the_clock_of_the_service_never_goes_back():
+    fleet = fleet_of()
+    for i, uav in enumerate(fleet.uavs):
+        told(fleet, uav, START, 200 + i)
+    fleet.advise(START + 10)
+    fleet.advise(START + 4)
+    assert fleet.report(Report("a", START + 5, fleet.ground.place(1)), START + 6) == "new"
+    assert (fleet.step, fleet.clock) == (10, START + 10)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"uav": "d"}, "ID: 'd' is no UAV of this fleet: a, b, c"),
+        ({"time": START + 60}, "time: 1700000060 s is 60.0 s after it came in"),
+        ({"detected": START + 60}, "source time: 1700000060 s is 60.0 s after it came in"),
+        ({"place": (0.0, 0.0)}, "lat, lon: 0, 0 deg is "),
+        ({"target": (0.0, 0.0)}, "lat, lon: 0, 0 deg is "),
+        ({"degrees": False}, "x, y [m]: places in LlanbedrTest are lat, lon [deg]"),
+        ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
+    ],
+)
+def test_what_no_uav_of_the_fleet_can_say_is_refused(changed, message):
+    fleet = fleet_of()
+    report = Report(**{"uav": "a", "time": START, "place": fleet.ground.place(3), **changed})
+    with pytest.raises(InputError) as error:
+        fleet.check(report, START)
+    assert str(error.value).startswith(message)
+
+
+def test_what_comes_in_late_fills_in_no_earlier_step_whenever_steps_are_taken():
+    """A fleet that is restored from its journal takes its steps later than it did."""
+    seen = []
+    for steps_at_once in (True, False):
+        fleet = fleet_of(**TASKS["history"])
+        for i, uav in enumerate(fleet.uavs):
+            told(fleet, uav, START, 200 + i, battery=80.0)
+        told(fleet, "a", START + 5, 210)
+        if steps_at_once:
+            fleet.advance(START + 6.5)
+        fleet.report(Report("a", START + 3, fleet.ground.place(205), battery=10.0), START + 6.6)
+        fleet.advance(START + 7)
+        seen.append(fleet.observe([0])[keys.HISTORY])
+    assert torch.equal(*seen)

@@ -1,0 +1,281 @@
+"""The program that advises real UAVs, run by its command line: tables, folders and HTTP, and its refusals."""
+
+import contextlib
+import csv
+import http.client
+import json
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+from helpers import check_refused
+
+from damian.advice.desk import Desk
+from damian.advice.inbox import read_inbox
+from damian.recipes.advise import AdviseConfig, main, make_desk
+from damian.recipes.shared.launch import launch
+from damian.recipes.train import main as train
+from damian.world.regions.config import RegionConfig
+
+HEAD = "ID,source time,lat,lon,source spotted,track,takeoff-landing time,battery,AoI,FLA"
+TABLE = f"""{HEAD}
+A,NA,52.8110,-4.1283,0,90,NA,88,2,0
+B,NA,52.8133,-4.1264,0,NA,NA,NA,0.5,0
+C,NA,52.8154,-4.1311,1,180,NA,70,NA,NA
+"""
+TOKEN = "a-token-of-the-service"
+SCRIPT = ["policy=greedy", "actions.distances=[0,30,60]", "region.initial_conditions=1"]
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Run the program with overrides in an empty folder; returns its run folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("table.csv").write_text(TABLE)
+
+    def run_recipe(*overrides: str) -> Path:
+        monkeypatch.setattr(sys, "argv", ["advise.py", *overrides, "hydra.run.dir=run"])
+        launch(main, "advise")
+        return tmp_path / "run"
+
+    return run_recipe
+
+
+def test_a_table_is_answered_with_landing_points_as_csv_and_json(run, capsys):
+    folder = run(*SCRIPT, "reports=table.csv")
+    printed = capsys.readouterr().out
+    assert {path.name for path in folder.iterdir()} == {
+        "config.yaml",
+        "run.json",
+        "advice.csv",
+        "advice.json",
+    }
+    table = (folder / "advice.csv").read_text()
+    assert printed.startswith(table)
+    rows = list(csv.DictReader(table.splitlines()))
+    assert [row["ID"] for row in rows] == ["A", "B", "C"]
+    assert [float(row["age"]) for row in rows] == [2.0, 0.5, 0.0]
+    for row, there in zip(rows, json.loads((folder / "advice.json").read_text()), strict=True):
+        assert 52.80 < float(row["lat"]) < 52.83
+        assert 0 <= float(row["distance"]) <= 60 + 30
+        assert (row["state"], float(row["lon"])) == (there["state"], there["lon"])
+    assert rows[2]["state"] == "hold", "who hears the source stays"
+
+
+def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
+    words = ["agents=2", "frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "eval_episodes=2"]
+    words += ["actions.distances=[0,30,60]", "episode.max_steps=6", "delay.obs=2", "delay.history=2"]
+    monkeypatch.setattr(sys, "argv", ["train.py", *words, "hydra.run.dir=trained"])
+    launch(train)
+    rows = TABLE.splitlines()
+    Path("two.csv").write_text("\n".join(rows[:3]))
+    answer = json.loads((run("checkpoint=trained", "reports=two.csv") / "advice.json").read_text())
+    assert [each["ID"] for each in answer] == ["A", "B"]
+    assert all(each["state"] in ("fly", "hold") for each in answer)
+
+
+def test_a_region_of_metres_has_places_in_metres(run):
+    Path("metres.json").write_text(
+        json.dumps([{"ID": 1, "x": 10, "y": 20, "time": 5}, {"ID": 2, "x": 60, "y": 20, "time": 5}])
+    )
+    vertices = "region.vertices=[[-200,-200],[200,-200],[200,200],[-200,200]]"
+    folder = run(*SCRIPT, "region=vertices", vertices, "reports=metres.json")
+    answer = json.loads((folder / "advice.json").read_text())
+    assert all(abs(each["x"]) < 200 and abs(each["y"]) < 200 for each in answer)
+    assert all(each["arrival"] >= 5.0 for each in answer), "in the time of the table"
+
+
+REFUSALS = [
+    (["policy=greedy"], "reports: is missing: give one of reports=FILE, folder=FOLDER, port=NUMBER"),
+    (["reports=table.csv", "port=0"], "reports: reports and port are given: give one of"),
+    (["policy=mode", "reports=table.csv"], "policy: mode needs checkpoint"),
+    (["policy=random", "reports=table.csv"], "policy: random is not one of mode, sampled, greedy"),
+    (["reports=nothing.csv"], "nothing.csv: no such file"),
+    (["folder=nothing", "uavs=[A]"], "folder: nothing is not there"),
+    (["folder=."], "uavs: [] is not a list of the IDs of 1 to 100 UAVs"),
+    (["reports=table.csv", "uavs=[A,B,C,D]"], "table.csv: no advice yet: no report of D has come in"),
+    (["reports=table.csv", "uavs=[A,B]"], "table.csv: line 4: ID: 'C' is no UAV of this fleet: A, B"),
+    (["reports=table.csv", "links=matrix"], "links: matrix is not server"),
+    (["reports=table.csv", "links=updown"], "links: updown is not server"),
+    (["port=70000"], "port: 70000 is not between 0 and 65535"),
+    (["port=0", "token=short"], "token: it is not a password of at least 16"),
+    (["port=0", "host=999.1.1.1"], "port: 999.1.1.1:0 cannot be used"),
+    (["resume=run"], "resume: nothing is trained"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), REFUSALS, ids=[" ".join(words) for words, _ in REFUSALS])
+def test_what_cannot_be_is_refused_in_one_line(run, capsys, words, message):
+    check_refused(lambda: run(*words), message, capsys)
+    assert not Path("run").exists()
+
+
+def desk_of(folder: Path) -> Desk:
+    region = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
+    return make_desk(AdviseConfig(policy="greedy", region=region), folder)
+
+
+@pytest.fixture
+def inbox(tmp_path):
+    (tmp_path / "inbox").mkdir()
+    return tmp_path / "inbox"
+
+
+def test_tables_in_a_folder_are_answered_and_wrong_ones_put_aside(inbox, tmp_path):
+    desk = desk_of(tmp_path / "journals")
+    desk.create("main", ["A", "B", "C"])
+    points = desk.fleet("main").ground.place
+    for name, uavs in (("1.csv", "AB"), ("2.csv", "C"), ("3.csv", "Z")):
+        rows = [f"{uav},{points(30 * i)[0]},{points(30 * i)[1]},{1e9 + i}" for i, uav in enumerate(uavs)]
+        (inbox / name).write_text("\n".join(["ID,lat,lon,time", *rows]))
+    (inbox / ".hidden.csv").write_text("not yet")
+    (inbox / "4.json").write_text("[" * 10_000)
+    assert read_inbox(desk, "main", inbox, 1e9 + 10)
+    names = {path.name for path in inbox.iterdir()}
+    refused = {f"{name}.refused{end}" for name in ("3.csv", "4.json") for end in ("", ".txt")}
+    assert names == {"1.csv.done", "2.csv.done", ".hidden.csv", "advice.csv", "advice.json", *refused}
+    assert "line 2: ID: 'Z' is no UAV" in (inbox / "3.csv.refused.txt").read_text()
+    assert [row["ID"] for row in json.loads((inbox / "advice.json").read_text())] == ["A", "B", "C"]
+    assert not read_inbox(desk, "main", inbox, 1e9 + 11)
+    again = desk_of(tmp_path / "journals").fleet("main")
+    assert [list(told) for told in again.told] == [list(told) for told in desk.fleet("main").told]
+
+
+class Program:
+    """``damian advise port=0`` as a process of its own."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        code = "from damian.recipes.command import main; main()"
+        given = [*SCRIPT, "port=0", f"token={TOKEN}", f"journal={folder / 'journals'}", *words]
+        given += [f"hydra.run.dir={folder}/run{time.time_ns()}"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-W", "ignore", "-c", code, "advise", *given],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=folder,
+        )
+        assert self.process.stdout is not None
+        self.url = next(line for line in self.process.stdout if line.startswith("listening")).split()[-1]
+
+    def __call__(self, method: str, path: str, body=None, token: str = TOKEN):
+        """Answer to a request; raises an ``OSError`` if there is none."""
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(
+            self.url + path, data, {"Authorization": f"Bearer {token}"}, method=method
+        )
+        try:
+            with urllib.request.urlopen(request, timeout=20) as answer:
+                return answer.status, json.loads(answer.read() or "null")
+        except urllib.error.HTTPError as error:
+            return error.code, json.loads(error.read())
+
+    def end(self, number: int) -> int:
+        self.process.send_signal(number)
+        code = self.process.wait(30)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        return code
+
+
+@pytest.mark.slow
+def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_path):
+    generator, acknowledged, advised = random.Random(3), {}, {}
+    points = desk_of(tmp_path / "other").make(["A"]).ground.place
+    start = time.time()
+    for round_ in range(3):
+        program = Program(tmp_path)
+        assert program("PUT", "/fleets/north", {"uavs": ["A", "B"]})[0] == (200 if round_ else 201)
+        status = program("GET", "/fleets/north")[1]
+        assert {each["ID"]: each["reports"] for each in status["uavs"]} == {
+            uav: len(acknowledged.get(uav, [])) for uav in "AB"
+        } or not round_
+        if round_:
+            at = {each["ID"]: each for each in program("GET", "/fleets/north/advice?uav=A")[1]["advice"]}
+            assert at["A"]["step"] >= advised["A"]["step"]
+
+        def send(uav: str, program=program) -> None:
+            while True:
+                lat, lon = points(generator.randrange(90))
+                row = {"ID": uav, "time": time.time() - generator.random(), "lat": lat, "lon": lon}
+                try:
+                    if program("POST", "/fleets/north/reports", row)[0] == 200:
+                        acknowledged.setdefault(uav, []).append(row["time"])
+                    code, answer = program("GET", f"/fleets/north/advice?uav={uav}")
+                    if code == 200:
+                        advised[uav] = answer["advice"][0]
+                except (OSError, http.client.HTTPException):
+                    return
+
+        threads = [threading.Thread(target=send, args=(uav,)) for uav in "AB"]
+        for thread in threads:
+            thread.start()
+        time.sleep(2.0)
+        assert program.end(signal.SIGKILL) == -signal.SIGKILL
+        for thread in threads:
+            thread.join()
+        journal = (tmp_path / "journals" / "north.jsonl").read_text().splitlines()
+        reports = [each for line in journal if '"reports"' in line for each in json.loads(line)["reports"]]
+        for uav, times in acknowledged.items():
+            there = [each["time"] for each in reports if each["id"] == uav]
+            assert {*times} <= {*there}
+            assert len(there) <= len(times) + 1 + round_, "at most the one that was not answered is there too"
+            acknowledged[uav] = there
+    assert time.time() - start > 6
+    assert all(len(times) > 20 for times in acknowledged.values())
+
+
+@pytest.mark.slow
+def test_the_program_ends_when_it_is_asked_to(tmp_path):
+    program = Program(tmp_path)
+    assert program("GET", "/fleets/north", token="wrong-wrong-wrong")[0] == 401
+    host, port = program.url.removeprefix("http://").split(":")
+    for junk in (b"\x00\xff" * 500, b"POST / HTTP/9.9\r\n\r\n", b"GET " + b"x" * 200_000):
+        with socket.create_connection((host, int(port)), timeout=10) as raw:
+            raw.sendall(junk)
+            raw.shutdown(socket.SHUT_WR)
+            with contextlib.suppress(ConnectionError):
+                assert b" 5" not in raw.recv(64)[:12]
+    assert program("PUT", "/fleets/north", {"uavs": ["A"]})[0] == 201
+    assert program("POST", "/fleets/north/reports", "x" * 10_000_000)[0] == 413
+    kept = [path.read_text() for path in tmp_path.rglob("*") if path.is_file()]
+    assert len(kept) >= 3
+    assert not any(TOKEN in text for text in kept), "no file keeps the token"
+    assert program.end(signal.SIGTERM) in (0, 143, -signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_the_program_watches_a_folder(inbox, tmp_path):
+    places = desk_of(tmp_path / "other").make(["A"]).ground.place
+    code = "from damian.recipes.command import main; main()"
+    words = [*SCRIPT, f"folder={inbox}", "uavs=[A,B]", f"hydra.run.dir={tmp_path}/run"]
+    with subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", code, "advise", *words], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert any(line.startswith("watching") for line in process.stdout)
+        rows = [f"{uav},{places(i)[0]},{places(i)[1]},{time.time()}" for i, uav in ((3, "A"), (60, "B"))]
+        (inbox / ".new").write_text("\n".join(["ID,lat,lon,time", *rows]))
+        (inbox / ".new").rename(inbox / "1.csv")
+        until = time.time() + 20
+        while not (inbox / "advice.csv").exists() and time.time() < until:
+            time.sleep(0.1)
+        process.terminate()
+    assert [row["ID"] for row in csv.DictReader((inbox / "advice.csv").read_text().splitlines())] == [
+        "A",
+        "B",
+    ]
+    assert (tmp_path / "run" / "journals" / "main.jsonl").read_text().count("\n") == 3
+
+
+def test_without_the_server_library_the_remedy_is_named(run, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    message = "port: 0 needs uvicorn, which is not installed: pip install 'damian[advise]'"
+    check_refused(lambda: run(*SCRIPT, "port=0"), message, capsys)
