@@ -22,9 +22,20 @@ ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
 TEXTS |= {"CHANGELOG.md": "CHANGELOG.md", "CITATION.cff": "CITATION.cff"}
 """Files beside docs/, and what they are called in the site."""
-SHOWN = ("train", "fly", "tune", "compare")
+SHOWN = ("train", "fly", "tune", "compare", "advise")
 """Programs whose settings have a page."""
-PACKAGES = ("transforms", "delays", "envs", "replay", "learners", "server", "world", "evaluation", "interop")
+PACKAGES = (
+    "transforms",
+    "delays",
+    "envs",
+    "replay",
+    "learners",
+    "server",
+    "world",
+    "evaluation",
+    "interop",
+    "advice",
+)
 """Packages with a page of the API, the most used first."""
 NOTEBOOKS = sorted(ROOT.glob("docs/notebooks/*.ipynb"))
 
@@ -74,7 +85,7 @@ def commands() -> str:
     hint = "Settings are overrides of [Hydra](https://hydra.cc); `damian PROGRAM --help KEY` explains one."
     parts = ["# Commands", hint]
     for name, what in PROGRAMS.items():
-        own = docstring(ROOT / "recipes" / f"{name}.py")
+        own = docstring(ROOT / "recipes" / f"{name.replace('-', '_')}.py")
         text = help_text(name, SETTINGS[name]) if name in SETTINGS else own
         parts += [f"## damian {name}", f"{what[0].upper()}{what[1:]}.", f"```text\n{text}\n```"]
     return "\n\n".join(parts)
