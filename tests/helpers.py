@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from twin import Uav
 
@@ -181,15 +181,21 @@ def sent_messages(output: TensorDictBase) -> Messages:
     return Messages.unpack(output["agents", "message"])
 
 
-def same(one: TensorDictBase, other: TensorDictBase) -> bool:
-    """Whether both have the same keys and bit-for-bit equal values."""
+def same(one: TensorDictBase, other: TensorDictBase, atol: float = 0.0) -> bool:
+    """Whether both have the same keys and equal values: bit for bit, or floats up to ``atol``."""
     keys = set(one.keys(True, True))
-    return keys == set(other.keys(True, True)) and all(one[k].equal(other[k]) for k in keys)
+
+    def equal(key: NestedKey) -> bool:
+        both = one[key], other[key]
+        is_near = atol > 0 and both[0].is_floating_point() and both[0].shape == both[1].shape
+        return torch.allclose(*both, rtol=0, atol=atol) if is_near else both[0].equal(both[1])
+
+    return keys == set(other.keys(True, True)) and all(map(equal, keys))
 
 
-def all_same(some: Sequence[TensorDictBase], others: Sequence[TensorDictBase]) -> bool:
-    """Whether both sequences are equal at every step, bit for bit."""
-    return len(some) == len(others) and all(map(same, some, others))
+def all_same(some: Sequence[TensorDictBase], others: Sequence[TensorDictBase], atol: float = 0.0) -> bool:
+    """Whether both sequences are equal at every step: bit for bit, or floats up to ``atol``."""
+    return len(some) == len(others) and all(same(*pair, atol) for pair in zip(some, others, strict=True))
 
 
 def heading(degrees: float) -> float:

@@ -54,6 +54,8 @@ class DelayedEnv(TransformedEnv):
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own random streams, so that it evolves the same alone as among others.
 
+        A belief is the same up to rounding: some processors multiply one row in another order than many.
+
         Args:
             seeds: integers, one for each world, [B].
         """

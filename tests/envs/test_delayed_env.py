@@ -194,7 +194,8 @@ def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
         alone = delayed(scenario, 1)
         alone.seed_worlds(seeds[w : w + 1])
         outputs = play(alone, [action[w : w + 1] for action in actions])
-        assert all_same([td[w : w + 1] for td in together], outputs)
+        rounding = 1e-6 if delays == "belief" else 0.0  # some processors multiply one row in another order
+        assert all_same([td[w : w + 1] for td in together], outputs, rounding)
 
 
 @every_delay
