@@ -82,6 +82,7 @@ def test_a_killed_search_goes_on_with_the_trial_that_it_was_training(search):
     assert [row["frames"] for row in rows(folder / "trial_1" / "metrics.csv")] == ["64.0", "128.0"]
 
 
+@pytest.mark.slow
 def test_several_processes_share_a_search(search):
     assert len(rows(search("trials=3", "processes=2") / "trials.csv")) == 3
 
