@@ -221,7 +221,7 @@ def serve(config: AdviseConfig, desk: Desk) -> None:
     try:
         uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
     except ImportError as error:
-        missing = f"needs {error.name}, which is not installed: pip install 'damian[advise]'"
+        missing = f"needs {error.name}, which is not installed: pip install starlette uvicorn httptools"
         raise InputError(f"port: {config.port} {missing}") from None
     given = config.token or os.environ.get("DAMIAN_TOKEN")
     check_token("DAMIAN_TOKEN", given)

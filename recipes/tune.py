@@ -55,7 +55,7 @@ try:
     from optuna.trial import FrozenTrial, Trial, TrialState
     from optuna.visualization import matplotlib as figures
 except ImportError as error:
-    raise InputError("damian tune: optuna is not installed; pip install damian[tune]") from error
+    raise InputError("damian tune: optuna is not installed; pip install optuna") from error
 
 STORAGE, TRIALS, TABLE = "search.db", "trials.csv", "table.md"
 FOLDER, CHOSEN, OVERRIDES = "folder", "chosen", "overrides"

@@ -87,4 +87,4 @@ def _installed(package: str) -> Any:
     try:
         return __import__(package)
     except ImportError:
-        raise InputError(f"logger: {package} is not installed; pip install damian[{package}]") from None
+        raise InputError(f"logger: {package} is not installed; pip install {package}") from None

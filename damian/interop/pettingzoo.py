@@ -13,7 +13,7 @@ from damian.interop.flight import METADATA, Array, Flight, row
 try:
     from pettingzoo import ParallelEnv
 except ImportError as error:
-    raise InputError("pettingzoo: it is not installed; pip install damian[interop]") from error
+    raise InputError("pettingzoo: it is not installed; pip install pettingzoo") from error
 
 ByAgent = dict[str, Any]
 

@@ -277,5 +277,5 @@ def test_the_program_watches_a_folder(inbox, tmp_path):
 
 def test_without_the_server_library_the_remedy_is_named(run, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "uvicorn", None)
-    message = "port: 0 needs uvicorn, which is not installed: pip install 'damian[advise]'"
+    message = "port: 0 needs uvicorn, which is not installed: pip install starlette uvicorn httptools"
     check_refused(lambda: run(*SCRIPT, "port=0"), message, capsys)
