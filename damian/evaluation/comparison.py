@@ -215,7 +215,8 @@ class Comparison:
         (norm,) = _estimates(_norms, array)
         if arm in naive or not naive:
             return Compared(seeds, norm)
-        return Compared(seeds, norm, _recovery(array), _estimates(_improvement, array)[0])
+        probability = Estimate(*np.clip(_estimates(_improvement, array)[0], 0.0, 1.0).tolist())
+        return Compared(seeds, norm, _recovery(array), probability)
 
     def overall(self) -> dict[str, tuple[int, Estimate]]:
         """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.
