@@ -1,15 +1,18 @@
 """The program that flies episodes, run by its command line: its files, and its refusals of wrong input."""
 
 import csv
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from helpers import check_refused
 from matplotlib.image import imread
 from PIL import Image
+from shapely.geometry import shape
 
 from damian.evaluation.episode import Episode
 from damian.recipes.fly import kept, main
@@ -199,3 +202,52 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(run, capsys, tmp_path, overrides, message):
     check_refused(lambda: run(*overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []
+
+
+def ring(lon: float, lat: float, *corners: tuple[float, float]) -> list[list[float]]:
+    """A closed ring of corners given as offsets [deg], with longitudes in [-180, 180]."""
+    degrees = [[(lon + x + 180) % 360 - 180, lat + y] for x, y in corners]
+    return [*degrees, degrees[0]]
+
+
+SQUARE = ((0.0, 0.0), (0.006, 0.0), (0.006, 0.004), (0.0, 0.004))
+SHAPES = {
+    "concave": [
+        [ring(11.0, 48.0, (0, 0), (0.006, 0), (0.006, 0.002), (0.002, 0.002), (0.002, 0.005), (0, 0.005))]
+    ],
+    "hole": [[ring(139.7, 35.6, *SQUARE), ring(139.702, 35.601, *((x / 4, y / 4) for x, y in SQUARE))]],
+    "islands": [[ring(-70.9, -53.2, *SQUARE)], [ring(-70.892, -53.2, *SQUARE)]],
+    "date line": [[ring(179.997, -16.8, *SQUARE)]],
+}
+
+
+@pytest.mark.parametrize(
+    "kind", ["hole", *(pytest.param(kind, marks=pytest.mark.slow) for kind in SHAPES if kind != "hole")]
+)
+def test_a_real_region_of_any_shape_goes_from_file_to_film(run, tmp_path, kind):
+    geometry = {"type": "MultiPolygon", "coordinates": SHAPES[kind]}
+    park = {"type": "Feature", "properties": {"name": "park"}, "geometry": geometry}
+    (tmp_path / "park.geojson").write_text(json.dumps(park))
+    words = ["region=geojson", "region.path=park.geojson", "region.lattice_step=40", "episode.max_steps=3"]
+    folder = run(*words, "delay.obs=1", "formats=[gif,html,geojson]")
+    episode = Episode.load(folder / "episode_0.json")
+    assert all(episode.region.buffer(0.1).contains(shapely.Point(*place)) for place in episode.landing_points)
+    assert len(shapely.get_parts(episode.region)) == len(SHAPES[kind])
+    written = json.loads((folder / "episode_0.geojson").read_text())
+    (region,) = [each for each in written["features"] if each["properties"]["kind"] == "region"]
+    corners = shapely.get_coordinates(shape(region["geometry"]))
+    given_corners = np.array([place for polygon in SHAPES[kind] for each in polygon for place in each])
+    assert np.abs(corners).max(0) == pytest.approx(np.abs(given_corners).max(0), abs=4e-3)
+    # Degrees are as long as at the region's latitude.
+    scale = np.array([111_320 * np.cos(np.radians(given_corners[0, 1])), 110_900])
+    shells = [shapely.Polygon(p[0], p[1:]) for p in unwrapped(SHAPES[kind])]
+    area = sum(shapely.transform(each, lambda c: c * scale).area for each in shells)
+    assert episode.region.area == pytest.approx(area, rel=0.02)
+    with Image.open(folder / "episode_0.gif") as film:
+        assert film.n_frames == 4
+    assert (folder / "episode_0.html").stat().st_size > 500_000
+
+
+def unwrapped(polygons: list) -> list:
+    """Polygons whose longitudes do not jump at the date line."""
+    return [[[[lon % 360, lat] for lon, lat in ring] for ring in polygon] for polygon in polygons]
