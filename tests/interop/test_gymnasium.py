@@ -29,7 +29,7 @@ KINDS = [
 """Every task, kind of action and motion; over them the delays take turns."""
 
 
-@pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS)
+@pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS[::3])  # every value of each
 def test_gymnasiums_checker_finds_nothing(task, actions, motion, delay):
     overrides = [f"actions={actions}", f"motion={motion}", delay]
     env = gymnasium.make(f"damian/{task.capitalize()}-v0", overrides=overrides)
@@ -178,6 +178,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_a_scenario_is_composed_inside_a_hydra_program_of_ones_own(tmp_path):
     (tmp_path / "program.py").write_text(HYDRA_PROGRAM)
     command = [sys.executable, "program.py", "hydra.run.dir=run"]

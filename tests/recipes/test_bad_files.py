@@ -246,27 +246,27 @@ def test_a_run_folder_of_any_content_is_refused_in_one_line(name, content):
     assert code == 2
 
 
-@examples(20, 1000)
+@examples(10, 1000)
 @given(contents("seed0_naive.json"))
 def test_a_stored_result_of_any_content_is_refused_in_one_line_or_read(content):
     for name in ("pendulum", "spread"):
         answer(name, ["--out", ".", "--seeds", "0"], write("seed0_naive.json", content))
 
 
-@examples(20, 1000)
+@examples(8, 1000)
 @given(contents("episode.json"))
 def test_an_episode_of_any_content_is_refused_in_one_line_or_shown(content):
     answer("replay", ["episode.json"], write("episode.json", content))
 
 
-@examples(30, 1000)
+@examples(10, 1000)
 @given(st.sampled_from(LOGS).flatmap(lambda file: st.tuples(st.just(file), contents(file))))
 def test_a_log_of_any_content_is_refused_in_one_line_or_fitted(case):
     file, content = case
     answer("fit-delays", [file, "--out", "trace.csv"], write(file, content))
 
 
-@examples(60, 3000)
+@examples(20, 3000)
 @given(st.sampled_from(LOGS).flatmap(contents), st.sampled_from(["csv", "json", "jsonl"]))
 def test_reports_of_any_content_are_refused_in_one_line_or_read(content, kind):
     with TemporaryDirectory() as folder:
