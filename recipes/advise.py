@@ -40,8 +40,8 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.evaluation.run_lock import is_folder
-from damian.evaluation.training_state import load_networks
 
+from .evaluate import stored_actor
 from .shared.command_line import SECRET
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
@@ -139,17 +139,12 @@ def make_desk(config: AdviseConfig, folder: Path | None) -> Desk:
         return node, make_policy(config, node)
 
     def make_fleet(uavs: list[str]) -> Fleet:
-        return Fleet(*_ordered(parts(len(uavs)), uavs), drawn=config.flown == "sampled", seed=config.seed)
+        node, policy = parts(len(uavs))
+        return Fleet(node, uavs, policy, drawn=config.flown == "sampled", seed=config.seed)
 
     overrides = without_token(config).overrides
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": overrides}
     return Desk(make_fleet, folder, about, config.durable)
-
-
-def _ordered(
-    parts: tuple[Node, TensorDictModuleBase], uavs: list[str]
-) -> tuple[Node, list[str], TensorDictModuleBase]:
-    return parts[0], uavs, parts[1]
 
 
 def make_policy(config: AdviseConfig, node: Node) -> TensorDictModuleBase:
@@ -160,9 +155,7 @@ def make_policy(config: AdviseConfig, node: Node) -> TensorDictModuleBase:
     """
     if not config.learnt:
         return greedy_policy(node.env)
-    actor = config.learner.make_actor(node.env, config.model)
-    load_networks(Path(str(config.checkpoint)), "checkpoint", {"actor": actor})
-    return actor
+    return stored_actor(config, node.env)
 
 
 def answer_table(config: AdviseConfig, folder: Path) -> None:
