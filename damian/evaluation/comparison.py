@@ -144,8 +144,8 @@ class Comparison:
 
     @property
     def undelayed(self) -> str:
-        """Name of the arm without delay."""
-        return next(name for name, arm in self.arms.items() if not arm.delayed)
+        """Name of the arm without delay; empty if there is none, and then nothing is compared with it."""
+        return next((name for name, arm in self.arms.items() if not arm.delayed), "")
 
     def tasks(self) -> list[str]:
         """Tasks with a finished run."""

@@ -170,6 +170,15 @@ def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     assert comparison.compared("t", "late")["aware"].recovery.value == pytest.approx((22 / 3 - 4) / 6)
 
 
+def test_arms_are_listed_where_no_arm_without_delay_ran(tmp_path):
+    scores = {name: values for name, values in SCORES.items() if name in ("blind", "aware")}
+    comparison = Comparison(rows_of("t", "late", scores), {name: ARMS[name] for name in scores})
+    assert "| aware | R0 | trained, sampled | 2 | 7.500 |" in markdown(comparison, [])
+    assert comparison.compared("t", "late") == {}
+    plot_curves(comparison, {}, {"steps": 1.0}, tmp_path / "curves.png")
+    plot_norms(comparison, tmp_path / "norms.png")
+
+
 def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
     never = {"success_rate": np.nan, "true_success_rate": np.nan}
     rows = rows_of("t", "late", SCORES) + [each | never for each in rows_of("u", "late", SCORES)]
