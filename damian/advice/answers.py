@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
-
 from damian.advice.fleet import Fleet
 
 CALENDAR = 1e8
@@ -33,9 +31,8 @@ def _advice(fleet: Fleet, uav: int) -> Answer:
     if decision is None:
         nothing = dict.fromkeys((first, second, "heading", "distance", "duration", "arrival", "step"))
         return {"ID": fleet.uavs[uav], "state": "none", **nothing, "age": round(age, 3)}
-    way = ground.points[decision.goal] - ground.points[decision.origin]
-    distance, moves = float(np.hypot(*way)), decision.goal != decision.origin
-    heading = float(np.degrees(np.arctan2(way[0], way[1])) % 360)
+    distance, heading = ground.way(decision.origin, decision.goal)
+    moves = decision.goal != decision.origin
     state = ("fly" if moves else "hold") if decision.step == fleet.step else "bound"
     place = ground.place(decision.goal)
     return {
@@ -43,8 +40,8 @@ def _advice(fleet: Fleet, uav: int) -> Answer:
         "state": state,
         first: place[0],
         second: place[1],
-        "heading": round(heading, 2) if moves else None,
-        "distance": round(distance, 2),
+        "heading": heading if moves else None,
+        "distance": distance,
         "duration": round(decision.duration, 2),
         "arrival": written(decision.time + decision.duration),
         "step": decision.step,

@@ -166,8 +166,8 @@ class Fleet:
         now = self.step_of(received)
         step = min(self.step_of(report.time), now)
         detected = None if report.detected is None else max(self.step_of(report.detected), 0)
-        sent = [each for each in self.told[uav] if each.step < step]
-        known = log.add(report, step, detected, (sent[-1].origin, sent[-1].goal) if sent else None)
+        sent = next((each for each in reversed(self.told[uav]) if each.step < step), None)
+        known = log.add(report, step, detected, sent and (sent.origin, sent.goal))
         due = max(now, self.step)
         if self.node.scenario.delay.hold == "max":
             due = max(due, step + self.node.law_longest)
@@ -317,9 +317,10 @@ class Fleet:
             raise Waiting(f"no advice yet: no report of {listed(silent)} has come in")
         if numbers is None:
             numbers = [uav for uav, known in enumerate(self.held) if not known.report.flies]
-        choosing = [uav for uav in numbers if not self.chosen[0, uav]]
+        chosen = self.chosen[0].tolist()
+        choosing = [uav for uav in numbers if not chosen[uav]]
         if choosing:  # else what has come in since then need not be looked at yet
-            ready = self._observe()[keys.READY][0]
+            ready = self._observe()[keys.READY][0].tolist()
             choosing = [uav for uav in choosing if ready[uav]]
         if choosing:
             self.choose(choosing, self.ask_policy(choosing))

@@ -1,5 +1,7 @@
 """The ground of a fleet: places in reports, as landing points of its region, and back."""
 
+import math
+
 import numpy as np
 import shapely
 
@@ -31,6 +33,7 @@ class Ground:
         self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
         self._found: dict[Place, int] = {}
         self._places: dict[int, Place] = {}
+        self._ways: dict[tuple[int, int], tuple[float, float]] = {}
         self._tree = shapely.STRtree(np.asarray(shapely.points(self.points)))
 
     def landing_point(self, place: Place) -> int:
@@ -71,3 +74,13 @@ class Ground:
         digits = DIGITS[self.columns]
         self._places[point] = round(float(place[0]), digits), round(float(place[1]), digits)
         return self._places[point]
+
+    def way(self, origin: int, goal: int) -> tuple[float, float]:
+        """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
+        if (origin, goal) not in self._ways:
+            if len(self._ways) >= REMEMBERED:
+                self._ways.clear()
+            east, north = (float(each) for each in self.points[goal] - self.points[origin])
+            heading = math.degrees(math.atan2(east, north)) % 360
+            self._ways[origin, goal] = round(math.hypot(east, north), 2), round(heading, 2)
+        return self._ways[origin, goal]

@@ -88,8 +88,14 @@ class UavLog:
 
     def has(self, time: float) -> bool:
         """Has a report that was generated at this time come in before."""
-        at = bisect.bisect_left(self.known, time, key=_generated)
+        at = self._place_of(time)
         return at < len(self.known) and self.known[at].report.time == time
+
+    def _place_of(self, time: float) -> int:
+        """Number of known reports that were generated before this time; mostly all."""
+        if not self.known or self.known[-1].report.time < time:
+            return len(self.known)
+        return bisect.bisect_left(self.known, time, key=_generated)
 
     def add(
         self, report: Report, step: int, detected: int | None, sent: tuple[int, int] | None = None
@@ -103,7 +109,7 @@ class UavLog:
             sent: landing points from which and to which the UAV had last been sent by then.
         """
         known = Known(report, step, sent, detected=detected)
-        at = bisect.bisect_left(self.known, report.time, key=_generated)
+        at = self._place_of(report.time)
         self.known.insert(at, known)
         for i in range(at, len(self.known)):
             self._fill(self.known[i], self.known[i - 1] if i else None)

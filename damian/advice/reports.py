@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -231,8 +232,8 @@ def _named(row: Mapping[Any, Any], where: str) -> dict[str, Any]:
     """
     named: dict[str, Any] = {}
     for name, value in row.items():
-        column = _ALIASES.get(plain := str(name).strip().lower().replace("_", " "), plain)
-        if column not in COLUMNS:
+        column = _column(str(name))
+        if column is None:
             known = ", ".join(COLUMNS)
             raise InputError(f"{where}: {show(name)} is no column; they are {known}")
         if column in named:
@@ -241,7 +242,12 @@ def _named(row: Mapping[Any, Any], where: str) -> dict[str, Any]:
     return {column: value for column, value in named.items() if not _is_unknown(value)}
 
 
-_ALIASES = {"takeoff landing time": "takeoff-landing time"}
+@lru_cache(1000)
+def _column(name: str) -> str | None:
+    """The column that a name means, if there is one."""
+    plain = name.strip().lower().replace("_", " ")
+    column = "takeoff-landing time" if plain == "takeoff landing time" else plain
+    return column if column in COLUMNS else None
 
 
 def _is_unknown(value: Any) -> bool:
@@ -258,12 +264,13 @@ def _id(row: Mapping[str, Any]) -> str:
 def _number(row: Mapping[str, Any], column: str, low: float, high: float, unit: str) -> float | None:
     if column not in row:
         return None
-    value, problem = row[column], f"is not a number between {low:g} and {high:g} {unit}"
+    value = row[column]
     try:
         number = float(value) if isinstance(value, str | int | float) else math.nan
     except (ValueError, OverflowError):
         number = math.nan
     if isinstance(value, bool) or not low <= number <= high:
+        problem = f"is not a number between {low:g} and {high:g} {unit}"
         raise InputError(f"{column}: {show(value)} {problem}")
     return number
 
@@ -309,12 +316,14 @@ def _is_number(text: str) -> bool:
 
 def _place(row: Mapping[str, Any], prefix: str) -> Place | None:
     """The place of the columns with this prefix."""
-    written = [columns for columns in (DEGREES, METRES) if any(prefix + c in row for c in columns)]
-    if len(written) > 1:
+    degrees = prefix + "lat" in row or prefix + "lon" in row
+    metres = prefix + "x" in row or prefix + "y" in row
+    if degrees and metres:
         raise InputError(f"{prefix}lat, {prefix}x: give either degrees or metres")
-    if not written:
+    if not degrees and not metres:
         return None
-    return _pair([row.get(prefix + column) for column in written[0]], written[0], prefix)
+    columns = DEGREES if degrees else METRES
+    return _pair([row.get(prefix + column) for column in columns], columns, prefix)
 
 
 def _pair(values: Sequence[Any], columns: tuple[str, str], prefix: str) -> Place:
