@@ -1,0 +1,156 @@
+"""Every command that README and docs show runs, in the order in which it is shown, with tiny numbers (slow).
+
+The commands of a document run one after the other in a folder with a trained run and the files that they
+name.
+"""
+
+import json
+import re
+import select
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import damian
+
+ROOT = Path(damian.__file__).parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PROGRAM = [sys.executable, "-W", "ignore", "-c", "from damian.recipes.command import main; main()"]
+TINY = ["frames=64", "worlds=8", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
+TINY += ["region.lattice_step=60", "episode.max_steps=12"]
+FLIGHTS = ["eval_episodes=3"]
+SHORTER = {
+    "train": TINY,
+    "tune": ["trials=2", "processes=1", f"overrides={json.dumps(TINY)}".replace('"', "'")],
+    "evaluate": FLIGHTS,
+    "fly": [*FLIGHTS, "episode.max_steps=12"],
+    "oracle": FLIGHTS,
+    "ceiling": FLIGHTS,
+    "compare": ["seeds=1", "processes=1", f"overrides={json.dumps(TINY)}".replace('"', "'")],
+}
+"""Settings that make the commands of a program short; they replace those of the document."""
+SWEPT = {"seed=0,1,2": "seed=0", "port=8000": "port=0"}
+PARK = [[-4.134, 52.808], [-4.122, 52.808], [-4.122, 52.817], [-4.134, 52.817], [-4.134, 52.808]]
+TABLE = (
+    "ID,lat,lon,source spotted,AoI\nA,52.8110,-4.1283,0,2\nB,52.8133,-4.1264,0,0.5\nC,52.8154,-4.1281,1,NA\n"
+)
+
+
+def commands(text: str) -> list[list[str]]:
+    """The words of the commands in the blocks of a document, without ``damian``."""
+    blocks = re.findall(r"^```\w*\n(.*?)^```", text.replace("\\\n", ""), re.DOTALL | re.MULTILINE)
+    lines = [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
+    return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("damian ")]
+
+
+def shortened(words: list[str]) -> list[str]:
+    """A command with tiny numbers."""
+    words = [SWEPT.get(word, word) for word in words]
+    if any(word.startswith("resume=") for word in words):
+        return [re.sub(r"^frames=.*", "frames=128", word) for word in words]
+    shorter = SHORTER.get(words[0], [])
+    if any(word.startswith("checkpoint=") for word in words):  # the region is that of the training
+        shorter = [word for word in shorter if not word.startswith("episode.")]
+    replaced = {word.split("=")[0] for word in shorter}
+    return [word for word in words if word.split("=")[0] not in replaced] + shorter
+
+
+COMMANDS = {file.name: commands(file.read_text()) for file in DOCUMENTS}
+COMMANDS = {name: found for name, found in COMMANDS.items() if found}
+
+
+def call(words: list[str], folder: Path) -> str:
+    """Run a command in a folder; returns what it prints."""
+    done = subprocess.run(
+        [*PROGRAM, *words], cwd=folder, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, (words, done.stderr[-2000:])
+    return done.stdout
+
+
+def call_service(words: list[str], folder: Path, sign: str) -> None:
+    """Run a command that ends only when it is stopped, until it prints a line that begins with a sign."""
+    process = subprocess.Popen([*PROGRAM, *words], cwd=folder, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        end = time.monotonic() + 120
+        while time.monotonic() < end and process.poll() is None:
+            if select.select([process.stdout], [], [], 1)[0] and process.stdout.readline().startswith(sign):
+                return
+        pytest.fail(f"{words} did not print {sign}")
+    finally:
+        process.terminate()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A trained run and the files that the documents name."""
+    folder = tmp_path_factory.mktemp("documents")
+    call(["train", *TINY, "hydra.run.dir=runs/FOLDER"], folder)
+    flight = ["fly", "policy=random", "formats=[]", "episode.max_steps=12", "region.lattice_step=60"]
+    call([*flight, "hydra.run.dir=undelayed"], folder)
+    call([*flight, "delay.obs=3", "hydra.run.dir=late"], folder)
+    shutil.copy(folder / "late" / "episode_0.json", folder / "runs" / "FOLDER")
+    shape = {"type": "Polygon", "coordinates": [PARK]}
+    park = {"type": "Feature", "properties": {"name": "park"}, "geometry": shape}
+    (folder / "park.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [park]}))
+    (folder / "table.csv").write_text(TABLE)
+    (folder / "inbox").mkdir()
+    for file in (ROOT / "examples" / "extending").glob("*.py"):
+        shutil.copy(file, folder)
+    return folder
+
+
+def write_journal(path: Path) -> None:
+    """A journal of two UAVs, each of whose reports comes in up to a second late."""
+    lines: list[dict] = [{"journal": "damian-advise", "version": 1, "fleet": "north", "uavs": ["A", "B"]}]
+    for n in range(60):
+        row = {"ID": "AB"[n % 2], "time": 1000.0 + n, "lat": 52.811, "lon": -4.128, "sequence": n // 2}
+        lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_the_documents_show_commands():
+    assert len(COMMANDS["README.md"]) >= 20
+    assert {"advise.md", "episodes.md", "runs.md"} <= {*COMMANDS}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_commands_of_a_document_run(name, trained, tmp_path):
+    folder = tmp_path / "folder"
+    shutil.copytree(trained, folder)
+    for words in map(shortened, COMMANDS[name]):
+        sources = {word.split("=")[0] for word in words} & {"port", "folder"}
+        if sources:
+            call_service(words, folder, {"port": "listening", "folder": "watching"}[sources.pop()])
+            continue
+        if words[0] == "fit-delays":
+            write_journal(folder / "journals" / "north.jsonl")
+        call(words, folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["episodes.md", "runs.md"])
+def test_the_python_of_a_document_runs(name, trained, tmp_path, monkeypatch):
+    folder = tmp_path / "folder"
+    shutil.copytree(trained, folder)
+    for each in ("undelayed", "late"):
+        shutil.copytree(folder / each, folder / "runs" / each)
+    monkeypatch.chdir(folder)
+    found: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs" / name).read_text(), re.DOTALL):
+        exec(block, found)
+    if name == "episodes.md":
+        assert found["picture"].ndim == 3
+        assert all(Path(made).stat().st_size > 10_000 for made in ("flight.gif", "both.html"))
+    else:
+        weights = found["weights"]("runs/FOLDER")
+        assert all(weight.isfinite().all() for weight in weights.values())
