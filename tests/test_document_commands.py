@@ -6,17 +6,17 @@ name.
 
 import json
 import re
-import select
 import shlex
 import shutil
 import subprocess
 import sys
-import time
+import threading
 from pathlib import Path
 
 import pytest
 
 import damian
+from damian.advice.journal import head
 
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -51,6 +51,8 @@ def commands(text: str) -> list[list[str]]:
 def shortened(words: list[str]) -> list[str]:
     """A command with tiny numbers."""
     words = [SWEPT.get(word, word) for word in words]
+    if shutil.which("ffmpeg") is None:
+        words = [word.replace(",mp4", "") for word in words]
     if any(word.startswith("resume=") for word in words):
         return [re.sub(r"^frames=.*", "frames=128", word) for word in words]
     shorter = SHORTER.get(words[0], [])
@@ -75,17 +77,13 @@ def call(words: list[str], folder: Path) -> str:
 
 def call_service(words: list[str], folder: Path, sign: str) -> None:
     """Run a command that ends only when it is stopped, until it prints a line that begins with a sign."""
-    process = subprocess.Popen([*PROGRAM, *words], cwd=folder, stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        end = time.monotonic() + 120
-        while time.monotonic() < end and process.poll() is None:
-            if select.select([process.stdout], [], [], 1)[0] and process.stdout.readline().startswith(sign):
-                return
-        pytest.fail(f"{words} did not print {sign}")
-    finally:
+    with subprocess.Popen([*PROGRAM, *words], cwd=folder, stdout=subprocess.PIPE, text=True) as process:
+        stop = threading.Timer(120, process.terminate)
+        stop.start()
+        found = any(line.startswith(sign) for line in process.stdout or ())
+        stop.cancel()
         process.terminate()
-        process.wait()
+    assert found, (words, sign)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +107,7 @@ def trained(tmp_path_factory) -> Path:
 
 def write_journal(path: Path) -> None:
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    lines: list[dict] = [{"journal": "damian-advise", "version": 1, "fleet": "north", "uavs": ["A", "B"]}]
+    lines = [head("north", ["A", "B"], {})]
     for n in range(60):
         row = {"ID": "AB"[n % 2], "time": 1000.0 + n, "lat": 52.811, "lon": -4.128, "sequence": n // 2}
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
