@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from typing import ClassVar
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -43,19 +44,20 @@ from damian.evaluation.run_lock import is_folder
 
 from .evaluate import stored_actor
 from .shared.command_line import SECRET
+from .shared.flown_policy import FlownPolicyConfig
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
-from .shared.settings import TrainConfig
 from .shared.stored_runs import save_config
 
-POLICIES = ("mode", "sampled", "greedy")
 FLEET = "main"
 """Name of the only fleet of a table or a folder."""
 
 
 @dataclass
-class AdviseConfig(TrainConfig):
+class AdviseConfig(FlownPolicyConfig):
     """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
+
+    policies: ClassVar[tuple[str, ...]] = ("mode", "sampled", "greedy")
 
     policy: str | None = None
     """``mode`` or ``sampled``: the policy of ``checkpoint``; ``greedy``: the script. If it is not given:
@@ -80,25 +82,9 @@ class AdviseConfig(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.policy is not None:
-            checks.one_of("policy", self.policy, POLICIES)
-            should = "flies no checkpoint: choose policy=mode|sampled, or leave out checkpoint"
-            checks.require(self.learnt or not self.checkpoint, "policy", self.policy, should)
-            should = "needs checkpoint: the run folder with the policy to fly"
-            checks.require(bool(self.checkpoint) or not self.learnt, "policy", self.policy, should)
         if self.port is not None:
             checks.whole("port", self.port, 0, 65535)
         check_token("token", self.token)
-
-    @property
-    def flown(self) -> str:
-        """The policy that flies, one of ``POLICIES``."""
-        return self.policy or ("mode" if self.checkpoint else "greedy")
-
-    @property
-    def learnt(self) -> bool:
-        """Is it that of a checkpoint?"""
-        return self.flown != "greedy"
 
     def check_source(self) -> None:
         """Require exactly one source of reports.

@@ -14,6 +14,7 @@ page of several.
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
+from typing import ClassVar
 
 import hydra
 import numpy as np
@@ -39,20 +40,21 @@ from damian.evaluation.replay_page import save_page
 from damian.learners.recurrent import add_recurrent_state
 
 from .evaluate import stored_actor
+from .shared.flown_policy import FlownPolicyConfig
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
-from .shared.settings import TrainConfig
 from .shared.stored_runs import save_config
 
-POLICIES = ("sampled", "mode", "greedy", "random")
 KEPT = ("all", "extremes")
 FORMATS, VIEWS = ("gif", "mp4", "png", "html", "geojson"), ("2d", "3d")
 FILMS = FORMATS[:2]
 
 
 @dataclass
-class FlyConfig(TrainConfig):
+class FlyConfig(FlownPolicyConfig):
     """All settings of ``damian fly``: those of ``damian train``, and what to fly and to keep."""
+
+    policies: ClassVar[tuple[str, ...]] = ("sampled", "mode", "greedy", "random")
 
     eval_episodes: int = 1
     """Episodes to fly."""
@@ -69,12 +71,6 @@ class FlyConfig(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.policy is not None:
-            checks.one_of("policy", self.policy, POLICIES)
-            should = f"flies no checkpoint: choose policy={'|'.join(POLICIES[:2])}, or leave out checkpoint"
-            checks.require(self.learnt or not self.checkpoint, "policy", self.policy, should)
-            should = "needs checkpoint: the run folder with the policy to fly"
-            checks.require(bool(self.checkpoint) or not self.learnt, "policy", self.policy, should)
         checks.one_of("keep", self.keep, KEPT)
         for each in self.formats:
             checks.one_of("formats", each, FORMATS)
@@ -82,16 +78,6 @@ class FlyConfig(TrainConfig):
             checks.one_of("views", each, VIEWS)
         films = "mp4" not in self.formats or FFMpegWriter.isAvailable()
         checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
-
-    @property
-    def flown(self) -> str:
-        """The policy that flies, one of ``POLICIES``."""
-        return self.policy or ("sampled" if self.checkpoint else "greedy")
-
-    @property
-    def learnt(self) -> bool:
-        """Is it that of a checkpoint?"""
-        return self.flown in POLICIES[:2]
 
 
 ConfigStore.instance().store(name="fly_schema", node=FlyConfig)
