@@ -26,6 +26,8 @@ from damian.common.errors import InputError
 from damian.common.markdown import markdown_table
 
 ALGORITHMS = {"mappo": MappoConfig, "masac": MasacConfig, "qmix": QmixConfig}
+AWARE = ("aware=history", "observation.own=true")
+"""A UAV knows its own latest message at once, and its latest actions."""
 WORLDS, STEPS = 32, 50
 """Worlds that are stepped as one batch, and their steps between two updates: an episode of delaybench."""
 EVALUATIONS, EPISODES = 10, 20
@@ -52,8 +54,7 @@ def make_task(args: argparse.Namespace) -> UavTask | DelayedVmasTask:
     """The task of ``--scenario``, with its delay."""
     if args.scenario.startswith("vmas/"):
         return DelayedVmasTask(args.scenario.removeprefix("vmas/"), delay=args.delay)
-    aware = ["aware=history"] if args.delay else []
-    settings = [f"scenario={args.scenario}", f"delay.obs={args.delay}", *aware, *args.overrides]
+    settings = [f"scenario={args.scenario}", f"delay.obs={args.delay}", *AWARE, *args.overrides]
     return UavTask(args.scenario.replace("/", "_"), {"overrides": settings})
 
 
@@ -72,7 +73,7 @@ def experiment_config(args: argparse.Namespace) -> ExperimentConfig:
     config = ExperimentConfig.get_from_yaml()
     config.max_n_frames, config.save_folder = args.frames, str(args.folder)
     config.prefer_continuous_actions = args.continuous
-    config.lr = 5e-4
+    config.lr, config.gamma = 1e-3, 0.9  # those of delaybench with DAMIAN's own learners
     config.on_policy_n_envs_per_worker = config.off_policy_n_envs_per_worker = WORLDS
     batch = WORLDS * STEPS
     config.on_policy_collected_frames_per_batch = config.off_policy_collected_frames_per_batch = batch
