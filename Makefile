@@ -111,8 +111,8 @@ $(VENV)/bench: $(VENV)/base
 $(BENCHMARL)/ready: pyproject.toml examples/benchmarl/requirements.txt
 	$(PYTHON) -m venv $(BENCHMARL)
 	$(BENCHMARL)/bin/pip install --quiet --disable-pip-version-check "$(TORCH)"
-	$(BENCHMARL)/bin/pip install --quiet --disable-pip-version-check --no-deps -r examples/benchmarl/requirements.txt
 	$(BENCHMARL)/bin/pip install --quiet --disable-pip-version-check -e . "$(TORCH)"
+	$(BENCHMARL)/bin/pip install --quiet --disable-pip-version-check --no-deps -r examples/benchmarl/requirements.txt
 	touch $@
 
 clean:

@@ -43,7 +43,7 @@ class UavTask(TaskClass):
     def scenario(self, kind: str) -> ScenarioConfig:
         """All settings, with ``discrete`` or ``continuous`` actions."""
         scenario = compose_scenario(*self.config["overrides"], f"actions={kind}")
-        problem = "BenchMARL needs a time limit [steps]"
+        problem = "is no time limit [steps], and BenchMARL needs one"
         checks.require(
             scenario.episode.max_steps is not None, "episode.max_steps", scenario.episode.max_steps, problem
         )
