@@ -1,4 +1,4 @@
-# make train | test | test-deep | test-slow | test-browser | bench | bench-quick | bench-advise | pictures | docs | page-libraries | check | format
+# make train | test | test-deep | test-slow | test-browser | bench | bench-quick | bench-advise | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -7,7 +7,7 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-deep test-slow test-browser bench bench-quick bench-advise pictures docs page-libraries check format clean
+.PHONY: train test test-deep test-slow test-browser bench bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
@@ -36,6 +36,15 @@ bench-advise: $(VENV)/test
 
 bench-quick: $(VENV)/bench
 	$(VENV)/bin/damian bench --quick
+
+# Algorithms of BenchMARL, in an environment of its own: it asks for another TorchRL than ours. Fails if one learns nothing.
+BENCHMARL := build/benchmarl-venv
+BENCHMARL_TRAIN = TQDM_DISABLE=1 $(BENCHMARL)/bin/python examples/benchmarl/train.py --folder build/benchmarl
+benchmarl: $(BENCHMARL)/ready
+	$(BENCHMARL_TRAIN) --algorithm mappo $(ARGS)
+	$(BENCHMARL_TRAIN) --algorithm masac $(ARGS)
+	$(BENCHMARL_TRAIN) --algorithm qmix $(ARGS)
+	$(BENCHMARL_TRAIN) --algorithm mappo --scenario vmas/navigation $(ARGS)
 
 # The film of the README, and the figures of the stored results.
 pictures: $(VENV)/base
@@ -97,6 +106,13 @@ $(VENV)/browser: $(VENV)/test
 
 $(VENV)/bench: $(VENV)/base
 	$(PIP) -e ".[bench]" "$(TORCH)"
+	touch $@
+
+$(BENCHMARL)/ready: pyproject.toml examples/benchmarl/requirements.txt
+	$(PYTHON) -m venv $(BENCHMARL)
+	$(BENCHMARL)/bin/pip install --quiet --disable-pip-version-check "$(TORCH)"
+	$(BENCHMARL)/bin/pip install --quiet --disable-pip-version-check -e . "$(TORCH)"
+	$(BENCHMARL)/bin/pip install --quiet --disable-pip-version-check --no-deps -r examples/benchmarl/requirements.txt
 	touch $@
 
 clean:
