@@ -1,0 +1,126 @@
+"""Workers of a training on a Ray cluster, or on a Ray of this machine alone, through TorchRL's collector."""
+
+import importlib.util
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+from damian.common.errors import InputError
+from damian.common.threads import available_cores
+
+Maker = Callable[[], EnvBase]
+START_LIMIT = 300
+"""Seconds after which a Ray cluster that has no room for the workers is given up."""
+_ENDLESS = 2**62
+"""Environment steps that no run reaches; ``RayCollector`` collects nothing if it is told -1."""
+
+
+def check_installed(key: str) -> None:
+    """Check that Ray can be imported.
+
+    Args:
+        key: the setting that asks for Ray.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise InputError(f"{key}: ray is not installed; pip install 'damian[ray]'")
+
+
+def connected_ray(processes: int) -> Any:
+    """The module ``ray``, connected to a cluster.
+
+    The cluster is the one that ``RAY_ADDRESS`` or ``ray start`` on this machine names; without one, a Ray with
+    at least ``processes`` CPUs is started for this program only, and ends with it.
+    """
+    # Ray counts its use and sends the numbers away unless it is told not to.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    import ray
+
+    if ray.is_initialized():
+        return ray
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    try:
+        ray.init(address="auto", **quiet)
+    except ConnectionError:
+        os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # only this machine can reach it
+        ray.init(
+            address="local", num_cpus=max(processes, available_cores()), include_dashboard=False, **quiet
+        )
+    return ray
+
+
+class RayWorkers:
+    """Workers as Ray actors with one CPU each.
+
+    Args:
+        makers: makes the environment of each worker, in its process.
+        actor: the actor whose weights the workers get before each batch.
+        frames: environment steps of a batch, over all workers.
+        collector: class of a worker's collector.
+        compiled: options of the compiled actor, or None.
+
+    Raises:
+        InputError: Ray is not installed, or has had no room for ``START_LIMIT`` seconds.
+    """
+
+    def __init__(
+        self,
+        makers: Sequence[Maker],
+        actor: torch.nn.Module,
+        frames: int,
+        collector: type[Collector],
+        compiled: dict[str, Any] | None,
+    ) -> None:
+        check_installed("collector")
+        self._ray = connected_ray(len(makers))
+        from torchrl.collectors.distributed import RayCollector
+
+        self.batches = RayCollector(
+            list(makers),
+            actor,
+            frames_per_batch=frames,
+            total_frames=_ENDLESS,
+            sync=True,
+            update_after_each_batch=True,
+            collector_class=collector,
+            collector_kwargs={"auto_register_policy_transforms": True, "compile_policy": compiled},
+            remote_configs={"num_cpus": 1, "scheduling_strategy": self._places(len(makers))},
+        )
+
+    def _places(self, number: int) -> Any:
+        """Room for ``number`` workers in the cluster, all at once."""
+        from ray.util.placement_group import placement_group
+        from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+
+        group = placement_group([{"CPU": 1}] * number)
+        try:
+            self._ray.get(group.ready(), timeout=START_LIMIT)
+        except self._ray.exceptions.GetTimeoutError:
+            free, all_of = (
+                int(found().get("CPU", 0))
+                for found in (self._ray.available_resources, self._ray.cluster_resources)
+            )
+            self._ray.shutdown()
+            problem = f"the Ray cluster has had no {number} free CPUs for {START_LIMIT} s: {free} of {all_of} are free"
+            raise InputError(f"workers: {problem}; choose fewer, or a larger cluster") from None
+        return PlacementGroupSchedulingStrategy(placement_group=group)
+
+    def lost(self, error: Exception) -> str | None:
+        """Which worker's end has caused an error; None if all are there."""
+        if not isinstance(error, self._ray.exceptions.RayActorError):
+            return None
+        workers = self.batches.remote_collectors
+        ids = [worker._actor_id.hex() for worker in workers]
+        number = ids.index(error.actor_id) if error.actor_id in ids else "?"
+        return f"worker {number} of {len(workers)} was lost: {str(error).strip().splitlines()[-1].strip()}"
+
+    def shutdown(self) -> None:
+        """End all workers, and the connection to Ray."""
+        self.batches.shutdown()
+        self._ray.shutdown()

@@ -1,0 +1,201 @@
+"""Collects batches with several workers, in processes of this machine or on a Ray cluster (docs/scaling.md).
+
+The workers are TorchRL's collectors: ``MultiSyncCollector`` and ``RayCollector``. Here is what a training adds
+to them: worlds and seeds of their own for each worker, a state for checkpoints, and one line for a lost worker.
+"""
+
+import copy
+import io
+import os
+import random
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector, MultiSyncCollector
+
+from damian.common import counter_rng
+from damian.common.errors import RunError
+from damian.common.threads import using_threads
+from damian.envs.delayed_env import DelayedEnv
+from damian.evaluation.checkpoint import plain
+from damian.evaluation.training_state import CarriedStep, RandomState
+from damian.learners.networks import COMPILE_OPTIONS
+from damian.learners.recurrent import add_recurrent_state
+
+from .learning_env import learning_env
+from .ray_workers import Maker, RayWorkers
+from .settings import TrainConfig
+
+
+class WorkerLost(RunError):
+    """A worker has ended; ``str(error)`` says which one, and how."""
+
+
+class WorkerCollector(Collector):
+    """The collector of one worker, which can hand out its state and go on from it."""
+
+    def dump(self) -> bytes:
+        """The state of the worlds, of the next step and of the random generators, for a checkpoint."""
+        buffer = io.BytesIO()
+        torch.save(plain({name: part.state_dict() for name, part in self._parts().items()}), buffer)
+        return buffer.getvalue()
+
+    def load(self, state: bytes) -> None:
+        """Go on from a state that ``dump`` has returned; only tensors and numbers are read."""
+        stored = torch.load(io.BytesIO(state), weights_only=True)
+        for name, part in self._parts().items():
+            part.load_state_dict(stored[name])
+
+    def process_id(self) -> int:
+        """Id of the worker's process on its machine."""
+        return os.getpid()
+
+    def _parts(self) -> dict[str, Any]:
+        return {"environment": self.env, "collector": CarriedStep(self), "random": RandomState()}
+
+
+def worker_seed(seed: int, worker: int) -> int:
+    """The seed of a worker's global generators, which draw its actions; 32 bits."""
+    return int(np.random.SeedSequence((seed, worker)).generate_state(1)[0])
+
+
+def worker_env(config: TrainConfig, actor: torch.nn.Module, worker: int) -> DelayedEnv:
+    """The environment of a worker, made in its process: its share of the run's worlds, [B / workers].
+
+    Args:
+        config: settings of the run.
+        actor: the actor, weights need not be there.
+        worker: number of the worker, from 0.
+
+    A world has the same random stream whichever process it is in; the actions are drawn from a generator of
+    each worker's own.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, and the main one answers it
+    torch.set_num_threads(1)
+    own, share = worker_seed(config.seed, worker), config.worlds // config.workers
+    for seed in (torch.manual_seed, np.random.seed, random.seed):
+        seed(own)
+    env = learning_env(replace(config, worlds=share))
+    add_recurrent_state(env, actor)
+    seeds = counter_rng.world_seeds(config.seed, config.worlds, env.device)
+    env.seed_worlds(seeds[worker * share : (worker + 1) * share])
+    return env
+
+
+class Processes:
+    """Workers in processes of this machine.
+
+    Args:
+        makers: makes the environment of each worker, in its process.
+        actor: the actor whose weights the workers get before each batch.
+        frames: environment steps of a batch, over all workers.
+        collector: class of a worker's collector.
+        compiled: options of the compiled actor, or None.
+    """
+
+    def __init__(
+        self,
+        makers: Sequence[Maker],
+        actor: torch.nn.Module,
+        frames: int,
+        collector: type[Collector],
+        compiled: dict[str, Any] | None,
+    ) -> None:
+        with using_threads(torch.get_num_threads()):  # the collector changes it
+            self.batches = MultiSyncCollector(
+                makers,
+                actor,
+                frames_per_batch=frames,
+                total_frames=-1,
+                collector_class=collector,
+                cat_results="stack",
+                update_at_each_batch=True,
+                auto_register_policy_transforms=True,
+                compile_policy=compiled,
+            )
+
+    def lost(self, error: Exception) -> str | None:
+        """Which worker's end has caused an error; None if all are there."""
+        processes = self.batches.procs
+        for number, process in enumerate(processes):
+            with suppress(ValueError):  # TorchRL has ended and closed the others
+                process.join(0.2)  # the pipe of a killed process closes before it has an exit code
+                if (code := process.exitcode) is not None and not process._closed:
+                    how = f"signal {-code}" if code < 0 else f"exit code {code}"
+                    return f"worker {number} of {len(processes)} (process {process.pid}) was lost: {how}"
+        return None
+
+    def shutdown(self) -> None:
+        """End all workers."""
+        with using_threads(torch.get_num_threads()):
+            self.batches.shutdown()
+
+
+KINDS: dict[str, type[Processes] | type[RayWorkers]] = {"process": Processes, "ray": RayWorkers}
+"""Where workers may be: values of the setting ``collector`` beside ``sync``, which has none."""
+
+
+class Workers:
+    """Collects batches [B, T]; worker w of W has the worlds from number w B / W on, in every batch.
+
+    Args:
+        config: settings of the run; ``config.collector`` says where the workers are.
+        actor: the actor that the learner changes; the workers get its weights before each batch.
+        frames: environment steps of a batch, over all worlds.
+
+    Raises:
+        InputError: the workers cannot be started.
+    """
+
+    def __init__(self, config: TrainConfig, actor: torch.nn.Module, frames: int) -> None:
+        skeleton = copy.deepcopy(actor).to("meta")
+        makers = [partial(worker_env, config, skeleton, worker) for worker in range(config.workers)]
+        compiled = {"options": COMPILE_OPTIONS} if config.compile else None
+        self._kind = KINDS[config.collector](makers, actor, frames, WorkerCollector, compiled)
+        self.process_ids: list[int] = self._on_all("process_id")
+        self._states: list[bytes] = self._on_all("dump")
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        batches = iter(self._kind.batches)
+        while True:
+            with self._naming_lost():
+                batch = next(batches)
+            yield batch.flatten(0, 1)
+
+    def keep_state(self) -> None:
+        """Make the state after the latest batch the one that a checkpoint stores, also if a worker is lost."""
+        self._states = self._on_all("dump")
+
+    def state_dict(self) -> dict[str, Any]:
+        """The states of all workers when ``keep_state`` was called."""
+        return {str(i): torch.frombuffer(bytearray(s), dtype=torch.uint8) for i, s in enumerate(self._states)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Let all workers go on from their states."""
+        self._states = [state[str(i)].numpy().tobytes() for i in range(len(self._states))]
+        self._on_all("load", [(each,) for each in self._states])
+
+    def shutdown(self) -> None:
+        """End all workers."""
+        self._kind.shutdown()
+
+    def _on_all(self, method: str, arguments: list[tuple] | None = None) -> list[Any]:
+        with self._naming_lost():
+            return self._kind.batches.map_fn(method, arguments)
+
+    @contextmanager
+    def _naming_lost(self) -> Iterator[None]:
+        """Turn what a lost worker causes into a ``WorkerLost``; all other errors stay."""
+        try:
+            yield
+        except Exception as error:
+            if lost := self._kind.lost(error):
+                raise WorkerLost(f"collector: {lost}") from error
+            raise
