@@ -1,7 +1,7 @@
-"""Collects batches with several workers, in processes of this machine or on a Ray cluster (docs/scaling.md).
+"""Collects batches with several workers, in processes or on a Ray cluster (docs/scaling.md).
 
-The workers are TorchRL's collectors: ``MultiSyncCollector`` and ``RayCollector``. Here is what a training adds
-to them: worlds and seeds of their own for each worker, a state for checkpoints, and one line for a lost worker.
+TorchRL's ``MultiSyncCollector`` and ``RayCollector`` do the work. This adds what a training needs beside them:
+worlds and seeds for each worker, their states for checkpoints, and one line if a worker is lost.
 """
 
 import copy
@@ -84,7 +84,7 @@ def worker_env(config: TrainConfig, actor: torch.nn.Module, worker: int) -> Dela
         seed(own)
     env = learning_env(replace(config, worlds=share))
     add_recurrent_state(env, actor)
-    seeds = counter_rng.world_seeds(config.seed, config.worlds, env.device)
+    seeds = counter_rng.world_seeds(config.seed, config.worlds)
     env.seed_worlds(seeds[worker * share : (worker + 1) * share])
     return env
 
@@ -170,7 +170,7 @@ class Workers:
             yield batch.flatten(0, 1)
 
     def keep_state(self) -> None:
-        """Make the state after the latest batch the one that a checkpoint stores, also if a worker is lost."""
+        """Make the present state the one that a checkpoint stores, also once a worker is lost."""
         self._states = self._on_all("dump")
 
     def state_dict(self) -> dict[str, Any]:
