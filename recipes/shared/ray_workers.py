@@ -3,7 +3,7 @@
 import importlib.util
 import os
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torchrl.collectors import Collector
@@ -35,12 +35,12 @@ def check_installed(key: str) -> None:
 def connected_ray(processes: int) -> Any:
     """The module ``ray``, connected to a cluster.
 
-    The cluster is the one that ``RAY_ADDRESS`` or ``ray start`` on this machine names; without one, a Ray with
-    at least ``processes`` CPUs is started for this program only, and ends with it.
+    The cluster is that of ``RAY_ADDRESS``, or the one to which ``ray start`` has added this machine; without
+    one, a Ray with at least ``processes`` CPUs is started for this program only, and ends with it.
     """
     # Ray counts its use and sends the numbers away unless it is told not to.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    import ray
+    import ray  # noqa: PLC0415 (an extra)
 
     if ray.is_initialized():
         return ray
@@ -79,7 +79,7 @@ class RayWorkers:
     ) -> None:
         check_installed("collector")
         self._ray = connected_ray(len(makers))
-        from torchrl.collectors.distributed import RayCollector
+        from torchrl.collectors.distributed import RayCollector  # noqa: PLC0415 (needs Ray)
 
         self.batches = RayCollector(
             list(makers),
@@ -88,15 +88,14 @@ class RayWorkers:
             total_frames=_ENDLESS,
             sync=True,
             update_after_each_batch=True,
-            collector_class=collector,
+            collector_class=cast(Any, collector),
             collector_kwargs={"auto_register_policy_transforms": True, "compile_policy": compiled},
             remote_configs={"num_cpus": 1, "scheduling_strategy": self._places(len(makers))},
         )
 
     def _places(self, number: int) -> Any:
         """Room for ``number`` workers in the cluster, all at once."""
-        from ray.util.placement_group import placement_group
-        from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+        from ray.util import placement_group, scheduling_strategies  # noqa: PLC0415 (an extra)
 
         group = placement_group([{"CPU": 1}] * number)
         try:
@@ -107,9 +106,9 @@ class RayWorkers:
                 for found in (self._ray.available_resources, self._ray.cluster_resources)
             )
             self._ray.shutdown()
-            problem = f"the Ray cluster has had no {number} free CPUs for {START_LIMIT} s: {free} of {all_of} are free"
-            raise InputError(f"workers: {problem}; choose fewer, or a larger cluster") from None
-        return PlacementGroupSchedulingStrategy(placement_group=group)
+            should = f"have found no room on Ray for {START_LIMIT} s: {free} of its {all_of} CPUs are free"
+            raise InputError(f"workers: {number} {should}; choose fewer, or a larger cluster") from None
+        return scheduling_strategies.PlacementGroupSchedulingStrategy(placement_group=group)
 
     def lost(self, error: Exception) -> str | None:
         """Which worker's end has caused an error; None if all are there."""
@@ -117,8 +116,9 @@ class RayWorkers:
             return None
         workers = self.batches.remote_collectors
         ids = [worker._actor_id.hex() for worker in workers]
-        number = ids.index(error.actor_id) if error.actor_id in ids else "?"
-        return f"worker {number} of {len(workers)} was lost: {str(error).strip().splitlines()[-1].strip()}"
+        found = getattr(error, "actor_id", None)
+        number = ids.index(found) if found in ids else "?"
+        return f"worker {number} of {len(workers)} was lost: {' '.join(str(error).split())}"
 
     def shutdown(self) -> None:
         """End all workers, and the connection to Ray."""

@@ -1,7 +1,7 @@
 """Collects batches with several workers, in processes or on a Ray cluster (docs/scaling.md).
 
-TorchRL's ``MultiSyncCollector`` and ``RayCollector`` do the work. This adds what a training needs beside them:
-worlds and seeds for each worker, their states for checkpoints, and one line if a worker is lost.
+TorchRL's ``MultiSyncCollector`` and ``RayCollector`` do the work. This adds what a training needs beside
+them: worlds and seeds for each worker, their states for checkpoints, and one line if a worker is lost.
 """
 
 import copy
