@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -32,8 +33,8 @@ def check_installed(key: str) -> None:
         raise InputError(f"{key}: ray is not installed; pip install 'damian[ray]'")
 
 
-def connected_ray(processes: int) -> Any:
-    """The module ``ray``, connected to a cluster.
+def connected_ray(processes: int) -> tuple[Any, bool]:
+    """The module ``ray``, connected to a cluster, and whether this call has connected it.
 
     The cluster is that of ``RAY_ADDRESS``, or the one to which ``ray start`` has added this machine; without
     one, a Ray with at least ``processes`` CPUs is started for this program only, and ends with it.
@@ -43,7 +44,7 @@ def connected_ray(processes: int) -> Any:
     import ray  # noqa: PLC0415 (an extra)
 
     if ray.is_initialized():
-        return ray
+        return ray, False
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     try:
         ray.init(address="auto", **quiet)
@@ -52,7 +53,7 @@ def connected_ray(processes: int) -> Any:
         ray.init(
             address="local", num_cpus=max(processes, available_cores()), include_dashboard=False, **quiet
         )
-    return ray
+    return ray, True
 
 
 class RayWorkers:
@@ -78,7 +79,7 @@ class RayWorkers:
         compiled: dict[str, Any] | None,
     ) -> None:
         check_installed("collector")
-        self._ray = connected_ray(len(makers))
+        self._ray, self._connected = connected_ray(len(makers))
         from torchrl.collectors.distributed import RayCollector  # noqa: PLC0415 (needs Ray)
 
         self.batches = RayCollector(
@@ -92,6 +93,7 @@ class RayWorkers:
             collector_kwargs={"auto_register_policy_transforms": True, "compile_policy": compiled},
             remote_configs={"num_cpus": 1, "scheduling_strategy": self._places(len(makers))},
         )
+        self.batches.update_policy_weights_(actor)
 
     def _places(self, number: int) -> Any:
         """Room for ``number`` workers in the cluster, all at once."""
@@ -110,17 +112,17 @@ class RayWorkers:
             raise InputError(f"workers: {number} {should}; choose fewer, or a larger cluster") from None
         return scheduling_strategies.PlacementGroupSchedulingStrategy(placement_group=group)
 
-    def lost(self, error: Exception) -> str | None:
-        """Which worker's end has caused an error; None if all are there."""
+    def lost(self, error: Exception) -> tuple[int, str] | None:
+        """The worker whose end has caused an error, and how it ended; None if all are there."""
         if not isinstance(error, self._ray.exceptions.RayActorError):
             return None
-        workers = self.batches.remote_collectors
-        ids = [worker._actor_id.hex() for worker in workers]
-        found = getattr(error, "actor_id", None)
-        number = ids.index(found) if found in ids else "?"
-        return f"worker {number} of {len(workers)} was lost: {' '.join(str(error).split())}"
+        ids = [worker._actor_id.hex() for worker in self.batches.remote_collectors]
+        exit_type = re.search(r"Worker exit type: (\w+)", str(error))
+        how = f"Ray says {exit_type[1]}" if exit_type else "its machine is gone"
+        return ids.index(getattr(error, "actor_id", "")), how
 
     def shutdown(self) -> None:
         """End all workers, and the connection to Ray."""
         self.batches.shutdown()
-        self._ray.shutdown()
+        if self._connected:
+            self._ray.shutdown()

@@ -7,18 +7,20 @@ them: worlds and seeds for each worker, their states for checkpoints, and one li
 import copy
 import io
 import os
+import queue
 import random
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from damian.common import counter_rng
 from damian.common.errors import RunError
@@ -41,15 +43,17 @@ class WorkerLost(RunError):
 class WorkerCollector(Collector):
     """The collector of one worker, which can hand out its state and go on from it."""
 
+    def __init__(self, *args: Any, traj_pool: Any = None, **options: Any) -> None:
+        # A pool that all workers share would number episodes by which worker comes first.
+        super().__init__(*args, **options)
+
     def dump(self) -> bytes:
         """The state of the worlds, of the next step and of the random generators, for a checkpoint."""
-        buffer = io.BytesIO()
-        torch.save(plain({name: part.state_dict() for name, part in self._parts().items()}), buffer)
-        return buffer.getvalue()
+        return packed(plain({name: part.state_dict() for name, part in self._parts().items()}))
 
     def load(self, state: bytes) -> None:
-        """Go on from a state that ``dump`` has returned; only tensors and numbers are read."""
-        stored = torch.load(io.BytesIO(state), weights_only=True)
+        """Go on from a state that ``dump`` has returned."""
+        stored = unpacked(state)
         for name, part in self._parts().items():
             part.load_state_dict(stored[name])
 
@@ -59,6 +63,18 @@ class WorkerCollector(Collector):
 
     def _parts(self) -> dict[str, Any]:
         return {"environment": self.env, "collector": CarriedStep(self), "random": RandomState()}
+
+
+def packed(state: dict[str, Any]) -> bytes:
+    """Nested dictionaries of tensors and numbers as bytes, which pipes pass faster than many tensors."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return buffer.getvalue()
+
+
+def unpacked(state: bytes) -> dict[str, Any]:
+    """What ``packed`` has packed; nothing in it is executed."""
+    return torch.load(io.BytesIO(state), weights_only=True)
 
 
 def worker_seed(seed: int, worker: int) -> int:
@@ -89,6 +105,20 @@ def worker_env(config: TrainConfig, actor: torch.nn.Module, worker: int) -> Dela
     return env
 
 
+class Weights(cast(Any, SharedMemWeightSyncScheme)):
+    """Sends weights through shared memory, and does not wait for a worker that has ended."""
+
+    processes: Sequence[Any] = ()
+    """Those of the workers, once they run."""
+
+    def _wait_for_ack(self, worker_ids: Any = None, timeout: float | None = None) -> None:
+        for worker, process in enumerate(self.processes):
+            while process.is_alive():  # else the collector finds it out at its next step
+                with suppress(queue.Empty):
+                    self._ack_queues[worker].get(timeout=0.5)
+                    break
+
+
 class Processes:
     """Workers in processes of this machine.
 
@@ -108,6 +138,7 @@ class Processes:
         collector: type[Collector],
         compiled: dict[str, Any] | None,
     ) -> None:
+        weights = Weights()
         with using_threads(torch.get_num_threads()):  # the collector changes it
             self.batches = MultiSyncCollector(
                 makers,
@@ -117,19 +148,19 @@ class Processes:
                 collector_class=collector,
                 cat_results="stack",
                 update_at_each_batch=True,
+                weight_sync_schemes={"policy": weights},
                 auto_register_policy_transforms=True,
                 compile_policy=compiled,
             )
+        weights.processes = self.batches.procs
 
-    def lost(self, error: Exception) -> str | None:
-        """Which worker's end has caused an error; None if all are there."""
-        processes = self.batches.procs
-        for number, process in enumerate(processes):
+    def lost(self, error: Exception) -> tuple[int, str] | None:
+        """The worker whose end has caused an error, and how it ended; None if all are there."""
+        for number, process in enumerate(self.batches.procs):
             with suppress(ValueError):  # TorchRL has ended and closed the others
                 process.join(0.2)  # the pipe of a killed process closes before it has an exit code
-                if (code := process.exitcode) is not None and not process._closed:
-                    how = f"signal {-code}" if code < 0 else f"exit code {code}"
-                    return f"worker {number} of {len(processes)} (process {process.pid}) was lost: {how}"
+                if (code := process.exitcode) is not None:
+                    return number, f"killed by signal {-code}" if code < 0 else f"exit code {code}"
         return None
 
     def shutdown(self) -> None:
@@ -159,7 +190,7 @@ class Workers:
         makers = [partial(worker_env, config, skeleton, worker) for worker in range(config.workers)]
         compiled = {"options": COMPILE_OPTIONS} if config.compile else None
         self._kind = KINDS[config.collector](makers, actor, frames, WorkerCollector, compiled)
-        self.process_ids: list[int] = self._on_all("process_id")
+        self.process_ids: list[int] = self._kind.batches.map_fn("process_id")
         self._states: list[bytes] = self._on_all("dump")
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -175,11 +206,11 @@ class Workers:
 
     def state_dict(self) -> dict[str, Any]:
         """The states of all workers when ``keep_state`` was called."""
-        return {str(i): torch.frombuffer(bytearray(s), dtype=torch.uint8) for i, s in enumerate(self._states)}
+        return {str(worker): unpacked(state) for worker, state in enumerate(self._states)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Let all workers go on from their states."""
-        self._states = [state[str(i)].numpy().tobytes() for i in range(len(self._states))]
+        self._states = [packed(state[str(worker)]) for worker in range(len(self._states))]
         self._on_all("load", [(each,) for each in self._states])
 
     def shutdown(self) -> None:
@@ -196,6 +227,10 @@ class Workers:
         try:
             yield
         except Exception as error:
-            if lost := self._kind.lost(error):
-                raise WorkerLost(f"collector: {lost}") from error
-            raise
+            if not (lost := self._kind.lost(error)):
+                raise
+            number, how = lost
+            which = (
+                f"worker {number} of {self._kind.batches.num_workers} (process {self.process_ids[number]})"
+            )
+            raise WorkerLost(f"collector: {which} was lost: {how}") from error
