@@ -16,6 +16,8 @@ from damian.common.threads import available_cores
 Maker = Callable[[], EnvBase]
 START_LIMIT = 300
 """Seconds after which a Ray cluster that has no room for the workers is given up."""
+ANSWER_LIMIT = 20
+"""Seconds in which a worker answers, unless it is collecting."""
 _ENDLESS = 2**62
 """Environment steps that no run reaches; ``RayCollector`` collects nothing if it is told -1."""
 
@@ -93,6 +95,7 @@ class RayWorkers:
             collector_kwargs={"auto_register_policy_transforms": True, "compile_policy": compiled},
             remote_configs={"num_cpus": 1, "scheduling_strategy": self._places(len(makers))},
         )
+        self._workers = list(self.batches.remote_collectors)
         self.batches.update_policy_weights_(actor)
 
     def _places(self, number: int) -> Any:
@@ -113,13 +116,21 @@ class RayWorkers:
         return scheduling_strategies.PlacementGroupSchedulingStrategy(placement_group=group)
 
     def lost(self, error: Exception) -> tuple[int, str] | None:
-        """The worker whose end has caused an error, and how it ended; None if all are there."""
-        if not isinstance(error, self._ray.exceptions.RayActorError):
-            return None
-        ids = [worker._actor_id.hex() for worker in self.batches.remote_collectors]
-        exit_type = re.search(r"Worker exit type: (\w+)", str(error))
-        how = f"Ray says {exit_type[1]}" if exit_type else "its machine is gone"
-        return ids.index(getattr(error, "actor_id", "")), how
+        """The worker whose end has caused an error, and how it ended; None if all are there.
+
+        What sends the weights has errors of its own, so that every worker is asked whether it lives. After an
+        error, TorchRL ends all others by ``ray.kill``.
+        """
+        for number, worker in enumerate(self._workers):
+            try:
+                self._ray.get(worker.process_id.remote(), timeout=ANSWER_LIMIT)
+            except self._ray.exceptions.GetTimeoutError:
+                continue  # it is busy
+            except self._ray.exceptions.RayActorError as end:
+                if "ray.kill" not in str(end):
+                    exit_type = re.search(r"Worker exit type: (\w+)", str(end))
+                    return number, f"Ray says {exit_type[1] if exit_type else 'that it has died'}"
+        return None
 
     def shutdown(self) -> None:
         """End all workers, and the connection to Ray."""

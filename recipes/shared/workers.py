@@ -156,12 +156,18 @@ class Processes:
 
     def lost(self, error: Exception) -> tuple[int, str] | None:
         """The worker whose end has caused an error, and how it ended; None if all are there."""
+        codes: dict[int, int] = {}
         for number, process in enumerate(self.batches.procs):
-            with suppress(ValueError):  # TorchRL has ended and closed the others
+            with suppress(ValueError):  # TorchRL closes the others, once it has ended them
                 process.join(0.2)  # the pipe of a killed process closes before it has an exit code
-                if (code := process.exitcode) is not None:
-                    return number, f"killed by signal {-code}" if code < 0 else f"exit code {code}"
-        return None
+                if process.exitcode is not None:
+                    codes[number] = process.exitcode
+        if not codes:
+            return None
+        # After an error, TorchRL makes all others exit, or ends them by SIGTERM if they take long.
+        number = min(codes, key=lambda each: (codes[each] == 0, codes[each] == -signal.SIGTERM))
+        code = codes[number]
+        return number, f"killed by signal {-code}" if code < 0 else f"exit code {code}"
 
     def shutdown(self) -> None:
         """End all workers."""

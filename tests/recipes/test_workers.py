@@ -1,4 +1,4 @@
-"""Collectors with several workers: the worlds of one process, seeds, weights, checkpoints, and lost workers."""
+"""Collectors with several workers: the worlds of one process, seeds, weights, states, and lost workers."""
 
 import itertools
 import multiprocessing
@@ -33,6 +33,7 @@ TWO = ["collector=process", "workers=2"]
 LATE = ["delay=paper", "aware=both", "delay.rew=2"]
 LIMIT = 240
 """Seconds after which a run has hung."""
+UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
 
 class ByMode(TensorDictModuleBase):
@@ -178,10 +179,20 @@ def test_a_lost_process_is_named_and_the_run_goes_on_from_its_latest_update(run,
     ]
 
 
-def started(*words: str) -> subprocess.Popen[str]:
-    """A run in a process of its own, as from the command line."""
-    command = [sys.executable, "-m", "damian.recipes.train", *TINY, *LATE, "frames=1600", *words]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def started(output: str, *words: str) -> subprocess.Popen[bytes]:
+    """A run in a process of its own, as from the command line, with its output in a file."""
+    command = [sys.executable, "-m", "damian.recipes.train", *words]
+    with open(output, "w") as file:
+        return subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=os.environ | UNBUFFERED)
+
+
+def waited_for(path: str, pattern: str) -> re.Match[str]:
+    """What a file has, once it has it."""
+    until = time.monotonic() + LIMIT
+    while not (found := re.search(pattern, Path(path).read_text() if Path(path).exists() else "")):
+        assert time.monotonic() < until, f"{path} has no {pattern}"
+        time.sleep(0.05)
+    return found
 
 
 @pytest.mark.slow
@@ -192,21 +203,18 @@ def test_a_run_that_lost_a_worker_and_was_resumed_equals_one_in_processes_that_l
     if kind == "ray":
         pytest.importorskip("ray")
     monkeypatch.chdir(tmp_path)
-    whole = started(*TWO, "hydra.run.dir=whole")
+    words = [*TINY, *LATE, "frames=1600"]
+    whole = started("whole.txt", *words, *TWO, "hydra.run.dir=whole")
     assert whole.wait(LIMIT) == 0
-    cut = started(f"collector={kind}", "workers=2", "hydra.run.dir=cut")
-    processes = re.search(r"processes (\d+), (\d+)", cut.stdout.readline())
-    until = time.monotonic() + LIMIT
-    while not Path("cut/metrics.csv").exists() or Path("cut/metrics.csv").read_text().count("\n") < 5:
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    os.kill(int(processes[2]), signal.SIGKILL)
+    cut = started("cut.txt", *words, f"collector={kind}", "workers=2", "hydra.run.dir=cut")
+    number = int(waited_for("cut.txt", r"workers \(processes \d+, (\d+)\)")[1])
+    waited_for("cut/metrics.csv", r"(.*\n){5}")
+    os.kill(number, signal.SIGKILL)
     assert cut.wait(LIMIT) == 3
-    error = cut.stderr.read().split("error: ")[-1].splitlines()[0]
-    assert error.startswith(f"collector: worker 1 of 2 (process {processes[2]}) was lost: ")
+    error = waited_for("cut.txt", "error: (.*)")[1]
+    assert error.startswith(f"collector: worker 1 of 2 (process {number}) was lost: ")
     assert error.endswith(", the latest; continue with resume=cut")
-    resumed = subprocess.Popen([sys.executable, "-m", "damian.recipes.train", "resume=cut"])
-    assert resumed.wait(LIMIT) == 0
+    assert started("resumed.txt", "resume=cut").wait(LIMIT) == 0
     check_equal(tmp_path / "whole", tmp_path / "cut")
 
 
