@@ -27,7 +27,6 @@ from .train import make_learner, replay_buffer
 TASKS = {
     "spotting (cheap)": ["scenario=spotting"],
     "tracking with a belief (expensive)": ["scenario=delaybench/tracking", "delay=paper", "aware=belief"],
-    "the same, 512 worlds": ["scenario=delaybench/tracking", "delay=paper", "aware=belief", "worlds=512"],
 }
 WORKERS = 2
 BATCHES = 3

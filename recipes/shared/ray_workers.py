@@ -38,8 +38,12 @@ def check_installed(key: str) -> None:
 def connected_ray(processes: int) -> tuple[Any, bool]:
     """The module ``ray``, connected to a cluster, and whether this call has connected it.
 
-    The cluster is that of ``RAY_ADDRESS``, or the one to which ``ray start`` has added this machine; without
-    one, a Ray with at least ``processes`` CPUs is started for this program only, and ends with it.
+    The cluster is that of the environment variable ``RAY_ADDRESS`` (``auto``: the one to which ``ray start``
+    has added this machine). Without it, a Ray with at least ``processes`` CPUs is started for this program
+    only, and ends with it.
+
+    Raises:
+        InputError: there is no cluster at ``RAY_ADDRESS``.
     """
     # Ray counts its use and sends the numbers away unless it is told not to.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -48,13 +52,15 @@ def connected_ray(processes: int) -> tuple[Any, bool]:
     if ray.is_initialized():
         return ray, False
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    try:
-        ray.init(address="auto", **quiet)
-    except ConnectionError:
+    if address := os.environ.get("RAY_ADDRESS"):
+        try:
+            ray.init(address=address, **quiet)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise InputError(f"RAY_ADDRESS: {address}: no Ray cluster answers there") from error
+    else:
         os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # only this machine can reach it
-        ray.init(
-            address="local", num_cpus=max(processes, available_cores()), include_dashboard=False, **quiet
-        )
+        cpus = max(processes, available_cores())
+        ray.init(address="local", num_cpus=cpus, include_dashboard=False, **quiet)
     return ray, True
 
 

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -33,7 +33,6 @@ TWO = ["collector=process", "workers=2"]
 LATE = ["delay=paper", "aware=both", "delay.rew=2"]
 LIMIT = 240
 """Seconds after which a run has hung."""
-UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
 
 class ByMode(TensorDictModuleBase):
@@ -179,11 +178,24 @@ def test_a_lost_process_is_named_and_the_run_goes_on_from_its_latest_update(run,
     ]
 
 
-def started(output: str, *words: str) -> subprocess.Popen[bytes]:
-    """A run in a process of its own, as from the command line, with its output in a file."""
-    command = [sys.executable, "-m", "damian.recipes.train", *words]
-    with open(output, "w") as file:
-        return subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=os.environ | UNBUFFERED)
+@pytest.fixture
+def started(tmp_path, monkeypatch) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Starts runs in processes of their own, as from the command line, with their output in a file."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    runs: list[subprocess.Popen[bytes]] = []
+
+    def start(output: str, *words: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "damian.recipes.train", *words]
+        with open(output, "w") as file:
+            environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+            runs.append(subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=environment))
+        return runs[-1]
+
+    yield start
+    for run in runs:
+        run.kill()
+        run.wait()
 
 
 def waited_for(path: str, pattern: str) -> re.Match[str]:
@@ -198,11 +210,10 @@ def waited_for(path: str, pattern: str) -> re.Match[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["process", "ray"])
 def test_a_run_that_lost_a_worker_and_was_resumed_equals_one_in_processes_that_lost_none(
-    tmp_path, monkeypatch, kind
+    tmp_path, started, kind
 ):
     if kind == "ray":
         pytest.importorskip("ray")
-    monkeypatch.chdir(tmp_path)
     words = [*TINY, *LATE, "frames=1600"]
     whole = started("whole.txt", *words, *TWO, "hydra.run.dir=whole")
     assert whole.wait(LIMIT) == 0
