@@ -29,7 +29,7 @@ TASKS = {
     "tracking with a belief (expensive)": ["scenario=delaybench/tracking", "delay=paper", "aware=belief"],
 }
 WORKERS = 2
-BATCHES = 3
+BATCHES = 2
 """Batches of a collector in each round."""
 
 

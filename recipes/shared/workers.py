@@ -167,7 +167,7 @@ class Processes:
         # After an error, TorchRL makes all others exit, or ends them by SIGTERM if they take long.
         number = min(codes, key=lambda each: (codes[each] == 0, codes[each] == -signal.SIGTERM))
         code = codes[number]
-        return number, f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+        return number, f"killed by signal {-code}" if code < 0 else f"exit code {code}, see above"
 
     def shutdown(self) -> None:
         """End all workers."""
