@@ -59,6 +59,7 @@ def connected_ray(processes: int) -> tuple[Any, bool]:
             raise InputError(f"RAY_ADDRESS: {address}: no Ray cluster answers there") from error
     else:
         os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # only this machine can reach it
+        os.environ.setdefault("RAY_worker_niceness", "0")  # else every other program goes before them
         cpus = max(processes, available_cores())
         ray.init(address="local", num_cpus=cpus, include_dashboard=False, **quiet)
     return ray, True

@@ -31,7 +31,7 @@ from damian.recipes.train import make_learner, replay_buffer
 
 TWO = ["collector=process", "workers=2"]
 LATE = ["delay=paper", "aware=both", "delay.rew=2"]
-LIMIT = 240
+LIMIT = 400
 """Seconds after which a run has hung."""
 
 
@@ -214,7 +214,7 @@ def test_a_run_that_lost_a_worker_and_was_resumed_equals_one_in_processes_that_l
 ):
     if kind == "ray":
         pytest.importorskip("ray")
-    words = [*TINY, *LATE, "frames=1600"]
+    words = [*TINY, *LATE, "frames=800"]
     whole = started("whole.txt", *words, *TWO, "hydra.run.dir=whole")
     assert whole.wait(LIMIT) == 0
     cut = started("cut.txt", *words, f"collector={kind}", "workers=2", "hydra.run.dir=cut")
