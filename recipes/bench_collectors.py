@@ -1,19 +1,19 @@
-"""Environment steps per second of a training with each collector (docs/scaling.md).
+"""Environment steps per second with each collector (docs/scaling.md).
 
-    python -m damian.recipes.bench_collectors [ROUNDS] [COLLECTOR ...]
+    python -m damian.recipes.bench_collectors [ROUNDS]
 
-All collectors run at the same time and are measured in turns, a few batches each, so that whatever else the
-machine does concerns all of them; the table has medians.
+All collectors run at the same time and take turns, a few batches each, and so does learning, so that whatever
+else the machine does concerns all of them. The numbers are medians.
 """
 
 import statistics
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import NamedTuple
 
 import torch
+from tensordict import TensorDictBase
 
 from damian.common.markdown import markdown_table
 from damian.common.threads import using_threads
@@ -28,64 +28,59 @@ TASKS = {
     "spotting (cheap)": ["scenario=spotting"],
     "tracking with a belief (expensive)": ["scenario=delaybench/tracking", "delay=paper", "aware=belief"],
 }
-WORKERS = 2
-BATCHES = 2
+COLLECTORS: dict[str, list[str]] = {
+    "sync": [],
+    "process": ["collector=process", "workers=2"],
+    "ray": ["collector=ray", "workers=2"],
+}
+"""Overrides that choose each collector."""
+BATCHES = 3
 """Batches of a collector in each round."""
 
-
-class Rate(NamedTuple):
-    """Environment steps per second, over all worlds."""
-
-    collected: float
-    trained: float
+Learn = Callable[[TensorDictBase], object]
 
 
-def rates(words: list[str], stack: ExitStack) -> Iterator[Rate]:
-    """Train; yields the speed of collecting, and of collecting and learning, in each update."""
+def begun(words: list[str], stack: ExitStack) -> tuple[Iterator[TensorDictBase], Learn]:
+    """Start a training; returns its batches, the first of which has been collected, and how it learns."""
     config = composed_config(*words)
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     learner = make_learner(config, env, replay_buffer(config, env))
-    collector = stack.enter_context(collecting(config, env, learner.actor))
-    batches = ticks(collector, clock, env.server)
-    while True:
-        begin = time.perf_counter()
-        batch = next(batches)
-        collected = time.perf_counter() - begin
+    batches = ticks(stack.enter_context(collecting(config, env, learner.actor)), clock, env.server)
+    next(batches)
+
+    def learn(batch: TensorDictBase) -> None:
         with using_threads(config.learning_threads):
             learner.learn(batch)
-        yield Rate(batch.numel() / collected, batch.numel() / (time.perf_counter() - begin))
+
+    return batches, learn
 
 
-def table(kinds: list[str], rounds: int) -> str:
-    """Measure all tasks and collectors."""
-    rows = []
-    for task, words in TASKS.items():
-        with ExitStack() as stack:
-            runs = {kind: rates([*words, *chosen(kind)], stack) for kind in kinds}
-            start = {kind: seconds_of(run) for kind, run in runs.items()}
-            measured: dict[str, list[Rate]] = {kind: [] for kind in kinds}
-            for _ in range(rounds):
-                for kind, run in runs.items():
-                    measured[kind] += [next(run) for _ in range(BATCHES)]
-        for kind in kinds:
-            medians = [statistics.median(rate) for rate in zip(*measured[kind], strict=True)]
-            rows.append([task, kind, *(f"{median:.0f}" for median in medians), f"{start[kind]:.0f}"])
-    return markdown_table(["task", "collector", "collected/s", "trained/s", "start [s]"], rows, left=2)
-
-
-def chosen(kind: str) -> list[str]:
-    """Overrides that choose a collector."""
-    return [] if kind == "sync" else [f"collector={kind}", f"workers={WORKERS}"]
-
-
-def seconds_of(run: Iterator[Rate]) -> float:
-    """Seconds until a run has made its first update."""
-    begin = time.perf_counter()
-    next(run)
-    return time.perf_counter() - begin
+def rows(task: str, words: list[str], rounds: int) -> Iterator[list[str]]:
+    """Measure the collectors in a task; yields a row of the table for each."""
+    with ExitStack() as stack:
+        start, runs = {}, {}
+        for name, choice in COLLECTORS.items():
+            begin = time.perf_counter()
+            runs[name] = begun([*words, *choice], stack)
+            start[name] = time.perf_counter() - begin
+        seconds: dict[str, list[float]] = {name: [] for name in (*runs, "learning")}
+        for _ in range(rounds):
+            for name, (batches, _) in runs.items():
+                for _ in range(BATCHES):
+                    begin = time.perf_counter()
+                    batch = next(batches)
+                    seconds[name].append(time.perf_counter() - begin)
+            begin = time.perf_counter()
+            runs["sync"][1](batch)
+            seconds["learning"].append(time.perf_counter() - begin)
+    median = {name: statistics.median(found) for name, found in seconds.items()}
+    for name in runs:
+        rates = [batch.numel() / (median[name] + more) for more in (0, median["learning"])]
+        yield [task, name, *(f"{rate:.0f}" for rate in rates), f"{start[name]:.0f}"]
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    number, *names = sys.argv[1:] or ["5"]
-    print(table(names or ["sync", "process", "ray"], int(number)))
+    measured = [row for task in TASKS.items() for row in rows(*task, int((sys.argv[1:] or ["5"])[0]))]
+    heads = ["task", "collector", "collected/s", "collected and learnt/s", "start [s]"]
+    print(markdown_table(heads, measured, left=2))

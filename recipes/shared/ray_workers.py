@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import random
 import re
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -88,6 +89,7 @@ class RayWorkers:
         compiled: dict[str, Any] | None,
     ) -> None:
         check_installed("collector")
+        state = random.getstate()  # Ray draws from Python's generator, of which the run has seeded this one
         self._ray, self._connected = connected_ray(len(makers))
         from torchrl.collectors.distributed import RayCollector  # noqa: PLC0415 (needs Ray)
 
@@ -104,6 +106,7 @@ class RayWorkers:
         )
         self._workers = list(self.batches.remote_collectors)
         self.batches.update_policy_weights_(actor)
+        random.setstate(state)
 
     def _places(self, number: int) -> Any:
         """Room for ``number`` workers in the cluster, all at once."""
