@@ -64,6 +64,7 @@ def rows(task: str, words: list[str], rounds: int) -> Iterator[list[str]]:
             runs[name] = begun([*words, *choice], stack)
             start[name] = time.perf_counter() - begin
         seconds: dict[str, list[float]] = {name: [] for name in (*runs, "learning")}
+        batch = next(runs["sync"][0])
         for _ in range(rounds):
             for name, (batches, _) in runs.items():
                 for _ in range(BATCHES):
