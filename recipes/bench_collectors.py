@@ -24,9 +24,11 @@ from .shared.launch import composed_config
 from .shared.learning_env import learning_env
 from .train import make_learner, replay_buffer
 
+TRACKING = ["scenario=delaybench/tracking", "delay=paper", "aware=belief"]
 TASKS = {
-    "spotting (cheap)": ["scenario=spotting"],
-    "tracking with a belief (expensive)": ["scenario=delaybench/tracking", "delay=paper", "aware=belief"],
+    "spotting, 64 worlds": ["scenario=spotting"],
+    "tracking with a belief, 128 worlds": TRACKING,
+    "tracking with a belief, 1024 worlds": [*TRACKING, "worlds=1024"],
 }
 COLLECTORS: dict[str, list[str]] = {
     "sync": [],
