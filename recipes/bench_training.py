@@ -29,8 +29,9 @@ from damian.learners.schedule import SystemClock
 
 from .shared.collecting import make_collector, ticks
 from .shared.launch import composed_config
+from .shared.learning_env import learning_env
 from .shared.settings import TrainConfig
-from .train import learning_env, make_learner, replay_buffer
+from .train import make_learner, replay_buffer
 
 RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
 RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
@@ -105,7 +106,7 @@ def damian(config: TrainConfig) -> Iterator[Seconds]:
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     learner = cast(Mappo, make_learner(config, env, replay_buffer(config, env)))
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
-    batches = ticks(collector, clock)
+    batches = ticks(collector, clock, env.server)
     while True:
         begin = time.perf_counter()
         batch = next(batches)

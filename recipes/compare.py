@@ -3,6 +3,7 @@
     damian compare experiment=usecase2 seeds=10 processes=2
     damian compare experiment=delaybench "tasks=[tracking]" "arms=[undelayed,naive,both]"
     damian compare experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
+    damian compare experiment=usecase2 seeds=10 processes=40 launcher=slurm "slurm={slurm_partition: cpu}"
     damian compare experiment=usecase2 report_only=true
     damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench
 
@@ -20,6 +21,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +55,8 @@ from .shared.composition_errors import COMPOSITION_ERRORS, one_line
 from .shared.experiment import Experiment
 from .shared.known_settings import CONF
 from .shared.launch import checked, launch, reported, shown
-from .shared.parallel import LOG, Run, check_stored, perform_all
+from .shared.launchers import LAUNCHERS, RayTasks, SlurmJobs
+from .shared.parallel import LOG, Launcher, Run, check_stored, perform_all
 from .train import train
 
 TABLE, MARKDOWN, FIGURE, CURVES = "table.csv", "table.md", "figure.png", "curves.png"
@@ -71,6 +74,13 @@ class CompareConfig:
     """Number of seeds, counted from ``experiment.first_seed``."""
     processes: int = 1
     """Number of runs at the same time; each has one thread unless ``overrides`` sets ``threads``."""
+    launcher: str = "local"
+    """Where the runs are carried out: in processes of this machine (``local``), as Ray tasks (``ray``) on the
+    cluster of ``RAY_ADDRESS`` or else on this machine, or as Slurm jobs (``slurm``). All machines must see
+    the folder of the comparison (docs/scaling.md)."""
+    slurm: Any = None
+    """Parameters of submitit's executor with ``launcher=slurm``, such as
+    ``{slurm_partition: cpu, timeout_min: 600}``; ``{cluster: local}`` starts the jobs on this machine."""
     tasks: list[str] | None = None
     """Names of the tasks to run; all of the experiment's if not given."""
     delays: list[str] | None = None
@@ -89,6 +99,11 @@ class CompareConfig:
     def __post_init__(self) -> None:
         checks.whole("seeds", self.seeds, 1, 10_000)
         checks.whole("processes", self.processes, 1, 1024)
+        checks.one_of("launcher", self.launcher, LAUNCHERS)
+        should = "means nothing without launcher=slurm"
+        checks.require(self.slurm is None or self.launcher == "slurm", "slurm", self.slurm, should)
+        mapping = self.slurm is None or isinstance(self.slurm, dict)
+        checks.require(mapping, "slurm", self.slurm, "is no mapping such as {slurm_partition: cpu}")
         checks.one_of("score", self.score, SCORES)
         checks.one_of("policy", self.policy, POLICIES)
         for word in self.overrides:
@@ -171,6 +186,15 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         yield Run(task, delay, name, seeded, folder / seed_folder, program, trains=program is train)
 
 
+def launcher_of(config: CompareConfig, folder: Path) -> Launcher | None:
+    """What carries out the runs of a comparison; None: processes of this machine."""
+    if config.launcher == "ray":
+        return partial(RayTasks, config.processes)
+    if config.launcher == "slurm":
+        return partial(SlurmJobs, config.processes, folder / "slurm", config.slurm or {})
+    return None
+
+
 def report(config: CompareConfig, results: Results, missing: Sequence[str], folder: Path) -> None:
     """Write the tables and the figures.
 
@@ -247,7 +271,8 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
         check_stored(run)
     try:
         if not config.report_only:
-            failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score))
+            told, launcher = (POLICIES[config.policy], config.score), launcher_of(config, folder)
+            failed = perform_all(runs, config.processes, told, launcher)
     except KeyboardInterrupt:
         print("interrupted; run the same command again to continue", file=sys.stderr)
         sys.exit(exit_code(signal.SIGINT))

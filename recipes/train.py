@@ -14,8 +14,8 @@ and the evaluation as result.csv and result.md (docs/runs.md).
 """
 
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager, closing, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -50,32 +50,20 @@ from damian.replay.backupdate import BackupdateStorage
 from damian.replay.corrections import corrections_of
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
-from damian.transforms.episode_totals import EpisodeTotals
 
-from .shared.collecting import make_collector, ticks
+from .shared.collecting import collecting, collector_parts, ticks
 from .shared.inheritance import settings_by_key
 from .shared.known_settings import CONF
 from .shared.launch import interrupted, launch, perform, prepare, reported
+from .shared.learning_env import learning_env
 from .shared.settings import TrainConfig
 from .shared.stored_runs import run_folder, save_config, stored_config
 from .shared.training_film import film_policy
+from .shared.workers import WorkerLost
 
 MEANING = """sampled: actions are drawn from the policy's distribution; mode: the most likely action is taken.
 Fly the one with the higher return: a policy without memory often needs chance to search."""
 """Lines under the table of an evaluation."""
-
-
-def learning_env(config: TrainConfig) -> DelayedEnv:
-    """The environment of the training, [B], with what the learner and the logs need."""
-    messages = config.backupdates or config.clock.trigger is not None
-    privileged = config.critic == "privileged"
-    reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
-    extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
-    env = make_env(config.train_scenario, config.worlds, config.seed, config.device, extras)
-    if config.compile:
-        env.compile()
-    env.append_transform(EpisodeTotals())
-    return env
 
 
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
@@ -137,36 +125,62 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
     learner = make_learner(config, env, buffer)
-    collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
-    state = TrainingState(folder, learner.components(), collector, clock, buffer)
-    begin(config, state)
-    print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
-    loggers, log_to = make_loggers(config.logger.custom, folder), config.logger
-    frames, settings = state.progress.frames, dict(settings_by_key(config))
-    log = MetricsLog(folder, log_to.tensorboard, log_to.csv, frames, loggers, settings)
-    bar = progress_bar(config, state)
-    with closing(log), closing(bar), Interrupt() as interrupt:
-        for batch in ticks(collector, clock) if not enough(config, state) else ():
-            numbers = update(config, learner, state, log, batch)
-            if watch:
-                watch(state.progress.frames, numbers)
-            show(bar, config, state)
-            finished, asked = enough(config, state), interrupt.asked
-            if finished or state.progress.updates % config.checkpoint_every == 0:
-                log.sync()
-                state.save_best()
-                state.save()
-            elif asked:
-                log.sync()
-                state.save()
-            if finished or asked:
-                break
-    collector.shutdown()
+    with collecting(config, env, learner.actor) as collector:
+        state = TrainingState(folder, learner.components(), collector_parts(collector), clock, buffer)
+        begin(config, state)
+        print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
+        log = open_log(config, state)
+        with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
+            batches = ticks(collector, clock, env.server)
+            with saved_if_lost(state, log, interrupt):
+                for batch in batches if not enough(config, state) else ():
+                    numbers = update(config, learner, state, log, batch)
+                    if watch:
+                        watch(state.progress.frames, numbers)
+                    show(bar, config, state)
+                    if save_or_stop(config, state, log, interrupt):
+                        break
     if interrupt.asked:
         sys.exit(interrupted(folder, interrupt.asked))
     random = report(config, folder, make_eval_env(config), learner.actor)
     plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {learner_title(config)}")
     print(f"learning curve: {folder / FIGURE}")
+
+
+def open_log(config: TrainConfig, state: TrainingState) -> MetricsLog:
+    """The files and loggers that get the numbers of each update."""
+    loggers, log_to = make_loggers(config.logger.custom, state.folder), config.logger
+    frames, settings = state.progress.frames, dict(settings_by_key(config))
+    return MetricsLog(state.folder, log_to.tensorboard, log_to.csv, frames, loggers, settings)
+
+
+def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> bool:
+    """Write a checkpoint after an update if one is due; returns whether the training ends here."""
+    finished, asked = enough(config, state), interrupt.asked is not None
+    due = finished or state.progress.updates % config.checkpoint_every == 0
+    if due or asked:
+        log.sync()
+        if due:
+            state.save_best()
+        state.save()
+    return finished or asked
+
+
+@contextmanager
+def saved_if_lost(state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> Iterator[None]:
+    """If a worker is lost, write the checkpoint of the latest update, and say how to go on.
+
+    Raises:
+        RunError: a worker was lost; not if the run was asked to stop, as a batch system asks all processes.
+    """
+    try:
+        yield
+    except WorkerLost as error:
+        log.sync()
+        state.save()
+        if not interrupt.asked:
+            saved = f"{state.folder / CHECKPOINT} is of update {state.saved}, the latest"
+            raise RunError(f"{error}; {saved}; continue with resume={state.folder}") from error
 
 
 def begin(config: TrainConfig, state: TrainingState) -> None:

@@ -50,7 +50,7 @@ class TrainingState:
     Args:
         folder: the run folder.
         components: of the learner, by name.
-        collector: with the environment; made, so that it has reset the environment.
+        collector: what changes while worlds step, by name; it has reset the environment.
         clock: the system clock.
         buffer: replay buffer on a ``TimeStorage``, if there is one.
     """
@@ -59,7 +59,7 @@ class TrainingState:
         self,
         folder: Path,
         components: Mapping[str, Any],
-        collector: Collector,
+        collector: Mapping[str, Any],
         clock: SystemClock,
         buffer: ReplayBuffer | None = None,
     ) -> None:
@@ -73,8 +73,7 @@ class TrainingState:
             "progress": self.progress,
             "episodes": self.episodes,
             "clock": clock,
-            "environment": collector.env,
-            "collector": _CarriedStep(collector),
+            **collector,
             **replay,
             "random": RandomState(),  # last, because loading the others may draw numbers
         }
@@ -174,7 +173,7 @@ def _content(path: Path, key: str) -> dict[str, Any]:
     return content
 
 
-class _CarriedStep:
+class CarriedStep:
     """The TensorDict with which a collector takes its next step: observations, hidden states, counters."""
 
     def __init__(self, collector: Collector) -> None:

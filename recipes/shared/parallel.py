@@ -8,11 +8,12 @@ import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -130,13 +131,20 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, node
 
 
-def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> list[Run]:
+Launcher = Callable[[], Executor]
+"""Makes what carries out runs elsewhere (``recipes/shared/launchers.py``), several at the same time."""
+
+
+def perform_all(
+    runs: Sequence[Run], processes: int, told: tuple[str, str], launcher: Launcher | None = None
+) -> list[Run]:
     """Carry out the runs that are not finished; returns those that failed.
 
     Args:
         runs: a run that flies the policy of another one must come after it.
         processes: number of runs at the same time.
         told: policy and measure of the latest run that the progress bar shows.
+        launcher: for runs that are not carried out in processes of this machine.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
@@ -144,7 +152,7 @@ def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> l
     todo, failed = [run for run in runs if not run.finished], []
     with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
         for trains in (True, False):  # two pools, because a pool whose worker was killed accepts no more runs
-            for run, error in perform_each([run for run in todo if run.trains == trains], processes):
+            for run, error in perform_each([r for r in todo if r.trains == trains], processes, launcher):
                 bar.update()
                 if error:
                     failed.append(run)
@@ -153,19 +161,26 @@ def perform_all(runs: Sequence[Run], processes: int, told: tuple[str, str]) -> l
     return failed
 
 
-def perform_each(runs: Iterable[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
+def perform_each(
+    runs: Iterable[Run], processes: int, launcher: Launcher | None = None
+) -> Iterator[tuple[Run, BaseException | None]]:
     """Carry out runs; yields each, when it has ended, with its error, or None.
 
     Args:
         runs: taken from an iterator one by one, as processes become free.
         processes: number of runs at the same time; a single one is this process.
+        launcher: for runs that are not carried out in processes of this machine.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
     """
     _stop.clear()
     with _sigterm_as_ctrl_c():
-        yield from _in_turn(runs) if processes == 1 else _in_pool(runs, processes)
+        if launcher is None and processes == 1:
+            yield from _in_turn(runs)
+        else:
+            here = partial(ProcessPoolExecutor, processes, _SPAWN, _begin, (_stop,))
+            yield from _in_pool(runs, processes, launcher or here)
 
 
 @contextmanager
@@ -189,10 +204,12 @@ def _in_turn(runs: Iterable[Run]) -> Iterator[tuple[Run, BaseException | None]]:
             yield run, None
 
 
-def _in_pool(runs: Iterable[Run], processes: int) -> Iterator[tuple[Run, BaseException | None]]:
+def _in_pool(
+    runs: Iterable[Run], processes: int, launcher: Launcher
+) -> Iterator[tuple[Run, BaseException | None]]:
     """Carry out runs in worker processes."""
     waiting, futures = iter(runs), dict[Future[None], Run]()
-    with ProcessPoolExecutor(processes, _SPAWN, _begin, (_stop,)) as pool:
+    with launcher() as pool:
         try:
             while futures := futures | _submit(pool, islice(waiting, processes - len(futures))):
                 for future in wait(futures, return_when=FIRST_COMPLETED).done:
@@ -209,7 +226,7 @@ def _in_pool(runs: Iterable[Run], processes: int) -> Iterator[tuple[Run, BaseExc
             raise
 
 
-def _submit(pool: ProcessPoolExecutor, runs: Iterable[Run]) -> dict[Future[None], Run]:
+def _submit(pool: Executor, runs: Iterable[Run]) -> dict[Future[None], Run]:
     """Submit runs to workers that start with Ctrl-C ignored: only a training run handles it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -218,7 +235,7 @@ def _submit(pool: ProcessPoolExecutor, runs: Iterable[Run]) -> dict[Future[None]
         signal.signal(signal.SIGINT, before)
 
 
-def _submitted(pool: ProcessPoolExecutor, run: Run) -> Future[None]:
+def _submitted(pool: Executor, run: Run) -> Future[None]:
     """What becomes of a run; an error if a worker of the pool was killed before it could begin."""
     try:
         return pool.submit(_perform, run)

@@ -26,6 +26,9 @@ MAX_BATCH = 100_000_000
 """Most environment steps, over all worlds, that are collected before an update; they lie in memory."""
 
 
+COLLECTORS = ("sync", "process", "ray")
+
+
 @dataclass
 class LoggerConfig:
     """Which files of metrics the training writes into the run folder."""
@@ -92,6 +95,14 @@ class TrainConfig(ScenarioConfig):
     threads: int | None = None
     """Number of threads with which the networks learn; all cores if not given. The worlds always step with
     one, because their tensors are small. Another number of threads gives other rounding errors."""
+    collector: str = "sync"
+    """Where the worlds step: in this process (``sync``), in ``workers`` processes of this machine
+    (``process``), or in ``workers`` Ray actors (``ray``), on the cluster of ``RAY_ADDRESS`` or else on this
+    machine. The workers get the weights of the actor before every batch (docs/scaling.md)."""
+    workers: int = 1
+    """Number of workers, among which the worlds are divided evenly, with ``collector=process`` or ``ray``;
+    each needs a core. The worlds are those of ``collector=sync``; actions are drawn from a generator for
+    each worker, whose seed follows from ``seed`` and the worker's number."""
     compile: bool = False
     """Compile the environment's step, the actor's, and the loss of MAPPO (unless ``model.rnn`` is set). The
     program then begins half a minute later, or a few seconds if it has run before; this pays off from about a
@@ -103,6 +114,8 @@ class TrainConfig(ScenarioConfig):
         should = f"is not the learner of these settings: choose one with learner={'|'.join(LEARNERS)}"
         checks.require(matches, "learner.name", self.learner.name, should)
         checks.one_of("critic", self.critic, ("server", "privileged"))
+        checks.one_of("collector", self.collector, COLLECTORS)
+        checks.in_range("workers", self.workers, 1, 1024)
         checks.in_range("seed", self.seed, 0, 2**31)
         for name in ("worlds", "eval_episodes"):
             checks.in_range(name, getattr(self, name), 1, checks.WORLDS)
@@ -133,6 +146,7 @@ class TrainConfig(ScenarioConfig):
         self.learner.check(setup)
         self._check_skip()
         self._check_backupdate()
+        self._check_workers()
         useless = self.delay.hold == "max" and self.longest_delay == 0
         checks.require(not useless, "delay.hold", "max", "means nothing without delayed messages (delay.obs)")
 
@@ -149,6 +163,15 @@ class TrainConfig(ScenarioConfig):
         for key in ("settle", "recompute_actor"):
             alone = getattr(self, key) and not self.backupdate
             checks.require(not alone, key, True, "means nothing without backupdate=true")
+
+    def _check_workers(self) -> None:
+        sync = self.collector == "sync"
+        alone, should = sync and self.workers > 1, "means nothing with collector=sync; choose process or ray"
+        checks.require(not alone, "workers", self.workers, should)
+        should = f"does not divide worlds={self.worlds}: every worker has as many worlds as the others"
+        checks.require(self.worlds % self.workers == 0, "workers", self.workers, should)
+        should = f"steps on processors; device={self.device} needs collector=sync"
+        checks.require(sync or self.device == "cpu", "collector", self.collector, should)
 
     def _check_skip(self) -> None:
         should = "does not go with model.rnn: hidden states change at every step, not only at decisions"

@@ -167,7 +167,7 @@ def batches(config: TrainConfig, n_steps: int, period: int) -> list[tuple[int, T
     collector = Collector(env, random_policy(env), frames_per_batch=frames, total_frames=-1)
     torch.manual_seed(3)
     collected, current = [], clock.period
-    for batch in ticks(collector, clock):
+    for batch in ticks(collector, clock, env.server):
         collected.append((current, batch))
         current = clock.period
         if sum(batch.shape[1] for _, batch in collected) >= n_steps:

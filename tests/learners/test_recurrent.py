@@ -22,6 +22,7 @@ from damian.learners.networks import ModelConfig, make_actor
 from damian.learners.recurrent import add_recurrent_state
 from damian.recipes import evaluate as evaluate_recipe
 from damian.recipes import oracle, train
+from damian.recipes.shared.collecting import make_collector
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
@@ -48,7 +49,7 @@ def delayed_env(kind: str = "discrete", motion: str = "instant", worlds: int = 4
 
 def batches(env: EnvBase, actor: torch.nn.Module, steps: int, n: int) -> Iterator[TensorDictBase]:
     """Collect n consecutive batches [B, T]."""
-    collector = train.make_collector(env, actor, env.batch_size.numel() * steps)
+    collector = make_collector(env, actor, env.batch_size.numel() * steps)
     yield from (batch.clone() for batch in itertools.islice(collector, n))
     collector.shutdown()
 

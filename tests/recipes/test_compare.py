@@ -178,6 +178,18 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
     assert "missing: usecase2/none/undelayed/seed_8" in (folder / "other" / "table.md").read_text()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["ray", "slurm"])
+def test_ray_tasks_and_slurm_jobs_give_the_same_results_as_this_process(compare, launcher):
+    pytest.importorskip("ray" if launcher == "ray" else "submitit")
+    words = [*TWO[:1], "seeds=1", "arms=[undelayed,unaware,deployed]", TWO[3]]
+    slurm = [] if launcher == "ray" else ["slurm={cluster: local}"]
+    expected = table(compare(*words) / "results.csv")
+    compare(*words, "processes=2", f"launcher={launcher}", *slurm, "hydra.run.dir=runs/usecase2/other")
+    found = table(Path("runs/usecase2/other/results.csv"))
+    assert [{**row, "seconds": 0} for row in found] == [{**row, "seconds": 0} for row in expected]
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -194,6 +206,9 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
         (["+seedz=3"], "seedz: no such key; did you mean seeds?"),
         (["seeds=0"], "seeds: 0 is not between 1 and"),
         (["processes=none"], "processes"),
+        (["launcher=cloud"], "launcher: cloud is not one of local, ray, slurm"),
+        (["slurm={cluster: local}"], "slurm: {'cluster': 'local'} means nothing without launcher=slurm"),
+        (["launcher=slurm", "slurm=cpu"], "slurm: cpu is no mapping such as {slurm_partition: cpu}"),
         (["score=age"], "score: age is not one of true_return, "),
         (["policy=best"], "policy: best is not one of sampled, mode"),
         (["experiment.arms.both.regime=R7"], "experiment.arms.both.regime: R7 is not one of R0, "),
