@@ -50,12 +50,13 @@ benchmarl: $(BENCHMARL)/ready
 	$(BENCHMARL_TRAIN) --algorithm qmix $(ARGS)
 	$(BENCHMARL_TRAIN) --algorithm mappo --scenario vmas/navigation $(ARGS)
 
-# The film of the README, and the figures of the stored results.
+# The film of the README, the figures of the delays, and those of the stored results.
 pictures: $(VENV)/base
 	rm -rf build/flight
 	$(VENV)/bin/damian fly scenario=delaybench/intermittent delay=burst aware=belief seed=2 episode.max_steps=40 \
 	  "formats=[gif]" hydra.run.dir=build/flight
 	cp build/flight/episode_0.gif docs/images/flight.gif
+	$(PY) docs/figures.py
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
 
 # The documentation site, in build/site.

@@ -1,14 +1,17 @@
 """The documents keep their word: their Python runs, their commands exist, their links lead somewhere."""
 
 import re
+import runpy
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
 
 import damian
+from damian import Constant
 from damian.delays.delay_line import DelayLine
 from damian.delays.samplers import Sampler
 from damian.evaluation.episode import COLUMNS
@@ -79,6 +82,14 @@ def test_the_delay_models_table_is_what_the_delay_line_and_back_updating_do():
     )
     known = [f"m{int(m)}" for m in latest_arrived(log).flatten()[:6]]
     assert known == cells["back-updated at step 7"][1:]
+
+
+def test_the_figure_of_the_delay_model_shows_what_back_updating_knows():
+    figures = runpy.run_path(str(ROOT / "docs" / "figures.py"))
+    assert figures["age_in_hindsight"](np.array([3, 1, 0, -1, 2, 0])).tolist() == [0, 0, 0, 1, 0, 0]
+    drawn = figures["draw_messages"](Constant(3), 6, seed=0)
+    assert drawn.delay.tolist() == [3] * 6
+    assert drawn.age.tolist() == [1, 2, 3, 3, 3, 3]
 
 
 def hold_messages(delays: list[int]) -> tuple[list[int], list[int]]:

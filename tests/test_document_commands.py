@@ -34,7 +34,15 @@ SHORTER = {
     "compare": ["seeds=1", "processes=1", f"overrides={json.dumps(TINY)}".replace('"', "'")],
 }
 """Settings that make the commands of a program short; they replace those of the document."""
-SWEPT = {"seed=0,1,2": "seed=0", "port=8000": "port=0"}
+INSTEAD = {
+    "seed=0,1,2": "seed=0",
+    "port=8000": "port=0",
+    "experiment=delays": "experiment=usecase2",
+    "slurm={slurm_partition: cpu, timeout_min: 600, mem_gb: 4}": "slurm={cluster: local, timeout_min: 600}",
+    "hydra/launcher=submitit_slurm": "hydra/launcher=submitit_local",
+    "hydra.launcher.partition=cpu": "hydra.launcher.timeout_min=60",
+}
+"""What stands instead of some words: fewer runs, any free port, and no Slurm."""
 PARK = [[-4.134, 52.808], [-4.122, 52.808], [-4.122, 52.817], [-4.134, 52.817], [-4.134, 52.808]]
 TABLE = (
     "ID,lat,lon,source spotted,AoI\nA,52.8110,-4.1283,0,2\nB,52.8133,-4.1264,0,0.5\nC,52.8154,-4.1281,1,NA\n"
@@ -50,7 +58,7 @@ def commands(text: str) -> list[list[str]]:
 
 def shortened(words: list[str]) -> list[str]:
     """A command with tiny numbers."""
-    words = [SWEPT.get(word, word) for word in words]
+    words = [INSTEAD.get(word, word) for word in words]
     if shutil.which("ffmpeg") is None:
         words = [word.replace(",mp4", "") for word in words]
     if any(word.startswith("resume=") for word in words):

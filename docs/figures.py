@@ -1,0 +1,95 @@
+"""Draws the figures of docs/concepts.md: what a delay is, and what the laws do (make pictures).
+
+python docs/figures.py
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torchrl.envs import GymEnv, TransformedEnv
+
+from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform
+
+IMAGES = Path(__file__).parent / "images"
+STEPS = 24
+LAWS = {
+    "constant: 3": Constant(3),
+    "the paper's: 15 % take 4 to 7 steps": Uniform(4, 7, probability=0.15),
+    "uniform: 1 to 7": Uniform(1, 7),
+    "geometric: 2 in the mean": Geometric(2),
+    "burst: at times 6 steps, half of them lost": Burst(enter=0.05, leave=0.2, bad=6, bad_loss=0.5),
+    "lag: for 20 steps the same, 0 to 6": Lag(Uniform(0, 6), update_period=20),
+}
+BLUE, ORANGE, GREY = "tab:blue", "tab:orange", "0.6"
+
+
+class Drawn(NamedTuple):
+    """Messages of consecutive steps, from step 1 on."""
+
+    delay: np.ndarray
+    """Delay of the message of each step [steps], -1 if it is lost, [T]."""
+    age: np.ndarray
+    """Age of the message that the receiver holds [steps], [T]."""
+
+
+def draw_messages(law: Any, n_steps: int, seed: int, loss: float = 0.0) -> Drawn:
+    """Let a law delay the observations of an environment."""
+    env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(law, loss=loss, delay_key="delay"))
+    env.set_seed(seed)
+    torch.manual_seed(seed)
+    steps = env.rollout(n_steps)["next"]
+    return Drawn(steps["delay"].flatten().numpy(), steps["age"].flatten().numpy())
+
+
+def age_in_hindsight(delay: np.ndarray) -> np.ndarray:
+    """Age of the newest message of each step or of an earlier one that ever arrives, [T]; step 0 is known."""
+    steps = np.arange(1, len(delay) + 1)
+    return steps - np.maximum.accumulate(np.where(delay >= 0, steps, 0))
+
+
+def plot_model(axes: tuple[Axes, Axes], drawn: Drawn) -> None:
+    """Draw each message from when it is sent until it arrives, and the ages of what is known."""
+    ways, ages = axes
+    for step, delay in enumerate(drawn.delay, 1):
+        if delay < 0:
+            ways.plot(step, 1, "x", color=ORANGE)
+            continue
+        ways.plot([step, step + delay], [1, 0], "-", color=BLUE if delay else GREY, lw=1)
+        ways.plot([step], [1], "o", color=BLUE, ms=3)
+        ways.plot([step + delay], [0], "v", color=BLUE, ms=4)
+    ways.set_yticks([0, 1], ["arrives", "sent"])
+    ways.set_title("Messages: each line is one on its way, crosses are lost", loc="left", fontsize=9)
+    steps = np.arange(1, len(drawn.age) + 1)
+    ages.step(steps, drawn.age, where="mid", color=BLUE, label="the server, when it acts")
+    hindsight = age_in_hindsight(drawn.delay)
+    ages.step(steps, hindsight, where="mid", color=ORANGE, label="back-updating, once all have arrived")
+    ages.set(xlabel="step", ylabel="age [steps]", xlim=(0.5, len(steps) + 0.5), ylim=(-0.4, 9))
+    ages.set_title("Age of the newest message that is known of a step", loc="left", fontsize=9)
+    ages.legend(fontsize=8, frameon=False, loc="upper left")
+
+
+def main() -> None:
+    """Draw and write both figures."""
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True)
+    plot_model((axes[0], axes[1]), draw_messages(Uniform(1, 7, probability=0.6), STEPS, seed=3, loss=0.12))
+    figure.savefig(IMAGES / "delay_model.png", dpi=110)
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    panels = figure.subplots(2, 3, sharex=True, sharey=True)
+    for panel, (name, law) in zip(panels.flat, LAWS.items(), strict=True):
+        age = draw_messages(law, 100, seed=0).age
+        panel.step(np.arange(1, len(age) + 1), age, where="mid", color=BLUE, lw=1)
+        panel.set_title(f"{name}\nmean age {age.mean():.1f}", fontsize=8, loc="left")
+    for panel in panels[:, 0]:
+        panel.set_ylabel("age [steps]", fontsize=8)
+    for panel in panels[-1]:
+        panel.set_xlabel("step", fontsize=8)
+    figure.savefig(IMAGES / "delay_laws.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()
