@@ -1,5 +1,6 @@
 """The documents keep their word: their Python runs, their commands exist, their links lead somewhere."""
 
+import dataclasses
 import re
 import runpy
 import shlex
@@ -13,6 +14,7 @@ import yaml
 import damian
 from damian import Constant
 from damian.delays.delay_line import DelayLine
+from damian.delays.laws import LAWS
 from damian.delays.samplers import Sampler
 from damian.evaluation.episode import COLUMNS
 from damian.recipes.command import PROGRAMS, SETTINGS
@@ -82,6 +84,20 @@ def test_the_delay_models_table_is_what_the_delay_line_and_back_updating_do():
     )
     known = [f"m{int(m)}" for m in latest_arrived(log).flatten()[:6]]
     assert known == cells["back-updated at step 7"][1:]
+
+
+def test_the_table_of_delay_laws_has_every_parameter_and_its_default():
+    text = (ROOT / "docs" / "concepts.md").read_text()
+    table = re.search(r"\| law \| parameters .*?\n\n", text, re.DOTALL)[0]
+    rows, laws = dict(re.findall(r"^\| `(\w+)`[^|]*\| ([^|]*) \|", table, re.MULTILINE)), dict(LAWS.items())
+    assert {*rows} == {*laws}
+    for law, cell in rows.items():
+        written = dict(re.findall(r"`(\w+)`(?: \[[^]]*\])?(?: \(([^)]*)\))?", cell))
+        fields = dataclasses.fields(laws[law])
+        assert [*written] == [field.name for field in fields]
+        for field in fields:
+            if type(field.default) in (int, float):
+                assert float(written[field.name]) == field.default, (law, field.name)
 
 
 def test_the_figure_of_the_delay_model_shows_what_back_updating_knows():

@@ -92,6 +92,7 @@ class UavEnv(EnvBase):
         server: Server | None = None,
         messages_only: bool = False,
     ) -> None:
+        checks.whole("num_worlds", num_worlds, 1, checks.WORLDS)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
         self.scenario = scenario or ScenarioConfig()
         self.extras, self.messages_only = frozenset(extras), messages_only

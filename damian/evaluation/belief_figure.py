@@ -25,6 +25,8 @@ _OTHERS = "0.6"
 
 _WIDTH = 7.0
 """Width of the figure [inches], that of a page's text."""
+_LARGE = 4
+"""Size of a region over that of the paths, from which on the map shows only the paths."""
 _ASPECT = 1.5
 """Width of the map divided by its height."""
 _OLD = "0.9"
@@ -92,11 +94,19 @@ def _draw_map(axis: Axes, flight: Episode, instant: int) -> None:
         axis.plot(*believed, "o", color=colour, markerfacecolor="none", markersize=9, zorder=4)
     axis.plot(*flight.source.T, color="black", linewidth=0.8, linestyle=":")
     axis.plot(*flight.source[instant], "*", color="black", markersize=10, zorder=5)
-    _zoom(axis, np.concatenate([flight.true.reshape(-1, 2), flight.source]), flight.radius)
+    _zoom(axis, _shown_positions(flight), flight.radius)
     has_error = not np.array_equal(flight.true[instant], flight.believed[instant])
     reason = ", when the server is most mistaken" if has_error else ""
     axis.set_title(f"paths, and the UAVs at {flight.time[instant]:g} s{reason}", fontsize="medium")
     _add_map_legend(axis, flight)
+
+
+def _shown_positions(flight: Episode) -> Floats:
+    """Positions that the map shows, [P, 2]: the paths, and the whole region unless they are small in it."""
+    paths = np.concatenate([flight.true.reshape(-1, 2), flight.source])
+    corners = np.reshape(shapely.bounds(flight.region), (2, 2))
+    small = np.ptp(corners, axis=0).max() > _LARGE * (np.ptp(paths, axis=0).max() + 2 * flight.radius)
+    return paths if small else np.concatenate([paths, corners])
 
 
 def _zoom(axis: Axes, positions: Floats, margin: float) -> None:
@@ -151,7 +161,7 @@ def _add_panel_legend(axis: Axes) -> None:
     handles = [
         _legend_entry("true", color="black", linewidth=0.8),
         _legend_entry("believed", linewidth=2.2),
-        Patch(color=_OLD, linewidth=0, label="belief is old"),
+        Patch(color=_OLD, linewidth=0, label="message is old"),
         _legend_entry("message arrives", marker=".", linestyle=""),
         _legend_entry("message is lost", marker="x", linestyle="", color="black", markersize=3.5),
     ]
@@ -163,7 +173,7 @@ def _draw_ages(axis: Axes, flight: Episode) -> None:
     for uav, colour in enumerate(_colours(flight)[:MOST_PANELS]):
         dashes = DASHES[uav % len(DASHES)]
         axis.step(flight.time, flight.age[:, uav], dashes, where="post", color=colour, linewidth=1.2)
-    axis.set_ylabel("age of\nbelief [s]")
+    axis.set_ylabel("age of\nmessage [s]")
     axis.set_ylim(0, 1.1 * float(flight.age.max()) or 1.0)
     axis.yaxis.set_major_locator(MaxNLocator(3))
     axis.set_title(f"mean age {flight.age.mean():.2f} s", fontsize="medium")

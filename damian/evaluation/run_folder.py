@@ -77,14 +77,15 @@ def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = F
     Args:
         rows: evaluations by name of the policy.
         can_succeed: whether the task can succeed; if so, success rate and steps are shown.
-        late: whether messages are delayed; if so, true measures are shown beside those that the server
-            perceived, with the age of information and the shares of late and lost messages.
+        late: whether messages are delayed; if so, what the server has seen stands beside what has truly
+            happened, with the age of information and the shares of late and lost messages.
     """
     success = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
-    columns = success | {"return": "episode_return"}
+    measures = success | {"return": "episode_return"}
+    columns = {title: f"true_{field}" for title, field in measures.items()} if late else measures
     if late:
-        columns |= {f"true {title}": f"true_{field}" for title, field in success.items()}
-        columns |= {"true return": "true_return", "age": "age", "late": "late", "lost": "lost"}
+        columns |= {f"seen {title}": field for title, field in measures.items()}
+        columns |= {"age": "age", "late": "late", "lost": "lost"}
     columns |= {"episodes": "episodes"}
     lines = (
         [name, *(_number(getattr(row, field)) for field in columns.values())] for name, row in rows.items()

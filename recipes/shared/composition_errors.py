@@ -123,6 +123,10 @@ def _about_key(text: str, error: BaseException, outer: str, program: str) -> str
     if key and re.search(_LIST, text):
         given = re.search(r"Error merging override \+*[\w.]+=(.*)", outer)
         return f"{key[1]}: it is a list: [{given[1] if given else '...'}]"
+    if key and (value := re.search(r"Value '(\S+)' of type 'float' could not be converted to Int", text)):
+        number = float(value[1])
+        whole = f"; write {number:.0f}" if number.is_integer() else ""
+        return f"{key[1]}: {value[1]} is not written as a whole number{whole}"
     return None
 
 

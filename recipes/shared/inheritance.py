@@ -1,7 +1,8 @@
 """A run that takes the policy of another one: the settings that it keeps, and those that must not change."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import fields, is_dataclass
+from inspect import get_annotations
 from typing import Any
 
 from damian.common.errors import InputError
@@ -11,19 +12,30 @@ from damian.envs.scenario import ScenarioConfig
 from .settings import TrainConfig
 
 
-def inherited(stored: TrainConfig, overrides: Sequence[str]) -> list[str]:
+def inherited(stored: TrainConfig, overrides: Sequence[str], own: Collection[str] = ()) -> list[str]:
     """The given overrides, preceded by those of a stored run that they do not replace.
 
     The policy keeps its histories of actions and messages, because it observes them, even if a file of the
     stored run's scenario or an option of ``delay`` says otherwise.
+
+    Args:
+        stored: settings of the stored run.
+        overrides: those of the new program.
+        own: keys that have another default in this program, which those of the stored run do not replace.
     """
-    given = [key_of(override) for override in overrides]
+    given = [*map(key_of, overrides), *own]
     history = [] if {"delay.history", "aware"} & {*given} else [f"delay.history={stored.delay.history}"]
     messages = stored.delay.messages
     history += [f"delay.messages={messages}"] if messages and "delay.messages" not in given else []
     replaced = [*given, *map(key_of, history)]
     kept = [old for old in stored.overrides if not any(_replaces(key, key_of(old)) for key in replaced)]
     return [*kept, *history, *overrides]
+
+
+def own_defaults(kind: type) -> set[str]:
+    """Keys of the training to which the settings of another program give another default."""
+    added = set[str]() if kind is TrainConfig else {*get_annotations(kind)}
+    return {field.name for field in fields(TrainConfig)} & added
 
 
 def key_of(override: str) -> str:

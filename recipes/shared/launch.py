@@ -32,7 +32,7 @@ from damian.evaluation.run_record import timed
 
 from .command_line import parsed, prepared, remember_words
 from .composition_errors import COMPOSITION_ERRORS, foreign_cause, one_line
-from .inheritance import changes, check_policy_fits, inherited
+from .inheritance import changes, check_policy_fits, inherited, own_defaults
 from .known_settings import CONF, SCHEMAS
 from .leftovers import drop_empty, drop_sweep, drop_unused, remember_folders, sweep_folder
 from .misspelt import no_such_key
@@ -77,7 +77,7 @@ def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
         raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
     stored = None if composed.checkpoint is None else stored_run(Path(composed.checkpoint))
     if stored:
-        overrides = inherited(stored, overrides)
+        overrides = inherited(stored, overrides, own_defaults(OmegaConf.get_type(composed)))
         composed = composed_with(str(hydra.job.config_name), overrides)
     config = checked(composed)
     config.overrides = overrides

@@ -103,7 +103,7 @@ def test_a_pickled_environment_continues_in_the_same_way(motion):
         assert same(act(env, action), act(twin_env, action))
 
 
-@pytest.mark.parametrize("vector", [SerialEnv, ParallelEnv])
+@pytest.mark.parametrize("vector", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
 def test_serial_and_parallel_environments_work(vector):
     env = vector(2, make_small)
     try:

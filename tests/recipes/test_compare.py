@@ -253,6 +253,7 @@ def test_a_mistake_in_an_experiment_of_ones_own_is_one_line(compare, capsys, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
 
+@pytest.mark.slow
 def test_a_comparison_flies_policies_in_held_out_tasks_and_the_script_that_knows_ever_more(compare, tmp_path):
     (tmp_path / "mine/experiment").mkdir(parents=True)
     (tmp_path / "mine/experiment/script.yaml").write_text(

@@ -335,6 +335,7 @@ def test_where_nothing_is_won_by_the_source_a_belief_is_left_out(spotted, succes
     assert config.observation.own
 
 
+@pytest.mark.slow
 def test_a_notebook_that_imports_damian_keeps_its_own_figures():
     code = "import matplotlib; matplotlib.use('svg'); import damian; damian.compose_scenario()\n"
     code += "import damian.evaluation.film, damian.recipes.train; print(matplotlib.get_backend())"

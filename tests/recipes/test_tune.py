@@ -67,6 +67,7 @@ def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys
     assert (folder / "trial_0" / "metrics.csv").stat().st_mtime_ns == written
 
 
+@pytest.mark.slow
 def test_a_killed_search_goes_on_with_the_trial_that_it_was_training(search):
     folder = search("trials=1")
     with killed_after(1):
@@ -87,6 +88,7 @@ def test_several_processes_share_a_search(search):
     assert len(rows(search("trials=3", "processes=2") / "trials.csv")) == 3
 
 
+@pytest.mark.slow
 def test_a_trial_that_is_worse_than_others_is_pruned(search, monkeypatch):
     hopeless = optuna.pruners.ThresholdPruner(lower=1e9)
     monkeypatch.setattr(tune.optuna.pruners, "MedianPruner", lambda *_, **__: hopeless)
