@@ -81,10 +81,10 @@ def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = F
             happened, with the age of information and the shares of late and lost messages.
     """
     success = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
-    measures = success | {"return": "episode_return"}
-    columns = {title: f"true_{field}" for title, field in measures.items()} if late else measures
+    columns = seen = success | {"return": "episode_return"}
     if late:
-        columns |= {f"seen {title}": field for title, field in measures.items()}
+        columns = {title: f"true_{field}" for title, field in success.items()} | {"return": "true_return"}
+        columns |= {f"seen {title}": field for title, field in seen.items()}
         columns |= {"age": "age", "late": "late", "lost": "lost"}
     columns |= {"episodes": "episodes"}
     lines = (

@@ -84,6 +84,8 @@ def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run,
     assert all(episode.about["policy"] == "mode" for episode in episodes)
     returns = [episode.perceived_return for episode in episodes]
     assert returns == sorted(returns)
+    one = run("policy=mode", "checkpoint=trained", folder="one")  # not as many as the training evaluated
+    assert [path.name for path in one.glob("episode_*.json")] == ["episode_0.json"]
 
 
 def test_the_episodes_are_those_in_which_a_training_evaluates_its_policy(run, monkeypatch):
