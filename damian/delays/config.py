@@ -20,11 +20,13 @@ class DelayConfig:
     """Delays and how they are handled. A law is a number of steps, a time, or a mapping (``law_of``)."""
 
     obs: Any = 0
-    """Law of the delay of each UAV's messages to the server node (paper, section 3.4)."""
+    """Delay of each UAV's messages to the server node (paper, section 3.4): steps such as 3, a time such as
+    3s, or a law such as {law: uniform, low: 3s, high: 7s}; there are constant, uniform, geometric, burst,
+    trace, lag and distance (docs/concepts.md has their parameters), and one's own (docs/extending.md)."""
     act: Any = 0
-    """Law of the delay of each action (section 3.3); a UAV holds its position until the first one arrives."""
+    """Delay of each action (section 3.3), written as ``obs``; a UAV holds until the first one arrives."""
     rew: Any = 0
-    """Law of the delay of the rewards, which must not lose any (section 3.5)."""
+    """Delay of the rewards, written as ``obs``; the law must not lose any (section 3.5)."""
     loss: float = 0.0
     """Probability that a message to the server node is lost."""
     hold: str = "none"
