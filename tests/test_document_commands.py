@@ -23,15 +23,16 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PROGRAM = [sys.executable, "-W", "ignore", "-c", "from damian.recipes.command import main; main()"]
 TINY = ["frames=64", "worlds=8", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]
+OF_RUNS = f"overrides={json.dumps([word for word in TINY if word != 'logger=csv'])}".replace('"', "'")
 FLIGHTS = ["eval_episodes=3"]
 SHORTER = {
     "train": TINY,
-    "tune": ["trials=2", "processes=1", f"overrides={json.dumps(TINY)}".replace('"', "'")],
+    "tune": ["trials=2", "processes=1", OF_RUNS],
     "evaluate": FLIGHTS,
     "fly": [*FLIGHTS, "episode.max_steps=12"],
     "oracle": FLIGHTS,
     "ceiling": FLIGHTS,
-    "compare": ["seeds=1", "processes=1", f"overrides={json.dumps(TINY)}".replace('"', "'")],
+    "compare": ["seeds=1", "processes=1", OF_RUNS],
 }
 """Settings that make the commands of a program short; they replace those of the document."""
 INSTEAD = {
