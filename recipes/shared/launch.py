@@ -77,7 +77,7 @@ def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
         raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
     stored = None if composed.checkpoint is None else stored_run(Path(composed.checkpoint))
     if stored:
-        overrides = inherited(stored, overrides, own_defaults(OmegaConf.get_type(composed)))
+        overrides = inherited(stored, overrides, own_defaults(OmegaConf.get_type(composed) or TrainConfig))
         composed = composed_with(str(hydra.job.config_name), overrides)
     config = checked(composed)
     config.overrides = overrides
