@@ -25,6 +25,7 @@ from helpers import (
 from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
+from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
@@ -101,6 +102,11 @@ def test_a_pickled_environment_continues_in_the_same_way(motion):
     for _ in range(5):
         action = random_actions(env, generator)
         assert same(act(env, action), act(twin_env, action))
+
+
+def test_there_is_at_least_one_world():
+    with pytest.raises(InputError, match="num_worlds: 0 is not between 1 and"):
+        UavEnv(square(), num_worlds=0)
 
 
 @pytest.mark.parametrize("vector", [SerialEnv, pytest.param(ParallelEnv, marks=pytest.mark.slow)])
