@@ -26,7 +26,7 @@ _OTHERS = "0.6"
 _WIDTH = 7.0
 """Width of the figure [inches], that of a page's text."""
 _LARGE = 4
-"""Size of a region over that of the paths, from which on the map shows only the paths."""
+"""The map leaves out the border of a region that is more than this many times as large as the paths in it."""
 _ASPECT = 1.5
 """Width of the map divided by its height."""
 _OLD = "0.9"

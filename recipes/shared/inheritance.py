@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from inspect import get_annotations
 from typing import Any
 
 from damian.common.errors import InputError
@@ -34,8 +33,8 @@ def inherited(stored: TrainConfig, overrides: Sequence[str], own: Collection[str
 
 def own_defaults(kind: type) -> set[str]:
     """Keys of the training to which the settings of another program give another default."""
-    added = set[str]() if kind is TrainConfig else {*get_annotations(kind)}
-    return {field.name for field in fields(TrainConfig)} & added
+    defaults = {field.name: field.default for field in fields(TrainConfig)}
+    return {field.name for field in fields(kind) if field.default != defaults.get(field.name, field.default)}
 
 
 def key_of(override: str) -> str:

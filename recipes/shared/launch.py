@@ -117,14 +117,19 @@ def composed_config(*overrides: str) -> TrainConfig:
         GlobalHydra.instance().hydra = running
 
 
+def seed_generators(seed: int) -> None:
+    """Seed the global random generators of torch, NumPy and Python; components of one's own may use each."""
+    for set_seed in (torch.manual_seed, np.random.seed, random.seed):
+        set_seed(seed)
+
+
 def perform(config: TrainConfig, folder: Path, program: Program) -> None:
     """Run a program in one thread with the seed of its configuration.
 
     A run that is refused before it has learnt or measured anything leaves no folder.
     """
     torch.set_num_threads(1)
-    for seed in (torch.manual_seed, np.random.seed, random.seed):  # components of one's own may use them
-        seed(config.seed)
+    seed_generators(config.seed)
     was_empty = not is_folder(folder) or not any(folder.iterdir())
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ import random
 import re
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torchrl.collectors import Collector
@@ -15,13 +15,27 @@ from torchrl.envs import EnvBase
 from damian.common.errors import InputError
 from damian.common.threads import available_cores
 
-Maker = Callable[[], EnvBase]
 START_LIMIT = 300
 """Seconds after which a Ray cluster that has no room for the workers is given up."""
 ANSWER_LIMIT = 20
 """Seconds in which a worker answers, unless it is collecting."""
 _ENDLESS = 2**62
 """Environment steps that no run reaches; ``RayCollector`` collects nothing if it is told -1."""
+
+
+class WorkerPlan(NamedTuple):
+    """What workers collect, wherever they are."""
+
+    makers: Sequence[Callable[[], EnvBase]]
+    """Makes the environment of each worker, in its process."""
+    actor: torch.nn.Module
+    """The actor whose weights the workers get before each batch."""
+    frames: int
+    """Environment steps of a batch, over all workers."""
+    collector: type[Collector]
+    """Class of a worker's collector."""
+    compiled: dict[str, Any] | None
+    """Options of the compiled actor, or None."""
 
 
 def check_installed(key: str) -> None:
@@ -71,42 +85,31 @@ class RayWorkers:
     """Workers as Ray actors with one CPU each.
 
     Args:
-        makers: makes the environment of each worker, in its process.
-        actor: the actor whose weights the workers get before each batch.
-        frames: environment steps of a batch, over all workers.
-        collector: class of a worker's collector.
-        compiled: options of the compiled actor, or None.
+        plan: what they collect.
 
     Raises:
         InputError: Ray is not installed, or has had no room for ``START_LIMIT`` seconds.
     """
 
-    def __init__(
-        self,
-        makers: Sequence[Maker],
-        actor: torch.nn.Module,
-        frames: int,
-        collector: type[Collector],
-        compiled: dict[str, Any] | None,
-    ) -> None:
+    def __init__(self, plan: WorkerPlan) -> None:
         check_installed("collector")
         state = random.getstate()  # Ray draws from Python's generator, of which the run has seeded this one
-        self._ray, self._connected = connected_ray(len(makers))
+        self._ray, self._connected = connected_ray(len(plan.makers))
         from torchrl.collectors.distributed import RayCollector  # noqa: PLC0415 (needs Ray)
 
         self.batches = RayCollector(
-            list(makers),
-            actor,
-            frames_per_batch=frames,
+            list(plan.makers),
+            plan.actor,
+            frames_per_batch=plan.frames,
             total_frames=_ENDLESS,
             sync=True,
             update_after_each_batch=True,
-            collector_class=cast(Any, collector),
-            collector_kwargs={"auto_register_policy_transforms": True, "compile_policy": compiled},
-            remote_configs={"num_cpus": 1, "scheduling_strategy": self._places(len(makers))},
+            collector_class=cast(Any, plan.collector),
+            collector_kwargs={"auto_register_policy_transforms": True, "compile_policy": plan.compiled},
+            remote_configs={"num_cpus": 1, "scheduling_strategy": self._places(len(plan.makers))},
         )
         self._workers = list(self.batches.remote_collectors)
-        self.batches.update_policy_weights_(actor)
+        self.batches.update_policy_weights_(plan.actor)
         random.setstate(state)
 
     def _places(self, number: int) -> Any:

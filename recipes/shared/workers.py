@@ -8,7 +8,6 @@ import copy
 import io
 import os
 import queue
-import random
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -31,8 +30,9 @@ from damian.evaluation.training_state import CarriedStep, RandomState
 from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state
 
+from .launch import seed_generators
 from .learning_env import learning_env
-from .ray_workers import Maker, RayWorkers
+from .ray_workers import RayWorkers, WorkerPlan
 from .settings import TrainConfig
 
 
@@ -95,9 +95,8 @@ def worker_env(config: TrainConfig, actor: torch.nn.Module, worker: int) -> Dela
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, and the main one answers it
     torch.set_num_threads(1)
-    own, share = worker_seed(config.seed, worker), config.worlds // config.workers
-    for seed in (torch.manual_seed, np.random.seed, random.seed):
-        seed(own)
+    seed_generators(worker_seed(config.seed, worker))
+    share = config.worlds // config.workers
     env = learning_env(replace(config, worlds=share))
     add_recurrent_state(env, actor)
     seeds = counter_rng.world_seeds(config.seed, config.worlds)
@@ -123,34 +122,23 @@ class Processes:
     """Workers in processes of this machine.
 
     Args:
-        makers: makes the environment of each worker, in its process.
-        actor: the actor whose weights the workers get before each batch.
-        frames: environment steps of a batch, over all workers.
-        collector: class of a worker's collector.
-        compiled: options of the compiled actor, or None.
+        plan: what they collect.
     """
 
-    def __init__(
-        self,
-        makers: Sequence[Maker],
-        actor: torch.nn.Module,
-        frames: int,
-        collector: type[Collector],
-        compiled: dict[str, Any] | None,
-    ) -> None:
+    def __init__(self, plan: WorkerPlan) -> None:
         weights = Weights()
         with using_threads(torch.get_num_threads()):  # the collector changes it
             self.batches = MultiSyncCollector(
-                makers,
-                actor,
-                frames_per_batch=frames,
+                plan.makers,
+                plan.actor,
+                frames_per_batch=plan.frames,
                 total_frames=-1,
-                collector_class=collector,
+                collector_class=plan.collector,
                 cat_results="stack",
                 update_at_each_batch=True,
                 weight_sync_schemes={"policy": weights},
                 auto_register_policy_transforms=True,
-                compile_policy=compiled,
+                compile_policy=plan.compiled,
             )
         weights.processes = self.batches.procs
 
@@ -195,7 +183,7 @@ class Workers:
         skeleton = copy.deepcopy(actor).to("meta")
         makers = [partial(worker_env, config, skeleton, worker) for worker in range(config.workers)]
         compiled = {"options": COMPILE_OPTIONS} if config.compile else None
-        self._kind = KINDS[config.collector](makers, actor, frames, WorkerCollector, compiled)
+        self._kind = KINDS[config.collector](WorkerPlan(makers, actor, frames, WorkerCollector, compiled))
         self.process_ids: list[int] = self._kind.batches.map_fn("process_id")
         self._states: list[bytes] = self._on_all("dump")
 
