@@ -3,15 +3,17 @@
     damian fly checkpoint=runs/first
     damian fly scenario=delaybench/tracking delay=paper aware=belief policy=greedy
     damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
+    damian fly journal=journals/north.jsonl "formats=[html,geojson]"
 
 Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
 The run folder gets config.yaml, and for each episode that is kept episode_N.json (docs/episodes.md explains
 it), the film episode_N.gif (and episode_N_3d.gif), and episode_N.png: a map, the positions over time, and the
 age of information. "formats=[html]" makes episode_N.html, which plays the episode; damian replay makes such a
-page of several.
+page of several. With a journal of damian advise nothing is flown: the episode is the flight that it tells.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import ClassVar
@@ -25,6 +27,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from damian.advice.fleet import Fleet
+from damian.advice.node import Node, for_uavs
+from damian.advice.playback import episode_of, head_of
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common import checks
@@ -39,10 +44,13 @@ from damian.evaluation.geojson import origin_of, save_geojson
 from damian.evaluation.replay_page import save_page
 from damian.learners.recurrent import add_recurrent_state
 
+from .advise import AdviseConfig
 from .evaluate import stored_actor
 from .shared.flown_policy import FlownPolicyConfig
+from .shared.inheritance import key_of, without
 from .shared.known_settings import CONF
-from .shared.launch import launch, perform, prepare, reported
+from .shared.launch import checked, composed_with, launch, perform, prepare, reported
+from .shared.settings import TrainConfig
 from .shared.stored_runs import save_config
 
 KEPT = ("all", "extremes")
@@ -68,9 +76,22 @@ class FlyConfig(FlownPolicyConfig):
     page that plays it in any browser, and ``geojson`` for map tools, over a real region."""
     views: list[str] = field(default_factory=lambda: ["2d"])
     """Views of the films: ``2d``, from above, and ``3d``, with the space above the region."""
+    journal: str | None = None
+    """Journal of ``damian advise`` whose flight to show, instead of flying; its settings apply too."""
+    span: list[float] | None = None
+    """First and last time of the journal to show, since its fleet began [s]; all if not given."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.journal is not None:
+            for key in ("checkpoint", "policy"):
+                given = getattr(self, key)
+                checks.require(
+                    given is None, key, given, "flies nothing beside journal: leave one of them out"
+                )
+        if self.span is not None:
+            good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal is not None
+            checks.require(good, "span", self.span, "is not [FIRST, LAST], two times of a journal [s]")
         checks.one_of("keep", self.keep, KEPT)
         for each in self.formats:
             checks.one_of("formats", each, FORMATS)
@@ -84,7 +105,9 @@ ConfigStore.instance().store(name="fly_schema", node=FlyConfig)
 
 
 def fly(config: FlyConfig) -> list[Episode]:
-    """Fly ``eval_episodes`` episodes."""
+    """Fly ``eval_episodes`` episodes, or take the one that the journal tells."""
+    if config.journal is not None:
+        return [episode_of_journal(config)]
     env = make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, EXTRAS)
     mode = ExplorationType.DETERMINISTIC if config.flown == "mode" else ExplorationType.RANDOM
     policy = make_policy(config, env)
@@ -92,6 +115,38 @@ def fly(config: FlyConfig) -> list[Episode]:
         rollout = env.rollout(config.horizon, policy, break_when_any_done=False)
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "seed": config.seed}
     return record(rollout, env.uav_env, {**about, "overrides": list(config.overrides)})
+
+
+def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
+    """The settings by which the fleet of the journal was advised, unless others are given now.
+
+    Raises:
+        InputError: it is no journal.
+    """
+    told = head_of(Path(str(config.journal)))["about"].get("overrides") or []
+    of_advice = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
+    replaced = [*map(key_of, config.overrides), *of_advice, "checkpoint"]
+    overrides = [*without([str(word) for word in told], replaced), *config.overrides]
+    settings: FlyConfig = checked(composed_with("fly", overrides), "fly")
+    settings.overrides = overrides
+    return settings
+
+
+def episode_of_journal(config: FlyConfig) -> Episode:
+    """The flight that the journal tells.
+
+    Raises:
+        InputError: the journal is damaged, its fleet never began, or nothing of it lies in the span.
+    """
+    path = Path(str(config.journal))
+    head = head_of(path)
+    uavs = head["uavs"]
+    node = Node(for_uavs(config.eval_scenario, len(uavs)), config.seed, reward_terms=True)
+    fleet = Fleet(node, uavs, greedy_policy(node.env))
+    span = None if config.span is None else (config.span[0], config.span[1])
+    about = {name: head["about"].get(name) for name in ("policy", "checkpoint")}
+    about |= {"overrides": list(config.overrides)}
+    return episode_of(path, fleet, about, span, partial(tqdm, unit=" lines", delay=1))
 
 
 def make_policy(config: FlyConfig, env: DelayedEnv) -> TensorDictModuleBase:
@@ -155,7 +210,10 @@ def summary(name: str, episode: Episode) -> str:
 def main(composed: DictConfig) -> None:
     if composed.resume is not None:
         raise InputError("resume: nothing is trained; give the run folder as checkpoint")
-    perform(*prepare(composed), show)  # type: ignore[arg-type]
+    config, folder = prepare(composed)
+    if composed.journal is not None:
+        config = with_settings_of_journal(config)  # type: ignore[arg-type]
+    perform(config, folder, show)  # type: ignore[arg-type]
 
 
 def run() -> None:

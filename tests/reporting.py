@@ -43,6 +43,7 @@ class Reporter:
         self.dt = env.uav_env.scenario.clock.dt
         self.points = env.uav_env.simulation.airspace.points[0]
         self.in_transit: list[tuple[int, int, dict[str, Any]]] = []
+        self.n_sent = [0] * env.uav_env.n_agents
 
     def number_at(self, xy: torch.Tensor) -> int:
         return int((self.points - xy).square().sum(-1).argmin())
@@ -72,7 +73,7 @@ class Reporter:
             f"target {second}": bound[1],
             "motions": int(messages.motions[uav]),
             "previous": [list(self.ground.place(int(p))) for p in messages.trail[uav, 1:]],
-            "sequence": step,
+            "sequence": self.n_sent[uav],
         }
         seen = float(messages.detected_time[uav])
         if seen >= 0:
@@ -88,7 +89,9 @@ class Reporter:
         for uav in range(one.time.shape[0]):
             known = at_once or keys.DELAY not in outputs.keys(True)
             delay = 0 if known else int(outputs[keys.DELAY][self.world, uav])
-            if delay >= 0 and (at_once or outputs[keys.MESSAGE_SENT][self.world, uav]):
+            sent = at_once or bool(outputs[keys.MESSAGE_SENT][self.world, uav])
+            self.n_sent[uav] += sent
+            if sent and delay >= 0:
                 self.in_transit.append((step + delay, uav, self.row(one, uav, step)))
 
     def arriving(self, step: int) -> list[dict[str, Any]]:

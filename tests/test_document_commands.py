@@ -38,6 +38,7 @@ SHORTER = {
 INSTEAD = {
     "seed=0,1,2": "seed=0",
     "port=8000": "port=0",
+    "span=[600,900]": "span=[10,20]",
     "experiment=delays": "experiment=usecase2",
     "slurm={slurm_partition: cpu, timeout_min: 600, mem_gb: 4}": "slurm={cluster: local, timeout_min: 600}",
     "hydra/launcher=submitit_slurm": "hydra/launcher=submitit_local",
@@ -64,6 +65,8 @@ def shortened(words: list[str]) -> list[str]:
         words = [word.replace(",mp4", "") for word in words]
     if any(word.startswith("resume=") for word in words):
         return [re.sub(r"^frames=.*", "frames=128", word) for word in words]
+    if any(word.startswith("journal=journals/") for word in words):
+        return words
     shorter = SHORTER.get(words[0], [])
     if any(word.startswith("checkpoint=") for word in words):  # the region is that of the training
         shorter = [word for word in shorter if not word.startswith("episode.")]
@@ -116,7 +119,7 @@ def trained(tmp_path_factory) -> Path:
 
 def write_journal(path: Path) -> None:
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    lines = [head("north", ["A", "B"], {})]
+    lines = [head("north", ["A", "B"], {"overrides": ["region=llanbedr"]})]
     for n in range(60):
         row = {"ID": "AB"[n % 2], "time": 1000.0 + n, "lat": 52.811, "lon": -4.128, "sequence": n // 2}
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})
@@ -139,7 +142,7 @@ def test_the_commands_of_a_document_run(name, trained, tmp_path):
         if sources:
             call_service(words, folder, {"port": "listening", "folder": "watching"}[sources.pop()])
             continue
-        if words[0] == "fit-delays":
+        if any("journals/" in word for word in words):
             write_journal(folder / "journals" / "north.jsonl")
         call(words, folder)
 

@@ -69,15 +69,7 @@ class Desk:
         """
         if not NAME.fullmatch(name):
             raise InputError(f"fleet: {show(name)} is not 1 to 64 letters, digits, _ and -")
-        good = isinstance(uavs, list) and 0 < len(uavs) <= MAX_UAVS and all(map(_is_id, uavs))
-        if not good:
-            problem = (
-                f"is not a list of the IDs of 1 to {MAX_UAVS} UAVs, each of 1 to 64 printable characters"
-            )
-            raise InputError(f"uavs: {show(uavs)} {problem}")
-        ids = [str(uav).strip() for uav in uavs]
-        if len({*ids}) < len(ids):
-            raise InputError(f"uavs: {show(ids)} names a UAV twice")
+        ids = checked_ids(uavs)
         if name in self.fleets and self.fleets[name].uavs != ids:
             raise InputError(f"fleet: {name} has other UAVs; end it first, or take another name")
         if name not in self.fleets and len(self.fleets) >= MAX_FLEETS:
@@ -206,6 +198,21 @@ class Desk:
             with named(f"{path}: line {number}"):
                 replay(fleet, entry)
         self.fleets[name], self._journals[name] = fleet, journal
+
+
+def checked_ids(uavs: Any) -> list[str]:
+    """The IDs of the UAVs of a fleet.
+
+    Raises:
+        InputError: they are not a list of IDs, or two are the same.
+    """
+    if not (isinstance(uavs, list) and 0 < len(uavs) <= MAX_UAVS and all(map(_is_id, uavs))):
+        problem = f"is not a list of the IDs of 1 to {MAX_UAVS} UAVs, each of 1 to 64 printable characters"
+        raise InputError(f"uavs: {show(uavs)} {problem}")
+    ids = [str(uav).strip() for uav in uavs]
+    if len({*ids}) < len(ids):
+        raise InputError(f"uavs: {show(ids)} names a UAV twice")
+    return ids
 
 
 def replay(fleet: Fleet, entry: Mapping[str, Any]) -> None:

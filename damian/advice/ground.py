@@ -45,10 +45,7 @@ class Ground:
         if place in self._found:
             return self._found[place]
         first, second = place
-        if self.region.origin is None:
-            x, y = first - self.region.offset[0], second - self.region.offset[1]
-        else:
-            x, y = (float(each) for each in to_local(first, second, self.region.origin))
+        x, y = self.local(place)
         point = int(self._tree.nearest(shapely.Point(x, y)))
         away = float(np.hypot(*(self.points[point] - (x, y))))
         if away > self.reach:
@@ -61,6 +58,14 @@ class Ground:
             self._found.clear()
         self._found[place] = point
         return point
+
+    def local(self, place: Place) -> tuple[float, float]:
+        """A place, east and north of the origin of the region [m]."""
+        first, second = place
+        if self.region.origin is None:
+            return first - self.region.offset[0], second - self.region.offset[1]
+        x, y = to_local(first, second, self.region.origin)
+        return float(x), float(y)
 
     def place(self, point: int) -> Place:
         """Where a landing point is."""

@@ -70,10 +70,18 @@ class ReportedEnv(UavEnv):
         scenario: all settings; its delays are not simulated.
         seed: of the region, if the region is random.
         device: of all tensors.
+        reward_terms: whether a transform writes the weighted terms of the reward.
     """
 
-    def __init__(self, scenario: ScenarioConfig, seed: int = 0, device: torch.device | str = "cpu") -> None:
-        super().__init__(scenario, 1, seed, device, {"message"}, messages_only=True)
+    def __init__(
+        self,
+        scenario: ScenarioConfig,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        reward_terms: bool = False,
+    ) -> None:
+        extras = {"message", "reward_terms"} if reward_terms else {"message"}
+        super().__init__(scenario, 1, seed, device, extras, messages_only=True)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
         outputs = super()._outputs_at_reset(initial, features)
@@ -116,20 +124,22 @@ class Node:
     Args:
         scenario: settings of the training; its number of UAVs is that of the fleet.
         seed: of the region, if the region is random.
+        reward_terms: compute the weighted terms of the reward too.
 
     Raises:
         InputError: the scenario lets UAVs compute observations that the server cannot know.
     """
 
-    def __init__(self, scenario: ScenarioConfig, seed: int = 0) -> None:
+    def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         scenario = served(scenario)
-        self.worlds, self.scenario, self.dt = ReportedEnv(scenario, seed), scenario, scenario.clock.dt
+        self.worlds = ReportedEnv(scenario, seed, reward_terms=reward_terms)
+        self.scenario, self.dt = scenario, scenario.clock.dt
         self.server, self.simulation = self.worlds.server, self.worlds.simulation
         longest = uplink_transform(scenario, False, reads_delay=False).sampler.longest
         self.law_longest, self.longest = longest, max(longest, REMEMBERED_STEPS)
         transforms = [
             *remembering_transforms(scenario, self.server, self.longest, delayed=True),
-            ServerNode(self.server),
+            ServerNode(self.server, reward_terms=reward_terms),
             *observation_transforms(scenario),
         ]
         self.env = DelayedEnv(self.worlds, Compose(*transforms))  # type: ignore[arg-type]

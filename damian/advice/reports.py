@@ -46,8 +46,8 @@ class Report:
     """Whether its places are degrees."""
     spotted: bool = False
     """Whether it spots the source."""
-    flies: bool = False
-    """Whether it is in the air."""
+    altitude: float | None = None
+    """Height above the ground [m]; the UAV flies if it is above 0."""
     detected: float | None = None
     """When it detected the source last [s]."""
     detected_at: Place | None = None
@@ -70,6 +70,11 @@ class Report:
     """Number of the report, which grows by one."""
     received: float | None = None
     """When the report came in [s], if it is read from a file."""
+
+    @property
+    def flies(self) -> bool:
+        """Whether the UAV is in the air."""
+        return self.altitude is not None and self.altitude > 0
 
 
 COLUMNS = {
@@ -200,7 +205,6 @@ def _report(row: Mapping[str, Any], now: float, file: bool) -> Report:
     if place is None:
         raise InputError("lat, lon: they are missing: where the UAV is [deg], or x, y [m]")
     spotted = _flag(row, "source spotted")
-    altitude = _number(row, "fla", -500, 1e5, "m")
     if time is None:
         time = (now if received is None else received) - age
     return Report(
@@ -209,7 +213,7 @@ def _report(row: Mapping[str, Any], now: float, file: bool) -> Report:
         place=place,
         degrees="lat" in row,
         spotted=spotted,
-        flies=altitude is not None and altitude > 0,
+        altitude=_number(row, "fla", -500, 1e5, "m"),
         detected=_time(row, "source time"),
         detected_at=_place(row, "source "),
         target=_place(row, "target "),

@@ -92,8 +92,9 @@ def _draw_map(axis: Axes, flight: Episode, instant: int) -> None:
         axis.plot(*np.stack([true, believed]).T, color="0.2", linewidth=0.8, zorder=3)
         axis.plot(*true, "o", color=colour, markersize=4.5, zorder=4)
         axis.plot(*believed, "o", color=colour, markerfacecolor="none", markersize=9, zorder=4)
-    axis.plot(*flight.source.T, color="black", linewidth=0.8, linestyle=":")
-    axis.plot(*flight.source[instant], "*", color="black", markersize=10, zorder=5)
+    if flight.source is not None:
+        axis.plot(*flight.source.T, color="black", linewidth=0.8, linestyle=":")
+        axis.plot(*flight.source[instant], "*", color="black", markersize=10, zorder=5)
     _zoom(axis, _shown_positions(flight), flight.radius)
     has_error = not np.array_equal(flight.true[instant], flight.believed[instant])
     reason = ", when the server is most mistaken" if has_error else ""
@@ -103,7 +104,8 @@ def _draw_map(axis: Axes, flight: Episode, instant: int) -> None:
 
 def _shown_positions(flight: Episode) -> Floats:
     """Positions that the map shows, [P, 2]: the paths, and the whole region unless they are small in it."""
-    paths = np.concatenate([flight.true.reshape(-1, 2), flight.source])
+    source = [] if flight.source is None else [flight.source]
+    paths = np.concatenate([flight.true.reshape(-1, 2), *source])
     corners = np.reshape(shapely.bounds(flight.region), (2, 2))
     small = np.ptp(corners, axis=0).max() > _LARGE * (np.ptp(paths, axis=0).max() + 2 * flight.radius)
     return paths if small else np.concatenate([paths, corners])
@@ -122,12 +124,14 @@ def _zoom(axis: Axes, positions: Floats, margin: float) -> None:
 def _add_map_legend(axis: Axes, flight: Episode) -> None:
     """Explain the colours of the UAVs, and the marks."""
     colours = _colours(flight)
-    uavs = [_legend_entry(f"UAV {uav}", color=colour) for uav, colour in enumerate(colours[:MOST_PANELS])]
+    named = zip(flight.names, colours[:MOST_PANELS], strict=False)
+    uavs = [_legend_entry(name, color=colour) for name, colour in named]
     uavs += [_legend_entry("other UAVs", color=_OTHERS)] if len(colours) > MOST_PANELS else []
+    source = _legend_entry("source", marker="*", linestyle="", color="black", markersize=8)
     marks = [
         _legend_entry("true", marker="o", linestyle="", markersize=4.5),
         _legend_entry("believed", marker="o", linestyle="", markersize=9, markerfacecolor="none"),
-        _legend_entry("source", marker="*", linestyle="", color="black", markersize=8),
+        *([] if flight.source is None else [source]),
         Patch(color="0.3", alpha=0.15, linewidth=0, label=f"footprint ({flight.radius:.0f} m)"),
         _legend_entry("border", color="0.4", linewidth=0.8, linestyle="--"),
     ]
@@ -152,7 +156,7 @@ def _draw_panel(axis: Axes, flight: Episode, uav: int) -> None:
         axis.plot(
             times, height, mark, color=mark_colour, markersize=3.5, transform=time_by_height, clip_on=False
         )
-    axis.set_ylabel(f"UAV {uav}\neast [m]")
+    axis.set_ylabel(f"{flight.names[uav]}\neast [m]")
     axis.yaxis.set_major_locator(MaxNLocator(3))
 
 

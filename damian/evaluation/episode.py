@@ -25,7 +25,9 @@ from damian.common.errors import InputError
 from damian.common.text_files import one_line, read_text
 from damian.envs.uav_env import UavEnv
 
-SCHEMA, VERSION = "damian-episode", 1
+SCHEMA, VERSION = "damian-episode", 2
+READABLE = (1, 2)
+"""Versions that can be read; in version 1 the source is always known."""
 DIGITS = 5
 """Significant digits of the numbers in a file."""
 
@@ -64,8 +66,10 @@ class Episode:
     track: Annotated[Floats, "headings, clockwise from north [rad], [T + 1, N]"]
     battery: Annotated[Floats, "battery levels [%], [T + 1, N]"]
     spotted: Annotated[Flags, "whether the UAV spots the source, [T + 1, N]"]
-    source: Annotated[Floats, "position of the source: east, north [m], [T + 1, 2]"]
-    emits: Annotated[Flags, "whether the source emits, [T + 1]"]
+    source: Annotated[
+        Floats | None, "position of the source: east, north [m]; null if nobody knows it, [T + 1, 2]"
+    ]
+    emits: Annotated[Flags | None, "whether the source emits; null if nobody knows it, [T + 1]"]
     sent: Annotated[Flags, "whether the UAV sent a message in the step; not at the reset, [T + 1, N]"]
     delay: Annotated[Integers, "delay of that message [steps], negative if it never arrives, [T + 1, N]"]
     believed: Annotated[Floats, "positions in the messages that the server held [m], [T + 1, N, 2]"]
@@ -81,6 +85,13 @@ class Episode:
     def n_agents(self) -> int:
         """Number of UAVs, N."""
         return self.position.shape[1]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the UAVs: their IDs if they are real ones, else their numbers."""
+        ids = self.about.get("uavs")
+        known = isinstance(ids, list) and len(ids) == self.n_agents
+        return [str(uav) for uav in ids] if known else [f"UAV {uav}" for uav in range(self.n_agents)]
 
     @property
     def true(self) -> Floats:
@@ -156,11 +167,11 @@ class Episode:
         """Read an episode from its file.
 
         Raises:
-            InputError: the file does not hold an episode of this version, or its columns do not fit together.
+            InputError: the file does not hold an episode of a version of ``READABLE``, or its columns do not fit together.
         """
         try:
             found = json.loads(read_text(path))
-            if (found["schema"], found["version"]) != (SCHEMA, VERSION):
+            if found["schema"] != SCHEMA or found["version"] not in READABLE:
                 raise ValueError(f"it is {found['schema']} of version {found['version']}")
             fixed = {f.name: found[f.name] for f in fields(cls) if f.name not in COLUMNS}
             fixed["region"] = shapely.from_geojson(json.dumps(found["region"]))
@@ -169,17 +180,21 @@ class Episode:
             columns = {name: _array(found[name]) for name in COLUMNS}
             _check_fixed(fixed)
             _check_columns(columns)
-            columns |= {name: columns[name].astype(bool) for name in ("spotted", "emits", "sent")}
+            flags = [name for name in ("spotted", "emits", "sent") if columns[name] is not None]
+            columns |= {name: columns[name].astype(bool) for name in flags}
             return cls(**fixed, **columns)
         except (OSError, LookupError, TypeError, ValueError, RecursionError, ShapelyError) as error:
             raise InputError(
-                f"{path}: it is no episode of version {VERSION}: {one_line(str(error))}"
+                f"{path}: it is no episode of version 1 or {VERSION}: {one_line(str(error))}"
             ) from error
 
 
 COLUMNS = {f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")}  # type: ignore[union-attr]
 """What each column means, by its name."""
 
+
+OPTIONAL = (("cells", "belief"), ("source", "emits"))
+"""Columns that are null together: without a belief, and where nobody knows the source."""
 
 OUTPUTS = (
     keys.STATE,
@@ -239,14 +254,9 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
     own, held = env.server.messages(message), env.server.messages(instants.get(keys.RECEIVED, message))
     n, dt = env.n_agents, env.scenario.clock.dt
     time = torch.arange(len(state), dtype=torch.float64) * dt
-    airspace, grid, belief = env.simulation.airspace, env.server.grid, instants.get(keys.BELIEF, None)
-    region = int(env.server.region_of(own)[0])
+    belief = instants.get(keys.BELIEF, None)
     return Episode(
-        about={**about, "damian": damian.__version__},
-        region=airspace.regions[region].polygon,
-        origin=airspace.regions[region].origin,
-        landing_points=np.asarray(airspace.points[region, : airspace.n_points[region]].cpu()),
-        radius=env.simulation.radius,
+        **fixed_of(env, about, int(env.server.region_of(own)[0])),
         instant=env.simulation.vehicles.instant,
         success=bool(cast(Tensor, instants[keys.SUCCESS])[-1]),
         time=np.asarray(time),
@@ -263,9 +273,26 @@ def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) 
         age=np.asarray((held.age(time) / dt).round() * dt),  # times in messages are float32
         reward=np.asarray(cast(Tensor, instants[keys.REWARD])[..., 0]),
         reward_terms={name: np.asarray(term) for name, term in instants.get(keys.REWARD_TERMS, {}).items()},
-        cells=None if belief is None or grid is None else np.asarray(grid.centres.cpu()),
+        cells=None if belief is None else cells_of(env),
         belief=None if belief is None else np.asarray(belief),
     )
+
+
+def fixed_of(env: UavEnv, about: Mapping[str, Any], region: int) -> dict[str, Any]:
+    """What an episode holds of the environment over one of its regions, beside the columns."""
+    airspace = env.simulation.airspace
+    return {
+        "about": {**about, "damian": damian.__version__},
+        "region": airspace.regions[region].polygon,
+        "origin": airspace.regions[region].origin,
+        "landing_points": np.asarray(airspace.points[region, : airspace.n_points[region]].cpu()),
+        "radius": env.simulation.radius,
+    }
+
+
+def cells_of(env: UavEnv) -> Floats | None:
+    """Centres of the belief's cells, [K, 2]; None without a belief."""
+    return None if env.server.grid is None else np.asarray(env.server.grid.centres.cpu())
 
 
 def _listed(values: Any) -> Any:
@@ -298,7 +325,7 @@ def _check_columns(columns: Mapping[str, Any]) -> None:
         letters = meaning[meaning.rindex("[") + 1 : -1]
         shape = tuple(sizes[each] if each in sizes else int(each) for each in letters.split(", "))
         values = columns[name]
-        if values is None and name in ("cells", "belief") and columns["cells"] is columns["belief"]:
+        if values is None and any(name in pair and columns[pair[0]] is columns[pair[1]] for pair in OPTIONAL):
             continue
         for each in values.values() if isinstance(values, Mapping) else [values]:
             if each is None or each.shape != shape or 0 in shape:

@@ -100,9 +100,13 @@ class Film:
         marks: list[Any] = [
             _mark("UAV, true", marker=DART, markersize=9),
             _mark("UAV, as the server\nbelieves, with age", marker="o", markerfacecolor="none", markersize=9),
-            _mark("source, emits", marker="*", color=INK, markersize=11),
-            _mark("source, silent", marker="*", color=INK, markerfacecolor="white", markersize=11),
         ]
+        if self.episode.source is not None:
+            white = {"markerfacecolor": "white"}
+            marks += [
+                _mark(f"source, {does}", marker="*", color=INK, markersize=11, **style)
+                for does, style in (("emits", {}), ("silent", white))
+            ]
         if self.episode.belief is not None:
             marks.append(Rectangle((0, 0), 1, 1, facecolor=HEAT(1.0), label="belief about\nthe source"))
         self.figure.legend(handles=marks, loc="upper left", bbox_to_anchor=(0.745, 0.95), frameon=False)
@@ -148,11 +152,16 @@ class Film:
             )
             axis.plot(ends[:, 1], np.full(len(ends), uav), ">", color=colour, markersize=3.5)
             axis.plot(begin[lost], np.full(lost.sum(), uav), "x", color=INK, markersize=4.5)
-        axis.set_yticks(range(episode.n_agents), [f"UAV {uav}" for uav in range(episode.n_agents)])
+        axis.set_yticks(range(episode.n_agents), [_short(name) for name in episode.names])
         axis.set(ylim=(episode.n_agents - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
         axis.set_xlabel("messages over time [s]: dots arrive at once, bars are late, crosses are lost")
         axis.spines["left"].set_visible(False)
         axis.tick_params(left=False)
+
+
+def _short(name: str) -> str:
+    """A name that fits beside its row."""
+    return name if len(name) <= 8 else f"{name[:7]}\N{HORIZONTAL ELLIPSIS}"
 
 
 def _mark(label: str, color: str = "0.3", **style: Any) -> Line2D:

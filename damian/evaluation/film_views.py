@@ -69,9 +69,7 @@ class MapView:
         return [heat]
 
     def _source(self, step: int) -> list[Any]:
-        fill = INK if self.episode.emits[step] else "white"
-        style = {"color": INK, "markerfacecolor": fill, "markersize": 13, "zorder": 6}
-        return self.axis.plot(*self.episode.source[step], "*", **style)
+        return _draw_source(self.axis, self.episode, step, (), {"markersize": 13, "zorder": 6})
 
     def _uav(self, step: int, uav: int) -> list[Any]:
         """Draw a UAV with its path and footprint, and where the server believes it to be."""
@@ -128,9 +126,8 @@ class SpaceView:
         """Draw the instant after so many steps; returns the artists that were drawn."""
         self.axis.view_init(elev=34, azim=-65 + TURN * step)
         uavs = [artist for uav in range(self.episode.n_agents) for artist in self._uav(step, uav)]
-        fill = INK if self.episode.emits[step] else "white"
-        style = {"color": INK, "markerfacecolor": fill, "markersize": 12, "zorder": 5}
-        return [*self._belief(step), *self.axis.plot(*self.episode.source[step], 0, "*", **style), *uavs]
+        source = _draw_source(self.axis, self.episode, step, (0,), {"markersize": 12, "zorder": 5})
+        return [*self._belief(step), *source, *uavs]
 
     def _belief(self, step: int) -> list[Any]:
         likely = zip(self.episode.likely_cells(step), shades(self.episode, step), strict=True)
@@ -164,6 +161,16 @@ class SpaceView:
             label, style = f"   {_age(episode, step, uav)}", {"fontsize": 7.5, "color": colour, "zorder": 8}
             drawn.append(axis.text(*held, 0, label, **style))
         return drawn
+
+
+def _draw_source(
+    axis: Any, episode: Episode, step: int, height: tuple[float, ...], style: dict[str, Any]
+) -> list[Any]:
+    """Draw the source, filled while it emits, if anybody knows it."""
+    if episode.source is None or episode.emits is None:
+        return []
+    fill = INK if episode.emits[step] else "white"
+    return axis.plot(*episode.source[step], *height, "*", color=INK, markerfacecolor=fill, **style)
 
 
 def limits(episode: Episode) -> tuple[Floats, Floats]:

@@ -35,7 +35,7 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     """An episode up to an instant as a FeatureCollection.
 
     The property ``kind`` of a feature says what it is: ``region``, ``landing points``, ``track`` (of a UAV,
-    with ``times`` [s] of its points, if it is one line), ``source track``, ``footprint``
+    with ``times`` [s] of its points, if it is one line), ``source track`` (if it is known), ``footprint``
     and ``coverage`` (what its footprints have covered) of a UAV, ``believed position`` (with ``age_s``), and
     ``belief`` (a cell, with the ``probability`` that the source is in it).
 
@@ -73,7 +73,7 @@ def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]
     yield shapely.MultiPoint(episode.landing_points), {"kind": "landing points"}
     times = episode.time[: step + 1].tolist()
     for uav in range(episode.n_agents):
-        path, label = episode.true[: step + 1, uav], {"uav": uav}
+        path, label = episode.true[: step + 1, uav], {"uav": uav, "name": episode.names[uav]}
         places: Any = shapely.points(path)
         footprints: Any = shapely.buffer(places, episode.radius, quad_segs=_CORNERS)
         covered = shapely.intersection(shapely.union_all(footprints), episode.region)
@@ -82,7 +82,8 @@ def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]
         yield covered, {"kind": "coverage", **label}
         age = float(episode.age[step, uav])
         yield shapely.Point(episode.believed[step, uav]), {"kind": "believed position", **label, "age_s": age}
-    yield _path(episode.source[: step + 1]), {"kind": "source track", "times": times}
+    if episode.source is not None:
+        yield _path(episode.source[: step + 1]), {"kind": "source track", "times": times}
     half = episode.cell_edge / 2 if episode.cells is not None else 0.0
     for cell in episode.likely_cells(step):
         (x, y), share = np.asarray(episode.cells)[cell], float(np.asarray(episode.belief)[step, cell])

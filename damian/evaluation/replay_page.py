@@ -25,9 +25,9 @@ _PAGE = Path(__file__).parent / "page"
 _LIBRARIES = "libraries.min.js"
 _PLAIN = " !$&'()*+,-./:;<=>?@[]^_`{|}~\\\""
 """Characters that a data URL may hold as they are."""
-_TOLD = ("policy", "checkpoint", "seed", "world")
+_TOLD = ("policy", "checkpoint", "seed", "world", "fleet")
 """What an episode's ``about`` tells of its flight, beside the overrides."""
-_NOT_FLOWN = (*_TOLD, "hydra", "formats", "views", "keep", "eval_episodes")
+_NOT_FLOWN = (*_TOLD, "hydra", "formats", "views", "keep", "eval_episodes", "journal", "span")
 """Overrides that say nothing of how an episode was flown, or that ``about`` repeats."""
 
 

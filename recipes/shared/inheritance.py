@@ -27,8 +27,12 @@ def inherited(stored: TrainConfig, overrides: Sequence[str], own: Collection[str
     messages = stored.delay.messages
     history += [f"delay.messages={messages}"] if messages and "delay.messages" not in given else []
     replaced = [*given, *map(key_of, history)]
-    kept = [old for old in stored.overrides if not any(_replaces(key, key_of(old)) for key in replaced)]
-    return [*kept, *history, *overrides]
+    return [*without(stored.overrides, replaced), *history, *overrides]
+
+
+def without(overrides: Sequence[str], replaced: Collection[str]) -> list[str]:
+    """The overrides but those that set one of these keys and groups."""
+    return [old for old in overrides if not any(_replaces(key, key_of(old)) for key in replaced)]
 
 
 def own_defaults(kind: type) -> set[str]:

@@ -156,7 +156,7 @@ def test_a_uav_in_flight_is_not_asked_and_took_off_from_where_it_was_sent():
         told(fleet, uav, START, 200 + i)
     fleet.advise(START + 1)
     decision = fleet.decision(0)
-    told(fleet, "a", START + 2, 300, flies=True, spotted=True)
+    told(fleet, "a", START + 2, 300, altitude=5.0, spotted=True)
     assert fleet.advise(START + 3) == [1, 2]
     held = fleet.held[0]
     assert (held.point, held.target, held.spotted) == (decision.origin, decision.goal, False)

@@ -81,7 +81,7 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
         assert again.region.equals_exact(episode.region, 1e-9)
         assert (again.about, again.success, again.origin) == (episode.about, episode.success, episode.origin)
     stored = json.loads((tmp_path / "episode.json").read_text())
-    assert (stored["schema"], stored["version"]) == ("damian-episode", 1)
+    assert (stored["schema"], stored["version"]) == ("damian-episode", 2)
     assert set(stored["meaning"]) == set(COLUMNS) <= set(stored)
 
 
@@ -89,7 +89,7 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
     ("text", "problem"),
     [
         ("{}", "'schema'"),
-        ('{"schema": "damian-episode", "version": 2}', "it is damian-episode of version 2"),
+        ('{"schema": "damian-episode", "version": 3}', "it is damian-episode of version 3"),
         ("no json", "Expecting value"),
         ("[1]", "list indices"),
     ],
@@ -97,7 +97,7 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
 def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, text, problem):
     path = tmp_path / "episode.json"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1: ") as refused:
+    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1 or 2: ") as refused:
         Episode.load(path)
     assert problem in str(refused.value)
     with pytest.raises(InputError, match="no episode"):
@@ -130,7 +130,7 @@ def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, text, pro
 def test_a_file_whose_columns_do_not_fit_is_refused_in_one_line(tmp_path, changes, problem):
     path = tmp_path / "episode.json"
     path.write_text(json.dumps({**flight().document(), **changes}))
-    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1: ") as refused:
+    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1 or 2: ") as refused:
         Episode.load(path)
     assert problem in str(refused.value)
     assert str(refused.value).isprintable()

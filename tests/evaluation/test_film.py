@@ -42,6 +42,19 @@ def test_the_source_is_filled_while_it_emits():
     assert colour_at(film, 1, 0.0, -120.0).max() < 0.3
 
 
+@pytest.mark.parametrize("view", ["2d", "3d"])
+def test_a_source_that_nobody_knows_is_neither_drawn_nor_explained(view):
+    about = {"uavs": ["A", "B with a long name"]}
+    film = Film(flight(1, source=None, emits=None, about=about), view)
+    if view == "2d":
+        np.testing.assert_allclose(colour_at(film, 0, 0.0, -120.0), colour_at(film, 0, 0.0, -150.0))
+    explained = [text.get_text() for text in film.figure.legends[0].get_texts()]
+    assert len(explained) == 2
+    assert not any("source" in text for text in explained)
+    labels = [text.get_text() for text in film.lanes.get_yticklabels()]
+    assert labels == ["A", "B with \N{HORIZONTAL ELLIPSIS}"]
+
+
 def test_a_ring_stands_where_the_server_believes_a_uav_only_if_it_is_mistaken_in_time():
     believed = np.tile([[-100.0, 100.0], [-100.0, -150.0]], (2, 1, 1))
     film = Film(flight(1, believed=believed, age=np.array([[0.0, 0.0], [0.0, 4.0]])))

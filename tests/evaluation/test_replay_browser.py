@@ -5,6 +5,7 @@ Run by `make test-browser`. Selenium is imported where it is used, so that the o
 
 import io
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib import import_module
 from shutil import which
 
@@ -238,6 +239,22 @@ def coloured(picture, uav, tolerance=40):
     """Rows and columns of the pixels that have about the colour of a UAV."""
     colour = np.array([int(COLOURS[uav][i : i + 2], 16) for i in (1, 3, 5)])
     return np.nonzero(np.abs(picture.astype(int) - colour).max(-1) < tolerance)
+
+
+def test_real_uavs_have_their_ids_and_an_unknown_source_is_not_drawn(opened):
+    about = {"uavs": ["north-1", "a rather long identifier of a UAV"], "fleet": "north"}
+    known = late_flight()
+    with opened(known) as page:
+        with_source = page.map()
+    with opened(replace(known, about=about, source=None, emits=None)) as page:
+        assert page.map() != with_source
+        heads = [head.text for head in page.all(".numbers tbody th")]
+        assert heads == about["uavs"]
+        page.press("END")
+        check_numbers(page, known, LAST)
+        page.press("v")
+        page.press("HOME")
+        check_numbers(page, known, 0)
 
 
 def test_the_space_shows_uavs_above_the_ground_and_turns(opened):

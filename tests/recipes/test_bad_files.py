@@ -377,7 +377,7 @@ def test_a_refused_sweep_leaves_no_folder(name, given_words):
         ("pendulum", ["--hidden", "10000000"], "--hidden: 10000000 is not between 1 and 16384"),
         ("pendulum", ["--out", "/dev/null/x"], "--out: /dev/null/x: Not a directory"),
         ("pendulum", ["--out", "x" * 5000], "File name too long"),
-        ("replay", ["x.json"], "x.json: it is no episode of version 1: no such file"),
+        ("replay", ["x.json"], "x.json: it is no episode of version 1 or 2: no such file"),
         ("replay", [], "the following arguments are required: EPISODE.json"),
         ("train", ["hydra.run.dir="], "hydra.run.dir: it is empty"),
         ("train", ["resume=" + "x" * 5000], "resume: "),

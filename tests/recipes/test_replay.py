@@ -35,7 +35,7 @@ def test_the_page_has_the_episodes_in_the_order_of_their_files(stored, tmp_path,
     [
         ([], "the following arguments are required: EPISODE.json"),
         (["--speed", "3"], "--speed"),
-        (["missing.json"], "missing.json: it is no episode of version 1: no such file"),
+        (["missing.json"], "missing.json: it is no episode of version 1 or 2: no such file"),
         (["late.json"] * (MOST + 1), f"EPISODE.json: {MOST + 1} is not between 1 and {MOST}"),
         (["late.json", "--out", "nowhere/page.html"], "--out: nowhere/page.html: it cannot be written"),
         (["late.json", "--out", "x" * 5000], "File name too long"),

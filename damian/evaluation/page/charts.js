@@ -21,7 +21,7 @@ export function chartsOf(episode, theme, showsBattery) {
   const ink = () => theme.ink;
   const byUav = (rows) =>
     rows[0].map((_, uav) => ({
-      name: `UAV ${uav}`,
+      name: episode.names[uav],
       values: rows.map((row) => row[uav]),
       colour: () => theme.uav(uav),
     }));

@@ -26,6 +26,10 @@ export class Episode {
   constructor(file) {
     Object.assign(this, file);
     this.nAgents = this.position[0].length;
+    const ids = this.about.uavs;
+    /** The UAVs in a table, and in a text: their IDs if they are real ones, else their numbers. */
+    this.ids = this.position[0].map((_, uav) => String(ids?.[uav] ?? uav));
+    this.names = this.ids.map((id) => (ids ? id : `UAV ${id}`));
     this.last = this.time.length - 1;
     this.end = this.time[this.last];
     this.dt = this.last ? this.time[1] - this.time[0] : 1;
@@ -66,7 +70,7 @@ export class Episode {
     return between(this.position, step, share, uav);
   }
 
-  /** Where the source is: east, north [m]. */
+  /** Where the source is, if it is known: east, north [m]. */
   sourcePlace({ step, share }) {
     return between(this.source, step, share);
   }

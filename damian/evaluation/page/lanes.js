@@ -81,7 +81,7 @@ export class Lanes {
     context.textBaseline = "middle";
     for (let uav = 0; uav < this.episode.nAgents; uav++) {
       context.fillStyle = theme.uav(uav);
-      context.fillText(`UAV ${uav}`, GUTTER - 8, y(uav));
+      context.fillText(this.episode.names[uav], GUTTER - 8, y(uav), GUTTER - 10);
     }
     context.textAlign = "left";
   }

@@ -34,7 +34,7 @@ function drawUav({ context, episode, now, theme, pixel, darts }, uav) {
   const [at, colour] = [pixel(episode.place(uav, now)), theme.uav(uav)];
   if (darts) marks.dart(context, at, episode.heading(uav, now), colour, theme);
   if (episode.nAgents > theme.uavs.length) {
-    marks.label(context, [at[0] + 9, at[1] + 9], String(uav), colour, theme);
+    marks.label(context, [at[0] + 9, at[1] + 9], episode.ids[uav], colour, theme);
   }
   if (episode.usesBattery) marks.battery(context, at, episode.battery[now.step][uav], colour, theme);
 }
@@ -47,8 +47,9 @@ function drawBelieved({ context, episode, now, layers, theme, pixel }, uav) {
   if (age > 0 || !layers.has("truth")) marks.ghost(context, held, age, colour, theme);
 }
 
-/** The source, with a wave that spreads over the step while it emits. */
+/** The source, if it is known, with a wave that spreads over the step while it emits. */
 function drawSource({ context, episode, now, theme, pixel }) {
+  if (!episode.source) return;
   const at = pixel([...episode.sourcePlace(now), 0]);
   if (episode.emits[now.step]) {
     context.strokeStyle = faint(theme.ink, 0.45 * (1 - now.share));

@@ -23,7 +23,7 @@ export class Readout {
       head.append(cell);
     }
     const body = table.createTBody();
-    this.rows = episode.position[0].map((_, uav) => row(body, uav, this.columns));
+    this.rows = episode.ids.map((id) => row(body, id, this.columns));
   }
 
   /** Show the numbers of the instant before a time. */
@@ -72,11 +72,11 @@ function written(value) {
 }
 
 /** A row of the table; returns its cells by name. */
-function row(body, uav, columns) {
+function row(body, id, columns) {
   const line = body.insertRow();
   const head = document.createElement("th");
   head.scope = "row";
-  head.textContent = uav;
+  head.textContent = id;
   line.append(head);
   const cells = columns.map((name) => {
     const cell = line.insertCell();

@@ -1,0 +1,259 @@
+"""The flight that a journal tells, as an episode, from which films, pages and GeoJSON are made.
+
+What the server node knew in each step is found by taking the steps again. Where the UAVs were is what they
+reported, in hindsight: late reports count for the time when they were generated, and between two reports a
+UAV is taken to move on the straight way. Nobody knows where the source was.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from damian import keys
+from damian.advice.answers import written
+from damian.advice.desk import checked_ids, replay
+from damian.advice.fitting import fit
+from damian.advice.fleet import Decision, Fleet
+from damian.advice.journal import entries, reports_of
+from damian.advice.reports import Report
+from damian.common.errors import InputError
+from damian.common.text_files import named
+from damian.evaluation.episode import Episode, Floats, cells_of, fixed_of
+
+MOST_STEPS = 20_000
+"""Most steps of an episode that is made from a journal."""
+
+
+@dataclass
+class Known:
+    """What the server node knew in each of S steps of N UAVs."""
+
+    steps: list[int] = field(default_factory=list)
+    """Numbers of the steps, each one more than the one before."""
+    believed: list[Tensor] = field(default_factory=list)
+    """Positions in the messages that it held [m], [N, 2] each."""
+    age: list[Tensor] = field(default_factory=list)
+    """Ages of these messages [s], [N] each."""
+    reward: list[Tensor] = field(default_factory=list)
+    """Rewards of the step, [N] each."""
+    terms: dict[str, list[Tensor]] = field(default_factory=dict)
+    """Their weighted terms by name, [N] each."""
+    belief: list[Tensor] = field(default_factory=list)
+    """Probability that the source is in a cell, [K] each; empty without a belief."""
+    success: bool = False
+    """Whether it knew in the last step that the task was accomplished."""
+    delay: dict[tuple[int, int], int] = field(default_factory=dict)
+    """Delays of the messages that arrived [steps], by the step in which they were generated and the UAV."""
+    told: list[tuple[int, Decision]] = field(default_factory=list)
+    """What UAVs were told to do, by number."""
+
+
+def head_of(path: Path) -> dict[str, Any]:
+    """The first line of a journal: ``fleet``, ``uavs``, and ``about`` (policy, checkpoint, overrides).
+
+    Raises:
+        InputError: it is no journal, or its first line is damaged.
+    """
+    head = next(entries(path))
+    with named(f"{path}: line 1"):
+        head["uavs"] = checked_ids(head.get("uavs"))
+        if not isinstance(head.get("about"), dict):
+            raise InputError("it is damaged: about is missing")
+    return head
+
+
+def episode_of(
+    path: Path,
+    fleet: Fleet,
+    about: Mapping[str, Any],
+    span: tuple[float, float] | None = None,
+    progress: Callable = iter,
+) -> Episode:
+    """The flight of a journal as an episode; ``source`` and ``emits`` are None.
+
+    Args:
+        path: the journal.
+        fleet: a new one of the UAVs of the journal, whose node writes the terms of the reward. Its policy is
+            not asked.
+        about: where the episode comes from; the name of the fleet, its UAVs and when it began are added.
+        span: first and last time to keep, since the fleet began [s]; all if not given.
+        progress: shows how far the journal has been read, as ``tqdm.tqdm``.
+
+    Raises:
+        InputError: the journal is damaged, not every UAV has reported, or the span has no steps or too many.
+    """
+    known, reports = _knowledge(path, fleet, span or (0.0, math.inf), progress)
+    steps = np.array(known.steps)
+    truth = [_hindsight(fleet, uav, reports[uav], steps) for uav in range(len(fleet.uavs))]
+    columns = {name: np.stack([each[name] for each in truth], 1) for name in truth[0]}
+    columns["target"] = _targets(fleet, known.told, columns["position"][0, :, :2], steps)
+    columns["sent"], columns["delay"] = _messages(fleet, known, reports, steps)
+    columns |= {name: _stacked(getattr(known, name)) for name in ("believed", "age", "reward")}
+    columns["sent"][0], columns["reward"][0] = False, 0.0
+    terms = {name: _stacked(rows) for name, rows in known.terms.items()}
+    for rows in terms.values():
+        rows[0] = 0.0
+    flight = {"fleet": head_of(path)["fleet"], "uavs": fleet.uavs, "began": written(cast(float, fleet.start))}
+    return Episode(
+        **fixed_of(fleet.node.worlds, {**about, **flight}, 0),
+        instant=False,
+        success=known.success,
+        time=np.arange(len(steps)) * fleet.node.dt,
+        **columns,
+        source=None,
+        emits=None,
+        reward_terms=terms,
+        cells=cells_of(fleet.node.worlds) if known.belief else None,
+        belief=_stacked(known.belief) if known.belief else None,
+    )
+
+
+def _knowledge(
+    path: Path, fleet: Fleet, span: tuple[float, float], progress: Callable
+) -> tuple[Known, list[list[Report]]]:
+    """What was known in the steps of a span, and all reports of each UAV."""
+    known, reports, end = Known(), [[] for _ in fleet.uavs], math.inf
+    for number, entry in enumerate(progress(list(entries(path))[1:]), 2):
+        with named(f"{path}: line {number}"):
+            if fleet.step <= end:
+                _take(fleet, known, entry, span)
+            if fleet.start is not None:
+                end = fleet.first_step + span[1] / fleet.node.dt
+            if "reports" in entry:
+                received, found = reports_of(entry)
+                for report in found:
+                    reports[fleet.number[report.uav]].append(replace(report, received=received))
+    if fleet.start is None:
+        raise InputError(f"{path}: the fleet never began: not every UAV has reported")
+    _advance(fleet, known, fleet.clock, span, is_last=True)
+    if not known.steps:
+        whole = f"the journal tells of 0 to {(fleet.step - fleet.first_step) * fleet.node.dt:g} s"
+        raise InputError(f"span: no step lies between {span[0]:g} and {span[1]:g} s: {whole}")
+    return known, reports
+
+
+def _take(fleet: Fleet, known: Known, entry: dict[str, Any], span: tuple[float, float]) -> None:
+    """Do again what a line says, after taking the steps before it."""
+    now, told = entry.get("received", entry.get("asked")), entry.get("told")
+    if isinstance(now, int | float):
+        _advance(fleet, known, now, span)
+    replay(fleet, entry)
+    for uav in told if isinstance(told, dict) else ():
+        known.told.append((fleet.number[uav], cast(Decision, fleet.decision(fleet.number[uav]))))
+
+
+def _advance(
+    fleet: Fleet, known: Known, now: float, span: tuple[float, float], is_last: bool = False
+) -> None:
+    """Take the steps up to an instant, and note those in the span; the last one is noted at the end.
+
+    Raises:
+        InputError: there are more steps in the span than an episode may have.
+    """
+    if fleet.start is None:
+        return
+    start, dt = fleet.start, fleet.node.dt
+    first, last = (fleet.first_step + each / dt for each in span)
+    if first > fleet.step:
+        fleet.advance(min(now, start + math.ceil(first) * dt))
+    until = min(fleet.step_of(now) + is_last, last + 1)
+    if until - fleet.step + len(known.steps) > MOST_STEPS and first <= fleet.step:
+        raise InputError(f"span: it has more than {MOST_STEPS} steps of {dt:g} s: give FIRST and LAST [s]")
+    while first <= fleet.step < until:
+        _note(fleet, known)
+        fleet.advance(start + (fleet.step + 1) * dt)
+
+
+def _note(fleet: Fleet, known: Known) -> None:
+    """Note what the server node knows at the end of a step."""
+    known.steps.append(fleet.step)
+    for uav, each in fleet.arrived:
+        sent = each.step, uav
+        known.delay[sent] = min(fleet.step - each.step, known.delay.get(sent, fleet.step))
+    outputs = fleet.observe([])
+    known.believed.append(fleet.points[[each.point for each in fleet.held]])
+    known.age.append(outputs[keys.AGE][0, :, 0] * fleet.node.dt)
+    reward = outputs.get(keys.REWARD, None)
+    known.reward.append(known.age[-1] * 0 if reward is None else cast(Tensor, reward)[0, :, 0])
+    for name in fleet.node.server.reward.terms:
+        term = outputs.get((*keys.REWARD_TERMS, name), None)
+        known.terms.setdefault(name, []).append(known.age[-1] * 0 if term is None else cast(Tensor, term)[0])
+    if (belief := outputs.get(keys.BELIEF, None)) is not None:
+        known.belief.append(cast(Tensor, belief)[0])
+    known.success = bool(outputs[keys.SUCCESS])
+
+
+def _hindsight(
+    fleet: Fleet, uav: int, reports: Sequence[Report], steps: NDArray[np.int64]
+) -> dict[str, NDArray[Any]]:
+    """Columns of a UAV that follow from its reports by the time when they were generated, [S, ...]."""
+    ordered = sorted(reports, key=lambda report: report.time)
+    at = np.clip([fleet.step_of(report.time) for report in ordered], fleet.first_step, None)
+    of_step = {int(step): report for step, report in zip(at, ordered, strict=True)}
+    knots, latest = np.array(list(of_step)), list(of_step.values())
+    places = np.array([(*fleet.ground.local(each.place), max(each.altitude or 0.0, 0.0)) for each in latest])
+    position = np.stack([np.interp(steps, knots, axis) for axis in places.T], -1)
+    newest = np.clip(np.searchsorted(knots, steps, side="right") - 1, 0, None)
+    spots = np.array([each.spotted and not each.flies for each in latest])
+    headings = [None if each.track is None else math.radians(each.track) for each in latest]
+    return {
+        "position": position,
+        "battery": _filled([each.battery for each in latest], 100.0)[newest],
+        "spotted": spots[newest],
+        "track": _course(position) if None in headings else _filled(headings, 0.0)[newest] % (2 * np.pi),
+    }
+
+
+def _filled(values: Sequence[float | None], first: float) -> Floats:
+    """Values in which the one before stands for each that is None."""
+    return np.array(list(_latest(values, first)))
+
+
+def _latest(values: Sequence[float | None], before: float) -> Iterator[float]:
+    for value in values:
+        before = before if value is None else value
+        yield before
+
+
+def _course(position: Floats) -> Floats:
+    """Headings by which a UAV has come to its positions [S, 3], clockwise from north [rad], [S]."""
+    east, north, _ = np.diff(position, axis=0, prepend=position[:1]).T
+    moved = [float(np.arctan2(*way)) if any(way) else None for way in zip(east, north, strict=True)]
+    return _filled(moved, 0.0) % (2 * np.pi)
+
+
+def _targets(
+    fleet: Fleet, told: Sequence[tuple[int, Decision]], begin: Floats, steps: NDArray[np.int64]
+) -> Floats:
+    """Landing points that the UAVs were told by then, [S, N, 2]; where they began before."""
+    targets = np.tile(begin, (len(steps), 1, 1))
+    for uav, decision in told:
+        targets[steps > decision.step, uav] = fleet.ground.points[decision.goal]
+    return targets
+
+
+def _messages(
+    fleet: Fleet, known: Known, reports: Sequence[Sequence[Report]], steps: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Whether a UAV sent a message in a step, and its delay [steps], -1 if it never arrived, [S, N] each."""
+    sent = np.zeros((len(steps), len(fleet.uavs)), bool)
+    delay = np.zeros(sent.shape, int)
+    for (step, uav), lag in known.delay.items():
+        if step >= steps[0]:
+            sent[step - steps[0], uav], delay[step - steps[0], uav] = True, lag
+    for message in fit([report for own in reports for report in own]).messages:
+        row, uav = fleet.step_of(message.time) - steps[0], fleet.number[message.uav]
+        if 0 <= row < len(steps) and not sent[row, uav]:  # lost, or it came in after the last of the steps
+            lag = -1 if message.received is None else fleet.step_of(message.received) - steps[0] - row
+            sent[row, uav], delay[row, uav] = True, lag
+    return sent, delay
+
+
+def _stacked(rows: Sequence[Tensor]) -> NDArray[Any]:
+    return np.stack([np.asarray(row) for row in rows])

@@ -1,0 +1,229 @@
+"""A journal tells what happened: the flight as a simulation recorded it, but for the source."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reporting import START, Reporter, names_of
+from tensordict.nn import TensorDictModuleBase
+
+from damian import keys
+from damian.advice.desk import Desk
+from damian.advice.fleet import Fleet
+from damian.advice.journal import Journal, head
+from damian.advice.node import Node
+from damian.advice.playback import episode_of, head_of
+from damian.baselines.greedy import greedy_policy
+from damian.common.errors import InputError
+from damian.delays.config import DelayConfig
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import EXTRAS
+from damian.evaluation.episode import Episode, record
+from damian.server.features import ObservationConfig
+from damian.server.termination import EpisodeConfig
+from damian.world.battery import BatteryConfig
+from damian.world.motion import MotionConfig
+from damian.world.regions.config import RegionConfig
+from damian.world.signal_source import SourceConfig
+
+N_STEPS = 60
+LLANBEDR = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
+SCENARIO = ScenarioConfig(
+    agents=3,
+    region=LLANBEDR,
+    source=SourceConfig(motion="dynamic", level_db=143.0, emission="per_step", emission_probability=0.6),
+    delay=DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, loss=0.2),
+    observation=ObservationConfig(local_features=["spotted", "battery"], belief=["belief_moments"]),
+    battery=BatteryConfig(enabled=True),
+    episode=EpisodeConfig(max_steps=None),
+)
+MOTIONS = {
+    "instant": MotionConfig(),
+    "flights": MotionConfig(kind="polynomial", max_speed=40.0, max_acceleration=20.0, sensing_time=2.0),
+}
+SCENARIOS = {name: replace(SCENARIO, motion=motion) for name, motion in MOTIONS.items()}
+
+
+def fleet_of(uavs: list[str], scenario: ScenarioConfig = SCENARIO) -> Fleet:
+    return Fleet(Node(scenario, 3, reward_terms=True), uavs, policy=lambda _: pytest.fail("it was asked"))
+
+
+@pytest.fixture(scope="module", params=SCENARIOS)
+def scenario(request) -> ScenarioConfig:
+    return SCENARIOS[request.param]
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory, scenario) -> tuple:
+    """A simulated flight, the episode that the simulation recorded, and the journal of its advice."""
+
+    def advised_fleet(uavs: list[str]) -> Fleet:
+        node = Node(scenario, 3)
+        return Fleet(node, uavs, greedy_policy(node.env))
+
+    folder = tmp_path_factory.mktemp("journals")
+    env = make_env(scenario, 1, 3, extras=EXTRAS)
+    desk, policy = Desk(advised_fleet, folder, {"policy": "greedy"}), greedy_policy(env)
+    desk.create("north", names_of(3))
+    reporter, step = Reporter(env, desk.fleet("north").ground), 0
+
+    def report(shown) -> float:
+        nonlocal step
+        reporter.send(shown, step, at_once=step == 0)
+        now = reporter.time_of(step) + 0.2 * reporter.dt
+        if rows := reporter.arriving(step):
+            desk.report("north", [("row", row_of(row)) for row in rows], now)
+        step += 1
+        return now
+
+    class Reporting(TensorDictModuleBase):
+        in_keys, out_keys = (keys.MESSAGE,), (keys.ACTION,)
+
+        def forward(self, shown):
+            ready = shown[keys.READY][0].nonzero().flatten().tolist()
+            desk.advise("north", report(shown) + 0.1, [names_of(3)[uav] for uav in ready])
+            return policy(shown)
+
+    rollout = env.rollout(N_STEPS, Reporting(), break_when_any_done=False)
+    end = report(rollout[:, -1]["next"])
+    desk.close()
+    Journal(folder / "north.jsonl").append({"asked": end, "told": {}})
+    return record(rollout, env.uav_env, {})[0], folder / "north.jsonl"
+
+
+def row_of(row: dict) -> dict:
+    return {name.lower().replace("_", " "): value for name, value in row.items()}
+
+
+@pytest.fixture(scope="module")
+def told(flown, scenario) -> Episode:
+    return episode_of(flown[1], fleet_of(names_of(3), scenario), {})
+
+
+def test_a_journal_tells_what_the_server_knew_bit_for_bit(flown, told):
+    recorded = flown[0]
+    assert np.array_equal(told.time, recorded.time)
+    for name in ("believed", "age", "belief", "cells", "landing_points"):
+        assert np.array_equal(getattr(told, name), getattr(recorded, name)), name
+    np.testing.assert_allclose(told.reward, recorded.reward, atol=1e-6)
+    for name, term in recorded.reward_terms.items():
+        np.testing.assert_allclose(told.reward_terms[name], term, atol=1e-6)
+    assert told.reward[1:].any()
+    assert (told.age > 0).any()
+
+
+def test_a_journal_tells_what_was_sent_and_when_it_arrived_unless_the_flight_ended_before(flown, told):
+    recorded = flown[0]
+    arrived = recorded.sent & (recorded.delay >= 0)
+    arrived &= np.arange(N_STEPS + 1)[:, None] + recorded.delay <= N_STEPS
+    assert np.array_equal(told.sent & (told.delay >= 0), arrived)
+    assert np.array_equal(told.delay[arrived], recorded.delay[arrived])
+    missing = recorded.sent & ~arrived
+    for uav in range(3):  # losses are seen by gaps between numbers, up to the last message that came in
+        last = np.flatnonzero(arrived[:, uav])[-1]
+        assert told.lost[:, uav].sum() == missing[:last, uav].sum()
+    if recorded.instant:  # messages of every step: it is also known when they were sent
+        assert not (told.lost & ~missing).any()
+    assert told.lost.any()
+
+
+def test_where_uavs_were_is_what_they_reported_in_hindsight(flown, told):
+    recorded = flown[0]
+    came = told.sent & (told.delay >= 0)
+    came[0] = True
+    # A message at takeoff names the landing point, which the UAV has just left.
+    np.testing.assert_allclose(told.true[came], recorded.true[came], atol=1.0)
+    np.testing.assert_allclose(told.battery[came], recorded.battery[came], atol=1e-4)
+    assert np.array_equal(told.spotted[came], recorded.spotted[came])
+    turn = (told.track[came] - recorded.track[came] + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(turn, 0, atol=1e-4)
+    assert told.spotted.any()
+    between = ~came
+    between[came.cumsum(0) == came.sum(0)] = False  # after the last report nothing moves
+    steps = np.arange(N_STEPS + 1)
+    for uav in range(3):
+        for axis in range(2):
+            straight = np.interp(steps, steps[came[:, uav]], recorded.true[came[:, uav], uav, axis])
+            np.testing.assert_allclose(told.true[:, uav, axis], straight, atol=1.0)
+    assert between.any()
+
+
+def test_targets_are_what_the_uavs_were_told(flown, told):
+    np.testing.assert_allclose(told.target, flown[0].target, atol=0.01)
+
+
+def test_nobody_knows_the_source_and_uavs_have_their_ids(told, tmp_path):
+    assert told.source is None
+    assert told.emits is None
+    assert told.names == names_of(3)
+    assert told.about["began"] == "2023-11-14T22:13:20.000Z"
+    told.save(tmp_path / "flight.json")
+    again = Episode.load(tmp_path / "flight.json")
+    assert again.source is None
+    assert again.names == names_of(3)
+    assert np.array_equal(again.sent, told.sent)
+
+
+def test_a_span_is_a_part_of_the_flight(flown, told, scenario):
+    first = int(np.flatnonzero(told.reward.any(-1))[0])
+    last = first + 10
+    span = told.time[first], told.time[last]
+    part = episode_of(flown[1], fleet_of(names_of(3), scenario), {}, span)
+    assert part.n_steps == last - first
+    assert part.time[0] == 0
+    assert np.array_equal(part.true, told.true[first : last + 1])
+    assert np.array_equal(part.reward[1:], told.reward[first + 1 : last + 1])
+    assert not part.reward[0].any()
+    assert not any(rows[0].any() for rows in part.reward_terms.values())
+    assert not part.sent[0].any()
+    assert np.array_equal(part.sent[1:], told.sent[first + 1 : last + 1])
+    assert np.array_equal(part.delay[part.sent], told.delay[first : last + 1][part.sent])
+    with pytest.raises(
+        InputError, match="span: no step lies between 100 and 200 s: the journal tells of 0 to"
+    ):
+        episode_of(flown[1], fleet_of(names_of(3)), {}, (100.0, 200.0))
+
+
+def test_a_silence_of_years_has_too_many_steps_unless_a_span_is_given(flown, tmp_path):
+    path = tmp_path / "x.jsonl"
+    path.write_bytes(flown[1].read_bytes())
+    Journal(path).append({"asked": START + 1e8, "told": {}})
+    with pytest.raises(InputError, match="span: it has more than 20000 steps of 1 s: give FIRST and LAST"):
+        episode_of(path, fleet_of(names_of(3)), {})
+    assert episode_of(path, fleet_of(names_of(3)), {}, (1e8 - 10, 1e8)).n_steps == 10
+
+
+def test_a_uav_that_reports_no_heading_points_where_it_came_from_and_flies_as_high_as_it_says(tmp_path):
+    path, fleet = tmp_path / "x.jsonl", fleet_of(["a"], replace(SCENARIO, agents=1))
+    written = Journal(path)
+    written.append(head("x", ["a"], {"policy": "greedy"}))
+    points = [fleet.ground.points[0], fleet.ground.points[0] + (60.0, 0.0)]
+    for second, height in ((0.0, 0.0), (4.0, 5.0), (8.0, 0.0)):
+        place = fleet.ground.place(fleet.ground.landing_point(place_of(fleet, points[second > 0])))
+        row = {"id": "a", "time": START + second, "lat": place[0], "lon": place[1], "fla": height}
+        written.append({"received": START + second + 0.1, "reports": [row]})
+    episode = episode_of(path, fleet, {})
+    np.testing.assert_allclose(episode.position[:, 0, 2], np.interp(episode.time, [0, 4, 8], [0, 5, 0]))
+    way = episode.true[-1, 0] - episode.true[0, 0]
+    assert np.hypot(*way) > 10
+    steps = np.flatnonzero(np.diff(episode.true[:, 0], axis=0).any(-1)) + 1
+    np.testing.assert_allclose(episode.track[steps, 0], np.arctan2(*way) % (2 * np.pi), atol=1e-9)
+
+
+def place_of(fleet: Fleet, point) -> tuple[float, float]:
+    nearest = np.hypot(*(fleet.ground.points - point).T).argmin()
+    return fleet.ground.place(int(nearest))
+
+
+def test_a_journal_without_a_flight_is_refused(tmp_path):
+    path = tmp_path / "x.jsonl"
+    Journal(path).append(head("x", ["a"], {}))
+    with pytest.raises(InputError, match=r"x\.jsonl: the fleet never began: not every UAV has reported"):
+        episode_of(path, fleet_of(["a"], replace(SCENARIO, agents=1)), {})
+    Journal(path).append({"asked": "soon"})
+    with pytest.raises(InputError, match=r"x\.jsonl: line 2: it is damaged: neither reports nor advice"):
+        episode_of(path, fleet_of(["a"], replace(SCENARIO, agents=1)), {})
+    path.write_text('{"journal": "damian-advice", "version": 1, "fleet": "x", "uavs": 3}\n')
+    with pytest.raises(InputError, match=r"x\.jsonl: line 1: uavs: 3 is not a list"):
+        head_of(path)

@@ -1,0 +1,98 @@
+"""The program that flies shows the flight of a journal of real UAVs instead."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import check_refused
+from PIL import Image
+
+from damian.advice.journal import Journal, head
+from damian.evaluation.episode import Episode
+from damian.recipes.fly import main
+from damian.recipes.shared.launch import launch
+
+WORDS = ["region=llanbedr", "delay=paper", "port=0", "policy=greedy", "agents=5", "token=x"]
+
+
+@pytest.fixture
+def show(tmp_path, monkeypatch):
+    """Run the program on a journal of two UAVs in an empty folder; returns its run folder."""
+    monkeypatch.chdir(tmp_path)
+    write_journal(tmp_path / "north.jsonl")
+
+    def run(*overrides: str) -> Path:
+        words = ["journal=north.jsonl", "formats=[]", *overrides, "hydra.run.dir=run"]
+        monkeypatch.setattr(sys, "argv", ["fly.py", *words])
+        launch(main, "fly")
+        return tmp_path / "run"
+
+    return run
+
+
+def write_journal(path: Path) -> None:
+    """Two UAVs that report their places for six seconds, the second one a second late."""
+    journal = Journal(path)
+    about = {"policy": "mode", "checkpoint": "runs/gone", "overrides": [*WORDS, "checkpoint=runs/gone"]}
+    journal.append(head("north", ["A", "B"], about))
+    for second in range(6):
+        for uav, late in (("A", 0.2), ("B", 1.2)):
+            place = {"lat": 52.811 + 1e-4 * second, "lon": -4.1290, "battery": 100 - second}
+            row = {"id": uav, "time": 1.7e9 + second, "source spotted": second == 3, **place}
+            journal.append({"received": 1.7e9 + second + late, "reports": [row]})
+    journal.close()
+
+
+def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(show):
+    folder = show("formats=[gif,png,html,geojson]", "views=[2d,3d]")
+    names = {"config.yaml", "run.json", "episode_0.json", "episode_0_3d.gif"}
+    names |= {f"episode_0.{kind}" for kind in ("gif", "png", "html", "geojson")}
+    assert {path.name for path in folder.iterdir()} == names
+    episode = Episode.load(folder / "episode_0.json")
+    assert (episode.n_agents, episode.names, episode.source) == (2, ["A", "B"], None)
+    assert episode.age[:, 1].min() > 0 == episode.age[:-1, 0].max()
+    about = dict(episode.about)
+    assert (about["policy"], about["checkpoint"], about["fleet"]) == ("mode", "runs/gone", "north")
+    assert about["began"] == "2023-11-14T22:13:20.000Z"
+    with Image.open(folder / "episode_0.gif") as film:
+        assert film.n_frames == episode.n_steps + 1
+    features = json.loads((folder / "episode_0.geojson").read_text())["features"]
+    kinds = [each["properties"]["kind"] for each in features]
+    assert kinds.count("track") == 2
+    assert "source track" not in kinds
+    assert [each["name"] for each in (f["properties"] for f in features) if each["kind"] == "track"] == [
+        "A",
+        "B",
+    ]
+
+
+def test_settings_are_those_of_the_advice_unless_others_are_given(show):
+    config = (show() / "config.yaml").read_text()
+    assert "law: " in config
+    words = Episode.load(Path("run/episode_0.json")).about["overrides"]
+    assert words[:3] == ["region=llanbedr", "delay=paper", "agents=5"]
+    assert not {word.partition("=")[0] for word in words} & {"port", "policy", "token", "checkpoint"}
+
+
+def test_a_setting_that_is_given_replaces_that_of_the_advice(show):
+    episode = Episode.load(show("clock.simulation=0.5s", "agents=2") / "episode_0.json")
+    assert np.diff(episode.time) == pytest.approx(0.5)
+    assert "agents=5" not in episode.about["overrides"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["policy=greedy"], "policy: greedy flies nothing beside journal: leave one of them out"),
+        (["checkpoint=run"], "checkpoint: run"),
+        (["span=[3]"], "span: [3.0] is not [FIRST, LAST], two times of a journal [s]"),
+        (["span=[90,99]"], "span: no step lies between 90 and 99 s: the journal tells of 0 to 5 s"),
+        (["journal=nothing.jsonl"], "nothing.jsonl: it cannot be read: No such file or directory"),
+        (["journal=null", "span=[1,2]"], "span: [1.0, 2.0] is not [FIRST, LAST], two times of a journal [s]"),
+        (["region=usecase"], "lat, lon"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_in_one_line(show, capsys, overrides, message):
+    check_refused(lambda: show(*overrides), message, capsys)
