@@ -100,12 +100,12 @@ def episode_of(
     for rows in terms.values():
         rows[0] = 0.0
     flight = {"fleet": head_of(path)["fleet"], "uavs": fleet.uavs, "began": written(cast(float, fleet.start))}
+    parts: dict[str, Any] = {**fixed_of(fleet.node.worlds, {**about, **flight}, 0), **columns}
     return Episode(
-        **fixed_of(fleet.node.worlds, {**about, **flight}, 0),
+        **parts,
         instant=False,
         success=known.success,
         time=np.arange(len(steps)) * fleet.node.dt,
-        **columns,
         source=None,
         emits=None,
         reward_terms=terms,

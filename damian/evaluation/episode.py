@@ -90,8 +90,9 @@ class Episode:
     def names(self) -> list[str]:
         """Names of the UAVs: their IDs if they are real ones, else their numbers."""
         ids = self.about.get("uavs")
-        known = isinstance(ids, list) and len(ids) == self.n_agents
-        return [str(uav) for uav in ids] if known else [f"UAV {uav}" for uav in range(self.n_agents)]
+        if isinstance(ids, list) and len(ids) == self.n_agents:
+            return [str(uav) for uav in ids]
+        return [f"UAV {uav}" for uav in range(self.n_agents)]
 
     @property
     def true(self) -> Floats:
@@ -167,7 +168,8 @@ class Episode:
         """Read an episode from its file.
 
         Raises:
-            InputError: the file does not hold an episode of a version of ``READABLE``, or its columns do not fit together.
+            InputError: the file does not hold an episode of a version that can be read, or its columns do not
+                fit together.
         """
         try:
             found = json.loads(read_text(path))
@@ -191,7 +193,6 @@ class Episode:
 
 COLUMNS = {f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")}  # type: ignore[union-attr]
 """What each column means, by its name."""
-
 
 OPTIONAL = (("cells", "belief"), ("source", "emits"))
 """Columns that are null together: without a belief, and where nobody knows the source."""
