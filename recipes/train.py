@@ -133,6 +133,7 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
         state = TrainingState(folder, learner.components(), collector_parts(collector), clock, buffer)
         begin(config, state)
         print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
+        note_long_delays(config)
         log = open_log(config, state)
         with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
             batches = ticks(collector, clock, env.server)
@@ -185,6 +186,13 @@ def saved_if_lost(state: TrainingState, log: MetricsLog, interrupt: Interrupt) -
         if not interrupt.asked:
             saved = f"{state.folder / CHECKPOINT} is of update {state.saved}, the latest"
             raise RunError(f"{error}; {saved}; continue with resume={state.folder}") from error
+
+
+def note_long_delays(config: TrainConfig) -> None:
+    """Say which delays are so long that nothing arrives before an episode ends."""
+    n_steps = config.episode.max_steps
+    for key in config.delay.settings_longer_than(n_steps, config.clock.dt) if n_steps else ():
+        print(f"note: {key} is at least as long as an episode of {n_steps} steps: nothing arrives in it")
 
 
 def begin(config: TrainConfig, state: TrainingState) -> None:

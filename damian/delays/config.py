@@ -82,6 +82,11 @@ class DelayConfig:
                 checks.require(read in CONTEXT_KEYS, f"delay.{name}", show(getattr(self, name)), should)
         checks.require(not samplers["rew"].loses, "delay.rew", show(self.rew), LOSES)
 
+    def settings_longer_than(self, n_steps: int, dt: float) -> list[str]:
+        """Names of the settings whose delay is always at least ``n_steps``, in which nothing can arrive then."""
+        samplers = self._samplers(dt).items()
+        return [f"delay.{name}" for name, each in samplers if each.certain and each.certain >= n_steps]
+
     def _samplers(self, dt: float) -> dict[str, Sampler]:
         """The samplers of the laws, by the name of the setting."""
         names = ("obs", "act", "rew")
