@@ -83,7 +83,7 @@ class DelayConfig:
         checks.require(not samplers["rew"].loses, "delay.rew", show(self.rew), LOSES)
 
     def settings_longer_than(self, n_steps: int, dt: float) -> list[str]:
-        """Names of the settings whose delay is always at least ``n_steps``, in which nothing can arrive then."""
+        """Names of the settings whose delay is always at least ``n_steps``: in so many, nothing arrives."""
         samplers = self._samplers(dt).items()
         return [f"delay.{name}" for name, each in samplers if each.certain and each.certain >= n_steps]
 
