@@ -64,10 +64,6 @@ from .shared.workers import WorkerLost
 MEANING = """sampled: actions are drawn from the policy's distribution; mode: the most likely action is taken.
 Fly the one with the higher return: a policy without memory often needs chance to search."""
 """Lines under the table of an evaluation."""
-MEANING_LATE = f"""{MEANING}
-seen: as the server perceived it, else as it truly was; age: mean age of what the server holds [steps]; late
-and lost: shares of the messages."""
-"""The same where messages are delayed."""
 
 
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
@@ -324,7 +320,7 @@ def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.M
     except InputError as error:  # the region is too large for the script, but not for what has learnt
         print(f"no {GREEDY} policy: {error}")
     can_succeed, late = config.episode.success_share is not None, has_message_delay(config)
-    table = save_results(rows, folder, can_succeed, late, MEANING_LATE if late else MEANING)
+    table = save_results(rows, folder, can_succeed, late, MEANING)
     print(f"\n{table}\n")
     return random
 

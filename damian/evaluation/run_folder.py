@@ -46,6 +46,11 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
     write_atomically(path, image.getvalue())
 
 
+SEEN = """seen: as the server perceived it, else as it truly was; age: mean age of what the server holds
+[steps]; late and lost: shares of the messages."""
+"""Lines under a table of evaluations in which messages are delayed."""
+
+
 def save_results(
     rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool, note: str = ""
 ) -> str:
@@ -56,12 +61,13 @@ def save_results(
         folder: the run folder.
         can_succeed: as for ``results_table``.
         late: as for ``results_table``.
-        note: a line under the table.
+        note: what stands under the table, before what its columns mean.
 
     Returns:
-        the table, with the note.
+        the table, with what stands under it.
     """
-    table = results_table(rows, can_succeed, late) + (f"\n\n{note}" if note else "")
+    below = "\n".join(filter(None, [note, SEEN if late else ""]))
+    table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, ["policy", *(field.name for field in fields(Evaluation))])
