@@ -6,8 +6,9 @@ UAV is taken to move on the straight way. Nobody knows where the source was.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, cast
 
@@ -128,7 +129,8 @@ def _knowledge(
             if "reports" in entry:
                 received, found = reports_of(entry)
                 for report in found:
-                    reports[fleet.number[report.uav]].append(replace(report, received=received))
+                    for uav in fleet.numbers_of([report.uav]) or ():
+                        reports[uav].append(replace(report, received=received))
     if fleet.start is None:
         raise InputError(f"{path}: the fleet never began: not every UAV has reported")
     _advance(fleet, known, fleet.clock, span, is_last=True)
@@ -212,13 +214,8 @@ def _hindsight(
 
 def _filled(values: Sequence[float | None], first: float) -> Floats:
     """Values in which the one before stands for each that is None."""
-    return np.array(list(_latest(values, first)))
-
-
-def _latest(values: Sequence[float | None], before: float) -> Iterator[float]:
-    for value in values:
-        before = before if value is None else value
-        yield before
+    filled = accumulate(values, lambda before, value: before if value is None else value, initial=first)
+    return np.array([*filled][1:])
 
 
 def _course(position: Floats) -> Floats:
