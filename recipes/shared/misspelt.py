@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 from .command_line import parsed
 from .known_settings import default_options, groups, known_settings
@@ -70,7 +71,12 @@ def _is_known(key: str, program: str) -> bool:
 def no_such_option(group: str, option: str, own_folder: str | None = None) -> str:
     """The message for an unknown option of a group, or for an unknown group."""
     options = groups(own_folder).get(group)
-    return f"{group}: {option} is not one of {', '.join(options)}" if options else no_such_key(group)
+    if not options:
+        return no_such_key(group)
+    plain = not own_folder and re.fullmatch(r"[\w/-]+", option)
+    here = sorted(Path().glob(f"*/{group}/{option}.yaml")) if plain else []
+    hint = "".join(f"; for {path} add --config-dir={path.parts[0]}" for path in here[:1])
+    return f"{group}: {option} is not one of {', '.join(options)}{hint}"
 
 
 def no_such_key(key: str, program: str = "train", value: str = "...", beside: Sequence[str] = ()) -> str:

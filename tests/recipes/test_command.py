@@ -119,6 +119,15 @@ def test_a_misspelt_word_is_answered_in_one_line(capsys, monkeypatch, words, mes
         assert refusal(capsys, *words).startswith(f"error: {message}")
 
 
+def test_an_option_of_ones_own_is_found_where_its_folder_was_not_named(capsys, monkeypatch, tmp_path):
+    (tmp_path / "own" / "delay").mkdir(parents=True)
+    (tmp_path / "own" / "delay" / "mine.yaml").write_text("delay: {obs: 3}")
+    monkeypatch.chdir(tmp_path)
+    hint = "; for own/delay/mine.yaml add --config-dir=own\n"
+    assert refusal(capsys, "train", "delay=mine").endswith(hint)
+    assert "add" not in refusal(capsys, "train", "delay=others")
+
+
 def test_a_misspelt_word_is_answered_without_loading_torch():
     code = "import sys; from damian.recipes.command import main\n"
     code += "try: main(['train', 'agnts=3'])\nfinally: print('torch' in sys.modules)"
