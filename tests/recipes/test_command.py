@@ -123,7 +123,7 @@ def test_an_option_of_ones_own_is_found_where_its_folder_was_not_named(capsys, m
     (tmp_path / "own" / "delay").mkdir(parents=True)
     (tmp_path / "own" / "delay" / "mine.yaml").write_text("delay: {obs: 3}")
     monkeypatch.chdir(tmp_path)
-    hint = "; for own/delay/mine.yaml add --config-dir=own\n"
+    hint = "; for own/delay/mine.yaml add --config-dir=own"
     assert refusal(capsys, "train", "delay=mine").endswith(hint)
     assert "add" not in refusal(capsys, "train", "delay=others")
 
