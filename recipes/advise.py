@@ -34,7 +34,7 @@ from damian.advice.desk import Desk
 from damian.advice.fleet import Fleet, Waiting
 from damian.advice.inbox import read_inbox
 from damian.advice.node import Node, for_uavs, served
-from damian.advice.reports import as_csv, read_file
+from damian.advice.tables import as_csv, read_file
 from damian.baselines.greedy import greedy_policy
 from damian.common import checks
 from damian.common.atomic_files import write_atomically

@@ -13,7 +13,8 @@ from damian import keys
 from damian.advice.fleet import Fleet
 from damian.advice.ground import Ground
 from damian.advice.node import Node
-from damian.advice.reports import Report, json_rows, read_rows
+from damian.advice.reports import Report, read_rows
+from damian.advice.tables import json_rows
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 

@@ -12,7 +12,8 @@ from damian import keys
 from damian.advice.answers import Answer, advice_of, status_of
 from damian.advice.fleet import Fleet
 from damian.advice.journal import SUFFIX, Journal, entries, head, reports_of
-from damian.advice.reports import Report, Rows, read_rows
+from damian.advice.reports import Report, read_rows
+from damian.advice.tables import Rows
 from damian.common.errors import InputError
 from damian.common.text_files import named, show
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from damian.advice.journal import SUFFIX, entries, reports_of
-from damian.advice.reports import Report, read_file, read_rows
+from damian.advice.reports import Report, read_rows
+from damian.advice.tables import read_file
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.delays.laws import LOST

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from damian.advice.desk import Desk
 from damian.advice.fleet import Waiting
-from damian.advice.reports import as_csv, read_file
+from damian.advice.tables import as_csv, read_file
 from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError
 

@@ -10,7 +10,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from damian.advice.reports import LATEST, Report, checked_rows, read_rows
+from damian.advice.reports import LATEST, Report, read_rows
+from damian.advice.tables import checked_rows
 from damian.common.atomic_files import writing
 from damian.common.errors import InputError
 from damian.common.text_files import named, one_line

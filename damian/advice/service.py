@@ -22,7 +22,7 @@ from starlette.routing import Route
 
 from damian.advice.desk import Desk, NoFleet
 from damian.advice.fleet import Waiting
-from damian.advice.reports import Rows, as_csv, csv_rows, json_rows, parsed_json
+from damian.advice.tables import Rows, as_csv, csv_rows, json_rows, parsed_json
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 

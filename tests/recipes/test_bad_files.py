@@ -20,7 +20,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from damian.advice.reports import read_file, read_rows
+from damian.advice.reports import read_rows
+from damian.advice.tables import read_file
 from damian.common.errors import InputError
 from damian.recipes import advise as advise_program
 from damian.recipes import bench, compare, evaluate, oracle, pendulum, spread, train
