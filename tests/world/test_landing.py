@@ -49,6 +49,13 @@ def booked(ranked, row, standing, ready):
     return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0), 64)
 
 
+def deferred_acceptance(ranking, row, standing, reach, n_points):
+    """Points booked by deferred acceptance, which otherwise serves only worlds with many UAVs."""
+    reached = ranking.distance[row, 0] <= reach
+    choice = torch.where(reached, ranking.point[row, 0].long(), standing)
+    return landing._assign_in_order(ranking, row, standing, reach, choice, n_points)
+
+
 @given(
     seed=st.integers(0, 2**32 - 1),
     n_agents=st.integers(1, 25),
@@ -75,7 +82,7 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
     spare=st.integers(0, 6),
     together=st.booleans(),
 )
-def test_booking_of_few_uavs_one_by_one_equals_deferred_acceptance(seed, n_agents, spare, together):
+def test_booking_of_few_uavs_one_by_one_equals_the_other_ways(seed, n_agents, spare, together):
     n_points = n_agents + spare
     ranked, row, standing, _ = map(torch.as_tensor, random_bookings(seed, 30, n_agents, n_points, together))
     generator = torch.Generator().manual_seed(seed)
@@ -83,6 +90,23 @@ def test_booking_of_few_uavs_one_by_one_equals_deferred_acceptance(seed, n_agent
     reach = 1.5 * torch.rand(row.shape, generator=generator) - 0.3  # some must stay, some reach few points
     one_by_one = landing._assign_one_by_one(ranking, row, standing, reach)
     assert one_by_one.equal(assign_landing_points(ranking, row, standing, reach, n_points))
+    assert one_by_one.equal(deferred_acceptance(ranking, row, standing, reach, n_points))
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_agents=st.integers(1, 20),
+    spare=st.integers(0, 6),
+    together=st.booleans(),
+)
+def test_deferred_acceptance_equals_serial_assignment_with_any_reach(seed, n_agents, spare, together):
+    n_points = n_agents + spare
+    ranked, row, standing, _ = map(torch.as_tensor, random_bookings(seed, 30, n_agents, n_points, together))
+    generator = torch.Generator().manual_seed(seed)
+    ranking = Ranking(ranked.int(), torch.rand(ranked.shape, generator=generator))
+    reach = 1.5 * torch.rand(row.shape, generator=generator) - 0.3
+    deferred = deferred_acceptance(ranking, row, standing, reach, n_points)
+    assert deferred.equal(_assign_serially(ranking, row, standing, reach))
 
 
 @given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(2, 12), spare=st.integers(0, 6))
