@@ -1,6 +1,7 @@
 """The Bayes filter of the source against its slow twin, and whether its probabilities are frequencies."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -36,6 +37,12 @@ grids = {
 every_grid = pytest.mark.parametrize("grid", grids.values(), ids=grids)
 
 
+def together(beliefs: Sequence[Tensor]) -> Tensor:
+    """The beliefs of the server [B, K] and of the UAVs [B, V - 1, K] as those of all receivers, [B, V, K]."""
+    server, own = beliefs
+    return torch.cat([server.unsqueeze(1), own], 1)
+
+
 class Flight:
     """Random reports with random delays, in worlds that begin new episodes and pause at random."""
 
@@ -62,13 +69,14 @@ class Flight:
     def begin(self, mask: Tensor) -> None:
         new = self.rows()
         self.first = torch.where(mask.unsqueeze(-1), new, self.first)
-        self.beliefs = _begin(*self.grid, *self.window, new, self.region, mask)
+        self.beliefs = together(_begin(*self.grid, *self.window, new, self.region, mask))
         for world in mask.nonzero().squeeze(-1).tolist():
             self.steps[world] = []
 
     def step(self, stepped: Tensor) -> None:
         rows, delay = self.rows(), self.draw(LONGEST + 2, *self.first.shape) - 1
-        slot, self.beliefs = _advance(*self.grid, *self.window, rows, delay, self.region, stepped)
+        slot, *beliefs = _advance(*self.grid, *self.window, rows, delay, self.region, stepped)
+        self.beliefs = together(beliefs)
         self.window = self.window._replace(slot=slot)
         for world in stepped.nonzero().squeeze(-1).tolist():
             self.steps[world].append((rows[world].tolist(), delay[world].tolist()))
@@ -132,7 +140,8 @@ def test_a_message_changes_nothing_before_it_arrives():
         for flight, row in zip(flights, (loud, quiet), strict=True):
             sent = row if age == 0 else nothing
             delay = torch.full((1, 3), 3)
-            slot, flight.beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+            slot, *beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+            flight.beliefs = together(beliefs)
             flight.window = flight.window._replace(slot=slot)
         assert torch.equal(flights[0].beliefs, flights[1].beliefs) == (age < 3)
 
@@ -155,9 +164,9 @@ def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Te
     for _ in range(n_steps):
         cell = torch.multinomial(grid.moves[cell], 1).squeeze(-1) if grid.moves is not None else cell
         delay = torch.where(torch.rand(n_worlds, 3) < 0.5, 0, torch.randint(-1, LONGEST + 1, (n_worlds, 3)))
-        slot, beliefs = _advance(*grid, *window, reports(cell), delay, region, everyone)
+        slot, beliefs, _ = _advance(*grid, *window, reports(cell), delay, region, everyone)
         window = window._replace(slot=slot)
-        said.append(beliefs[:, 0])
+        said.append(beliefs)
         was.append(torch.nn.functional.one_hot(cell, beliefs.shape[-1]))
     return torch.stack(said).flatten(), torch.stack(was).flatten().float()
 
