@@ -215,41 +215,35 @@ def _to_compute(
         begins: how long ago the first step was, [V, B] steps.
         region: index of the region of each world, [B].
     """
-    (n_viewers, n_worlds), n_steps = begins.shape, len(back) - 1
+    n_worlds, n_steps = begins.shape[1], len(back) - 1
     due = torch.arange(n_steps, device=back.device).view(-1, 1, 1) <= begins
     lag, viewer, world = _chosen(due)
     slot, earlier = (back.flatten().index_select(0, each * n_worlds + world) for each in (lag, lag + 1))
     receiver, agent = viewer * n_worlds + world, torch.arange(window.report.shape[1], device=back.device)
     at = (slot * len(agent) * n_worlds + world).unsqueeze(-1) + agent * n_worlds
-    known, sent = (gather_rows(each.flatten(), at) for each in _reports(grid, window, back.unsqueeze(1)))
+    known = (window.delay >= 0) & (window.delay <= back.unsqueeze(1))
+    known = torch.where(known, window.report, grid.no_report)
+    reports = gather_rows(_marked(grid, known).flatten(), at)
+    if len(begins) > 1:
+        own = gather_rows(_marked(grid, window.report).flatten(), at)
+        reports = torch.where(viewer.unsqueeze(-1) == agent + 1, own, reports)
     work = _Computed(
         _row(window, earlier, viewer, world),
         slot * due[0].numel() + receiver,
         lag <= begins.flatten().index_select(0, receiver),
         region.index_select(0, world),
-        torch.where(viewer.unsqueeze(-1) == agent + 1, sent, known),
+        reports,
     )
     counts = [due[0].numel()] * n_steps
     if devices.data_dependent(due.device):
-        counts = due.flatten(1).sum(-1).tolist()
+        counts = lag.bincount(minlength=n_steps).tolist()
     steps = zip(*(each.split(counts) for each in work), strict=True)
     return (_Computed(*each) for each in reversed([*steps]))
 
 
-def _reports(grid: SourceGrid, window: Window, lag: Tensor) -> tuple[Tensor, Tensor]:
-    """What the server knows of the steps in the ring, and all that was reported, [S, N, B].
-
-    Both are rows of ``SourceGrid.log_reports``, with the repeated reports marked as such.
-
-    Args:
-        grid: cells and tables.
-        window: beliefs of the latest steps.
-        lag: how long ago the step of each slot was, [S, 1, B] steps.
-    """
-    sent = window.report
-    known = torch.where((window.delay >= 0) & (window.delay <= lag), sent, grid.no_report)
-    known, sent = (repeated(grid, each, each.roll(1, 0)) for each in (known, sent))
-    return known, sent
+def _marked(grid: SourceGrid, reports: Tensor) -> Tensor:
+    """The reports in a ring [S, N, B], with those marked that repeat the one of the slot before."""
+    return repeated(grid, reports, reports.roll(1, 0))
 
 
 def _latest(window: Window, slot: Tensor) -> tuple[Tensor, Tensor]:
