@@ -176,15 +176,15 @@ def _begins(grid: SourceGrid, window: Window, back: Tensor, stepped: Tensor) -> 
     """
     sent, lag = window.report != grid.no_report, back.unsqueeze(1)
     arrives = (sent & (window.delay == lag)).amax(1)
-    first = torch.where(stepped, torch.where(arrives, back, 0).amax(0), -1).unsqueeze(0)
+    first = torch.where(stepped, (arrives * back).amax(0), -1).unsqueeze(0)
     if window.shared.shape[1] == 1:
         return first
     missing = sent & ((window.delay < 0) | (window.delay > lag))
     before = back.gather(0, first + 1).expand(1, *window.shared.shape[1:])  # the slot of the step before
-    alone = torch.where(missing, lag, -1).amax(0).minimum(first)
+    alone = ((missing * (lag + 1)).amax(0) - 1).minimum(first)
     alone = torch.where(window.shared.gather(0, before)[0, 1:], alone, first)
     begins = torch.cat([first, alone])
-    window.shared.copy_(torch.where(lag <= first, lag > begins, window.shared))
+    window.shared.logical_or_(lag <= first).logical_and_(lag > begins)
     return begins
 
 
@@ -221,8 +221,8 @@ def _to_compute(
     slot, earlier = (back.flatten().index_select(0, each * n_worlds + world) for each in (lag, lag + 1))
     receiver, agent = viewer * n_worlds + world, torch.arange(window.report.shape[1], device=back.device)
     at = (slot * len(agent) * n_worlds + world).unsqueeze(-1) + agent * n_worlds
-    known = (window.delay >= 0) & (window.delay <= back.unsqueeze(1))
-    known = torch.where(known, window.report, grid.no_report)
+    unknown = (window.delay < 0) | (window.delay > back.unsqueeze(1))
+    known = window.report.maximum(unknown * grid.no_report)  # no report is the last row
     reports = gather_rows(_marked(grid, known).flatten(), at)
     if len(begins) > 1:
         own = gather_rows(_marked(grid, window.report).flatten(), at)
