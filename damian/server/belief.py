@@ -121,3 +121,14 @@ def chance_of_staying(grid: SourceGrid, belief: Tensor, rows: Tensor) -> Tensor:
     """
     chance = gather_rows(grid.next_staying, rows.clamp(max=len(grid.next_staying) - 1))
     return chance.mul_(belief.unsqueeze(-2)).sum(-1)
+
+
+@torch.library.custom_op("damian::entropy", mutates_args=())
+def entropy(belief: Tensor) -> Tensor:
+    """The entropy of each belief [*, K], in nats, [*]."""
+    return belief.clamp(min=1e-12).log_().mul_(belief).sum(-1).neg_()
+
+
+@entropy.register_fake
+def _(belief: Tensor) -> Tensor:
+    return belief.new_empty(belief.shape[:-1])

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from damian.common.tensors import gather_rows
-from damian.server.belief import chance_of_staying, detection_chance, report_rows
+from damian.server.belief import chance_of_staying, detection_chance, entropy, report_rows
 from damian.server.feature_cache import FeatureCache
 from damian.server.features import FEATURES, feature
 
@@ -51,8 +51,8 @@ def _belief_moments(v: FeatureCache) -> Tensor:
     mean = torch.stack(mean, -1)
     variance = (square - mean.square().sum(-1)).clamp(min=0)
     offset = (mean.unsqueeze(-2) - v.wanted(v.messages.position)) / v.scale.unsqueeze(-1)
-    entropy = -(belief * belief.clamp(min=1e-12).log()).sum(-1) / math.log(max(belief.shape[-1], 2))
-    shared = torch.stack([variance.sqrt() / v.context.scale, entropy], -1).unsqueeze(-2)
+    unsure = entropy(belief) / math.log(max(belief.shape[-1], 2))
+    shared = torch.stack([variance.sqrt() / v.context.scale, unsure], -1).unsqueeze(-2)
     return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1)
 
 
