@@ -75,7 +75,8 @@ def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, 
         mask: worlds that begin an episode, [B] bool.
     """
     report = report_rows(grid, messages, torch.ones_like(messages.spotted))
-    return Beliefs(*_begin(*grid, *window, report, region, mask))
+    _begin(*grid, *window, report, region, mask)
+    return latest(window, window.slot)
 
 
 def advance(
@@ -99,6 +100,14 @@ def advance(
     return slot, Beliefs(*beliefs)
 
 
+def latest(window: Window, slot: Tensor) -> Beliefs:
+    """The beliefs of a step, by its slot in each world, [B]."""
+    viewer = torch.arange(window.belief.shape[1], device=slot.device)
+    world = torch.arange(len(slot), device=slot.device).unsqueeze(-1)
+    row, held = _row(window, slot.unsqueeze(-1), viewer, world), window.belief.flatten(0, 2)
+    return Beliefs(held.index_select(0, row[:, 0]), gather_rows(held, row[:, 1:]))
+
+
 # Operators of their own: the number of worlds to work on depends on data, which no compiler can trace.
 
 _TYPES: dict[Any, str] = {Tensor: "Tensor", Tensor | None: "Tensor?", float: "float"}
@@ -120,21 +129,22 @@ def _unpacked(arguments: tuple) -> tuple[SourceGrid, Window, tuple[Tensor, ...]]
     return SourceGrid(*arguments[:n_grid]), Window(*arguments[n_grid:n_both]), arguments[n_both:]
 
 
-@_operator("begin_belief", "Tensor first, Tensor region, Tensor mask", "(Tensor, Tensor)")
-def _begin(*arguments: Any) -> tuple[Tensor, Tensor]:
+@_operator("begin_belief", "Tensor first, Tensor region, Tensor mask", "()")
+def _begin(*arguments: Any) -> None:
     grid, window, (first, region, mask) = _unpacked(arguments)
     (world,) = _chosen(mask)
+    if not len(world):
+        return
     begun, slot, known, region = (each.index_select(0, world) for each in (mask, window.slot, first, region))
     _write(window.belief, _row(window, slot, 0, world), first_belief(grid, known, region), begun)
     window.report.masked_fill_(mask, grid.no_report)  # nothing is in transit
     for held, new in ((window.shared, mask), (window.report, first), (window.delay, torch.zeros_like(first))):
         _write_step(held, window.slot, new.view(len(mask), -1).T, mask)
-    return _latest(window, window.slot)
 
 
 @_begin.register_fake
-def _(*arguments: Any) -> tuple[Tensor, Tensor]:
-    return _like_latest(_unpacked(arguments)[1])
+def _(*arguments: Any) -> None:
+    pass
 
 
 @_operator(
@@ -145,15 +155,15 @@ def _(*arguments: Any) -> tuple[Tensor, Tensor]:
 def _advance(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
     grid, window, (sent, sent_delay, region, stepped) = _unpacked(arguments)
     n_slots = len(window.belief)
-    latest = torch.where(stepped, (window.slot + 1) % n_slots, window.slot)
-    _write_step(window.report, latest, sent.T, stepped)
-    _write_step(window.delay, latest, sent_delay.T, stepped)
-    back = (latest - torch.arange(n_slots, device=latest.device).unsqueeze(-1)) % n_slots
+    slot = torch.where(stepped, (window.slot + 1) % n_slots, window.slot)
+    _write_step(window.report, slot, sent.T, stepped)
+    _write_step(window.delay, slot, sent_delay.T, stepped)
+    back = (slot - torch.arange(n_slots, device=slot.device).unsqueeze(-1)) % n_slots
     for each in _to_compute(grid, window, back, _begins(grid, window, back, stepped), region):
         before = window.belief.flatten(0, 2).index_select(0, each.before)
         new = weigh(predict(grid, before, each.region), likelihood(grid, each.reports))
         _write(window.belief, each.row, new, each.mask)
-    return latest, *_latest(window, latest)
+    return slot, *latest(window, slot)
 
 
 @_advance.register_fake
@@ -246,17 +256,8 @@ def _marked(grid: SourceGrid, reports: Tensor) -> Tensor:
     return repeated(grid, reports, reports.roll(1, 0))
 
 
-def _latest(window: Window, slot: Tensor) -> tuple[Tensor, Tensor]:
-    """The beliefs of the server [B, K] and of the UAVs [B, V - 1, K] in the slots [B]."""
-    viewer = torch.arange(window.belief.shape[1], device=slot.device)
-    world = torch.arange(len(slot), device=slot.device).unsqueeze(-1)
-    row = _row(window, slot.unsqueeze(-1), viewer, world)
-    held = window.belief.flatten(0, 2)
-    return held.index_select(0, row[:, 0]), gather_rows(held, row[:, 1:])
-
-
 def _like_latest(window: Window) -> tuple[Tensor, Tensor]:
-    """Empty tensors like those of ``_latest``."""
+    """Empty tensors like those of ``latest``."""
     _, n_viewers, n_worlds, n_cells = window.belief.shape
     empty = window.belief.new_empty
     return empty(n_worlds, n_cells), empty(n_worlds, n_viewers - 1, n_cells)

@@ -13,7 +13,7 @@ from torch import Tensor
 from damian.common.errors import InputError
 from damian.envs.scenario import make_simulation
 from damian.server.belief import chance_of_staying, detection_chance
-from damian.server.belief_window import _advance, _begin, empty_window
+from damian.server.belief_window import _advance, _begin, empty_window, latest
 from damian.server.source_grid import SourceGrid, build_source_grid
 from damian.world.signal_source import SourceConfig
 
@@ -69,7 +69,8 @@ class Flight:
     def begin(self, mask: Tensor) -> None:
         new = self.rows()
         self.first = torch.where(mask.unsqueeze(-1), new, self.first)
-        self.beliefs = together(_begin(*self.grid, *self.window, new, self.region, mask))
+        _begin(*self.grid, *self.window, new, self.region, mask)
+        self.beliefs = together(latest(self.window, self.window.slot))
         for world in mask.nonzero().squeeze(-1).tolist():
             self.steps[world] = []
 
