@@ -147,6 +147,30 @@ def test_a_message_changes_nothing_before_it_arrives():
         assert torch.equal(flights[0].beliefs, flights[1].beliefs) == (age < 3)
 
 
+def test_a_uav_shares_the_servers_belief_from_where_the_server_knows_its_reports():
+    grid, everyone = grids["one region"], torch.ones(1, dtype=torch.bool)
+    flight = Flight(grid, 1, own=True)
+
+    def step(delay_of_the_first_uav: int) -> list[bool]:
+        """Which UAVs share the belief after a step in which the first one hears the source."""
+        sent, delay = torch.tensor([[1, 4, 6]]), torch.tensor([[delay_of_the_first_uav, 0, 0]])
+        slot, *beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+        flight.window, flight.beliefs = flight.window._replace(slot=slot), together(beliefs)
+        shared = flight.window.shared[slot, 1:, 0].flatten().tolist()
+        assert shared == [torch.equal(own, beliefs[0][0]) for own in beliefs[1][0]]
+        return shared
+
+    assert step(0) == [True, True, True]
+    assert step(2) == [False, True, True]
+    assert step(0) == [False, True, True]
+    assert step(0) == [True, True, True]  # it arrives
+    assert flight.window.shared[:, 1:].all()  # so that the steps in between are shared too
+    assert all(step(-1) == [False, True, True] for _ in range(2))
+    assert all(step(0) == [False, True, True] for _ in range(LONGEST + 3))  # it never arrives
+    flight.begin(everyone)
+    assert step(0) == [True, True, True]
+
+
 def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Tensor]:
     """Beliefs, and whether the source is in the cell, where all happens as the grid assumes."""
     torch.manual_seed(0)
