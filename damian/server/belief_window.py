@@ -163,13 +163,16 @@ def _advance(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         before = window.belief.flatten(0, 2).index_select(0, each.before)
         new = weigh(predict(grid, before, each.region), likelihood(grid, each.reports))
         _write(window.belief, each.row, new, each.mask)
-    return slot, *latest(window, slot)
+    beliefs = latest(window, slot)
+    return slot, beliefs.server, beliefs.own
 
 
 @_advance.register_fake
 def _(*arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
     window = _unpacked(arguments)[1]
-    return torch.empty_like(window.slot), *_like_latest(window)
+    _, n_viewers, n_worlds, n_cells = window.belief.shape
+    server, own = (n_worlds, n_cells), (n_worlds, n_viewers - 1, n_cells)
+    return torch.empty_like(window.slot), window.belief.new_empty(server), window.belief.new_empty(own)
 
 
 def _begins(grid: SourceGrid, window: Window, back: Tensor, stepped: Tensor) -> Tensor:
@@ -246,7 +249,7 @@ def _to_compute(
     )
     counts = [due[0].numel()] * n_steps
     if devices.data_dependent(due.device):
-        counts = lag.bincount(minlength=n_steps).tolist()
+        counts = lag.bincount().tolist()  # as far as the oldest step of any
     steps = zip(*(each.split(counts) for each in work), strict=True)
     return (_Computed(*each) for each in reversed([*steps]))
 
@@ -254,13 +257,6 @@ def _to_compute(
 def _marked(grid: SourceGrid, reports: Tensor) -> Tensor:
     """The reports in a ring [S, N, B], with those marked that repeat the one of the slot before."""
     return repeated(grid, reports, reports.roll(1, 0))
-
-
-def _like_latest(window: Window) -> tuple[Tensor, Tensor]:
-    """Empty tensors like those of ``latest``."""
-    _, n_viewers, n_worlds, n_cells = window.belief.shape
-    empty = window.belief.new_empty
-    return empty(n_worlds, n_cells), empty(n_worlds, n_viewers - 1, n_cells)
 
 
 def _row(window: Window, slot: Tensor, viewer: Tensor | int, world: Tensor) -> Tensor:

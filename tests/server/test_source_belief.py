@@ -147,6 +147,14 @@ def test_a_message_changes_nothing_before_it_arrives():
         assert torch.equal(flights[0].beliefs, flights[1].beliefs) == (age < 3)
 
 
+def test_a_step_that_no_world_takes_changes_nothing():
+    flight = Flight(grids["one region"], 3, own=True)
+    flight.step(torch.ones(3, dtype=torch.bool))
+    before = [flight.beliefs, *(each.clone() for each in flight.window)]
+    flight.step(torch.zeros(3, dtype=torch.bool))
+    assert all(map(torch.equal, before, [flight.beliefs, *flight.window]))
+
+
 def test_a_uav_shares_the_servers_belief_from_where_the_server_knows_its_reports():
     grid, everyone = grids["one region"], torch.ones(1, dtype=torch.bool)
     flight = Flight(grid, 1, own=True)
