@@ -280,7 +280,8 @@ def _chosen(mask: Tensor) -> tuple[Tensor, ...]:
     """Indices at which a mask is true; all of them where shapes must not depend on data."""
     if devices.data_dependent(mask.device):
         return mask.nonzero(as_tuple=True)
-    return torch.unravel_index(torch.arange(mask.numel(), device=mask.device), mask.shape)
+    every = torch.meshgrid(*(torch.arange(n, device=mask.device) for n in mask.shape), indexing="ij")
+    return tuple(each.flatten() for each in every)
 
 
 def _write(held: Tensor, row: Tensor, new: Tensor, mask: Tensor) -> None:
