@@ -7,7 +7,7 @@ from torch import Tensor
 from damian import keys
 from damian.keys import next_key
 from damian.replay.step_keys import Recompute
-from damian.server.belief import Evidence, evidence, predict, repeated, report_rows, weigh
+from damian.server.belief import likelihood, predict, repeated, report_rows, weigh
 from damian.server.server import Server
 
 
@@ -73,11 +73,11 @@ def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     rows, first = report_rows(grid, messages, arrived), server.messages(steps[keys.MESSAGE])
     first = report_rows(grid, first, torch.ones_like(first.spotted))
     previous = torch.where(begins, first, rows.roll(1, 0))
-    found, region = evidence(grid, repeated(grid, rows, previous)), server.region_of(messages)
+    likely, region = likelihood(grid, repeated(grid, rows, previous)), server.region_of(messages)
     belief, corrected = before[0], []
     for i in range(len(delay)):  # each belief follows from the one before
         belief = torch.where(begins[i], before[i], belief)
-        belief = weigh(grid, predict(grid, belief, region[i]), Evidence(found.match[i], found.silent[i]))
+        belief = weigh(predict(grid, belief, region[i]), likely[i])
         if i == 0:  # where its episode began earlier, what had been reported then is not known
             belief = torch.where(begins[0], belief, after[0])
         corrected.append(belief)

@@ -6,8 +6,6 @@ late, out of order or never: a belief is exact for the messages that have arrive
 over all steps since the oldest of those that came in late (``damian.transforms.Belief``).
 """
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
@@ -29,16 +27,7 @@ def repeated(grid: SourceGrid, rows: Tensor, before: Tensor) -> Tensor:
         before: the rows of the same UAVs one step before, [*, N].
     """
     same = (rows == before) & (rows != grid.no_report)
-    return torch.where(same, rows + grid.no_report // 2, rows)
-
-
-class Evidence(NamedTuple):
-    """What messages of one step say about where the source was at that step."""
-
-    match: Tensor
-    """Probability of what the UAVs report, if the source emits in the cell, [*, K]."""
-    silent: Tensor
-    """1 if no UAV has detected anything, else 0: the probability of the reports if it does not emit, [*]."""
+    return torch.add(rows, same, alpha=grid.no_report // 2)  # takes a third of the time of ``where``
 
 
 def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor) -> Tensor:
@@ -53,16 +42,19 @@ def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor) -> Tensor:
     return torch.where(sent & ~messages.in_flight, row, grid.no_report)
 
 
-def evidence(grid: SourceGrid, rows: Tensor) -> Evidence:
-    """What N reports of one step say.
+def likelihood(grid: SourceGrid, rows: Tensor) -> Tensor:
+    """Probability of N reports of one step by the cell of the source, [*, K].
 
     Args:
         grid: cells and tables.
         rows: rows of ``SourceGrid.log_reports``, [*, N].
     """
     log = embedding_bag(rows.flatten(0, -2), grid.log_reports, mode="sum")  # gathers and sums at once
-    silent = ~(rows % 2 == 1).any(-1)  # the row of no report is even
-    return Evidence(log.exp().view(*rows.shape[:-1], log.shape[-1]), silent.to(log.dtype))
+    match = log.exp_().view(*rows.shape[:-1], log.shape[-1])
+    if grid.emits < 1:
+        silent = ~(rows % 2 == 1).any(-1, keepdim=True)  # the row of no report is even
+        match = grid.emits * match + (1 - grid.emits) * silent
+    return match.add_(_LEAST)
 
 
 def predict(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
@@ -81,18 +73,14 @@ def predict(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
     return moved * (gather_rows(grid.prior, region) > 0)
 
 
-def weigh(grid: SourceGrid, predicted: Tensor, found: Evidence) -> Tensor:
+def weigh(predicted: Tensor, likely: Tensor) -> Tensor:
     """The belief after the messages of a step, [*, K].
 
     Args:
-        grid: cells and tables.
         predicted: the belief before them, [*, K].
-        found: what they say.
+        likely: their ``likelihood``, [*, K].
     """
-    likelihood = found.match
-    if grid.emits < 1:
-        likelihood = grid.emits * likelihood + (1 - grid.emits) * found.silent.unsqueeze(-1)
-    weighed = (likelihood + _LEAST).mul_(predicted)
+    weighed = predicted * likely
     return weighed.div_(weighed.sum(-1, keepdim=True))
 
 
@@ -104,7 +92,7 @@ def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
         rows: rows of ``SourceGrid.log_reports`` for the first messages (``report_rows``), [*, N].
         region: index of the region, [*].
     """
-    return weigh(grid, gather_rows(grid.prior, region), evidence(grid, rows))
+    return weigh(gather_rows(grid.prior, region), likelihood(grid, rows))
 
 
 def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
@@ -132,4 +120,15 @@ def chance_of_staying(grid: SourceGrid, belief: Tensor, rows: Tensor) -> Tensor:
         rows: rows of ``SourceGrid.log_reports`` for what the UAVs report now, not marked as repeated, [*, N].
     """
     chance = gather_rows(grid.next_staying, rows.clamp(max=len(grid.next_staying) - 1))
-    return (chance * belief.unsqueeze(-2)).sum(-1)
+    return chance.mul_(belief.unsqueeze(-2)).sum(-1)
+
+
+@torch.library.custom_op("damian::entropy", mutates_args=())
+def entropy(belief: Tensor) -> Tensor:
+    """The entropy of each belief [*, K], in nats, [*]."""
+    return belief.clamp(min=1e-12).log_().mul_(belief).sum(-1).neg_()
+
+
+@entropy.register_fake
+def _(belief: Tensor) -> Tensor:
+    return belief.new_empty(belief.shape[:-1])

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from damian.common.tensors import gather_rows
-from damian.server.belief import chance_of_staying, detection_chance, report_rows
+from damian.server.belief import chance_of_staying, detection_chance, entropy, report_rows
 from damian.server.feature_cache import FeatureCache
 from damian.server.features import FEATURES, feature
 
@@ -28,17 +28,15 @@ def _belief_gain(v: FeatureCache) -> Tensor:
         raise ValueError("belief_gain needs the landing points to which actions lead")
     everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
     standing = v.wanted(v.messages.trail[..., 0])
-    here = (standing % n_points).unsqueeze(-1)
     rows = v.wanted(report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted)))
     stays = chance_of_staying(v.grid, v.belief, rows).unsqueeze(-1)
-    chance = detection_chance(v.grid, v.belief, v.region).unsqueeze(-2)
-    chance = chance.expand(*standing.shape, -1).scatter(-1, here, stays)
-    goals = gather_rows(v.context.goals, standing)
-    nearest, second = goals[..., 0], goals[..., -1]
-    taken = torch.zeros(*everyone.shape[:-1], n_points, dtype=torch.bool, device=everyone.device)
-    taken = taken.scatter(-1, everyone, True).unsqueeze(-2).expand(*standing.shape, -1)
-    taken = taken.gather(-1, nearest) & (nearest != here)
-    return chance.gather(-1, torch.where(taken, second, nearest))
+    chance = detection_chance(v.grid, v.belief, v.region)
+    chance = chance.scatter(-1, everyone, -chance.gather(-1, everyone))  # negative where a UAV stands
+    chance = chance.unsqueeze(-2).expand(*standing.shape, -1)
+    chance = chance.scatter(-1, (standing % n_points).unsqueeze(-1), stays)
+    goals = v.context.goals
+    nearest, second = (chance.gather(-1, gather_rows(each, standing)) for each in (goals[0], goals[-1]))
+    return torch.where(nearest < 0, second.abs(), nearest)
 
 
 @FEATURES.register("belief_moments")
@@ -53,8 +51,8 @@ def _belief_moments(v: FeatureCache) -> Tensor:
     mean = torch.stack(mean, -1)
     variance = (square - mean.square().sum(-1)).clamp(min=0)
     offset = (mean.unsqueeze(-2) - v.wanted(v.messages.position)) / v.scale.unsqueeze(-1)
-    entropy = -(belief * belief.clamp(min=1e-12).log()).sum(-1) / math.log(max(belief.shape[-1], 2))
-    shared = torch.stack([variance.sqrt() / v.context.scale, entropy], -1).unsqueeze(-2)
+    unsure = entropy(belief) / math.log(max(belief.shape[-1], 2))
+    shared = torch.stack([variance.sqrt() / v.context.scale, unsure], -1).unsqueeze(-2)
     return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1)
 
 

@@ -46,7 +46,7 @@ class ServerContext(NamedTuple):
     """Largest number of landing points in a region, L."""
     goals: Tensor | None = None
     """For ``belief_gain``: the preferred landing points to which each discrete action may lead, as indices in
-    their region, by the flat id of the landing point on which it begins, [R*L, A, C], C at most 2."""
+    their region, by the flat id of the landing point on which it begins, [C, R*L, A], C at most 2."""
     grid: SourceGrid | None = None
     """Cells in which the source may be; None if no feature reads the belief."""
     belief: Tensor | None = None

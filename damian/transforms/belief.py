@@ -7,7 +7,7 @@ from torchrl.data import Bounded, Composite
 
 from damian import keys
 from damian.server.belief import report_rows
-from damian.server.belief_window import Window, advance, begin, empty_window
+from damian.server.belief_window import Beliefs, Window, advance, begin, empty_window
 from damian.server.server import Server
 from damian.server.source_grid import SourceGrid
 from damian.transforms.base import StatefulTransform
@@ -55,7 +55,7 @@ class Belief(StatefulTransform):
 
     @property
     def row_dims(self) -> dict[str, int]:
-        return dict.fromkeys(("belief", "report", "delay"), 1)
+        return dict.fromkeys(("belief", "shared", "report", "delay"), 2)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         n_worlds, n_agents = self.rows.numel(), tensordict.get(keys.MESSAGE).shape[-2]
@@ -64,7 +64,7 @@ class Belief(StatefulTransform):
     def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
         n_agents, n_cells = tensordict.get(keys.MESSAGE).shape[-2], self._grid.prior.shape[-1]
         viewers = 1 + n_agents * self.own
-        return n_rows * (self.longest + 2) * (viewers * 4 * n_cells + n_agents * 16)
+        return n_rows * (self.longest + 2) * (viewers * (4 * n_cells + 1) + n_agents * 16)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         messages = self.server.messages(as_rows(entries[keys.MESSAGE], self.rows))
@@ -79,8 +79,8 @@ class Belief(StatefulTransform):
         region = self.server.region_of(messages)
         every = torch.ones_like(region, dtype=torch.bool)
         stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
-        slot, belief = advance(self._grid, Window(**memory), report, delay, region, stepped)
-        return memory | {"slot": slot}, self._written(belief)
+        slot, beliefs = advance(self._grid, Window(**memory), report, delay, region, stepped)
+        return memory | {"slot": slot}, self._written(beliefs)
 
     def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
         """Note a message whose delay nobody knew when it was sent, before the step in which it arrives.
@@ -96,16 +96,14 @@ class Belief(StatefulTransform):
             messages = self.server.messages(message.view(1, 1, -1))
             slot = (memory["slot"] + 1 - lag) % len(memory["report"])
             every = torch.ones_like(messages.spotted)
-            memory["report"][slot, 0, agent] = report_rows(self._grid, messages, every).view(-1)
-            memory["delay"][slot, 0, agent] = lag
+            memory["report"][slot, agent] = report_rows(self._grid, messages, every).view(-1)
+            memory["delay"][slot, agent] = lag
         return memory
 
-    def _written(self, belief: Tensor) -> Entries:
-        """The entries to write, from the beliefs of all receivers, [M, V, K]."""
-        belief = from_rows(belief, self.rows)
-        # Contiguous tensors are multiplied three times as fast.
-        own: Entries = {keys.OWN_BELIEF: belief[..., 1:, :].contiguous()} if self.own else {}
-        return {keys.BELIEF: belief[..., 0, :], **own}
+    def _written(self, beliefs: Beliefs) -> Entries:
+        """The entries to write."""
+        own: Entries = {keys.OWN_BELIEF: from_rows(beliefs.own, self.rows)} if self.own else {}
+        return {keys.BELIEF: from_rows(beliefs.server, self.rows), **own}
 
     @property
     def _grid(self) -> SourceGrid:

@@ -142,8 +142,9 @@ class Candidates:
         return Ranking(nearest, distance), torch.arange(len(own), device=own.device).view_as(flat)
 
     def goals(self) -> Tensor:
-        """The two nearest landing points to which each discrete action may lead, [R*L, A, C] indices."""
-        return self.ranking.point.view(-1, self.config.n_actions, self.n_candidates)[..., :2].long()
+        """The two nearest landing points to which each discrete action may lead, [C, R*L, A] indices."""
+        point = self.ranking.point.view(-1, self.config.n_actions, self.n_candidates)
+        return point[..., :2].movedim(-1, 0).long().contiguous()
 
     def _rank_all(self) -> None:
         """Tabulate the candidates of every (landing point, action).

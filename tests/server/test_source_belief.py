@@ -1,6 +1,7 @@
 """The Bayes filter of the source against its slow twin, and whether its probabilities are frequencies."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from torch import Tensor
 from damian.common.errors import InputError
 from damian.envs.scenario import make_simulation
 from damian.server.belief import chance_of_staying, detection_chance
-from damian.server.belief_window import _advance, _begin, empty_window
+from damian.server.belief_window import _advance, _begin, empty_window, latest
 from damian.server.source_grid import SourceGrid, build_source_grid
 from damian.world.signal_source import SourceConfig
 
@@ -34,6 +35,12 @@ grids = {
     "several regions": make_grid(regions=3),
 }
 every_grid = pytest.mark.parametrize("grid", grids.values(), ids=grids)
+
+
+def together(beliefs: Sequence[Tensor]) -> Tensor:
+    """The beliefs of the server [B, K] and of the UAVs [B, V - 1, K] as those of all receivers, [B, V, K]."""
+    server, own = beliefs
+    return torch.cat([server.unsqueeze(1), own], 1)
 
 
 class Flight:
@@ -62,13 +69,15 @@ class Flight:
     def begin(self, mask: Tensor) -> None:
         new = self.rows()
         self.first = torch.where(mask.unsqueeze(-1), new, self.first)
-        self.beliefs = _begin(*self.grid, *self.window, new, self.region, mask)
+        _begin(*self.grid, *self.window, new, self.region, mask)
+        self.beliefs = together(latest(self.window, self.window.slot))
         for world in mask.nonzero().squeeze(-1).tolist():
             self.steps[world] = []
 
     def step(self, stepped: Tensor) -> None:
         rows, delay = self.rows(), self.draw(LONGEST + 2, *self.first.shape) - 1
-        slot, self.beliefs = _advance(*self.grid, *self.window, rows, delay, self.region, stepped)
+        slot, *beliefs = _advance(*self.grid, *self.window, rows, delay, self.region, stepped)
+        self.beliefs = together(beliefs)
         self.window = self.window._replace(slot=slot)
         for world in stepped.nonzero().squeeze(-1).tolist():
             self.steps[world].append((rows[world].tolist(), delay[world].tolist()))
@@ -132,9 +141,42 @@ def test_a_message_changes_nothing_before_it_arrives():
         for flight, row in zip(flights, (loud, quiet), strict=True):
             sent = row if age == 0 else nothing
             delay = torch.full((1, 3), 3)
-            slot, flight.beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+            slot, *beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+            flight.beliefs = together(beliefs)
             flight.window = flight.window._replace(slot=slot)
         assert torch.equal(flights[0].beliefs, flights[1].beliefs) == (age < 3)
+
+
+def test_a_step_that_no_world_takes_changes_nothing():
+    flight = Flight(grids["one region"], 3, own=True)
+    flight.step(torch.ones(3, dtype=torch.bool))
+    before = [flight.beliefs, *(each.clone() for each in flight.window)]
+    flight.step(torch.zeros(3, dtype=torch.bool))
+    assert all(map(torch.equal, before, [flight.beliefs, *flight.window]))
+
+
+def test_a_uav_shares_the_servers_belief_from_where_the_server_knows_its_reports():
+    grid, everyone = grids["one region"], torch.ones(1, dtype=torch.bool)
+    flight = Flight(grid, 1, own=True)
+
+    def step(delay_of_the_first_uav: int) -> list[bool]:
+        """Which UAVs share the belief after a step in which the first one hears the source."""
+        sent, delay = torch.tensor([[1, 4, 6]]), torch.tensor([[delay_of_the_first_uav, 0, 0]])
+        slot, *beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+        flight.window, flight.beliefs = flight.window._replace(slot=slot), together(beliefs)
+        shared = flight.window.shared[slot, 1:, 0].flatten().tolist()
+        assert shared == [torch.equal(own, beliefs[0][0]) for own in beliefs[1][0]]
+        return shared
+
+    assert step(0) == [True, True, True]
+    assert step(2) == [False, True, True]
+    assert step(0) == [False, True, True]
+    assert step(0) == [True, True, True]  # it arrives
+    assert flight.window.shared[:, 1:].all()  # so that the steps in between are shared too
+    assert all(step(-1) == [False, True, True] for _ in range(2))
+    assert all(step(0) == [False, True, True] for _ in range(LONGEST + 3))  # it never arrives
+    flight.begin(everyone)
+    assert step(0) == [True, True, True]
 
 
 def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Tensor]:
@@ -155,9 +197,9 @@ def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Te
     for _ in range(n_steps):
         cell = torch.multinomial(grid.moves[cell], 1).squeeze(-1) if grid.moves is not None else cell
         delay = torch.where(torch.rand(n_worlds, 3) < 0.5, 0, torch.randint(-1, LONGEST + 1, (n_worlds, 3)))
-        slot, beliefs = _advance(*grid, *window, reports(cell), delay, region, everyone)
+        slot, beliefs, _ = _advance(*grid, *window, reports(cell), delay, region, everyone)
         window = window._replace(slot=slot)
-        said.append(beliefs[:, 0])
+        said.append(beliefs)
         was.append(torch.nn.functional.one_hot(cell, beliefs.shape[-1]))
     return torch.stack(said).flatten(), torch.stack(was).flatten().float()
 
