@@ -54,6 +54,10 @@ class Belief(StatefulTransform):
         return KeyUsage(reads=self.in_keys, creates=self.out_keys)
 
     @property
+    def memory_sizes(self) -> dict[str, int]:
+        return {"longest": self.longest, "own": int(self.own)}
+
+    @property
     def row_dims(self) -> dict[str, int]:
         return dict.fromkeys(("belief", "shared", "report", "delay"), 2)
 
