@@ -33,6 +33,7 @@ from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, R
 from damian.server.termination import EpisodeConfig
 from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
 from damian.world import coverage
+from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 
 # Without delays.
@@ -320,6 +321,21 @@ def test_uavs_without_a_valid_action_do_not_act(compiles):
     before = env.uav_env.state.goal.clone()
     assert env.step(td)["next", "agents", "ready"].all()
     assert env.uav_env.state.goal.equal(before)
+
+
+@both_kinds
+def test_random_actions_are_those_that_torchrl_draws(kind):
+    env = delayed(square(actions=ActionConfig(kind=kind)))
+    step = env.reset()
+    torch.manual_seed(5)
+    expected = TransformedEnv.rand_action(env, step.clone())
+    for given in (step.clone(), None):
+        torch.manual_seed(5)
+        drawn = env.rand_action(given)
+        assert drawn[ACTION].equal(expected[ACTION])
+        assert drawn.batch_size == expected.batch_size
+        assert drawn["agents"].batch_size == expected["agents"].batch_size
+    assert all_same(expected, env.rand_action(step.clone()).set(ACTION, expected[ACTION]))
 
 
 def test_existing_environments_run_in_worker_processes():
