@@ -185,7 +185,8 @@ def test_a_span_is_a_part_of_the_flight(flown, told, scenario):
         episode_of(flown[1], fleet_of(names_of(3)), {}, (100.0, 200.0))
 
 
-def test_a_silence_of_years_has_too_many_steps_unless_a_span_is_given(flown, tmp_path):
+def test_a_silence_of_years_has_too_many_steps_unless_a_span_is_given(flown, tmp_path, monkeypatch):
+    monkeypatch.setattr("damian.advice.fleet.SILENT_STEPS", 40)
     path = tmp_path / "x.jsonl"
     path.write_bytes(flown[1].read_bytes())
     Journal(path).append({"asked": START + 1e8, "told": {}})

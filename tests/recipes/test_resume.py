@@ -39,7 +39,7 @@ CASES = {
     "predictive": ["learner=predictive_mappo", "delay.messages=4", "delay.obs=2", "aware=backupdate", *FEW],
     "privileged": ["critic=privileged", "source.motion=dynamic", "observation.own=true", "delay.obs=2"],
 }
-QUICK = ("sac", "triggered")
+QUICK = ("sac",)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,10 @@ from damian.server.termination import EpisodeConfig
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
 SAC = ["learner=sac", "learner.updates=2", "learner.batch_size=32", "learner.warm_up=100"]
-both_learners = pytest.mark.parametrize("learner", [["learner=mappo"], SAC], ids=["mappo", "sac"])
+both_learners = pytest.mark.parametrize(
+    "learner",
+    [pytest.param(["learner=mappo"], id="mappo"), pytest.param(SAC, id="sac", marks=pytest.mark.slow)],
+)
 GOLDEN = Path(__file__).parents[1] / "data"
 
 
