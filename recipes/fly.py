@@ -145,7 +145,7 @@ def episode_of_journal(config: FlyConfig) -> Episode:
     fleet = Fleet(node, uavs, greedy_policy(node.env))
     span = None if config.span is None else (config.span[0], config.span[1])
     about = {name: head["about"].get(name) for name in ("policy", "checkpoint")}
-    about |= {"overrides": list(config.overrides)}
+    about |= {"overrides": list(config.overrides), "fleet": head["fleet"]}
     return episode_of(path, fleet, about, span, partial(tqdm, unit=" lines", delay=1))
 
 

@@ -1,8 +1,9 @@
 """The flight that a journal tells, as an episode, from which films, pages and GeoJSON are made.
 
-What the server node knew in each step is found by taking the steps again. Where the UAVs were is what they
-reported, in hindsight: late reports count for the time when they were generated, and between two reports a
-UAV is taken to move on the straight way. Nobody knows where the source was.
+The server node applies the reports and decisions of the journal again, step by step, and so knows what it
+knew then. The positions of the UAVs are those that they reported, in hindsight: late reports count for the
+time when they were generated, and between two reports a UAV is taken to move on the straight way. Nobody
+knows where the source was.
 """
 
 import math
@@ -82,7 +83,7 @@ def episode_of(
         path: the journal.
         fleet: a new one of the UAVs of the journal, whose node writes the terms of the reward. Its policy is
             not asked.
-        about: where the episode comes from; the name of the fleet, its UAVs and when it began are added.
+        about: where the episode comes from; the UAVs of the fleet and when it began are added.
         span: first and last time to keep, since the fleet began [s]; all if not given.
         progress: shows how far the journal has been read, as ``tqdm.tqdm``.
 
@@ -100,7 +101,7 @@ def episode_of(
     terms = {name: _stacked(rows) for name, rows in known.terms.items()}
     for rows in terms.values():
         rows[0] = 0.0
-    flight = {"fleet": head_of(path)["fleet"], "uavs": fleet.uavs, "began": written(cast(float, fleet.start))}
+    flight = {"uavs": fleet.uavs, "began": written(cast(float, fleet.start))}
     parts: dict[str, Any] = {**fixed_of(fleet.node.worlds, {**about, **flight}, 0), **columns}
     return Episode(
         **parts,
@@ -141,7 +142,7 @@ def _knowledge(
 
 
 def _take(fleet: Fleet, known: Known, entry: dict[str, Any], span: tuple[float, float]) -> None:
-    """Do again what a line says, after taking the steps before it."""
+    """Apply the reports or decisions of a line, after the steps before it."""
     now, told = entry.get("received", entry.get("asked")), entry.get("told")
     if isinstance(now, int | float):
         _advance(fleet, known, now, span)

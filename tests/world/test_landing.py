@@ -49,6 +49,14 @@ def booked(ranked, row, standing, ready):
     return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0), 64)
 
 
+def bookings_within_reach(seed, n_agents, n_points, together):
+    """Random bookings of 30 worlds in which some UAVs must stay, and some reach few points."""
+    ranked, row, standing, _ = map(torch.as_tensor, random_bookings(seed, 30, n_agents, n_points, together))
+    generator = torch.Generator().manual_seed(seed)
+    ranking = Ranking(ranked.int(), torch.rand(ranked.shape, generator=generator))
+    return ranking, row, standing, 1.5 * torch.rand(row.shape, generator=generator) - 0.3
+
+
 def deferred_acceptance(ranking, row, standing, reach, n_points):
     """Points booked by deferred acceptance, which otherwise serves only worlds with many UAVs."""
     reached = ranking.distance[row, 0] <= reach
@@ -84,10 +92,7 @@ def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
 )
 def test_booking_of_few_uavs_one_by_one_equals_the_other_ways(seed, n_agents, spare, together):
     n_points = n_agents + spare
-    ranked, row, standing, _ = map(torch.as_tensor, random_bookings(seed, 30, n_agents, n_points, together))
-    generator = torch.Generator().manual_seed(seed)
-    ranking = Ranking(ranked.int(), torch.rand(ranked.shape, generator=generator))
-    reach = 1.5 * torch.rand(row.shape, generator=generator) - 0.3  # some must stay, some reach few points
+    ranking, row, standing, reach = bookings_within_reach(seed, n_agents, n_points, together)
     one_by_one = landing._assign_one_by_one(ranking, row, standing, reach)
     assert one_by_one.equal(assign_landing_points(ranking, row, standing, reach, n_points))
     assert one_by_one.equal(deferred_acceptance(ranking, row, standing, reach, n_points))
@@ -101,10 +106,7 @@ def test_booking_of_few_uavs_one_by_one_equals_the_other_ways(seed, n_agents, sp
 )
 def test_deferred_acceptance_equals_serial_assignment_with_any_reach(seed, n_agents, spare, together):
     n_points = n_agents + spare
-    ranked, row, standing, _ = map(torch.as_tensor, random_bookings(seed, 30, n_agents, n_points, together))
-    generator = torch.Generator().manual_seed(seed)
-    ranking = Ranking(ranked.int(), torch.rand(ranked.shape, generator=generator))
-    reach = 1.5 * torch.rand(row.shape, generator=generator) - 0.3
+    ranking, row, standing, reach = bookings_within_reach(seed, n_agents, n_points, together)
     deferred = deferred_acceptance(ranking, row, standing, reach, n_points)
     assert deferred.equal(_assign_serially(ranking, row, standing, reach))
 
