@@ -3,12 +3,15 @@
 import csv
 import json
 import shlex
+import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import check_refused
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -200,30 +203,20 @@ def test_resuming_a_finished_run_trains_no_further(run, capsys, learner):
     assert resumed["resumed"][0]["command"] == f"damian train resume={folder} frames=100 hydra.run.dir=second"
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
+def test_a_damaged_run_folder_is_refused_in_one_line(run, capsys):
+    whole = run(*TINY, folder="whole")
+    for damage, message in (
         (lambda f: (f / "config.yaml").write_text("a: [1"), "config.yaml: "),
         (lambda f: (f / "config.yaml").write_text("- 1"), "config.yaml: "),
-        (
-            lambda f: (f / "config.yaml").write_text(""),
-            "config.yaml: it has no agents, so it is not the whole",
-        ),
-        (lambda f: (f / "config.yaml").unlink(), "first holds no config.yaml, so there is no run"),
+        (lambda f: (f / "config.yaml").write_text(""), "it has no agents, so it is not the whole"),
+        (lambda f: (f / "config.yaml").unlink(), "damaged holds no config.yaml, so there is no run"),
         (lambda f: (f / "checkpoint.pt").write_text("{"), "checkpoint.pt: it is no checkpoint of damian"),
         (lambda f: (f / "metrics.csv").write_text("x,y\n1,2\n"), "metrics.csv, line 1: no column frames"),
-    ],
-)
-def test_a_damaged_run_folder_is_refused_in_one_line(run, capsys, damage, message):
-    folder = run(*TINY, folder="first")
-    damage(folder)
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        run(f"resume={folder}", "frames=512", folder="second")
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert stopped.value.code == 2
-    assert error.startswith("error: ")
-    assert message in error
+    ):
+        folder = shutil.copytree(whole, whole.with_name("damaged"))
+        damage(folder)
+        check_refused(partial(run, "resume=damaged", "frames=512", folder="second"), message, capsys)
+        shutil.rmtree(folder)
 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(run, capsys):

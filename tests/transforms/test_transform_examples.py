@@ -70,6 +70,7 @@ def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew(capsys):
     assert capsys.readouterr().out.endswith("critics learn from: 0.0\n")
 
 
+@pytest.mark.slow  # what each transform's own test shows, in the words of the document
 def test_compiled_steps_have_no_graph_break(capsys):
     run("late_compiled")["main"](num_worlds=4, backend="eager")
     assert capsys.readouterr().out.endswith("steps of UAVs: 80\n")
