@@ -39,7 +39,7 @@ from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.evaluation.belief_figure import plot_beliefs
 from damian.evaluation.episode import Episode, record
-from damian.evaluation.film import save_film
+from damian.evaluation.film import VIEWS, check_gif, save_film
 from damian.evaluation.geojson import origin_of, save_geojson
 from damian.evaluation.replay_page import save_page
 from damian.learners.recurrent import add_recurrent_state
@@ -54,7 +54,7 @@ from .shared.settings import TrainConfig
 from .shared.stored_runs import save_config
 
 KEPT = ("all", "extremes")
-FORMATS, VIEWS = ("gif", "mp4", "png", "html", "geojson"), ("2d", "3d")
+FORMATS = ("gif", "mp4", "png", "html", "geojson")
 FILMS = FORMATS[:2]
 
 
@@ -79,7 +79,7 @@ class FlyConfig(FlownPolicyConfig):
     journal: str | None = None
     """Journal of ``damian advise`` whose flight to show, instead of flying; its settings apply too."""
     span: list[float] | None = None
-    """First and last time of the journal to show, since its fleet began [s]; all if not given."""
+    """First and last time of the journal to show, since every UAV had reported [s]; all if not given."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,6 +89,12 @@ class FlyConfig(FlownPolicyConfig):
                 checks.require(
                     given is None, key, given, "flies nothing beside journal: leave one of them out"
                 )
+            for key, default in (("eval_episodes", 1), ("keep", "all")):
+                given, should = (
+                    getattr(self, key),
+                    "chooses nothing: a journal tells one flight; leave it out",
+                )
+                checks.require(given == default, key, given, should)
         if self.span is not None:
             good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal is not None
             checks.require(good, "span", self.span, "is not [FIRST, LAST], two times of a journal [s]")
@@ -125,7 +131,7 @@ def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
     """
     told = head_of(Path(str(config.journal)))["about"].get("overrides") or []
     of_advice = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
-    replaced = [*map(key_of, config.overrides), *of_advice, "checkpoint"]
+    replaced = [*map(key_of, config.overrides), *of_advice, "checkpoint", "eval_episodes"]
     overrides = [*without([str(word) for word in told], replaced), *config.overrides]
     settings: FlyConfig = checked(composed_with("fly", overrides), "fly")
     settings.overrides = overrides
@@ -175,11 +181,14 @@ def show(config: FlyConfig, folder: Path) -> None:
     """Fly episodes and fill the run folder.
 
     Raises:
-        InputError: GeoJSON is asked for, and the region has no place on Earth.
+        InputError: GeoJSON is asked for, and the region has no place on Earth; or an episode is too long for
+            a GIF.
     """
     episodes = kept(fly(config), config.keep)
     if "geojson" in config.formats:
         origin_of(next(iter(episodes.values())))
+    if "gif" in config.formats:
+        check_gif(max(episodes.values(), key=lambda episode: episode.n_steps))
     save_config(config, folder)
     for name, episode in tqdm(episodes.items(), unit=" episodes"):
         episode.save(folder / f"{name}.json")

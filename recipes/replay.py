@@ -24,13 +24,15 @@ def parse(words: Sequence[str] | None) -> tuple[list[Path], Path]:
     """The files of the episodes, and that of the page.
 
     Raises:
-        InputError: an option is unknown, no episode is given, or too many are.
+        InputError: an option is unknown, no episode is given, too many are, or the page is no HTML file.
     """
     parser = Parser("damian replay", description="Make one page that plays stored episodes side by side.")
     parser.add_argument("episodes", type=Path, nargs="+", metavar="EPISODE.json", help="files of damian fly")
     parser.add_argument("--out", type=Path, default=Path("replay.html"), help="the page (replay.html)")
     args = parser.parse_args(words)
     checks.in_range("EPISODE.json", len(args.episodes), 1, MOST)
+    page = args.out.suffix.lower() in (".html", ".htm")  # else a forgotten name would cost an episode
+    checks.require(page, "--out", args.out, "is no page: its name must end in .html")
     return args.episodes, args.out
 
 

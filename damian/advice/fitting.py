@@ -46,6 +46,10 @@ class Fit(NamedTuple):
     """How lost messages were found."""
     ahead: int
     """Messages that came in before they were generated, by the clocks; their delay counts as 0."""
+    pauses: int
+    """Gaps in which more than ``LONGEST_GAP`` messages are missing; none of them counts as lost."""
+    start: float
+    """When steps begin to count [s]: when the fleet began."""
 
     @property
     def delays(self) -> np.ndarray:
@@ -87,26 +91,43 @@ def fit(reports: Iterable[Report]) -> Fit:
     """Delays of reports, and which are missing between them.
 
     Where reports of a UAV are numbered (``sequence``), a missing number is a lost message. Where they are
-    not, but most come in whole periods, a gap of several periods has lost messages in it. Else no loss can be
-    seen.
+    not, but most come in whole periods, a gap of several periods has lost messages in it, unless the UAV was
+    in the air, where it is silent. Else no loss can be seen. Nothing is lost before the fleet begins.
 
     Args:
         reports: which say when they came in.
     """
+    reports = list(reports)
     found: list[Message] = []
     kinds: set[str] = set()
+    start, pauses = _began(reports), 0
     by_uav = sorted(reports, key=lambda report: (report.uav, report.time, report.received))
     for uav, own in groupby(by_uav, lambda report: report.uav):
         first_copies = [next(copies) for _, copies in groupby(own, lambda report: report.time)]
         gaps, kind = _gaps(first_copies)
         kinds.add(kind)
+        pauses += sum(gap > LONGEST_GAP for gap in gaps)
         for report, n_lost, after in zip(first_copies, [0, *gaps], [None, *first_copies], strict=False):
-            for i in range(n_lost):
+            for i in range(n_lost if n_lost <= LONGEST_GAP else 0):
                 share = (i + 1) / (n_lost + 1)
-                found.append(Message(uav, after.time + share * (report.time - after.time), None))  # type: ignore[union-attr]
+                time = after.time + share * (report.time - after.time)  # type: ignore[union-attr]
+                if time >= start:
+                    found.append(Message(uav, time, None))
             found.append(Message(uav, report.time, report.received))
     ahead = sum(m.received is not None and m.received < m.time for m in found)
-    return Fit(found, " and ".join(sorted(kinds)), ahead)
+    return Fit(found, " and ".join(sorted(kinds)), ahead, pauses, start)
+
+
+def _began(reports: Sequence[Report]) -> float:
+    """When the fleet of these reports began [s], as ``damian advise`` has it: once a report of each UAV has
+    come in, at the oldest one of their newest ones."""
+    newest: dict[str, float] = {}
+    n_uavs = len({report.uav for report in reports})
+    for report in sorted(reports, key=lambda report: report.received):  # type: ignore[arg-type,return-value]
+        newest[report.uav] = max(report.time, newest.get(report.uav, -math.inf))
+        if len(newest) == n_uavs:
+            break
+    return min(newest.values())
 
 
 def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
@@ -115,7 +136,7 @@ def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
     if len(numbers) > 1 and all(number is not None for number in numbers):
         steps = [int(after) - int(before) for before, after in pairwise(numbers)]  # type: ignore[arg-type]
         # A UAV that starts anew counts from the beginning.
-        return [step - 1 if 0 < step <= LONGEST_GAP else 0 for step in steps], "by their numbers"
+        return [max(step - 1, 0) for step in steps], "by their numbers"
     between = np.diff([report.time for report in reports])
     if len(between) >= 2:
         period = float(np.median(between))
@@ -123,7 +144,7 @@ def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
         regular = np.abs(periods - periods.round()) <= REGULAR
         if (regular & (periods.round() >= 1)).mean() >= MOST:
             missing = (periods.round().astype(int) - 1).clip(min=0)
-            missing[missing >= LONGEST_GAP] = 0
+            missing[[report.flies for report in reports[:-1]]] = 0
             return missing.tolist(), f"by their period of {period:.3g} s"
     return [0] * len(between), "not to be seen (no numbers, no period)"
 
@@ -140,7 +161,6 @@ def trace_rows(fitted: Fit, dt: float | None = None) -> list[str]:
     Raises:
         InputError: a delay is longer than any that can be simulated.
     """
-    start = min(message.time for message in fitted.messages)
     rows = []
     for message in fitted.messages:
         if message.received is None:
@@ -151,7 +171,7 @@ def trace_rows(fitted: Fit, dt: float | None = None) -> list[str]:
             rows.append(f"{delay:.6f}s" if delay >= 1e-6 else "0")
             continue
         generated, came_in = (
-            math.floor((time - start) / dt + _ROUNDING) for time in (message.time, message.received)
+            math.floor((time - fitted.start) / dt + _ROUNDING) for time in (message.time, message.received)
         )
         steps = max(came_in - generated, 0)
         if steps > LONGEST:
@@ -174,6 +194,10 @@ def summary(fitted: Fit) -> str:
         f"({fitted.n_lost / n:.1%}), {fitted.losses}",
         f"delay [s]: mean {delays.mean():.3f}, {quantiles}, longest {delays.max():.3f}",
     ]
+    if fitted.pauses:
+        lines.append(
+            f"{fitted.pauses} gaps of more than {LONGEST_GAP} messages are taken as pauses, not as losses"
+        )
     if fitted.ahead:
         lines.append(
             f"{fitted.ahead} came in before they were generated: clocks differ; their delay counts as 0"

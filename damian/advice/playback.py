@@ -83,8 +83,8 @@ def episode_of(
         path: the journal.
         fleet: a new one of the UAVs of the journal, whose node writes the terms of the reward. Its policy is
             not asked.
-        about: where the episode comes from; the UAVs of the fleet and when it began are added.
-        span: first and last time to keep, since the fleet began [s]; all if not given.
+        about: where the episode comes from; the IDs of the UAVs and the time of its first instant are added.
+        span: first and last time to keep, since every UAV had reported [s]; all if not given.
         progress: shows how far the journal has been read, as ``tqdm.tqdm``.
 
     Raises:
@@ -101,7 +101,8 @@ def episode_of(
     terms = {name: _stacked(rows) for name, rows in known.terms.items()}
     for rows in terms.values():
         rows[0] = 0.0
-    flight = {"uavs": fleet.uavs, "began": written(cast(float, fleet.start))}
+    began = cast(float, fleet.start) + known.steps[0] * fleet.node.dt
+    flight = {"uavs": fleet.uavs, "began": written(began)}
     parts: dict[str, Any] = {**fixed_of(fleet.node.worlds, {**about, **flight}, 0), **columns}
     return Episode(
         **parts,

@@ -84,14 +84,18 @@ def read_rows(rows: Rows, now: float, file: bool) -> list[Report]:
 def _report(row: Mapping[str, Any], now: float, file: bool) -> Report:
     received = _time(row, "receive time") if file else None
     if not file and "receive time" in row:
-        raise InputError("receive time: only a file may say it; the service looks at its own clock")
+        reads = "only damian advise reports=FILE and damian fit-delays read it"
+        raise InputError(f"receive time: {reads}; the service looks at its own clock")
     time, age = _time(row, "time"), _number(row, "aoi", 0, LATEST, "s") or 0.0
     if file and received is None and time is not None:
         received = time + age
     place = _place(row, "")
     if place is None:
         raise InputError("lat, lon: they are missing: where the UAV is [deg], or x, y [m]")
-    spotted = _flag(row, "source spotted")
+    spotted, detected = _flag(row, "source spotted"), _time(row, "source time")
+    detected_at = _place(row, "source ")
+    if detected_at is not None and detected is None and not spotted:
+        raise InputError("source time: it is missing: when the source was detected at this place [s]")
     if time is None:
         time = (now if received is None else received) - age
     return Report(
@@ -101,8 +105,8 @@ def _report(row: Mapping[str, Any], now: float, file: bool) -> Report:
         degrees="lat" in row,
         spotted=spotted,
         altitude=_number(row, "fla", -500, 1e5, "m"),
-        detected=_time(row, "source time"),
-        detected_at=_place(row, "source "),
+        detected=detected,
+        detected_at=detected_at,
         target=_place(row, "target "),
         track=_number(row, "track", -360, 360, "deg"),
         battery=_number(row, "battery", 0, 100, "%"),
@@ -183,7 +187,10 @@ def _place(row: Mapping[str, Any], prefix: str) -> Place | None:
         raise InputError(f"{prefix}lat, {prefix}x: give either degrees or metres")
     if not degrees and not metres:
         return None
-    columns = DEGREES if degrees else METRES
+    columns, own = (DEGREES if degrees else METRES), (METRES if "x" in row or "y" in row else DEGREES)
+    if columns != own:
+        given, asked = (f"{prefix}{', '.join(names)}" for names in (columns, own))
+        raise InputError(f"{given}: the place of the UAV is {', '.join(own)}: give {asked} too")
     return _pair([row.get(prefix + column) for column in columns], columns, prefix)
 
 

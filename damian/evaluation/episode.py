@@ -30,6 +30,8 @@ READABLE = (1, 2)
 """Versions that can be read; in version 1 the source is always known."""
 DIGITS = 5
 """Significant digits of the numbers in a file."""
+TIME_DIGITS = 9
+"""Those of times, which must differ from step to step in long episodes too."""
 
 LIKELY = 0.02
 """Smallest probability of a cell worth showing, as a share of that of the most probable one."""
@@ -150,7 +152,7 @@ class Episode:
         write_atomically(path, json.dumps(self.document(), separators=(",", ":")))
 
     def document(self) -> dict[str, Any]:
-        """What a file holds of the episode, with numbers of ``DIGITS`` significant digits."""
+        """What a file holds of the episode, with numbers of ``DIGITS`` significant digits, times of more."""
         fixed = {
             "region": json.loads(shapely.to_geojson(self.region)),
             "origin": self.origin,
@@ -160,6 +162,7 @@ class Episode:
             "success": self.success,
         }
         columns = {name: _listed(getattr(self, name)) for name in COLUMNS}
+        columns["time"] = _listed(self.time, TIME_DIGITS)
         head = {"schema": SCHEMA, "version": VERSION, "about": self.about, "meaning": COLUMNS}
         return {**head, **fixed, **columns}
 
@@ -296,14 +299,14 @@ def cells_of(env: UavEnv) -> Floats | None:
     return None if env.server.grid is None else np.asarray(env.server.grid.centres.cpu())
 
 
-def _listed(values: Any) -> Any:
-    """Arrays as nested lists with ``DIGITS`` significant digits, for JSON."""
+def _listed(values: Any, digits: int = DIGITS) -> Any:
+    """Arrays as nested lists with so many significant digits, for JSON."""
     if isinstance(values, Mapping):
-        return {name: _listed(each) for name, each in values.items()}
+        return {name: _listed(each, digits) for name, each in values.items()}
     if values is None or not np.issubdtype(values.dtype, np.floating):
         return None if values is None else values.astype(int).tolist()
     size = np.abs(values, out=np.ones_like(values, float), where=values != 0)
-    scale = 10.0 ** (DIGITS - 1 - np.floor(np.log10(size)))
+    scale = 10.0 ** (digits - 1 - np.floor(np.log10(size)))
     return np.where(values == 0, 0.0, np.round(values * scale) / scale).tolist()
 
 
@@ -320,6 +323,12 @@ def _check_columns(columns: Mapping[str, Any]) -> None:
     Raises:
         ValueError: one does not, or time does not increase.
     """
+    for name, values in columns.items():
+        optional = values is None and any(name in pair for pair in OPTIONAL)
+        if not optional and isinstance(values, Mapping) != (name == "reward_terms"):
+            raise ValueError(f"{name} is not {'lists by name' if name == 'reward_terms' else 'a list'}")
+        if not optional and not isinstance(values, np.ndarray | Mapping):
+            raise ValueError(f"{name} is missing")
     (instants,), (_, agents, _) = columns["time"].shape, columns["position"].shape
     sizes = {"T + 1": instants, "N": agents, "K": 0 if columns["cells"] is None else len(columns["cells"])}
     for name, meaning in COLUMNS.items():

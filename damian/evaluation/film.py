@@ -14,22 +14,32 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
+from damian.common import checks
 from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.episode import Episode
 from damian.evaluation.film_views import DART, HEAT, INK, MapView, SpaceView
 
+VIEWS = ("2d", "3d")
 DPI = 100
 SIZE = (7.2, 7.0)
 """Width and height of a film [inches]."""
 STEPS_PER_SECOND = 4
 """Steps that a film shows in a second."""
+LONGEST_GIF = 1000
+"""Most steps of a GIF, all of whose pictures (half a megabyte each) are in memory until it is written."""
 LAST_STEPS = 6
 """Steps for whose time a film shows the last instant."""
 _STYLE: dict[Any, Any] = {"font.size": 8.5, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
-    """Write a film of an episode: a GIF if the path ends so, else what ffmpeg makes of the path."""
+    """Write a film of an episode: a GIF if the path ends so, else what ffmpeg makes of the path.
+
+    Raises:
+        InputError: there is no such view, or the episode is too long for a GIF.
+    """
+    if path.suffix == ".gif":
+        check_gif(episode)
     film, steps = Film(episode, view), range(episode.n_steps + 1)
     if path.suffix != ".gif":
         writer = FFMpegWriter(STEPS_PER_SECOND)
@@ -38,9 +48,19 @@ def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
                 film.draw(step)
                 writer.grab_frame()
         return
-    first, *others = [Image.fromarray(film.frame(step)) for step in steps]
+    first, *others = [film.image(step) for step in steps]
     times = [1000 // STEPS_PER_SECOND] * episode.n_steps + [1000 * LAST_STEPS // STEPS_PER_SECOND]
     first.save(path, save_all=True, append_images=others, duration=times, loop=0)
+
+
+def check_gif(episode: Episode) -> None:
+    """Refuse an episode that is too long for a GIF.
+
+    Raises:
+        InputError: it has more than ``LONGEST_GIF`` steps.
+    """
+    should = f"steps are more than {LONGEST_GIF}, the most of a gif: choose mp4 or html, or a shorter episode"
+    checks.require(episode.n_steps <= LONGEST_GIF, "formats", episode.n_steps, should)
 
 
 class Film:
@@ -54,9 +74,13 @@ class Film:
     Args:
         episode: the episode to draw.
         view: ``2d``: from above; ``3d``: with the space above it.
+
+    Raises:
+        InputError: there is no such view.
     """
 
     def __init__(self, episode: Episode, view: str = "2d") -> None:
+        checks.one_of("view", view, VIEWS)
         self.episode = episode
         self.colours = [COLOURS[uav % len(COLOURS)] for uav in range(episode.n_agents)]
         with matplotlib.rc_context(_STYLE):
@@ -95,6 +119,10 @@ class Film:
         canvas: Any = self.figure.canvas
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+    def image(self, step: int) -> Image.Image:
+        """The picture of an instant in 256 colours, which is a third of its size."""
+        return Image.fromarray(self.frame(step)).quantize(dither=Image.Dither.NONE)
 
     def _draw_legend(self) -> None:
         marks: list[Any] = [

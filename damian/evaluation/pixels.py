@@ -12,7 +12,7 @@ from torchrl.envs import Transform
 from damian.common import checks
 from damian.envs.uav_env import UavEnv
 from damian.evaluation.episode import at_instant, episode_of
-from damian.evaluation.film import DPI, SIZE, Film
+from damian.evaluation.film import DPI, SIZE, VIEWS, Film
 
 
 class LiveFilm:
@@ -27,7 +27,7 @@ class LiveFilm:
     def __init__(self, env: UavEnv, view: str = "2d") -> None:
         should = "is not 1: a film shows one world"
         checks.require(env.batch_size[0] == 1, "film: number of worlds", env.batch_size[0], should)
-        checks.one_of("film: view", view, ("2d", "3d"))
+        checks.one_of("film: view", view, VIEWS)
         for extra in ("message", "state"):
             checks.require(extra in env.extras, "film: extras", sorted(env.extras), f"lack {extra}")
         self.env, self.view = env, view

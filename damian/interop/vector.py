@@ -46,12 +46,9 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
         return instant.observation[:, 0], _infos(instant.infos)
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        actions = np.asarray(actions)
-        valid = actions.shape == self.action_space.shape and self.action_space.contains(
-            actions.astype(self.action_space.dtype, copy=False)
-        )
-        checks.require(valid, "actions", actions, f"are not in {self.action_space}")
-        last, instant = self.flight.step(actions[:, None], reset=True)
+        given, kind = np.asarray(actions), self.action_space.dtype
+        checks.require(self._contains(given), "actions", given, f"are not in {self.action_space}")
+        last, instant = self.flight.step(given.astype(kind)[:, None], reset=True)
         infos, done = _infos(instant.infos), last.terminated | last.truncated
         if done.any():
             final = np.full(self.num_envs, None, object)
@@ -60,6 +57,12 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
             infos |= {"final_obs": final, "_final_obs": done, "final_info": _infos(last.infos)}
             infos["_final_info"] = done
         return instant.observation[:, 0], last.reward[:, 0], last.terminated, last.truncated, infos
+
+    def _contains(self, actions: Array) -> bool:
+        """Are these actions of all worlds, in any type of number that loses nothing?"""
+        space = self.action_space
+        fits = actions.shape == space.shape and np.can_cast(actions.dtype, space.dtype or float, "same_kind")
+        return fits and space.contains(actions.astype(space.dtype))
 
 
 def _infos(infos: dict[str, Array]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ def compose_scenario(*overrides: str) -> ScenarioConfig:
     Raises:
         InputError: an override is misspelt, or its value is impossible.
     """
-    return composed_config(*overrides).eval_scenario
+    return composed_config(*overrides)
 
 
 def gymnasium_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavGymEnv:

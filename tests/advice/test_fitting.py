@@ -110,3 +110,27 @@ def test_a_journal_is_a_log(log):
     lines = [head, *reports, {"asked": 5.0, "step": 5, "told": {}, "advice": []}]
     path = log("".join(f"{json.dumps(line)}\n" for line in lines) + '{"cut', "x.jsonl")
     assert trace_rows(fit(read_log(path))) == ["0.250000s"] * 4
+
+
+def test_steps_count_from_when_the_fleet_began_and_nothing_is_lost_before(log):
+    lines = ["A,1000,1000.6,53.1,-4.5"]
+    lines += [f"{uav},{1100.5 + i},{1101.1 + i},53.1,-4.5" for i in range(20) for uav in "AB"]
+    fitted = fit(read_log(log("\n".join(["ID,time,receive time,lat,lon", *lines]))))
+    assert fitted.start == 1100.5
+    assert fitted.n_lost == 0
+    assert trace_rows(fitted, dt=1.0) == ["1", *["0"] * 40]
+
+
+def test_a_uav_that_is_silent_in_flight_loses_nothing(log):
+    times = [t for start in range(0, 100, 20) for t in (*range(start, start + 12), start + 11.5)]
+    lines = [f"A,{t},{t + 0.1},53.1,-4.5,{60 if t % 20 == 11.5 else 0}" for t in times]
+    fitted = fit(read_log(log("\n".join(["ID,time,receive time,lat,lon,FLA", *lines]))))
+    assert fitted.losses == "by their period of 1 s"
+    assert fitted.n_lost == 0
+
+
+def test_a_long_pause_is_told_and_counts_as_no_loss(log):
+    lines = [f"A,{i},{i + 0.1},53.1,-4.5,{i}" for i in (*range(10), *range(5000, 5010))]
+    fitted = fit(read_log(log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines]))))
+    assert (fitted.n_lost, fitted.pauses) == (0, 1)
+    assert "1 gaps of more than 1000 messages are taken as pauses" in summary(fitted)

@@ -121,10 +121,18 @@ REFUSED = {
     "no place": ({"lat": None, "lon": None}, "row 2: lat, lon: they are missing"),
     "half a place": ({"lat": None}, "row 2: lat: it is missing [deg]"),
     "two places": ({"x": 1.0}, "row 2: lat, x: give either degrees or metres"),
+    "another unit": (
+        {"target x": 1.0},
+        "row 2: target x, y: the place of the UAV is lat, lon: give target lat",
+    ),
+    "a source without a time": (
+        {"source lat": 52.8, "source lon": -4.1},
+        "row 2: source time: it is missing: when the source was detected at this place [s]",
+    ),
     "no flag": ({"source_spotted": "maybe"}, "row 2: source spotted: 'maybe' is not 1 or 0"),
     "no time": ({"time": "noon"}, "row 2: time: 'noon' is neither seconds nor a time such as"),
     "an unknown column": ({"speed": 3}, "row 2: 'speed' is no column; they are id, time, aoi, lat"),
-    "a time of receipt": ({"receive time": NOW}, "row 2: receive time: only a file may say it"),
+    "a time of receipt": ({"receive time": NOW}, "row 2: receive time: only damian advise reports=FILE"),
     "readings": ({"readings": [1.0]}, "row 2: readings: 1 numbers are not 0, as in the training"),
 }
 

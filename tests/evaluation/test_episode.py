@@ -113,7 +113,11 @@ def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, text, pro
         ({"cells": [[0.0, 0.0]], "belief": [[0.5, 0.5]] * 4}, "belief has not the shape [T + 1, K]: (4, 2)"),
         ({"belief": [[1.0]] * 4}, "cells has not the shape [K, 2]: None"),
         ({"reward_terms": {"near": [[1.0, 2.0]]}}, "reward_terms has not the shape"),
-        ({"track": None}, "track has not the shape [T + 1, N]: None"),
+        ({"track": None}, "track is missing"),
+        ({"time": None}, "time is missing"),
+        ({"position": {}}, "position is not a list"),
+        ({"spotted": {"a": [[True]]}}, "spotted is not a list"),
+        ({"reward_terms": [[1.0, 2.0]] * 4}, "reward_terms is not lists by name"),
         ({"source": [[0.0, 1e300]] * 4}, "source holds something else than numbers up to 1e+09"),
         ({"source": [[0.0, float("nan")]] * 4}, "source holds something else than numbers"),
         ({"time": [0.0, 1.0, 1.0, 2.0]}, "time does not increase"),
@@ -144,3 +148,9 @@ def test_an_episode_without_optional_columns_survives_its_file(flown, tmp_path):
     assert again.belief is None
     assert again.reward_terms == {}
     assert again.origin == (53.0, -4.0)
+
+
+def test_the_times_of_a_long_episode_differ(tmp_path):
+    long = flight(1, time=np.array([12000.0, 12000.8]))
+    long.save(tmp_path / "episode.json")
+    assert Episode.load(tmp_path / "episode.json").time.tolist() == [12000.0, 12000.8]

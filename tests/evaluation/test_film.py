@@ -6,6 +6,8 @@ from episodes import flight
 from matplotlib.colors import to_rgb
 from PIL import Image
 
+from damian.common.errors import InputError
+from damian.evaluation import film as films
 from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.film import Film, save_film
 
@@ -106,3 +108,12 @@ def test_a_film_of_the_space_shows_a_uav_above_the_place_where_it_stands():
     colours = [(np.abs(film.frame(0) / 255 - to_rgb(COLOURS[1])).max(-1) < 0.02) for film in (low, high)]
     heights = [np.nonzero(colour[:450, :500])[0].min() for colour in colours]
     assert heights[1] < heights[0] - 20
+
+
+def test_a_gif_of_too_many_steps_and_an_unknown_view_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(films, "LONGEST_GIF", 2)
+    with pytest.raises(InputError, match="formats: 3 steps are more than 2, the most of a gif: choose mp4"):
+        save_film(flight(3), tmp_path / "film.gif")
+    assert not any(tmp_path.iterdir())
+    with pytest.raises(InputError, match="view: 3D is not one of 2d, 3d"):
+        Film(flight(1), "3D")

@@ -159,10 +159,29 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
     with pytest.raises(InputError, match="seed"):
         vector.reset(seed=[1, 2])
     vector.reset()
-    with pytest.raises(InputError, match="actions"):
-        vector.step([0])
+    for wrong in ([0], np.array([0.7, 1.2]), np.array([-0.5, 1.0])):
+        with pytest.raises(InputError, match="actions"):
+            vector.step(wrong)
+    vector.step(np.array([0, 1], np.int32))
     with pytest.raises(InputError, match="render_mode: human is not one of rgb_array"):
         UavGymEnv(compose_scenario("agents=1"), render_mode="human")
+
+
+def test_steps_in_which_the_uav_cannot_choose_are_skipped_if_asked():
+    def readiness(*overrides: str) -> list[bool]:
+        words = ["motion=polynomial", "episode.max_steps=40", *overrides]
+        env = gymnasium.make("damian/Spotting-v0", overrides=words)
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        found, ended = [], False
+        while not ended:
+            *_, terminated, truncated, info = env.step(env.action_space.sample())
+            found.append(bool(info["ready"]))
+            ended = terminated or truncated
+        return found
+
+    assert not all(readiness())
+    assert all(readiness("clock.skip=true")[:-1])
 
 
 HYDRA_PROGRAM = """

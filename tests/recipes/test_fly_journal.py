@@ -55,7 +55,7 @@ def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(show):
     assert episode.age[:, 1].min() > 0 == episode.age[:-1, 0].max()
     about = dict(episode.about)
     assert (about["policy"], about["checkpoint"], about["fleet"]) == ("mode", "runs/gone", "north")
-    assert about["began"] == "2023-11-14T22:13:20.000Z"
+    assert about["began"] == "2023-11-14T22:13:21.000Z", "when both had reported"
     with Image.open(folder / "episode_0.gif") as film:
         assert film.n_frames == episode.n_steps + 1
     features = json.loads((folder / "episode_0.geojson").read_text())["features"]
@@ -87,6 +87,8 @@ def test_a_setting_that_is_given_replaces_that_of_the_advice(show):
     [
         (["policy=greedy"], "policy: greedy flies nothing beside journal: leave one of them out"),
         (["checkpoint=run"], "checkpoint: run"),
+        (["eval_episodes=7"], "eval_episodes: 7 chooses nothing: a journal tells one flight; leave it out"),
+        (["keep=extremes"], "keep: extremes chooses nothing"),
         (["span=[3]"], "span: [3.0] is not [FIRST, LAST], two times of a journal [s]"),
         (["span=[90,99]"], "span: no step lies between 90 and 99 s: the journal tells of 0 to 5 s"),
         (["journal=nothing.jsonl"], "nothing.jsonl: it cannot be read: No such file or directory"),
@@ -96,3 +98,9 @@ def test_a_setting_that_is_given_replaces_that_of_the_advice(show):
 )
 def test_what_cannot_be_shown_is_refused_in_one_line(show, capsys, overrides, message):
     check_refused(lambda: show(*overrides), message, capsys)
+
+
+def test_a_later_span_begins_later(show):
+    episode = Episode.load(show("span=[2,4]") / "episode_0.json")
+    assert episode.about["began"] == "2023-11-14T22:13:23.000Z"
+    assert episode.time[0] == 0
