@@ -57,6 +57,7 @@ from .shared.known_settings import CONF
 from .shared.launch import checked, launch, reported, shown
 from .shared.launchers import LAUNCHERS, RayTasks, SlurmJobs
 from .shared.parallel import LOG, Launcher, Run, check_stored, perform_all
+from .shared.settings import TrainConfig
 from .train import train
 
 TABLE, MARKDOWN, FIGURE, CURVES = "table.csv", "table.md", "figure.png", "curves.png"
@@ -111,6 +112,8 @@ class CompareConfig:
             should = "cannot be the same for every run: the comparison sets it; leave it out"
             checks.require(not ours, "overrides", word, should)
         for kind in ("tasks", "delays", "arms"):
+            none = getattr(self, kind) == [] and kind != "delays"
+            checks.require(not none, kind, [], "names none: leave it out, for all of them")
             for name in getattr(self, kind) or ():
                 checks.one_of(kind, name, getattr(self.experiment, kind))
         for name, arm in self.chosen("arms").items():
@@ -168,7 +171,10 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     source = arm.policy_of or (name if task != trained_in and not arm.ceiling else None)
     overrides = whole_laws(["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides])
     try:
-        unseeded = checked(compose("train", overrides))
+        unseeded: TrainConfig = checked(compose("train", overrides))
+        late = [] if arm.delayed else unseeded.late
+        should = "delays this arm, with which others are compared: put delays under experiment.delays"
+        checks.require(not late, ", ".join(late), "its value", should)
         if source is None and not arm.ceiling:
             unseeded.check_learning()
     except COMPOSITION_ERRORS as error:

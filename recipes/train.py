@@ -129,7 +129,7 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
         state = TrainingState(folder, learner.components(), collector_parts(collector), clock, buffer)
         begin(config, state)
         print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
-        note_long_delays(config)
+        note_what_never_happens(config)
         log = open_log(config, state)
         with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
             batches = ticks(collector, clock, env.server)
@@ -184,8 +184,11 @@ def saved_if_lost(state: TrainingState, log: MetricsLog, interrupt: Interrupt) -
             raise RunError(f"{error}; {saved}; continue with resume={state.folder}") from error
 
 
-def note_long_delays(config: TrainConfig) -> None:
-    """Say which delays are so long that nothing arrives before an episode ends."""
+def note_what_never_happens(config: TrainConfig) -> None:
+    """Say which delays are so long that nothing arrives in an episode, and whether nothing is learnt."""
+    warm_up = getattr(config.learner, "warm_up", 0)
+    if warm_up > config.frames:
+        print(f"note: learner.warm_up: all {config.frames} steps are fewer than {warm_up}: nothing is learnt")
     n_steps = config.episode.max_steps
     for key in config.delay.settings_longer_than(n_steps, config.clock.dt) if n_steps else ():
         print(f"note: {key} is at least as long as an episode of {n_steps} steps: nothing arrives in it")

@@ -37,7 +37,7 @@ from tqdm import tqdm
 from damian.common import checks
 from damian.common.errors import InputError, RunError
 from damian.common.markdown import markdown_table
-from damian.evaluation.comparison import SCORES
+from damian.evaluation.comparison import LESS_IS_BETTER, SCORES
 from damian.evaluation.interrupt import exit_code
 
 from .compare import POLICIES
@@ -80,7 +80,7 @@ class TuneConfig(TrainConfig):
     prune: bool = True
     """Whether to stop trainings that are worse than the median."""
     score: str = "true_return"
-    """The measure of the evaluation that is maximised."""
+    """The measure of the evaluation that is to be best: least, if it counts steps."""
     policy: str = "sampled"
     """The policy that is evaluated: actions ``sampled`` from it, or its ``mode``."""
 
@@ -90,6 +90,13 @@ class TuneConfig(TrainConfig):
         checks.whole("processes", self.processes, 1, 1024)
         checks.one_of("score", self.score, SCORES)
         checks.one_of("policy", self.policy, POLICIES)
+        should = "is not for a search, which trains every policy from the beginning: leave it out"
+        checks.require(self.checkpoint is None, "checkpoint", self.checkpoint, should)
+
+    @property
+    def sign(self) -> int:
+        """1 if the greatest score is the best, -1 if the least is."""
+        return -1 if self.score in LESS_IS_BETTER else 1
 
 
 OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields(TrainConfig)}
@@ -120,7 +127,7 @@ class Search:
             storage=self.storage,
             sampler=optuna.samplers.TPESampler(seed=config.seed),
             pruner=self.pruner,
-            direction="maximize",
+            direction="maximize" if config.sign > 0 else "minimize",
             load_if_exists=True,
         )
         stored, asked = self.study.user_attrs.get(OVERRIDES), [*overrides, f"search={config.search}"]
@@ -203,12 +210,13 @@ def train_watched(
         trial: the trial's id in it.
         pruner: decides whether to stop.
     """
-    watched = Trial(optuna.load_study(study_name="damian", storage=storage, pruner=pruner), trial)
+    study = optuna.load_study(study_name="damian", storage=storage, pruner=pruner)
+    watched, sign = Trial(study, trial), 1 if study.direction == optuna.study.StudyDirection.MAXIMIZE else -1
 
     def watch(frames: int, numbers: dict[str, float]) -> None:
         value = numbers.get("episode_return", math.nan)
         if not math.isnan(value):
-            watched.report(value, frames)
+            watched.report(sign * value, frames)  # a return, whatever the score
             if watched.should_prune():
                 raise optuna.TrialPruned
 
@@ -222,11 +230,12 @@ def search(config: TuneConfig, overrides: list[str], folder: Path) -> None:
     """Carry out the trials that are missing, and report on all of them."""
     found = Search(config, overrides, folder)
     found.continue_interrupted()
-    done, best = found.n_finished, math.nan
+    done, best, sign = found.n_finished, math.nan, config.sign
     with tqdm(total=config.trials, initial=done, unit=" trials", disable=done >= config.trials) as bar:
         for run, error in perform_each(found.runs(), config.processes):
             value = found.tell(run, error)
-            best = max(best, value) if value is not None and not math.isnan(best) else (value or best)
+            if value is not None and not sign * best >= sign * value:  # the first best is nan
+                best = value
             bar.set_postfix({config.score: "-" if value is None else f"{value:.3g}", "best": f"{best:.3g}"})
             bar.update()
             if error is not None:
@@ -244,7 +253,7 @@ def report(found: Search) -> None:
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     if not complete:
         raise RunError(f"no trial of {found.folder} has a value: see the log.txt of each")
-    complete.sort(key=lambda trial: -(trial.value or 0.0))
+    complete.sort(key=lambda trial: -found.config.sign * (trial.value or 0.0))
     head = ["trial", "state", found.config.score, *found.space]
     with (found.folder / TRIALS).open("w", newline="") as file:
         csv.writer(file).writerows([head, *(row(found, trial) for trial in trials)])

@@ -140,6 +140,9 @@ class Sac:
         self.targets = SoftUpdate(self.loss, tau=config.tau)
         masked = keys.ACTION_MASK in self.actor.in_keys
         self.observed = ["observation", setup.critic_key[-1], *["action_mask"] * masked]
+        # The first message of an episode begins a belief that back-updating computes again.
+        believes = keys.BELIEF in env.observation_spec.keys(True)
+        self.unread = [key for key in _UNREAD if not (believes and key == keys.MESSAGE)]
         self.return_scale = None
         if config.normalize_reward:
             self.return_scale = ReturnScale(env.full_reward_spec[keys.REWARD].zero(), config.gamma)
@@ -157,11 +160,13 @@ class Sac:
         """
         if self.return_scale is not None:
             self.return_scale.update(batch)
-        self.buffer.extend(batch.exclude(*_UNREAD))
+        self.buffer.extend(batch.exclude(*self.unread))
         storage = cast(TimeStorage, self.buffer.storage)
         steps, order = storage.steps, storage.latest()
         settled = order[: max(len(order) - self.setup.settle_steps, 0)]
         ready, ready_next = (cast(Tensor, steps[k])[settled] for k in (keys.READY, next_key(keys.READY)))
+        if (valid := steps.get(keys.VALID, None)) is not None:  # not after an end that was known only later
+            ready = ready & cast(Tensor, valid)[settled]
         done, terminated = (steps[next_key(key)][settled].squeeze(-1) for key in (keys.DONE, keys.TERMINATED))
         decisions = find_decisions(ready, ready_next, done, terminated, self.config.n_steps)
         if len(order) * batch.shape[0] < self.config.warm_up or not len(decisions.begin):
@@ -205,7 +210,7 @@ _UNREAD: list[NestedKey] = [
     next_key(keys.REWARD_TERMS),
     next_key(keys.EPISODE_REWARD),
 ]
-"""Entries that SAC never reads; they are not stored, to save memory."""
+"""Entries that SAC never reads; they are not stored, to save memory, unless back-updating reads them."""
 
 
 def make_action_value(env: EnvBase, model: ModelConfig, read: list[NestedKey]) -> TensorDictModule:

@@ -79,10 +79,26 @@ def read_space(search: Mapping[str, Any]) -> dict[str, Values]:
         good = numbers and least < values.low < values.high
         should = "is no range: low must be less than high" + (", and more than 0" if values.log else "")
         checks.require(good, f"search.{key}", written, should)
+        checks.require(isinstance(values.log, bool), f"search.{key}.log", values.log, "is not true or false")
+        _check_step(f"search.{key}.step", values)
         space[key] = values
     if not space:
         raise InputError("search: it is empty: name a setting, such as search.learner.lr")
     return space
+
+
+def _check_step(key: str, values: Values) -> None:
+    """Check the step of a range.
+
+    Raises:
+        InputError: it is no number above 0, or no whole one in a range of whole numbers.
+    """
+    step, whole = values.step, isinstance(values.low, int) and isinstance(values.high, int)
+    if step is None:
+        return
+    number = isinstance(step, int) or (isinstance(step, float) and not whole)
+    good = number and not isinstance(step, bool) and step > 0
+    checks.require(good, key, step, f"is no {'whole ' * whole}number above 0")
 
 
 def _leaves(node: Mapping[str, Any], path: str) -> Iterator[tuple[str, Mapping[str, Any]]]:

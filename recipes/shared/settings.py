@@ -185,6 +185,13 @@ class TrainConfig(ScenarioConfig):
         return self.threads or available_cores()
 
     @property
+    def late(self) -> list[str]:
+        """Settings by which messages, actions or rewards are late."""
+        laws = {"delay.act": self.delay.act, "delay.rew": self.delay.rew}
+        late = [key for key, law in laws.items() if has_delay(law, self.clock.dt)]
+        return [*["delay.obs"] * has_message_delay(self), *late]
+
+    @property
     def longest_delay(self) -> int:
         """Longest delay of a message [steps]."""
         return self.delay.uplink.sampler(self.clock.dt).longest

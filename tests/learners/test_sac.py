@@ -238,6 +238,19 @@ def test_updates_draw_from_all_settled_decisions_that_the_replay_buffer_still_ho
     assert difference.amin(0).max() < 1e-5  # every expected decision is drawn
 
 
+def test_steps_after_an_end_that_was_known_only_later_are_not_learnt_from():
+    env = UavEnv(everything("instant", kind="discrete"), 4)
+    config, buffer = SacConfig(updates=1, batch_size=200, warm_up=0), ReplayBuffer(storage=TimeStorage(200))
+    learner = RecordingSac(env, config, learning(SMALL), buffer)
+    flight = fly(env, learner.actor, 12)
+    flight["valid"] = torch.zeros(4, 12, 1, dtype=torch.bool)
+    flight["valid"][:, 7] = True
+    learner.learn(flight)
+    (drawn,) = learner.drawn
+    found = {tuple(row) for row in drawn[OBSERVATION].tolist()}
+    assert found == {tuple(row) for row in flight[OBSERVATION][:, 7].flatten(0, 1).tolist()}
+
+
 def recording_learner(env: UavEnv | None = None, **changed) -> RecordingSac:
     """A learner that has made one update."""
     env = env or UavEnv(everything(kind="discrete"), 4)

@@ -218,6 +218,11 @@ def test_ray_tasks_and_slurm_jobs_give_the_same_results_as_this_process(compare,
         (["+agents=3"], "agents: it is a setting of the runs; all of them get it by \"overrides=['agents="),
         (["overrides=agents"], "overrides: it is a list: [agents]"),
         (["arms=unaware"], "arms: it is a list: [unaware]"),
+        (["arms=[]"], "arms: [] names none: leave it out, for all of them"),
+        (
+            ["overrides=['delay.obs=3','delay.rew=1']"],
+            "usecase2/none/undelayed: delay.obs, delay.rew: its value delays this arm",
+        ),
     ],
 )
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(

@@ -67,6 +67,7 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
         ["aware=backupdate"],
         ["delay=paper", "aware=backupdate", "clock.server=2s", "delay.rew=3", "delay.reward_window=3"],
         ["learner=sac", "delay.rew=3", "aware=backupdate", "settle=true", "clock.server=2s"],
+        ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
     ],
 )
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):

@@ -67,6 +67,15 @@ def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys
     assert (folder / "trial_0" / "metrics.csv").stat().st_mtime_ns == written
 
 
+def test_the_best_of_scores_that_count_steps_is_the_least(search, capsys, monkeypatch):
+    scores = iter([5.0, 3.0])
+    monkeypatch.setattr(tune.Run, "score", lambda *_: next(scores))
+    folder = search("trials=2", "score=true_steps", "episode.max_steps=4")
+    best = rows(folder / "trials.csv")[1]
+    assert best["true_steps"] == "3"
+    assert f"learner.lr={best['learner.lr']}" in capsys.readouterr().out.split("The best:")[1]
+
+
 @pytest.mark.slow
 def test_a_killed_search_goes_on_with_the_trial_that_it_was_training(search):
     folder = search("trials=1")
@@ -130,6 +139,10 @@ def test_settings_that_are_refused_and_trainings_that_fail_are_told_and_the_sear
         ({"learner": {"lr": {"low": 1, "high": 2, "choices": [1]}}}, "is neither"),
         ({"learner": {"lr": {"choices": []}}}, "is no list of values"),
         ({"learner": {"lr": 3}}, "search.learner.lr: 3 is neither"),
+        ({"learner": {"lr": {"low": 0.1, "high": 1, "log": "maybe"}}}, "lr.log: maybe is not true or false"),
+        ({"learner": {"lr": {"low": 0.1, "high": 1, "step": "a"}}}, "lr.step: a is no number above 0"),
+        ({"learner": {"lr": {"low": 0.1, "high": 1, "step": -1}}}, "lr.step: -1 is no number above 0"),
+        ({"delay": {"history": {"low": 1, "high": 9, "step": 2.5}}}, "step: 2.5 is no whole number above 0"),
     ],
 )
 def test_a_space_that_cannot_be_searched_is_refused(search, message):
@@ -159,6 +172,7 @@ def test_every_learner_has_a_space(capsys):
     [
         (["resume=x"], "resume: the same command"),
         (["trials=0"], "trials: 0"),
+        (["checkpoint=first"], "checkpoint: first is not for a search, which trains every policy from"),
         (["policy=greedy"], "policy: greedy is not one of sampled, mode"),
         (["+search.learner.lrr.low=1", "+search.learner.lrr.high=2"], "search: "),
         (["-m", "seed=0,1"], "-m: "),
