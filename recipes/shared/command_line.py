@@ -98,7 +98,7 @@ SECRET = "token"
 
 def is_secret(word: str) -> bool:
     """Does an override set a password, however it is written?"""
-    return word.strip().lstrip("+~").partition("=")[0].partition("@")[0].strip() == SECRET
+    return word.lstrip("+~").partition("=")[0] == SECRET
 
 
 def remember_words() -> None:
