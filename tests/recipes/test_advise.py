@@ -121,8 +121,8 @@ REFUSALS = [
         ["reports=table.csv", "durable=true"],
         "durable: True is for a service; a table that is answered once has no",
     ),
-    (["reports=table.csv", "uavs=[A,A]"], "uavs: ['A', 'A'] names a UAV twice"),
-    (["reports=table.csv", "region=geojson", "region.path=no.geojson"], "no.geojson: no such file"),
+    (["reports=table.csv", "uavs=[A,A]"], "error: uavs: ['A', 'A'] names a UAV twice"),
+    (["reports=table.csv", "region=geojson", "region.path=no.geojson"], "error: no.geojson: no such file"),
     (["folder=.", "uavs=[A]", "journal=../{folder}"], "journal: ../{folder} is the folder of the tables too"),
 ]
 
