@@ -19,6 +19,8 @@ import os
 import secrets
 import socket
 import time
+from collections.abc import Sequence
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -40,10 +42,10 @@ from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
-from damian.evaluation.run_lock import is_folder
+from damian.evaluation.run_lock import is_folder, locked
 
 from .evaluate import stored_actor
-from .shared.command_line import SECRET
+from .shared.command_line import is_secret
 from .shared.flown_policy import FlownPolicyConfig
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
@@ -90,12 +92,16 @@ class AdviseConfig(FlownPolicyConfig):
         """Require exactly one source of reports.
 
         Raises:
-            InputError: there is none, or more than one.
+            InputError: there is none, or more than one, or a journal is named that nothing would write.
         """
         given = [name for name in ("reports", "folder", "port") if getattr(self, name) is not None]
         if len(given) != 1:
             problem = f"{' and '.join(given)} are given" if given else "is missing"
             raise InputError(f"reports: {problem}: give one of reports=FILE, folder=FOLDER, port=NUMBER")
+        if self.reports is not None:
+            for name in ("journal", "durable"):
+                problem = "is for a service; a table that is answered once has no journal: leave it out"
+                checks.require(not getattr(self, name), name, getattr(self, name), problem)
 
 
 def check_token(key: str, token: str | None) -> None:
@@ -109,15 +115,21 @@ def check_token(key: str, token: str | None) -> None:
 def without_token(config: AdviseConfig) -> AdviseConfig:
     """The settings, as files may keep them."""
     kept = copy.copy(config)
-    kept.token, kept.overrides = None, [word for word in config.overrides if not word.startswith(SECRET)]
+    kept.token, kept.overrides = None, [word for word in config.overrides if not is_secret(word)]
     return kept
 
 
 ConfigStore.instance().store(name="advise_schema", node=AdviseConfig)
 
 
-def make_desk(config: AdviseConfig, folder: Path | None) -> Desk:
-    """The desk of the policy that the settings name; journals lie in a folder, if there is one."""
+def make_desk(config: AdviseConfig, folder: Path | None, is_locked: bool = False) -> Desk:
+    """The desk of the policy that the settings name; journals lie in a folder, if there is one.
+
+    Args:
+        config: all settings.
+        folder: of the journals.
+        is_locked: it is the run folder, which is locked already.
+    """
 
     @cache
     def parts(n_uavs: int) -> tuple[Node, TensorDictModuleBase]:
@@ -130,7 +142,7 @@ def make_desk(config: AdviseConfig, folder: Path | None) -> Desk:
 
     overrides = without_token(config).overrides
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": overrides}
-    return Desk(make_fleet, folder, about, config.durable)
+    return Desk(make_fleet, folder, about, config.durable, is_locked)
 
 
 def make_policy(config: AdviseConfig, node: Node) -> TensorDictModuleBase:
@@ -148,15 +160,18 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
     """Answer one table of reports: print the advice, and write it into the run folder.
 
     Raises:
-        InputError: the table is wrong, or does not have every UAV.
+        InputError: the table is wrong, or does not have every UAV; or the settings are.
     """
     path = Path(str(config.reports))
     now = time.time()
     with named(path):
         rows = read_file(path)
+    desk = make_desk(config, None)
+    with nullcontext() if config.uavs else named(path):
         uavs = config.uavs or list(dict.fromkeys(str(row.get("id")).strip() for _, row in rows))
-        desk = make_desk(config, None)
-        desk.create(FLEET, desk.check_new(FLEET, uavs))
+        checked = desk.check_new(FLEET, uavs)
+    desk.create(FLEET, checked)
+    with named(path):
         desk.report(FLEET, rows, now, file=True)
         try:
             answer = desk.advise(FLEET, desk.fleet(FLEET).clock)
@@ -184,11 +199,22 @@ def advise(config: AdviseConfig, folder: Path) -> None:
         return
     save_config(without_token(config), folder)
     journals = Path(config.journal) if config.journal else folder / "journals"
-    desk = make_desk(config, journals)
-    if config.port is not None:
-        serve(config, desk)
-    else:
-        watch(config, desk)
+    inbox = None if config.folder is None else Path(config.folder)
+    if inbox is not None and not is_folder(inbox):
+        raise InputError(f"folder: {inbox} is not there")
+    if inbox is not None and is_same(inbox, journals):
+        raise InputError(f"journal: {journals} is the folder of the tables too: name another one")
+    alone = nullcontext() if inbox is None or is_same(inbox, folder) else locked(inbox, "folder")
+    with alone, closing(make_desk(config, journals, is_same(journals, folder))) as desk:
+        if inbox is None:
+            serve(config, desk)
+        else:
+            watch(inbox, desk, config.uavs)
+
+
+def is_same(one: Path, other: Path) -> bool:
+    """Do two paths name the same folder?"""
+    return os.path.realpath(one) == os.path.realpath(other)
 
 
 def serve(config: AdviseConfig, desk: Desk) -> None:
@@ -233,17 +259,14 @@ def listening(config: AdviseConfig) -> socket.socket:
     return listener
 
 
-def watch(config: AdviseConfig, desk: Desk) -> None:
+def watch(inbox: Path, desk: Desk, uavs: Sequence[str]) -> None:
     """Answer every table that comes into a folder, until the program is stopped.
 
     Raises:
-        InputError: there is no such folder, or no UAVs are given.
+        InputError: no UAVs are given.
+        RunError: the folder is not there any more, or cannot be written.
     """
-    inbox = Path(str(config.folder))
-    if not is_folder(inbox):
-        raise InputError(f"folder: {inbox} is not there")
-    uavs = desk.check_new(FLEET, list(config.uavs))
-    desk.create(FLEET, uavs)
+    desk.create(FLEET, desk.check_new(FLEET, list(uavs)))
     print(f"watching {inbox}", flush=True)
     while True:
         if not read_inbox(desk, FLEET, inbox, time.time()):

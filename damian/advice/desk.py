@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,12 @@ from damian.advice.answers import Answer, advice_of, status_of
 from damian.advice.fleet import Fleet
 from damian.advice.journal import SUFFIX, Journal, entries, head, reports_of
 from damian.advice.reports import Report, read_rows
+from damian.advice.same_service import check_goals, check_same
 from damian.advice.tables import Rows
-from damian.common.errors import InputError
+from damian.common.atomic_files import writing
+from damian.common.errors import InputError, RunError
 from damian.common.text_files import named, show
+from damian.evaluation.run_lock import is_folder, locked
 
 MAX_FLEETS, MAX_UAVS = 1000, 100
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -30,12 +34,17 @@ class Desk:
 
     Args:
         make_fleet: makes the fleet of UAVs with these IDs.
-        folder: of the journals; those in it are restored. None: nothing is kept.
-        about: which policy flies, for the journals.
+        folder: of the journals; those in it are restored, and no other desk may use it until this one is
+            closed. None: nothing is kept.
+        about: which policy flies by which settings, for the journals: ``policy``, ``checkpoint`` and
+            ``overrides``.
         durable: as in ``Journal``.
+        is_locked: the folder is locked by who makes the desk.
 
     Raises:
-        InputError: a journal is damaged, or of another policy.
+        InputError: a journal is damaged, or of another policy or other settings, or another desk uses the
+            folder.
+        RunError: the folder cannot be written.
     """
 
     def __init__(
@@ -44,13 +53,19 @@ class Desk:
         folder: Path | None = None,
         about: Mapping[str, Any] | None = None,
         durable: bool = False,
+        is_locked: bool = False,
     ) -> None:
         self._make_fleet, self._folder, self._durable = make_fleet, folder, durable
         self.about = dict(about or {})
         self.fleets: dict[str, Fleet] = {}
         self._journals: dict[str, Journal] = {}
-        for path in sorted(folder.glob(f"*{SUFFIX}")) if folder is not None else ():
-            self._restore(path)
+        self._at_close = ExitStack()
+        if folder is not None:
+            try:
+                self._open(folder, is_locked)
+            except BaseException:
+                self.close()
+                raise
 
     def fleet(self, name: str) -> Fleet:
         """The fleet of a name.
@@ -90,7 +105,11 @@ class Desk:
         made = fleet or self.make(uavs)
         if self._folder is not None:
             journal = Journal(self._folder / f"{name}{SUFFIX}", self._durable)
-            journal.append(head(name, uavs, self.about))
+            try:
+                journal.append(head(name, uavs, self.about))
+            except BaseException:
+                journal.close()
+                raise
             self._journals[name] = journal
         self.fleets[name] = made
         return True
@@ -100,12 +119,22 @@ class Desk:
         return self._make_fleet(uavs)
 
     def end(self, name: str, now: float) -> None:
-        """End a fleet; its journal stays, under another name."""
+        """End a fleet; its journal stays, under another name.
+
+        Raises:
+            RunError: the journal cannot be renamed; the fleet goes on.
+        """
         self.fleet(name)
-        del self.fleets[name]
-        if journal := self._journals.pop(name, None):
+        if journal := self._journals.get(name):
             journal.close()
-            journal.path.rename(journal.path.with_suffix(f".{now:.3f}.ended"))
+            try:
+                with writing(journal.path):
+                    journal.path.rename(journal.path.with_suffix(f".{now:.3f}.ended"))
+            except RunError:
+                self._journals[name] = Journal(journal.path, self._durable)
+                raise
+            del self._journals[name]
+        del self.fleets[name]
 
     def report(self, name: str, rows: Rows, now: float, file: bool = False) -> list[str]:
         """Take reports, all or none of them.
@@ -121,14 +150,15 @@ class Desk:
 
         Raises:
             InputError: a row is wrong; none is taken.
+            RunError: the journal cannot be written; none is taken.
         """
         fleet, reports = self.fleet(name), read_rows(rows, now, file)
+        current, now = (None, now) if file else (now, max(now, fleet.clock))
         for (where, _), report in zip(rows, reports, strict=True):
             try:
-                fleet.check(report, now if report.received is None else report.received)
+                fleet.check(report, now if report.received is None else report.received, current)
             except InputError as error:
                 raise InputError(f"{where}: {error}") from None
-        now = max(now, fleet.clock) if not file else now
         kept = [
             {column: value for column, value in row.items() if column not in ("aoi", "receive time")}
             | {"time": report.time}
@@ -149,17 +179,24 @@ class Desk:
             only: answer only those that ask.
 
         Raises:
-            InputError: a UAV is of another fleet.
+            InputError: a UAV is of another fleet, or the fleet began too long ago.
             Waiting: not every UAV has reported yet.
+            RunError: the journal cannot be written; no UAV has chosen.
         """
         fleet = self.fleet(name)
         numbers = fleet.numbers_of(asking)
+        fleet.advance(now)
+        before = fleet.choices()
         choosing = fleet.advise(now, asking)
         answer = advice_of(fleet, numbers if only else None)
         if choosing:
             told = {fleet.uavs[uav]: fleet.told[uav][-1].action for uav in choosing}
             advice = answer if numbers is None else advice_of(fleet, choosing)
-            self._write(name, {"asked": fleet.clock, "step": fleet.step, "told": told, "advice": advice})
+            try:
+                self._write(name, {"asked": fleet.clock, "step": fleet.step, "told": told, "advice": advice})
+            except BaseException:  # nobody is told what is in no journal
+                fleet.take_back(before)
+                raise
         return answer
 
     def status(self, name: str) -> Answer:
@@ -172,13 +209,27 @@ class Desk:
             fleet.advance(now)
 
     def close(self) -> None:
-        """Close all journals."""
+        """Close all journals, and leave their folder to others."""
         for journal in self._journals.values():
             journal.close()
+        self._journals.clear()
+        self._at_close.close()
+
+    def _open(self, folder: Path, is_locked: bool) -> None:
+        """Take a folder of journals, and restore the fleets in it."""
+        is_new = not is_folder(folder)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        if not is_locked:
+            self._at_close.enter_context(locked(folder, "journal"))
+        if is_new:
+            self._at_close.callback(_remove_if_empty, folder)
+        for path in sorted(folder.glob(f"*{SUFFIX}")):
+            self._restore(path)
 
     def _write(self, name: str, entry: dict[str, Any]) -> None:
-        if journal := self._journals.get(name):
-            journal.append(entry)
+        if self._folder is not None:
+            self._journals[name].append(entry)
 
     def _restore(self, path: Path) -> None:
         """Restore a fleet from its journal."""
@@ -187,18 +238,34 @@ class Desk:
             journal.close()
             path.unlink()
             return
+        try:
+            name, fleet = self._replayed(path)
+        except BaseException:
+            journal.close()
+            raise
+        self.fleets[name], self._journals[name] = fleet, journal
+
+    def _replayed(self, path: Path) -> tuple[str, Fleet]:
+        """The fleet of a journal, and its name."""
         first, *others = entries(path)
-        was = {name: (first.get("about") or {}).get(name) for name in ("policy", "checkpoint")}
-        own = {name: self.about.get(name) for name in was}
-        if was != own:
-            raise InputError(f"{path}: it is of {show(was)}, not of {show(own)}: name another journal=FOLDER")
-        name = str(first.get("fleet"))
+        name = first["fleet"]
         with named(path):
-            fleet = self._make_fleet(self.check_new(name, first.get("uavs")))
+            check_same(first.get("about"), self.about)
+            uavs = self.check_new(name, first.get("uavs"))
+            if path.name != f"{name}{SUFFIX}":
+                remedy = f"name it {name}{SUFFIX}, or move it to another folder"
+                raise InputError(f"it is the journal of the fleet {name}, or a copy of it: {remedy}")
+            fleet = self._make_fleet(uavs)
         for number, entry in enumerate(others, 2):
             with named(f"{path}: line {number}"):
                 replay(fleet, entry)
-        self.fleets[name], self._journals[name] = fleet, journal
+                check_goals(fleet, entry)
+        return name, fleet
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def checked_ids(uavs: Any) -> list[str]:
@@ -225,8 +292,10 @@ def replay(fleet: Fleet, entry: Mapping[str, Any]) -> None:
         _taken(fleet, reports, received)
         return
     asked, told = entry.get("asked"), entry.get("told")
-    if not isinstance(asked, int | float) or not isinstance(told, dict) or fleet.start is None:
+    if not isinstance(asked, int | float) or not isinstance(told, dict):
         raise InputError("it is damaged: neither reports nor advice")
+    if fleet.start is None:
+        raise InputError("it is damaged: advice before every UAV has reported")
     fleet.advance(asked)
     numbers = fleet.numbers_of(list(told)) or []
     if fleet.hidden is not None:

@@ -9,7 +9,6 @@ the former.
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,11 +17,12 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
+from damian.advice.clocks import LIFE, check_ahead, check_first, check_life
+from damian.advice.decisions import TOLD, Choices, Decision, Told
 from damian.advice.ground import Ground
 from damian.advice.known import Known, UavLog, messages_of
 from damian.advice.node import FOREVER, LateMessage, Memories, Node, Reported
 from damian.advice.reports import Report
-from damian.common.checks import SECONDS
 from damian.common.errors import InputError
 from damian.common.text_files import listed, show
 from damian.envs.uav_env import Outputs
@@ -30,14 +30,8 @@ from damian.learners.recurrent import AgentGRU
 from damian.world.messages import Messages
 from damian.world.state import State
 
-FUTURE = 1.0
-"""How far the clock of a UAV may be ahead of that of the server [s]."""
 SILENT_STEPS = 1000
 """Steps without any report after which beliefs stand still."""
-GRACE = 60.0
-"""A landing point stays booked for so long after a late arrival [s], unless the UAV reports to be there."""
-TOLD = 64
-"""Decisions of a UAV that are kept: a late report in flight was of one of them."""
 _ROUNDING = 1e-3
 """Share of a step by which times may be rounded."""
 
@@ -46,34 +40,11 @@ class Waiting(Exception):
     """The fleet has not begun, because UAVs have not reported yet; ``str(error)`` names them."""
 
 
-@dataclass(frozen=True)
-class Decision:
-    """What a UAV was told to do."""
-
-    step: int
-    """The step in which it chose."""
-    time: float
-    """When it was told [s]."""
-    action: Any
-    """The action: a number, or distance and heading in [0, 1]."""
-    origin: int
-    """Landing point from which it flies."""
-    goal: int
-    """Landing point to which it flies; the same if it holds."""
-    duration: float
-    """Expected duration of the flight [s]."""
-
-    @property
-    def expires(self) -> float:
-        """When the landing point is no longer booked, unless the UAV reports to be there [s]."""
-        return self.time + 2 * self.duration + GRACE
-
-
 class Fleet:
     """The server node of one fleet, and the policy that it asks.
 
     Args:
-        node: for as many UAVs; it is used by this fleet only.
+        node: for as many UAVs; fleets may share it, because it remembers nothing of them.
         uavs: IDs of the UAVs, in the order in which they book landing points.
         policy: from observations to actions.
         drawn: actions are drawn; if not, the most likely ones are taken.
@@ -99,7 +70,7 @@ class Fleet:
         """When step 0 began [s]; None until every UAV has reported."""
         self.step, self.clock = 0, 0.0
         self.held: list[Known] = []
-        self.told: list[deque[Decision]] = [deque(maxlen=TOLD) for _ in self.uavs]
+        self.told: Told = [deque(maxlen=TOLD) for _ in self.uavs]
         self.pending: list[tuple[int, int, Known]] = []  # step from which it counts, UAV, report
         self.arrived: list[tuple[int, Known]] = []  # those that count from this step on
         self.before: Memories | None = None
@@ -117,21 +88,24 @@ class Fleet:
         """The step in which an instant lies."""
         return math.floor((time - (self.start or 0.0)) / self.node.dt + _ROUNDING)
 
-    def check(self, report: Report, received: float) -> None:
+    def check(self, report: Report, received: float, now: float | None = None) -> None:
         """Check a report before it is added.
 
+        Args:
+            report: the report.
+            received: when it came in, by the clock of the fleet, which never goes back [s].
+            now: the time, if it comes in now; None for one that is recorded [s].
+
         Raises:
-            InputError: the UAV is of another fleet, the report is of the future or from another region, or
+            InputError: the UAV is of another fleet, its clock is wrong, the report is from another region, or
                 it came in so late that steps cannot be counted.
         """
         if report.uav not in self.number:
             raise InputError(f"ID: {show(report.uav)} is no UAV of this fleet: {listed(self.uavs)}")
-        for name, time in (("time", report.time), ("source time", report.detected)):
-            if time is not None and time > received + FUTURE:
-                ahead = f"{time:.13g} s is {time - received:.1f} s after it came in"
-                raise InputError(f"{name}: {ahead}: set the clock of the UAV")
-        if self.start is not None and received - self.start > SECONDS:
-            raise InputError(f"time: the fleet began more than {SECONDS:g} s ago: begin a new one")
+        check_ahead(report, received if now is None else now)
+        if now is not None and self.start is None:
+            check_first(report, now)
+        check_life(self.start, received)
         self.logs[self.number[report.uav]].check(report)
 
     def report(self, report: Report, received: float) -> str:
@@ -158,7 +132,7 @@ class Fleet:
         log.late += late
         if self.start is None:
             log.add(report, 0, None)
-            if all(each.known for each in self.logs):
+            if not self._missing():
                 self._begin(received)
             return "late" if late else "new"
         if report.time < self.start:
@@ -175,6 +149,12 @@ class Fleet:
         self.outputs = self.sent = None
         self._collect()
         return "late" if late else "new"
+
+    def _missing(self) -> list[str]:
+        """The UAVs for which the fleet waits: each must have a report in which the fleet can begin."""
+        oldest = self.clock - LIFE
+        found = zip(self.uavs, self.logs, strict=True)
+        return [uav for uav, log in found if log.newest is None or log.newest.report.time < oldest]
 
     def _begin(self, received: float) -> None:
         """Begin with the newest report of each UAV."""
@@ -307,14 +287,17 @@ class Fleet:
             again.
 
         Raises:
-            InputError: a UAV is of another fleet.
+            InputError: a UAV is of another fleet, or the fleet began too long ago.
             Waiting: not every UAV has reported yet.
         """
         numbers = self.numbers_of(asking)
         self.advance(now)
         if self.start is None:
-            silent = [uav for uav, log in zip(self.uavs, self.logs, strict=True) if not log.known]
-            raise Waiting(f"no advice yet: no report of {listed(silent)} has come in")
+            missing = self._missing()
+            known = any(self.logs[self.number[uav]].known for uav in missing)
+            since = f" that is newer than {LIFE:g} s" if known else ""
+            raise Waiting(f"no advice yet: no report of {listed(missing)}{since} has come in")
+        check_life(self.start, self.clock)
         if numbers is None:
             numbers = [uav for uav, known in enumerate(self.held) if not known.report.flies]
         chosen = self.chosen[0].tolist()
@@ -380,6 +363,14 @@ class Fleet:
         self.chosen = self.chosen | valid
         mask = valid.view(*valid.shape, *[1] * (action.dim() - 2))
         self.action = torch.where(mask, action, self.action)
+
+    def choices(self) -> Choices:
+        """What the UAVs have chosen so far, for ``take_back``."""
+        return Choices([deque(each, TOLD) for each in self.told], self.action, self.chosen, self.hidden_after)
+
+    def take_back(self, before: Choices) -> None:
+        """Take back what UAVs have chosen in this step since ``choices``, because they were not told."""
+        self.told, self.action, self.chosen, self.hidden_after = before
 
     def decision(self, uav: int) -> Decision | None:
         """What a UAV was told last."""

@@ -7,12 +7,12 @@ from damian.advice.desk import Desk
 from damian.advice.fleet import Waiting
 from damian.advice.tables import as_csv, read_file
 from damian.common.atomic_files import write_atomically, writing
-from damian.common.errors import InputError
+from damian.common.errors import InputError, RunError
 
 TABLES = (".csv", ".json", ".jsonl")
 ANSWERS = ("advice.csv", "advice.json")
-DONE, REFUSED = ".done", ".refused"
-"""Added to the name of a table that was read, or refused; a file ``*.refused.txt`` says why."""
+DONE, REFUSED, REASON = ".done", ".refused", ".refused.txt"
+"""Added to the name of a table that was read, or refused, and to that of the file that says why."""
 
 
 def read_inbox(desk: Desk, name: str, folder: Path, now: float) -> bool:
@@ -20,6 +20,8 @@ def read_inbox(desk: Desk, name: str, folder: Path, now: float) -> bool:
 
     A table must appear complete: write it under another name, such as one that begins with a dot, and rename
     it. The answer is ``advice.csv`` and ``advice.json`` in the folder. A table that is wrong changes nothing.
+    Files ``NAME.done``, ``NAME.refused`` and ``NAME.refused.txt`` are of the newest table of that name; the
+    time is put into the names of those of an earlier one.
 
     Args:
         desk: the fleets.
@@ -31,9 +33,12 @@ def read_inbox(desk: Desk, name: str, folder: Path, now: float) -> bool:
         Whether there was any table.
 
     Raises:
-        RunError: an answer cannot be written.
+        RunError: the folder cannot be read any more, or an answer cannot be written.
     """
-    paths = sorted(path for path in folder.iterdir() if _is_table(path))
+    try:
+        paths = sorted(path for path in folder.iterdir() if _is_table(path))
+    except OSError as error:
+        raise RunError(f"folder: {folder}: it cannot be read: {error.strerror}") from None
     taken = [_read(desk, name, path, now) for path in paths]
     if any(taken):
         try:
@@ -52,12 +57,24 @@ def _is_table(path: Path) -> bool:
 
 def _read(desk: Desk, name: str, path: Path, now: float) -> bool:
     """Give a table to the desk; returns whether it was taken."""
+    reason = ""
     try:
         desk.report(name, read_file(path), now)
         end = DONE
     except InputError as error:
         end = REFUSED
-        write_atomically(path.with_name(f"{path.name}{REFUSED}.txt"), f"{error}\n")
+        reason = str(error)
     with writing(path):
+        _keep_earlier(path, now)
+        if reason:
+            write_atomically(path.with_name(path.name + REASON), f"{reason}\n")
         path.rename(path.with_name(path.name + end))
     return end == DONE
+
+
+def _keep_earlier(path: Path, now: float) -> None:
+    """Give the files of an earlier table of this name other names, with the time."""
+    for end in (DONE, REFUSED, REASON):
+        earlier = path.with_name(path.name + end)
+        if earlier.exists():
+            earlier.rename(path.with_name(f"{path.name}.{now:.3f}{end}"))

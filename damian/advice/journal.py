@@ -8,13 +8,13 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from damian.advice.reports import LATEST, Report, read_rows
-from damian.advice.tables import checked_rows
+from damian.advice.tables import checked_rows, no_constant
 from damian.common.atomic_files import writing
 from damian.common.errors import InputError
-from damian.common.text_files import named, one_line
+from damian.common.text_files import named, one_line, show
 
 FORMAT, VERSION = "damian-advice", 1
 SUFFIX = ".jsonl"
@@ -37,9 +37,9 @@ class Journal:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
             size = path.stat().st_size
-            kept = path.read_bytes().rfind(b"\n") + 1
-            if kept < size:
-                os.ftruncate(self._file, kept)
+            self._end = path.read_bytes().rfind(b"\n") + 1
+            self._torn = self._end < size
+            self._cut()
 
     def append(self, entry: dict[str, Any]) -> None:
         """Write a line.
@@ -49,12 +49,23 @@ class Journal:
         """
         line = json.dumps(entry, separators=(",", ":"), allow_nan=False).encode() + b"\n"
         with writing(self.path):
-            size = os.fstat(self._file).st_size
-            if os.write(self._file, line) != len(line):
-                os.ftruncate(self._file, size)
-                raise OSError(None, "the disk is full")
-            if self._durable:
-                os.fsync(self._file)
+            self._cut()
+            self._torn = True
+            try:
+                if os.write(self._file, line) != len(line):
+                    raise OSError(None, "the disk is full")
+                if self._durable:
+                    os.fsync(self._file)
+            except OSError:
+                self._cut()
+                raise
+            self._end, self._torn = self._end + len(line), False
+
+    def _cut(self) -> None:
+        """Remove what is left of a line that could not be written."""
+        if self._torn:
+            os.ftruncate(self._file, self._end)
+            self._torn = False
 
     def close(self) -> None:
         """Close the file."""
@@ -77,6 +88,8 @@ def entries(path: Path) -> Iterator[dict[str, Any]]:
             entry = _parsed(line, number)
             if number == 1 and (entry.get("journal"), entry.get("version")) != (FORMAT, VERSION):
                 raise InputError(f"line 1: it is no journal of damian advise of version {VERSION}")
+            if number == 1 and not isinstance(entry.get("fleet"), str):
+                raise InputError("line 1: it is damaged: the name of the fleet is missing")
             yield entry
         if not lines:
             raise InputError("it is empty")
@@ -84,12 +97,21 @@ def entries(path: Path) -> Iterator[dict[str, Any]]:
 
 def _parsed(line: bytes, number: int) -> dict[str, Any]:
     try:
-        entry = json.loads(line)
+        entry = json.loads(line, parse_constant=no_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"line {number}: it is damaged: {one_line(str(error))[:200]}") from None
     if not isinstance(entry, dict):
         raise InputError(f"line {number}: it is no object")
+    for name in ("received", "asked"):
+        value = entry.get(name)
+        if isinstance(value, int | float) and not _is_time(value):
+            raise InputError(f"line {number}: it is damaged: {name}: {show(value)} is not a time [s]")
     return entry
+
+
+def _is_time(value: Any) -> bool:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and abs(value) <= LATEST  # which NaN is not
 
 
 def reports_of(entry: Mapping[str, Any]) -> tuple[float, list[Report]]:
@@ -99,10 +121,10 @@ def reports_of(entry: Mapping[str, Any]) -> tuple[float, list[Report]]:
         InputError: the line is damaged.
     """
     received, found = entry.get("received"), entry.get("reports")
-    if not isinstance(received, int | float) or not isinstance(found, list) or abs(received) > LATEST:
+    if not _is_time(received) or not isinstance(found, list):
         raise InputError("it is damaged: no reports, or no time at which they came in")
     rows = checked_rows([(f"row {n}", row) for n, row in enumerate(found, 1)])
-    return received, read_rows(rows, received, file=False)
+    return cast(float, received), read_rows(rows, cast(float, received), file=False)
 
 
 def head(name: str, uavs: list[str], about: dict[str, Any]) -> dict[str, Any]:

@@ -157,12 +157,13 @@ def parsed_json(text: str | bytes, where: str) -> Any:
         InputError: it is none.
     """
     try:
-        return json.loads(text, parse_constant=_no_constant)
+        return json.loads(text, parse_constant=no_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: it is not JSON: {str(error)[:200]}") from None
 
 
-def _no_constant(name: str) -> Any:
+def no_constant(name: str) -> Any:
+    """Refuse NaN and Infinity, which Python would read as numbers of JSON."""
     raise ValueError(f"{name} is not a number of JSON; write null for what is not known")
 
 

@@ -92,8 +92,13 @@ _typed: list[str] = []
 """The command line as it was typed; empty in a worker process of a comparison."""
 
 
-SECRET = "token="
-"""Begin of a word that sets a password."""
+SECRET = "token"
+"""Key of the setting that is a password."""
+
+
+def is_secret(word: str) -> bool:
+    """Does an override set a password, however it is written?"""
+    return word.lstrip("+~").partition("=")[0] == SECRET
 
 
 def remember_words() -> None:
@@ -108,7 +113,7 @@ def typed_words() -> list[str]:
 
 def typed_command() -> str:
     """The command line as it was typed, without the password of a service, which no file should keep."""
-    return command([f"{SECRET}..." if word.startswith(SECRET) else word for word in typed_words()])
+    return command([f"{SECRET}=..." if is_secret(word) else word for word in typed_words()])
 
 
 def command(words: Sequence[str]) -> str:

@@ -7,7 +7,9 @@ import torch
 from reporting import START, flights
 
 from damian import keys
-from damian.advice.fleet import GRACE, Fleet
+from damian.advice.clocks import FIRST, LIFE
+from damian.advice.decisions import GRACE
+from damian.advice.fleet import Fleet, Waiting
 from damian.advice.node import Node
 from damian.advice.reports import Report
 from damian.baselines.greedy import greedy_policy
@@ -216,3 +218,79 @@ def test_what_comes_in_late_fills_in_no_earlier_step_whenever_steps_are_taken():
         fleet.advance(START + 7)
         seen.append(fleet.observe([0])[keys.HISTORY])
     assert torch.equal(*seen)
+
+
+def test_a_first_report_that_is_old_when_it_comes_in_shows_a_clock_that_was_never_set():
+    """The fleet would begin in 1970 and be over at once. In a journal it stays what it was."""
+    fleet = fleet_of()
+    report = Report("a", 12.0, fleet.ground.place(3))
+    message = (
+        "time: 12 s is 1699999988.0 s before it came in, more than the 3600 s of a first report: set the"
+    )
+    with pytest.raises(InputError, match=message):
+        fleet.check(report, START, START)
+    fleet.check(replace(report, time=START - FIRST), START, START)
+    fleet.check(report, START)
+    for i, uav in enumerate(fleet.uavs):
+        told(fleet, uav, START, 30 * i)
+    fleet.check(report, START, START)
+    assert fleet.report(report, START) == "old", "it changes nothing any more"
+
+
+def test_a_fleet_begins_with_reports_of_the_time_that_it_lasts():
+    """One UAV reports, and the others come when its report is too old for a fleet to begin with it."""
+    fleet = fleet_of()
+    told(fleet, "a", START, 0)
+    late = START + 2 * LIFE
+    told(fleet, "b", late, 30)
+    told(fleet, "c", late, 60)
+    with pytest.raises(Waiting, match=r"no report of a that is newer than 1e\+06 s has come in"):
+        fleet.advise(late + 1)
+    told(fleet, "a", late + 2, 3)
+    assert fleet.advise(late + 3) == [0, 1, 2]
+    assert fleet.start == late
+
+
+def test_a_fleet_that_began_too_long_ago_neither_takes_reports_nor_advises():
+    fleet = fleet_of()
+    for i, uav in enumerate(fleet.uavs):
+        told(fleet, uav, START, 30 * i)
+    assert fleet.advise(START + LIFE - 1) == [0, 1, 2]
+    message = r"the fleet began more than 1e\+06 s ago: end it, and begin a new one"
+    with pytest.raises(InputError, match=message):
+        told(fleet, "a", START + LIFE + 1, 0)
+    with pytest.raises(InputError, match=message):
+        fleet.advise(START + LIFE + 1)
+
+
+@pytest.mark.parametrize("task", ["history", "belief", "clocks", "flights"])
+def test_fleets_that_share_a_node_do_not_see_each_other(task):
+    """Beside another fleet, which began earlier elsewhere, a fleet observes what it does alone."""
+    scenario = scenario_of(**TASKS[task])
+
+    def flown(node: Node, beside: Fleet | None) -> list[dict]:
+        fleet, seen = Fleet(node, ["a", "b", "c"], greedy_policy(node.env)), []
+        for step in range(12):
+            for other in [beside] if beside else []:
+                told(other, "b", START + step, 90 - step, battery=50.0, spotted=step % 2 == 0)
+                other.advise(START + step + 0.5)
+            for i, uav in enumerate(fleet.uavs):
+                told(fleet, uav, START + step - i, 30 * i + step, spotted=step == 5)
+            fleet.advise(START + step + 0.5)
+            read = fleet.observe([0, 1, 2])
+            seen.append(
+                {key: read[key] for key in (keys.OBSERVATION, keys.HISTORY) if key in read.keys(True)}
+            )
+        return [*seen, {uav: list(each) for uav, each in zip(fleet.uavs, fleet.told, strict=True)}]
+
+    shared = Node(scenario, 3)
+    beside = Fleet(shared, ["a", "b", "c"], greedy_policy(shared.env))
+    for i, uav in enumerate(beside.uavs):
+        told(beside, uav, START - 20, 200 + i, spotted=True)
+    beside.advise(START - 10)
+    *alone, told_alone = flown(Node(scenario, 3), None)
+    *together, told_together = flown(shared, beside)
+    assert told_alone == told_together
+    for one, other in zip(alone, together, strict=True):
+        assert one.keys() == other.keys() != set()
+        assert all(torch.equal(one[key], other[key]) for key in one)

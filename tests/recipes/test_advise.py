@@ -13,6 +13,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,11 @@ from helpers import check_refused
 
 from damian.advice.desk import Desk
 from damian.advice.inbox import read_inbox
+from damian.advice.same_service import FREE
+from damian.evaluation.run_lock import is_locked, locked
 from damian.recipes.advise import AdviseConfig, main, make_desk
-from damian.recipes.shared.launch import launch
+from damian.recipes.shared.launch import RUN_ERROR, launch
+from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import main as train
 from damian.world.regions.config import RegionConfig
 
@@ -109,13 +113,74 @@ REFUSALS = [
     (["port=0", "token=short"], "token: it is not a password of at least 16"),
     (["port=0", "host=999.1.1.1"], "port: 999.1.1.1:0 cannot be used"),
     (["resume=run"], "resume: nothing is trained"),
+    (
+        ["reports=table.csv", "journal=kept"],
+        "journal: kept is for a service; a table that is answered once has no",
+    ),
+    (
+        ["reports=table.csv", "durable=true"],
+        "durable: True is for a service; a table that is answered once has no",
+    ),
+    (["reports=table.csv", "uavs=[A,A]"], "error: uavs: ['A', 'A'] names a UAV twice"),
+    (["reports=table.csv", "region=geojson", "region.path=no.geojson"], "error: no.geojson: no such file"),
+    (["folder=.", "uavs=[A]", "journal=../{folder}"], "journal: ../{folder} is the folder of the tables too"),
 ]
 
 
 @pytest.mark.parametrize(("words", "message"), REFUSALS, ids=[" ".join(words) for words, _ in REFUSALS])
-def test_what_cannot_be_is_refused_in_one_line(run, capsys, words, message):
+def test_what_cannot_be_is_refused_in_one_line(run, capsys, monkeypatch, words, message):
+    monkeypatch.setattr("damian.recipes.advise.read_inbox", lambda *_: pytest.fail("it was not refused"))
+    name = Path.cwd().name
+    words, message = [word.format(folder=name) for word in words], message.format(folder=name)
     check_refused(lambda: run(*words), message, capsys)
-    assert not Path("run").exists()
+    assert {path.name for path in Path().iterdir()} == {"table.csv"}
+
+
+def test_a_table_of_too_many_uavs_is_named(run, capsys):
+    rows = [f"{i},NA,52.8110,-4.1283,0,90,NA,88,2,0" for i in range(101)]
+    Path("many.csv").write_text("\n".join([HEAD, *rows]))
+    check_refused(lambda: run(*SCRIPT, "reports=many.csv"), "many.csv: uavs: ['0', '1', ", capsys)
+
+
+@pytest.mark.parametrize("key", ["journal", "folder"])
+def test_two_services_do_not_share_a_folder(run, capsys, monkeypatch, key):
+    for used in ("watch", "serve"):
+        monkeypatch.setattr(f"damian.recipes.advise.{used}", lambda *_: pytest.fail("it was not refused"))
+    Path("shared").mkdir()
+    words = ["folder=shared", "uavs=[A]"] if key == "folder" else ["journal=shared", "port=0"]
+    with locked(Path("shared")):
+        check_refused(lambda: run(*SCRIPT, *words), f"{key}: shared is in use by another run: wait", capsys)
+    assert {path.name for path in Path().iterdir()} == {"table.csv", "shared"}
+
+
+def test_journals_may_lie_in_the_run_folder_itself(run, monkeypatch):
+    def advised(config, desk):
+        desk.create("north", ["A"])
+        assert is_locked(Path("run"))
+
+    monkeypatch.setattr("damian.recipes.advise.serve", advised)
+    folder = run(*SCRIPT, "port=0", "journal=run")
+    assert (folder / "north.jsonl").exists()
+    assert not is_locked(folder)
+
+
+@pytest.mark.parametrize("word", ["token=", "+token=", "++token="])
+def test_no_file_keeps_the_token_however_it_is_written(run, monkeypatch, word):
+    def advised(config, desk):
+        assert config.token == TOKEN
+        desk.create("north", ["A"])
+
+    monkeypatch.setattr("damian.recipes.advise.serve", advised)
+    folder = run(*SCRIPT, "port=0", f"{word}{TOKEN}")
+    kept = {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()}
+    assert {*kept} == {"config.yaml", "run.json", "north.jsonl"}
+    assert not [name for name, text in kept.items() if TOKEN in text]
+    assert "token=..." in kept["run.json"]
+
+
+def test_every_setting_of_the_service_itself_may_change_with_a_restart():
+    own = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
+    assert own <= {*FREE}
 
 
 def desk_of(folder: Path) -> Desk:
@@ -145,8 +210,44 @@ def test_tables_in_a_folder_are_answered_and_wrong_ones_put_aside(inbox, tmp_pat
     assert "line 2: ID: 'Z' is no UAV" in (inbox / "3.csv.refused.txt").read_text()
     assert [row["ID"] for row in json.loads((inbox / "advice.json").read_text())] == ["A", "B", "C"]
     assert not read_inbox(desk, "main", inbox, 1e9 + 11)
+    desk.close()
     again = desk_of(tmp_path / "journals").fleet("main")
     assert [list(told) for told in again.told] == [list(told) for told in desk.fleet("main").told]
+
+
+def test_the_files_beside_a_table_are_of_the_newest_one_of_its_name(inbox, tmp_path):
+    """A wrong table is corrected under its name, and the next one has the same name again."""
+    desk = desk_of(tmp_path / "journals")
+    desk.create("main", ["A"])
+    lat, lon = desk.fleet("main").ground.place(3)
+
+    def read(now: float, uav: str) -> dict[str, str]:
+        (inbox / "x.csv").write_text(f"ID,lat,lon,time\n{uav},{lat},{lon},{now}")
+        assert read_inbox(desk, "main", inbox, now)
+        return {path.name: path.read_text() for path in inbox.iterdir() if path.name.startswith("x")}
+
+    assert {*read(1e9 + 1, "Z")} == {"x.csv.refused", "x.csv.refused.txt"}
+    found = read(1e9 + 2, "A")
+    earlier = {"x.csv.1000000002.000.refused", "x.csv.1000000002.000.refused.txt"}
+    assert {*found} == {"x.csv.done", *earlier}
+    assert "'Z' is no UAV" in found["x.csv.1000000002.000.refused.txt"]
+    found = read(1e9 + 3, "A")
+    assert {*found} == {"x.csv.done", "x.csv.1000000003.000.done", *earlier}
+    assert found["x.csv.done"].endswith("1000000003.0")
+    assert found["x.csv.1000000003.000.done"].endswith("1000000002.0"), "nothing is lost"
+    assert {"x.csv.refused", "x.csv.refused.txt"} <= {*read(1e9 + 4, "Z")}
+    assert "x.csv.done" not in read(1e9 + 5, "Z")
+    desk.close()
+
+
+def test_a_watched_folder_that_is_gone_is_named_with_its_key(run, monkeypatch, capsys):
+    Path("inbox").mkdir()
+    monkeypatch.setattr("damian.recipes.advise.time.sleep", lambda _: Path("inbox").rmdir())
+    with pytest.raises(SystemExit) as ended:
+        run(*SCRIPT, "folder=inbox", "uavs=[A]")
+    assert ended.value.code == RUN_ERROR
+    message = "error: folder: inbox: it cannot be read: No such file or directory\n"
+    assert capsys.readouterr().err == message
 
 
 class Program:
