@@ -6,6 +6,7 @@ and time and memory run out, long before a computer refuses a number.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -70,6 +71,13 @@ def above(key: str, value: float, low: float, unit: str = "") -> None:
     in_range(key, value, low + TINY, max(low + TINY, LARGEST.get(unit, HUGE)), unit)
 
 
+def seed(key: str, value: Any, low: int | None = None) -> None:
+    """Require the seed of random draws: a whole number, from ``low`` on if that is given."""
+    good = isinstance(value, Integral) and not isinstance(value, bool)
+    require(good, key, repr(value), "is not a whole number such as 0")
+    require(low is None or int(value) >= low, key, value, f"is not at least {low}")
+
+
 def weight(key: str, value: float) -> None:
     """Require a weight of a reward or a loss: a finite number that is not huge."""
     good = _is_number(value) and math.isfinite(value)
@@ -116,6 +124,17 @@ def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:
     require(value in choices, key, value, problem)
 
 
+def names(key: str, given: Any, known: Sequence[str]) -> frozenset[Any]:
+    """Require a collection of names, such as the extras of an environment, and none that is not known."""
+    should = f"is not a list of names such as ['{known[0]}']"
+    listed = isinstance(given, Iterable) and not isinstance(given, str | bytes | Mapping)
+    require(listed, key, repr(given), should)
+    found = list(given)
+    for name in found:
+        one_of(key, name, known)
+    return frozenset(found)
+
+
 def distinct(key: str, values: Sequence[Any]) -> None:
     """Require that no value of a list appears twice."""
     again = next((value for i, value in enumerate(values) if value in values[:i]), None)
@@ -150,6 +169,14 @@ def device(key: str, value: str) -> None:
     available = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
     available += ["cuda"] * (len(available) > 1)
     require(value in available, key, value, f"is not one of the devices here: {', '.join(available)}")
+
+
+def integers(key: str, value: Any, shape: Sequence[int]) -> None:
+    """Require a tensor of integers of this shape."""
+    good = isinstance(value, torch.Tensor) and not (value.is_floating_point() or value.is_complex())
+    good = good and value.dtype != torch.bool and tuple(value.shape) == tuple(shape)
+    found = f"a tensor of {value.dtype}, {list(value.shape)}" if isinstance(value, torch.Tensor) else value
+    require(good, key, found, f"is not a tensor of integers of shape {list(shape)}, one for each world")
 
 
 def _require_bounds(key: str, value: Any, *bounds: Any) -> None:

@@ -9,6 +9,7 @@ the operations of Philox, and good enough for simulation, not for cryptography.
 """
 
 import hashlib
+from operator import index
 
 import torch
 from torch import Tensor
@@ -58,7 +59,7 @@ def _product(key: Tensor, counter: Tensor) -> Tensor:
 
 def world_seeds(seed: int, n_worlds: int, device: torch.device | None = None) -> Tensor:
     """Derive one key for each world from a seed, [B] int64; neighbouring seeds share no streams."""
-    wrapped = (seed + 2**63) % 2**64 - 2**63
+    wrapped = (index(seed) + 2**63) % 2**64 - 2**63
     base = torch.full((n_worlds,), wrapped, dtype=torch.long, device=device)
     return bits64(base, torch.zeros_like(base), torch.arange(n_worlds, device=device))
 

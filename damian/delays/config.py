@@ -8,7 +8,7 @@ from damian.common import checks
 from damian.common.text_files import show
 from damian.delays.delay_line import ORDERS
 from damian.delays.laws import LONGEST, LOSES, Held, Law, law_of, sampler_of
-from damian.delays.link_sampler import is_matrix
+from damian.delays.link_sampler import check_losses, is_matrix
 from damian.delays.samplers import Sampler
 
 CONTEXT_KEYS = {"position": keys.POSITION}
@@ -122,7 +122,7 @@ class LinkConfig:
             idle = meant is not None and field.name not in meant and value != field.default
             problem = f"means nothing with links={self.kind}"
             checks.require(not idle, f"links.{field.name}", show(value), problem)
-        if self.kind == "updown":
+        if self.kind == "updown" or not is_matrix(self.loss):
             checks.in_range("links.loss", self.loss, 0.0, 1.0)
         if self.range is not None:
             checks.above("links.range", self.range, 0.0, "m")
@@ -134,7 +134,8 @@ class LinkConfig:
         """Check what is given for each pair of UAVs.
 
         Raises:
-            InputError: there is not one entry for each receiver and sender, or ``hears`` is not of bools.
+            InputError: there is not one entry for each receiver and sender, a loss is no probability, or
+                ``hears`` is not of bools.
         """
         for name in ("delay", "loss", "hears"):
             matrix = getattr(self, name)
@@ -144,21 +145,26 @@ class LinkConfig:
             good = len(matrix) == n_agents and all(is_matrix(row) and len(row) == n_agents for row in matrix)
             should = f"is not {n_agents} lists (receivers) of {n_agents} entries (senders)"
             checks.require(good, f"links.{name}", "it", should)
+            if name == "loss":
+                check_losses("links.loss", matrix)
             bools = name != "hears" or all(isinstance(hears, bool) for row in matrix for hears in row)
             checks.require(bools, "links.hears", show(matrix), _NO_BOOLS)
 
-    def laws(self) -> list[Law]:
-        """All laws of the links.
+    def laws(self) -> dict[str, Law]:
+        """All laws of the links, by name, such as ``links.delay`` or ``links.delay[0][1]``.
 
         Raises:
             InputError: one is not valid.
         """
-        laws = [law for row in self.delay for law in row] if is_matrix(self.delay) else [self.delay]
-        return [law_of(law, "links.delay") for law in laws]
+        if not is_matrix(self.delay):
+            return {"links.delay": law_of(self.delay, "links.delay")}
+        rows = [enumerate(row) for row in self.delay]
+        named = {f"links.delay[{i}][{j}]": law for i, row in enumerate(rows) for j, law in row}
+        return {name: law_of(law, name) for name, law in named.items()}
 
     def reads(self, dt: float) -> set[str]:
         """Names of the entries that the links read: what their laws do, and positions for a range."""
-        read = {name for law in self.laws() for name in sampler_of(law, dt, key="links.delay").reads}
+        read = {name for key, law in self.laws().items() for name in sampler_of(law, dt, key=key).reads}
         return read | ({"position"} if self.range is not None else set())
 
 

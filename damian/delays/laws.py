@@ -22,7 +22,7 @@ from damian.common.registry import Registry
 from damian.common.text_files import named, read_table, show
 from damian.delays.lag_sampler import LagSampler
 from damian.delays.samplers import ContextSampler, HeldSampler, MessageContext, Recorded, Sampler
-from damian.delays.times import LONGEST, Delay, in_steps, seconds  # noqa: F401 (others import all of them here)
+from damian.delays.times import LONGEST, Delay, check_dt, in_steps, seconds  # noqa: F401 (others import all of them here)
 
 LOSES = "loses messages, but no reward may be lost"
 
@@ -62,6 +62,7 @@ def sampler_of(law: Law, dt: float = 1.0, loss: float = 0.0, key: str = "delay")
     Raises:
         InputError: a parameter is invalid, or a law of one's own raises an error or returns no ``Sampler``.
     """
+    check_dt(dt)
     name = f"law {law_name(law)}"
     with naming_errors(f"{key}: {name}"):
         sampler = law.sampler(dt, loss, key)

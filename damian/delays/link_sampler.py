@@ -114,10 +114,23 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
             distinct.append(law)
             samplers.append(sampler_of(law, dt, key=name))
     index = torch.tensor([distinct.index(law) for _, law in laws])
+    check_losses("loss", loss)
     losses = torch.as_tensor(loss, dtype=torch.float64).expand(n, n)
-    for number in losses.flatten().tolist():
-        checks.in_range("loss", number, 0.0, 1.0)
     return LinkSampler(samplers, index, losses.flatten().clone())
+
+
+def check_losses(key: str, loss: Any) -> None:
+    """Require a probability, or a nested list or tensor of one for each link.
+
+    Raises:
+        InputError: one is not between 0 and 1; the error names the link, as ``links.loss[0][1]``.
+    """
+    if not is_matrix(loss):
+        checks.in_range(key, loss, 0.0, 1.0)
+        return
+    for i, row in enumerate(loss.tolist() if isinstance(loss, Tensor) else loss):
+        for j, probability in enumerate(row):
+            checks.in_range(f"{key}[{i}][{j}]", probability, 0.0, 1.0)
 
 
 def same_size(settings: Mapping[str, Any]) -> int | None:

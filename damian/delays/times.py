@@ -1,6 +1,7 @@
 """Delays as they are written: in steps (``3``) or as a time with its unit (``"3s"``, ``"0.5m"``)."""
 
 import math
+from numbers import Integral
 
 from damian.common import checks
 
@@ -9,6 +10,13 @@ Delay = int | str
 
 LONGEST = 10_000
 """Longest delay allowed [steps], because every message in transit takes memory."""
+
+
+def check_dt(dt: float) -> None:
+    """Require the length of a step: a number of seconds above 0."""
+    good = isinstance(dt, int | float) and not isinstance(dt, bool)
+    checks.require(good, "dt", repr(dt), "is not the length of a step in seconds, such as 0.5")
+    checks.above("dt", dt, 0.0, "s")
 
 
 def in_steps(key: str, delay: Delay, dt: float) -> int:
@@ -20,9 +28,9 @@ def in_steps(key: str, delay: Delay, dt: float) -> int:
     if isinstance(delay, str):
         steps = math.ceil(min(seconds(key, delay) / dt, LONGEST + 1) - 1e-9)
     else:
-        is_steps = isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
+        is_steps = isinstance(delay, Integral) and not isinstance(delay, bool) and delay >= 0
         checks.require(is_steps, key, delay, "is neither whole steps such as 3 nor a time such as 3s or 0.5m")
-        steps = delay
+        steps = int(delay)
     checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
     return steps
 

@@ -15,7 +15,7 @@ from damian.delays.config import CONTEXT_KEYS
 from damian.delays.laws import law_of
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
-from damian.envs.uav_env import UavEnv
+from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,
@@ -49,7 +49,7 @@ def make_env(
     Args:
         scenario: all settings, ``delay`` and ``clock`` included.
         num_worlds: number of parallel environments, B.
-        seed: of the worlds and of the delays.
+        seed: of the worlds and of the delays; at least 0.
         device: of all tensors.
         extras: as in ``UavEnv``; if messages are delayed, ``message`` also outputs ``received`` (the messages
             that the server holds), their ``age`` [steps], and the ``delay`` [steps] of the messages sent, and
@@ -57,14 +57,16 @@ def make_env(
             all under ``"agents"``.
 
     Raises:
-        InputError: the scenario asks for something impossible, or combines ``clock.skip`` with ``message``.
+        InputError: the scenario asks for something impossible, or combines ``clock.skip`` with ``message``,
+            or another argument is not valid.
     """
+    extras = checks.names("extras", extras, ALL_EXTRAS)
     problem = "skips steps, but back-updating and evaluation need the messages of every step"
     checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
     remote, linked = has_server_node(scenario), scenario.links.kind == "matrix"
     dt = scenario.clock.dt
     needed = {"message"} if remote or linked else set()
-    needed |= {*scenario.delay.reads(dt), *scenario.links.reads(dt)}
+    needed |= {"position"} if scenario.delay.reads(dt) | scenario.links.reads(dt) else set()
     simulation = make_simulation(scenario, seed)
     server = make_server(scenario, simulation)
     env = UavEnv(

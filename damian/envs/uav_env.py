@@ -29,8 +29,10 @@ Bounds = dict[NestedKey, tuple[Tensor, Tensor]]
 """Lowest and highest values of each column of an observation, [N, F] each, by key."""
 
 EXTRAS = ("message", "state", "reward_terms")
-"""Default optional outputs; further ones are ``position``, for delay laws, and ``privileged``, only for
-reference experiments."""
+"""Default optional outputs."""
+
+ALL_EXTRAS = (*EXTRAS, "position", "privileged")
+"""All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments only."""
 
 _DONE = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
 
@@ -77,7 +79,7 @@ class UavEnv(EnvBase):
     ``UavEnv(...).compile()`` compiles the step (half a minute at first, then up to twice as fast).
 
     Raises:
-        InputError: the scenario asks for something impossible.
+        InputError: the scenario asks for something impossible, or another argument is not valid.
     """
 
     def __init__(
@@ -95,7 +97,8 @@ class UavEnv(EnvBase):
         checks.whole("num_worlds", num_worlds, 1, checks.WORLDS)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
         self.scenario = scenario or ScenarioConfig()
-        self.extras, self.messages_only = frozenset(extras), messages_only
+        checks.device("device", str(device))
+        self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
         self.simulation = simulation or make_simulation(self.scenario, seed)
         self.server = server or make_server(self.scenario, self.simulation)
         problem = "needs the transform Belief before a ServerNode: build the environment by damian.make_env"
@@ -179,7 +182,12 @@ class UavEnv(EnvBase):
 
         Args:
             seeds: integers, one for each world, [B].
+
+        Raises:
+            InputError: there is not one integer for each world.
         """
+        checks.integers("seeds", seeds, self.batch_size)
+        seeds = seeds.to(self.device, torch.long)
         row = torch.zeros_like(seeds)
         first = tree_map(lambda table: table.index_select(0, row), self.simulation.initial)
         self.state = first._replace(seed=seeds)

@@ -181,14 +181,19 @@ class BackupdateStorage(TimeStorage):
         Args:
             world: index of each sender's world, [K].
             agent: index of each sender in its world, [K]; not used if the messages are at the root.
-            steps_ago: steps from the generation of each message to the latest stored step, [K].
+            steps_ago: steps from the generation of each message to the latest stored step, [K]; with K = 0
+                nothing changes.
             message: packed messages, [K, M].
 
         Raises:
-            InputError: a message is older than the longest delay, or than the stored steps, ``agent`` is
-                missing, or the storage has no messages.
+            InputError: a message is older than the longest delay, or than the stored steps, no steps are
+                stored, ``agent`` is missing, or the storage has no messages.
         """
         checks.require(self.recompute is not None, "recompute", None, "recomputes nothing from messages")
+        if not steps_ago.numel():
+            return
+        should = "belong to no step: none is stored yet, so extend the replay buffer first"
+        checks.require(len(self) > 0, "receive", f"{len(steps_ago)} messages", should)
         oldest, newest = int(steps_ago.max()), int(steps_ago.min())
         reach = min(self.longest, cast(int, self._len_along_dim0) - 1)
         if newest < 0 or oldest > reach:

@@ -79,7 +79,8 @@ class ActionDelay(ActionTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        return KeyUsage(replaces=[self.action_key])
+        flags = [self.valid_key] if self.valid_key else []
+        return KeyUsage(replaces=[self.action_key], flags=flags)
 
     @property
     def row_dims(self) -> dict[str, int]:

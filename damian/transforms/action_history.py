@@ -79,7 +79,8 @@ class ActionHistory(ActionTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        return KeyUsage(reads=self._reads, appends=self.in_keys, records=[self.action_key])
+        created = [] if self.in_keys else self.out_keys
+        return KeyUsage(reads=self._reads, creates=created, appends=self.in_keys, records=[self.action_key])
 
     @property
     def memory_sizes(self) -> dict[str, int]:

@@ -6,6 +6,7 @@ from typing import Any, NoReturn
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite
 from torchrl.envs import Compose, EnvBase
 
 from damian.common import checks
@@ -19,6 +20,7 @@ from damian.transforms.entries import (
     from_rows,
     read_keys,
     require_keys,
+    require_new,
     reset_rows,
     row_shape,
     select_entries,
@@ -67,6 +69,8 @@ class StatefulTransform(MemoryTransform):
     """Keys of the entries that are removed from the outputs."""
     sent_key: NestedKey | None = None
     """Key of the flag that tells which rows send a message in this step; None if all do."""
+    optional_keys: Sequence[str] = ()
+    """Names of those arguments whose key is that of an entry to create, or None to leave it out."""
     after_skipping: bool = False
     """Whether the transform sees only the merged steps of ``SkipUntilReady``, as TorchRL's transforms do."""
 
@@ -80,6 +84,8 @@ class StatefulTransform(MemoryTransform):
         gradients: bool = False,
     ) -> None:
         super().__init__(*(read_keys(keys) for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)))
+        if seed is not None:
+            checks.seed(f"{type(self).__name__}: seed", seed)
         self._seed = seed
         self.gradients = gradients
         self.memory_setting = type(self).__name__, "its memory"
@@ -316,6 +322,25 @@ class StatefulTransform(MemoryTransform):
         return tensordict
 
     # The place of the transform in an environment.
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """The specs with those of what the transform writes.
+
+        Raises:
+            InputError: it would write two entries under one name, or over an entry that there is already.
+        """
+        name, created = type(self).__name__, self.key_usage.creates
+        checks.distinct(f"{name}: names of the entries that it writes", created)
+        present = {key for spec in output_spec.values() if spec is not None for key in spec.keys(True)}
+        for key in created:
+            require_new(name, key, present, self._other_name(key))
+        return super().transform_output_spec(output_spec)
+
+    def _other_name(self, key: NestedKey) -> str:
+        """How to name an entry of ``optional_keys`` in another way, as the end of an error."""
+        argument = next((name for name in self.optional_keys if getattr(self, name) == key), None)
+        old, new = (one if isinstance(one, str) else one[-1] for one in (self.row_key, key))
+        return f", such as {argument}='{old}_{new}', or None to leave it out" if argument else ""
 
     def set_container(self, container: Any) -> None:
         super().set_container(container)

@@ -20,7 +20,9 @@ from damian.transforms.entries import (
     Memory,
     as_rows,
     read_keys,
+    require_as_many,
     require_keys,
+    require_new,
     row_bytes,
     row_shape,
     select_entries,
@@ -93,6 +95,8 @@ class Channel(StatefulTransform):
         >>> env = TransformedEnv(env, Channel(Uniform(1, 5), loss=0.1))
         >>> env.rollout(100)["agents", "received"]  # [32, 100, 3, 3, 18]
     """
+
+    optional_keys = ("age_key", "mask_key")
 
     def __init__(
         self,
@@ -290,11 +294,8 @@ class Channel(StatefulTransform):
         require_keys("Channel", self.required_keys, observation_spec)
         agents, device = spec_rows(observation_spec, self._beside), observation_spec.device
         self._check_agents(agents, len(observation_spec.shape))
-        for key in [*self._written, *([self.action_key] if self.action_key else [])]:
-            good = key not in observation_spec.keys(True, True)
-            checks.require(
-                good, "Channel", key, "is already an entry of the environment: choose another name"
-            )
+        if self.action_key:
+            require_new("Channel", self.action_key, observation_spec.keys(True))
         sent = [observation_spec[key] for key in self.in_keys]
         kinds = [(spec.shape[len(agents) :], spec.dtype) for spec in sent]
         kinds += [((self.message_size,), torch.float32)] if self.message_size else []
@@ -330,9 +331,9 @@ def _keys_of(
     checks.require(isinstance(beside, tuple), "action_key" if not sent else "in_keys", beside, _NO_GROUP)
     names = [f"received_{key[-1]}" for key in sent] if len(sent) > 1 else ["received"]
     written = [sibling_key(beside, key) for key in (names if out_keys is None else read_keys(out_keys))]
-    should = f"are not {len(names)} keys, as many as what is sent"
-    checks.require(len(written) == len(names), "out_keys", written, should)
-    return sent, cast(list[NestedKey], written), beside
+    written = cast(list[NestedKey], written)
+    require_as_many(names, written)
+    return sent, written, beside
 
 
 _NO_GROUP = "is not in a group of agents, as ('agents', 'observation') is"

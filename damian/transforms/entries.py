@@ -23,10 +23,33 @@ Change = tuple[Memory, Entries]
 
 
 def read_keys(written: NestedKey | Sequence[NestedKey]) -> list[NestedKey]:
-    """Keys as TorchRL's transforms take them: a name or a tuple of names is one key, a list holds several."""
+    """Keys as TorchRL's transforms take them: a name or a tuple of names is one key, a list holds several.
+
+    Raises:
+        InputError: something is no key.
+    """
     nested = isinstance(written, tuple) and all(isinstance(part, str) for part in written)
-    keys = [written] if written and (isinstance(written, str) or nested) else written
-    return [unravel_key(key) for key in keys]  # type: ignore[arg-type]
+    one = isinstance(written, str) or (nested and bool(written))
+    checks.require(one or isinstance(written, Iterable), "keys", repr(written), _NO_KEY)
+    keys: list[NestedKey] = [written] if one else list(written)  # type: ignore[list-item]
+    for key in keys:
+        good = isinstance(key, str) or (isinstance(key, tuple) and _names(key))
+        checks.require(bool(key) and good, "keys", repr(key), _NO_KEY)
+    return [unravel_key(key) for key in keys]
+
+
+def _names(key: tuple[object, ...]) -> bool:
+    """Is a nested key made of names, at any depth, as ``unravel_key`` takes it?"""
+    return all(isinstance(part, str) or (isinstance(part, tuple) and _names(part)) for part in key)
+
+
+_NO_KEY = "is not a key such as 'observation' or ('agents', 'observation'), nor a list of keys"
+
+
+def require_as_many(sent: Sequence[NestedKey], written: Sequence[NestedKey]) -> None:
+    """Require one of ``out_keys`` for each entry that is sent."""
+    should = f"are not {len(sent)} keys, as many as what is sent"
+    checks.require(len(written) == len(sent), "out_keys", written, should)
 
 
 def path_of(key: NestedKey) -> tuple[str, ...]:
@@ -84,6 +107,22 @@ def require_keys(transform: str, keys: Sequence[NestedKey], present: TensorDictB
         if isinstance(key, tuple) and all(part in known for part in key):
             should = f"is one nested key, which the environment lacks; two keys are written {list(key)}"
         checks.require(key in known, transform, key, should)
+
+
+def require_new(transform: str, key: NestedKey, present: Iterable[NestedKey], remedy: str = "") -> None:
+    """Require that an entry that a transform creates has a name of its own, as it would replace another.
+
+    Args:
+        transform: name of the transform, for errors.
+        key: of the entry.
+        present: keys of what there is already.
+        remedy: what to say beside that another name is needed.
+
+    Raises:
+        InputError: there is such an entry already.
+    """
+    should = f"is already an entry of the environment: choose another name{remedy}"
+    checks.require(unravel_key(key) not in present, transform, key, should)
 
 
 def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[NestedKey]:

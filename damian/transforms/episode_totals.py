@@ -47,7 +47,7 @@ class EpisodeTotals(StatefulTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        return KeyUsage(derives=[(self.in_keys[0], self.return_key)])
+        return KeyUsage(derives=[(self.in_keys[0], self.return_key)], creates=self.out_keys)
 
     @property
     def required_keys(self) -> list[NestedKey]:

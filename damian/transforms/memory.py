@@ -125,7 +125,7 @@ class MemoryTransform(Transform):
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Set a seed for each world, [B] integers: a world's draws then do not depend on the other worlds."""
-        self._seed, self._world_seeds = None, seeds
+        self._seed, self._world_seeds = None, seeds.to(torch.long)
         self.clear_memory()
 
     def streams(self, batch: torch.Size, device: torch.device) -> Tensor:

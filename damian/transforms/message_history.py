@@ -40,8 +40,8 @@ class MessageHistory(StatefulTransform):
     Args:
         steps: number of latest steps, K.
         message_key: key of the message of a step, [..., D].
-        out_key: key of the history, [..., L, D + 3]; L is K, or N K with ``group``. A bare name, here and
-            below, means an entry beside the message.
+        out_key: key of the history, [..., L, D + 3], float32, or float64 as the messages; L is K, or N K with
+            ``group``. A bare name, here and below, means an entry beside the message.
         delay_key: key of the delay of the message sent in this step [steps], [..., 1], -1 if it never
             arrives; None if messages are not delayed.
         sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
@@ -94,9 +94,10 @@ class MessageHistory(StatefulTransform):
         return self.step_keys
 
     def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
-        n_columns = self._encoded(tensordict.get(self.row_key)).shape[-1]
+        encoded = self._encoded(tensordict.get(self.row_key))
+        n_columns, kept, written = encoded.shape[-1], encoded.dtype.itemsize, _dtype(encoded).itemsize
         receivers = tensordict.get(self.row_key).shape[-2] if self.group else 1
-        return n_rows * self.steps * (8 + 4 * n_columns + 4 * receivers * (n_columns + 3))
+        return n_rows * self.steps * (8 + kept * n_columns + written * receivers * (n_columns + 3))
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         message = as_rows(self._encoded(tensordict.get(self.row_key)), self.rows)
@@ -189,7 +190,14 @@ class MessageHistory(StatefulTransform):
         spec, rows = observation_spec[self.row_key], spec_rows(observation_spec, self.row_key)
         should = "needs messages of several agents, under a nested key such as ('agents', 'message')"
         checks.require(not self.group or len(rows) > len(observation_spec.shape), "group", True, should)
-        width = self._encoded(spec.zero()).shape[-1]
-        shape = (*rows, self.steps * (rows[-1] if self.group else 1), width + 3)
-        observation_spec[self.out_keys[0]] = Unbounded(torch.Size(shape), device=observation_spec.device)
+        encoded = self._encoded(spec.zero())
+        shape = (*rows, self.steps * (rows[-1] if self.group else 1), encoded.shape[-1] + 3)
+        observation_spec[self.out_keys[0]] = Unbounded(
+            torch.Size(shape), dtype=_dtype(encoded), device=observation_spec.device
+        )
         return observation_spec
+
+
+def _dtype(encoded: Tensor) -> torch.dtype:
+    """The type of a history of such messages: theirs, or float32 if that holds less than the flags need."""
+    return torch.promote_types(encoded.dtype, torch.float32)

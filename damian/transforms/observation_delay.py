@@ -20,6 +20,7 @@ from damian.transforms.entries import (
     Memory,
     as_rows,
     from_rows,
+    require_as_many,
     require_keys,
     row_bytes,
     select_entries,
@@ -62,13 +63,16 @@ class ObservationDelay(StatefulTransform):
     A bare name for one of the five keys above means an entry in the same TensorDict as ``in_keys[0]``.
 
     Raises:
-        InputError: the delay or the order is not valid, or the law reads what has no key.
+        InputError: the delay or the order is not valid, the law reads what has no key, or ``in_keys`` and
+            ``out_keys`` are none or not as many.
 
     Examples:
         >>> delay = ObservationDelay(Uniform(3, 7), loss=0.1)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), delay)
         >>> env.rollout(100)["age"]  # steps since each observation was generated
     """
+
+    optional_keys = ("age_key", "fresh_key", "delay_key")
 
     def __init__(
         self,
@@ -89,6 +93,8 @@ class ObservationDelay(StatefulTransform):
     ) -> None:
         checks.one_of("order", order, ORDERS)
         super().__init__(in_keys, out_keys or in_keys, seed=seed, gradients=gradients)
+        checks.require(bool(self.in_keys), "in_keys", in_keys, "name nothing to send")
+        require_as_many(self.in_keys, self.out_keys)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
         self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
@@ -104,6 +110,7 @@ class ObservationDelay(StatefulTransform):
     @property
     def key_usage(self) -> KeyUsage:
         created = [key for key in self.out_keys if key not in self.in_keys]
+        created += [key for key in (self.age_key, self.fresh_key, self.delay_key) if key is not None]
         return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=created)
 
     @property

@@ -49,7 +49,7 @@ class OnboardNode(StatefulTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        return KeyUsage(reads=self.in_keys, creates=self.out_keys)
+        return KeyUsage(reads=self.in_keys, overwrites=self.out_keys)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         device = tensordict.get(self.in_keys[0]).device

@@ -27,7 +27,9 @@ class KeyUsage(NamedTuple):
     reads: Sequence[NestedKey] = ()
     """Entries that it reads from the environment's outputs."""
     creates: Sequence[NestedKey] = ()
-    """Entries that it creates, or overwrites regardless of their values."""
+    """Entries that it creates, under names that no other entry may have (``require_new``)."""
+    overwrites: Sequence[NestedKey] = ()
+    """Entries that it writes regardless of whether they exist, and of their values."""
     delays: Sequence[NestedKey] = ()
     """Entries whose values it delays or holds."""
     appends: Sequence[NestedKey] = ()
@@ -44,6 +46,8 @@ class KeyUsage(NamedTuple):
     """Entries that it computes from others: pairs of the entry read and another one written."""
     skips: bool = False
     """Whether it may keep worlds from stepping."""
+    flags: Sequence[NestedKey] = ()
+    """Flags that it writes for the environment, beside the actions."""
 
 
 def check_order(transforms: Sequence[Transform]) -> None:
@@ -56,7 +60,8 @@ def check_order(transforms: Sequence[Transform]) -> None:
         transforms: transforms in the order in which they process the environment's outputs.
 
     Raises:
-        InputError: two transforms are in the wrong order; the message names them and the key.
+        InputError: two transforms are in the wrong order, or write the same flag for the environment; the
+            message names them and the key.
     """
     usages = [(transform, _usage_of(transform)) for transform in transforms]
     for (first, a), (second, b) in itertools.combinations(usages, 2):
@@ -66,7 +71,7 @@ def check_order(transforms: Sequence[Transform]) -> None:
 
 def _check_pair(first: Transform, a: KeyUsage, second: Transform, b: KeyUsage) -> None:
     names = type(first).__name__, type(second).__name__
-    for key in _common_keys([*a.reads, *a.delays, *a.appends], b.creates):
+    for key in _common_keys([*a.reads, *a.delays, *a.appends], [*b.creates, *b.overwrites]):
         raise _wrong_order(names, f"it uses {key}, which {names[1]} creates")
     for key in _common_keys(a.records, b.replaces):
         why = f"it must record {key} as chosen, and actions pass the transforms in reverse order"
@@ -75,6 +80,8 @@ def _check_pair(first: Transform, a: KeyUsage, second: Transform, b: KeyUsage) -
         raise _wrong_order(names, f"{names[1]} must not delay what it appends to {key}")
     if a.pays_at_end and b.may_end:
         raise _wrong_order(names, f"what is in transit when {names[1]} ends an episode would be lost")
+    for key in _common_keys(a.flags, b.flags):
+        raise InputError(f"{names[1]}: {key} is already the flag of another {names[0]}: choose another name")
     if a.skips and _declares_key_usage(second):
         raise _wrong_order(names, f"{names[1]} must know which worlds skip a step")
     for key, derived in a.derives:

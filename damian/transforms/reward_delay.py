@@ -111,8 +111,8 @@ class RewardDelay(RewardTransform):
 
     Rewards that are received in the same step are added up. In the last step of an episode, all rewards that
     are still in transit are received, so that none is lost. Hence the transform must come after every
-    transform that ends episodes, such as ``StepCounter(max_steps=100)``. With delay 0 the rollout is the
-    same, bit for bit, as without the transform.
+    transform that ends episodes, such as ``StepCounter(max_steps=100)``, and not in a worker if these end
+    around the workers. With delay 0 the rollout is the same, bit for bit, as without the transform.
 
     Rewards in transit lie in a ring of K slots (``past``), one for each coming step; ``due`` [K, M] is the
     time at which those in a slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a
@@ -146,6 +146,8 @@ class RewardDelay(RewardTransform):
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardDelay(Uniform(0, 4)))
         >>> rollout = env.rollout(200)  # the sum of the rewards is that of the environment
     """
+
+    optional_keys = ("delay_key", "earned_key")
 
     def __init__(
         self,

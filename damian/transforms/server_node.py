@@ -65,7 +65,7 @@ class ServerNode(StatefulTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        return KeyUsage(reads=self._read_keys, creates=self.out_keys)
+        return KeyUsage(reads=self._read_keys, overwrites=self.out_keys)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         rows = tensordict.get(self.in_keys[0])

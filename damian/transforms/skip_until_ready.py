@@ -12,6 +12,7 @@ from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import Change, Entries, Memory
+from damian.transforms.order import KeyUsage
 
 
 class SkipUntilReady(StatefulTransform):
@@ -54,6 +55,10 @@ class SkipUntilReady(StatefulTransform):
     @property
     def row_key(self) -> NestedKey:
         return keys.DONE
+
+    @property
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(creates=self.out_keys)
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         return memory, {keys.DURATION: torch.zeros_like(entries[keys.DONE], dtype=torch.long)}

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from damian.common import checks
 from damian.common.errors import InputError
+from damian.common.text_files import show
 from damian.transforms.action_specs import ActionTransform
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import require_keys
@@ -53,8 +54,8 @@ def delay_trajectories(
         The steps with what the transforms change or add; ``data`` stays as it is.
 
     Raises:
-        InputError: the transform would have changed what happened, as ``ActionDelay`` does, or the data
-            lacks an entry.
+        InputError: the transform would have changed what happened, as ``ActionDelay`` does, or is none, or
+            the data lacks an entry or has no steps.
 
     Examples:
         >>> steps = GymEnv("Pendulum-v1").rollout(400, break_when_any_done=False)
@@ -62,6 +63,8 @@ def delay_trajectories(
         >>> late["next", "age"]  # steps since each observation was generated
     """
     _check_data(data)
+    should = "is not a transform, such as ObservationDelay(2), or a Compose(...) of several"
+    checks.require(isinstance(transform, Transform), "transform", show(transform), should)
     leaves = leaf_transforms(transform)
     for leaf in leaves:
         _check_transform(leaf)
@@ -135,6 +138,7 @@ def _check_data(data: TensorDictBase) -> None:
     is_steps = isinstance(data, TensorDictBase) and data.dim() > 0 and ("next", "done") in data.keys(True)
     if not is_steps:
         raise InputError('data: it has no ("next", "done"): give steps as TorchRL stores them, [*, T]')
+    checks.require(data.batch_size.numel() > 0, "data", f"shape {list(data.batch_size)}", "has no steps")
     shape, done = tuple(data.batch_size), tuple(data.get(("next", "done")).shape)
     checks.require(done == (*shape, 1), "data", f'("next", "done") of shape {done}', f"is not {(*shape, 1)}")
     names = list(data.names)
@@ -195,7 +199,7 @@ def _check_transform(transform: Transform) -> None:
             f"the stored ones; {remedy}"
         )
     skips = type(transform).skipped_worlds is not StatefulTransform.skipped_worlds
-    if skips or any(_name(key) in _ENDS for key in usage.creates):
+    if skips or any(_name(key) in _ENDS for key in [*usage.creates, *usage.overwrites]):
         raise InputError(
             f"transform: {name} changes how long steps or episodes last, but stored steps are over; {remedy}"
         )

@@ -8,9 +8,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from damian.envs.pipeline import make_env
-from damian.envs.uav_env import EXTRAS, UavEnv
+from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 
-ALL_EXTRAS = [*EXTRAS, "position", "privileged"]
 NAMES = [name for name in dir(EnvBase) if name.endswith("_unbatched")]
 N_WORLDS = 5
 """Another number than that of the UAVs, so that no dimension is taken for another one."""

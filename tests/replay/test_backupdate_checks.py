@@ -184,3 +184,17 @@ def test_batches_of_another_shape_than_steps_of_the_same_worlds_are_refused(know
 
 def test_recompute_must_correct_something_unless_hindsight_is_stored():
     refuse("recompute: {} corrects nothing: return at least one entry", lambda steps, messages: {})
+
+
+@pytest.mark.parametrize("group", [(), ("agents",)], ids=["at the root", "in a group"])
+def test_no_messages_change_nothing_and_messages_need_stored_steps(group):
+    storage, none, one = make_storage(group), torch.zeros(0, dtype=torch.long), torch.zeros(1).long()
+    with pytest.raises(InputError) as error:
+        storage.receive(one, one, one, torch.zeros(1, 2))
+    assert str(error.value) == (
+        "receive: 1 messages belong to no step: none is stored yet, so extend the replay buffer first"
+    )
+    storage.receive(none, none, none, torch.zeros(0, 2))  # before any step too
+    before = stored(storage, rollout(make_env(group), 8)).clone()
+    storage.receive(none, none if group else None, none, torch.zeros(0, 2))
+    assert (storage[storage.latest()] == before).all()

@@ -59,7 +59,7 @@ def test_all_streams_of_an_environment_differ(wrap):
             ObservationDelay(LATE, "state", seed=0),
             RewardDelay(LATE, ("agents", "reward"), seed=0),
             RewardDelay(LATE, "team_reward", seed=0),
-            ObservationDelay(LATE, ("agents", "observation"), seed=0),
+            ObservationDelay(LATE, ("agents", "observation"), age_key=None, seed=0),
         ]
 
     for seeded in (False, True):

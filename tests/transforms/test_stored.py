@@ -311,6 +311,16 @@ def test_a_history_needs_the_range_of_the_actions():
         delay_trajectories(data, ActionHistory(2, "chosen"), action_spec=Counting([0]).action_spec)
 
 
+def test_what_is_no_transform_is_refused_and_so_is_data_without_steps():
+    late = ObservationDelay(1, [OBSERVATION])
+    for wrong in ([late], None, ObservationDelay):
+        with pytest.raises(InputError, match=r"transform: .* is not a transform, such as Obs.* Compose\("):
+            delay_trajectories(counted(5), wrong)  # type: ignore[arg-type]
+    for data, shape in ((counted(5)[:, :0], r"\[4, 0\]"), (counted(5)[0][:0], r"\[0\]")):
+        with pytest.raises(InputError, match=f"data: shape {shape} has no steps"):
+            delay_trajectories(data, late)
+
+
 def test_steps_without_what_is_needed_are_refused():
     late = ObservationDelay(1, [OBSERVATION])
     with pytest.raises(InputError, match=r'no \("next", "done"\)'):

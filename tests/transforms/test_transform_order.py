@@ -8,6 +8,7 @@ from contract import (
     Drift,
     unserved,
 )
+from plain_env import Plain
 from torchrl.envs import (
     CatFrames,
     CatTensors,
@@ -16,8 +17,10 @@ from torchrl.envs import (
     InitTracker,
     RandomTruncationTransform,
     RewardSum,
+    SerialEnv,
     StepCounter,
     TerminateTransform,
+    Transform,
     TransformedEnv,
 )
 
@@ -196,3 +199,21 @@ def test_a_warning_says_what_follows_from_an_entry_before_it_is_delayed(early, l
 def test_a_transform_that_changes_an_entry_in_place_may_come_before_its_delay():
     env = TransformedEnv(Drift(), Compose(CatFrames(2, -1, ["observation"]), delay(), StepCounter(4)))
     assert env.rollout(3)["observation"].shape == (3, 3, 4)
+
+
+def test_an_end_around_the_workers_loses_the_rewards_of_a_delay_within_them():
+    """What docs/transforms.md says, and the two remedies that it names."""
+
+    def paid(inner: list[Transform], outer: list[Transform]) -> list[float]:
+        workers = SerialEnv(2, lambda: TransformedEnv(Plain(), Compose(*copies(inner))))
+        env = TransformedEnv(workers, Compose(*outer))
+        steps = env.rollout(8, break_when_any_done=False)  # two episodes of 4 steps, which earn 1, 2, 3 and 4
+        return steps["next", "agents", "reward"][0, 0, :, 0, 0].tolist()
+
+    def copies(transforms: list[Transform]) -> list[Transform]:
+        return [transform.clone() for transform in transforms]
+
+    key = ("agents", "reward")
+    assert paid([RewardDelay(2, key)], [StepCounter(4)]) == [0, 0, 1, 2] * 2
+    assert paid([StepCounter(4), RewardDelay(2, key)], []) == [0, 0, 1, 2 + 3 + 4] * 2
+    assert paid([], [StepCounter(4), RewardDelay(2, key)]) == [0, 0, 1, 2 + 3 + 4] * 2

@@ -1,0 +1,87 @@
+"""Wrong arguments of ``make_env``, of ``UavEnv`` and of what they return are refused in one line."""
+
+import numpy as np
+import pytest
+import torch
+from helpers import square
+
+from damian import keys
+from damian.common.errors import InputError
+from damian.delays.config import DelayConfig, LinkConfig
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import UavEnv
+
+EXTRAS = "message, state, reward_terms, position, privileged"
+NO_SEED = "is not a whole number such as 0"
+
+WRONG = {
+    f"extras: mesage is not one of {EXTRAS}": {"extras": ["mesage"]},
+    "extras: 'message' is not a list of names such as ['message']": {"extras": "message"},
+    "extras: None is not a list of names such as ['message']": {"extras": None},
+    "seed: -3 is not at least 0": {"seed": -3},
+    f"seed: 'a' {NO_SEED}": {"seed": "a"},
+    f"seed: 1.5 {NO_SEED}": {"seed": 1.5},
+    "device: foo is not one of the devices here: cpu": {"device": "foo"},
+    "device: cuda is not one of the devices here: cpu": {"device": "cuda"},
+    "device: cuda:1 is not one of the devices here: cpu": {"device": torch.device("cuda:1")},
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+@pytest.mark.parametrize("make", [make_env, UavEnv])
+def test_a_wrong_argument_is_one_line(line, make, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    with pytest.raises(InputError) as error:
+        make(square(delay=DelayConfig(obs=2)), 2, **WRONG[line])
+    assert str(error.value) == line
+
+
+def test_extras_may_be_any_collection_and_a_seed_one_of_numpy():
+    scenario = square(delay=DelayConfig(obs={"law": "uniform", "high": 3}))
+    envs = [make_env(scenario, 2, 3, extras=extras) for extras in (["message"], ("message",), {"message"})]
+    envs.append(make_env(scenario, 2, np.int64(3), torch.device("cpu"), frozenset({"message"})))  # type: ignore[arg-type]
+    steps = [env.rollout(5, policy=_hold, break_when_any_done=False) for env in envs]
+    assert all(keys.DELAY in one.keys(True, True) for one in steps)
+    assert all((one == steps[0]).all() for one in steps)
+
+
+def _hold(td):
+    return td.set(keys.ACTION, torch.zeros(td["agents"].shape, dtype=torch.long))
+
+
+def test_links_that_depend_on_the_receiver_need_no_extra_of_that_name():
+    law = {"law": "distance", "range": 50.0}
+    env = make_env(square(links=LinkConfig("matrix", delay=law)), 2)
+    assert env.uav_env.extras == {"message", "position"}
+
+
+@pytest.mark.parametrize("agents", [2.0, "2", True])
+def test_a_number_of_uavs_that_is_not_whole_is_refused(agents):
+    with pytest.raises(InputError, match=f"agents: {agents} is not a whole number"):
+        ScenarioConfig(agents=agents)
+
+
+WORLDS = 4
+SEEDS = {
+    "a tensor of torch.int64, [3]": torch.arange(3),
+    "a tensor of torch.int64, [4, 1]": torch.arange(4).view(4, 1),
+    "a tensor of torch.float32, [4]": torch.ones(4),
+    "a tensor of torch.bool, [4]": torch.ones(4, dtype=torch.bool),
+    "[1, 2, 3, 4]": [1, 2, 3, 4],
+}
+
+
+@pytest.mark.parametrize("found", SEEDS)
+@pytest.mark.parametrize("obs", [0, 2])
+def test_there_is_one_seed_for_each_world(found, obs):
+    env = make_env(square(delay=DelayConfig(obs=obs)), WORLDS)
+    for one in (env, env.uav_env):
+        with pytest.raises(InputError) as error:
+            one.seed_worlds(SEEDS[found])
+        line = f"seeds: {found} is not a tensor of integers of shape [4], one for each world"
+        assert str(error.value) == line
+    env.seed_worlds(torch.arange(WORLDS, dtype=torch.int32))
+    small = env.reset()
+    env.seed_worlds(torch.arange(WORLDS))
+    assert (env.reset() == small).all()

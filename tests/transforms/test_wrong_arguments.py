@@ -1,0 +1,74 @@
+"""A wrong argument of a transform is one line that names it, its value and what would be right."""
+
+import numpy as np
+import pytest
+from torchrl.envs import Compose, GymEnv, TransformedEnv
+
+from damian.common.errors import InputError
+from damian.delays.laws import Lag, Uniform
+from damian.transforms import (
+    ActionDelay,
+    Channel,
+    CumulativeReward,
+    MessageHistory,
+    ObservationDelay,
+    RewardDelay,
+    SampleAndHold,
+)
+
+NO_KEY = "is not a key such as 'observation' or ('agents', 'observation'), nor a list of keys"
+NO_SEED = "is not a whole number such as 0"
+NO_STEP = "is not the length of a step in seconds, such as 0.5"
+
+WRONG = {
+    "out_keys: ['a'] are not 2 keys, as many as what is sent": lambda: ObservationDelay(
+        1, ["camera", "gps"], ["a"]
+    ),
+    "out_keys: ['a', 'b'] are not 1 keys, as many as what is sent": lambda: ObservationDelay(
+        1, "camera", ["a", "b"]
+    ),
+    "in_keys: [] name nothing to send": lambda: ObservationDelay(1, []),
+    "in_keys: [] is empty, and so is in_keys_inv: name the entries or the actions to hold": lambda: (
+        SampleAndHold(2, [], [])
+    ),
+    f"keys: 3 {NO_KEY}": lambda: ObservationDelay(1, 3),  # type: ignore[arg-type]
+    f"keys: None {NO_KEY}": lambda: RewardDelay(1, [None]),  # type: ignore[arg-type,list-item]
+    f"keys: ('agents', 3) {NO_KEY}": lambda: MessageHistory(1, [("agents", 3)]),  # type: ignore[arg-type,list-item]
+    "dt: 0.0 s is not above 0 s": lambda: ObservationDelay("3s", dt=0.0),
+    "dt: -1 s is not above 0 s": lambda: SampleAndHold("3s", dt=-1),
+    f"dt: '1s' {NO_STEP}": lambda: ActionDelay("3s", dt="1s"),  # type: ignore[arg-type]
+    f"dt: None {NO_STEP}": lambda: RewardDelay(Lag(1, "2s"), dt=None),  # type: ignore[arg-type]
+    f"dt: True {NO_STEP}": lambda: Channel("3s", dt=True),
+    f"ObservationDelay: seed: 'a' {NO_SEED}": lambda: ObservationDelay(1, seed="a"),  # type: ignore[arg-type]
+    f"RewardDelay: seed: 1.5 {NO_SEED}": lambda: RewardDelay(1, seed=1.5),  # type: ignore[arg-type]
+    f"Channel: seed: True {NO_SEED}": lambda: Channel(1, seed=True),
+    "delay: 3.0 is neither whole steps such as 3 nor a time such as 3s or 0.5m": lambda: ObservationDelay(
+        np.float64(3)
+    ),
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_a_wrong_argument_is_one_line(line):
+    with pytest.raises(InputError) as error:
+        WRONG[line]()
+    assert str(error.value) == line
+
+
+def test_whole_numbers_of_numpy_are_steps_and_seeds():
+    def ages(number: type) -> list[float]:
+        delays = ObservationDelay(Uniform(number(1), number(4)), seed=number(3))
+        rewards = [RewardDelay(number(2)), CumulativeReward(3)]
+        env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(delays, SampleAndHold(number(2)), *rewards))
+        return env.rollout(30)["age"].flatten().tolist()
+
+    assert ages(np.int64) == ages(np.int32) == ages(int)
+    assert len({*ages(int)}) > 3
+
+
+def test_every_whole_number_is_a_seed():
+    drawn = []
+    for seed in (-1, 0, 2**70 + 5):
+        env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(Uniform(1, 9), seed=seed))
+        drawn.append(env.rollout(20)["age"].flatten().tolist())
+    assert drawn[0] != drawn[1] != drawn[2]
