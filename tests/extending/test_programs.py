@@ -134,6 +134,7 @@ def run_resumed(run, name: str) -> None:
     run(f"resume={name}", "frames=256", name="unused")
 
 
+@pytest.mark.slow
 def test_a_student_imitates_a_teacher_without_delay(run, capsys):
     run(*TINY, name="teacher")
     words = [*TINY, "delay.obs=2", "delay.history=3", "learner=distillation:DistillationConfig"]

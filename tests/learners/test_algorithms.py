@@ -52,7 +52,7 @@ KINDS, MOTIONS = ("discrete", "continuous"), ("instant", "polynomial")
 
 
 @pytest.mark.parametrize("aware", AWARE)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [KINDS[0], pytest.param(KINDS[1], marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("learner", "rnn"),
     [("mappo", "none"), ("sac", "none"), pytest.param("mappo", "gru", marks=pytest.mark.slow)],

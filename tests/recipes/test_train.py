@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import check_refused
+from helpers import check_refused, every_second
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -53,22 +53,24 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize(
     "overrides",
-    [
-        [],
-        ["scenario=tracking", "motion=polynomial", "agents=2"],
-        ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
-        ["scenario=energy", "motion=polynomial", "observation.ctde=true"],
-        ["scenario=mixed", "logger=csv", "agents=1"],
-        ["scenario=spotting", "reward=tracking", "region=usecase", "actions=continuous"],
-        ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
-        ["delay=paper", "aware=both", "motion=polynomial"],
-        ["delay=burst", "aware=backupdate", "scenario=mixed", "delay.order=arrival"],
-        ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
-        ["aware=backupdate"],
-        ["delay=paper", "aware=backupdate", "clock.server=2s", "delay.rew=3", "delay.reward_window=3"],
-        ["learner=sac", "delay.rew=3", "aware=backupdate", "settle=true", "clock.server=2s"],
-        ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
-    ],
+    every_second(
+        [
+            [],
+            ["scenario=tracking", "motion=polynomial", "agents=2"],
+            ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
+            ["scenario=energy", "motion=polynomial", "observation.ctde=true"],
+            ["scenario=mixed", "logger=csv", "agents=1"],
+            ["scenario=spotting", "reward=tracking", "region=usecase", "actions=continuous"],
+            ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
+            ["delay=paper", "aware=both", "motion=polynomial"],
+            ["delay=burst", "aware=backupdate", "scenario=mixed", "delay.order=arrival"],
+            ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
+            ["aware=backupdate"],
+            ["delay=paper", "aware=backupdate", "clock.server=2s", "delay.rew=3", "delay.reward_window=3"],
+            ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
+            ["learner=sac", "delay.rew=3", "aware=backupdate", "settle=true", "clock.server=2s"],
+        ]
+    ),
 )
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):
     folder = run(*TINY, *overrides)
@@ -95,6 +97,7 @@ def test_the_same_seed_gives_the_same_curve_and_another_one_another(run, learner
     assert (one / "metrics.csv").read_text() != (other / "metrics.csv").read_text()
 
 
+@pytest.mark.slow
 def test_films_show_the_policy_while_it_learns_and_change_nothing(run):
     filmed = run(*TINY, "episode.max_steps=3", "logger.film_every=1", folder="filmed")
     plain = run(*TINY, "episode.max_steps=3", folder="plain")
