@@ -279,7 +279,7 @@ KEEPS_GOING = EpisodeConfig(max_steps=None)
 
 
 def every_second(cases: Iterable[Any]) -> list[Any]:
-    """Cases of a long list, of which ``make test`` runs every second one, and ``make test-slow`` the others."""
+    """Cases of a long list: ``make test`` runs every second one, ``make test-slow`` the others."""
     rows = [case if isinstance(case, tuple) else (case,) for case in cases]
     slow = pytest.mark.slow
     return [pytest.param(*row, marks=[slow] if number % 2 else []) for number, row in enumerate(rows)]
