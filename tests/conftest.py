@@ -4,7 +4,10 @@ One thread, because many small tensors are slower on more. ``make test`` tries t
 ``make test-deep`` tries thousands of new ones (``--hypothesis-profile=deep``).
 """
 
+import math
 import os
+from itertools import groupby
+from zlib import crc32
 
 import pytest
 import torch
@@ -19,10 +22,21 @@ settings.load_profile("same")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark property tests, so that ``make test-deep`` finds them."""
+    """Mark property tests, which ``make test-deep`` runs, and the cases that ``sample`` leaves to be slow."""
     for item in items:
         if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
             item.add_marker("property")
+    sampled = [(item, mark.args[0]) for item in items if (mark := item.get_closest_marker("sample"))]
+    sampled.sort(key=lambda pair: (_function(pair[0]), crc32(pair[0].nodeid.encode())))
+    for _, group in groupby(sampled, key=lambda pair: _function(pair[0])):
+        cases = list(group)
+        for item, _ in cases[math.ceil(len(cases) / cases[0][1]) :]:
+            item.add_marker("slow")
+
+
+def _function(item: pytest.Item) -> str:
+    """The test of which the item is a case."""
+    return item.nodeid.partition("[")[0]
 
 
 @pytest.fixture(autouse=True)

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -276,14 +276,6 @@ MOTIONS = {
 }
 FLYING = MOTIONS["polynomial"]
 KEEPS_GOING = EpisodeConfig(max_steps=None)
-
-
-def every_second(cases: Iterable[Any]) -> list[Any]:
-    """Cases of a long list: ``make test`` runs every second one, ``make test-slow`` the others."""
-    rows = [case if isinstance(case, tuple) else (case,) for case in cases]
-    slow = pytest.mark.slow
-    return [pytest.param(*row, marks=[slow] if number % 2 else []) for number, row in enumerate(rows)]
-
 
 both_motions = pytest.mark.parametrize("motion", ["instant", "polynomial"])
 both_kinds = pytest.mark.parametrize("kind", ["discrete", "continuous"])

@@ -68,6 +68,7 @@ TASKS = {
 }
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("task", "fraction"), [*((task, 0.0) for task in TASKS), ("late", 0.7), ("flights", 0.7)]
 )
@@ -263,6 +264,7 @@ def test_a_fleet_that_began_too_long_ago_neither_takes_reports_nor_advises():
         fleet.advise(START + LIFE + 1)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("task", ["history", "belief", "clocks", "flights"])
 def test_fleets_that_share_a_node_do_not_see_each_other(task):
     """Beside another fleet, which began earlier elsewhere, a fleet observes what it does alone."""

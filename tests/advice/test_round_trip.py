@@ -60,6 +60,7 @@ def served(scenario, policy_of, n_worlds: int, horizon: int, drawn: bool = False
         return evaluate(env, Client(env, ground, http, lambda time: now.__setitem__(0, time), START), horizon)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("task", "policy_of"),
     [("late", greedy_policy), ("flights", greedy_policy), ("belief", network), ("flights", recurrent)],

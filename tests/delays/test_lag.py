@@ -94,6 +94,7 @@ def senders(transform: Any, lag: Lag, loss: float = 0.0) -> list[Sender]:
 # Beside the twin; the episodes of the worlds end at random steps.
 
 
+@pytest.mark.sample(2)
 @every_lag
 @pytest.mark.parametrize(
     ("order", "loss", "sent_key"), [("generation", 0.0, None), ("arrival", 0.25, "message_sent")]

@@ -105,6 +105,7 @@ def test_without_any_delay_there_are_no_transforms():
 # Specs and TorchRL's rules.
 
 
+@pytest.mark.sample(2)
 @every_delay
 @both_kinds
 @both_motions
@@ -183,6 +184,7 @@ def test_an_action_has_no_effect_before_it_is_executed():
 # Batches of worlds.
 
 
+@pytest.mark.sample(2)
 @every_delay
 @both_motions
 def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
@@ -199,6 +201,7 @@ def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
         assert all_same([td[w : w + 1] for td in together], outputs, rounding)
 
 
+@pytest.mark.sample(2)
 @every_delay
 @both_motions
 def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
@@ -233,6 +236,7 @@ def test_the_same_seed_draws_the_same_delays_and_another_seed_different_ones():
 # Action delays and observation delays.
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("i", range(4))
 @pytest.mark.parametrize("j", range(4))
 def test_an_action_delay_of_j_steps_has_the_effect_of_j_more_steps_of_observation_delay(i, j):
@@ -259,6 +263,7 @@ def test_an_action_delay_of_j_steps_has_the_effect_of_j_more_steps_of_observatio
     assert len(both[1].flatten(0, 1).unique(dim=0)) > 8
 
 
+@pytest.mark.sample(2)
 @both_motions
 @pytest.mark.parametrize(
     "changed",

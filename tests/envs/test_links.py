@@ -37,6 +37,7 @@ LINKS = {
 every_link = pytest.mark.parametrize("links", LINKS.values(), ids=LINKS)
 
 
+@pytest.mark.sample(2)
 @every_link
 @both_motions
 @pytest.mark.parametrize("extras", [(), EXTRAS])

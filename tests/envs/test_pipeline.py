@@ -179,6 +179,7 @@ def test_a_uav_observes_the_latest_broadcast_before_its_own_tick():
         assert outputs[2 * t][OBSERVATION][..., :-4].equal(at_agent_tick[OBSERVATION][..., :-4])
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("act", [0, 2, {"law": "geometric", "mean": 2}], ids=["none", "2", "random"])
 @pytest.mark.parametrize(
     ("motion", "agents"), [("instant", "3s"), ("polynomial", "1s"), ("polynomial", "3s")]

@@ -72,6 +72,7 @@ def test_without_delays(motion, kind):
     check_equal_to_torchrls_way(everything(motion, kind))
 
 
+@pytest.mark.sample(2)
 @every_delay
 def test_with_delays(delays):
     check_equal_to_torchrls_way(everything("polynomial", **DELAYS[delays]))

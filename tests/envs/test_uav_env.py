@@ -57,6 +57,7 @@ def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(motion, delaye
         other = after.select(*other.keys(True, True), strict=False)
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("region", REGIONS)
 @both_kinds
 @both_motions
@@ -143,6 +144,7 @@ def test_without_extras_observations_and_rewards_are_the_same(motion):
 # Worlds and seeds.
 
 
+@pytest.mark.sample(2)
 @both_kinds
 @both_motions
 def test_worlds_stepped_together_equal_worlds_stepped_alone(motion, kind):

@@ -119,6 +119,7 @@ def by_hand(flight: TensorDictBase, server: Server, needed: int) -> tuple[dict[s
     return means | {name: mean(name) for name in averaged} | pooled, rows
 
 
+@pytest.mark.sample(2)
 @both_motions
 @pytest.mark.parametrize("delay", DELAYS)
 def test_an_evaluation_equals_counting_step_by_step(motion, delay):

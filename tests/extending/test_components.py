@@ -93,6 +93,7 @@ def test_a_sensor_and_a_feature_that_reads_it_are_trained_with(run):
     check_trained_and_evaluated(run, *SENSOR, "delay=paper", "aware=both", "motion=polynomial")
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -205,6 +206,7 @@ def test_a_mistake_in_a_law_that_sees_the_context_is_one_clear_line(run, folder,
     assert not (folder / "run").exists()
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

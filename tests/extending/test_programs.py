@@ -176,6 +176,7 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
     assert "| naive | R0 |" in (compared / "table.md").read_text()
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

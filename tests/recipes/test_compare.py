@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import check_refused, every_second
+from helpers import check_refused
 from hydra import initialize_config_dir
 
 from damian.evaluation.comparison import CEILING, SAMPLED, Arm
@@ -194,48 +194,47 @@ def test_ray_tasks_and_slurm_jobs_give_the_same_results_as_this_process(compare,
     assert measured(Path("runs/usecase2/other")) == expected
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("overrides", "message"),
-    every_second(
-        [
-            ([listed("framess=3")], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
-            ([listed("delay=papers")], "delay: papers is not one of burst, distance, lag, none, paper"),
-            ([listed("agents=two")], "agents: Value 'two'"),
-            ([listed("delay.loss=0.1", "source.position=[1,2,3]")], "source.position: [1, 2, 3] is not"),
-            (["overrides=[seed=3]"], "a value with = in it needs quotes"),
-            ([listed("seed=3")], "overrides: seed=3 cannot be the same for every run"),
-            (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
-            (["arms=[undelayed,awake]"], "arms: awake is not one of undelayed, unaware, deployed, history"),
-            (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
-            (["seedz=3"], "seedz: no such key; did you mean seeds?"),
-            (["+seedz=3"], "seedz: no such key; did you mean seeds?"),
-            (["seeds=0"], "seeds: 0 is not between 1 and"),
-            (["processes=none"], "processes"),
-            (["launcher=cloud"], "launcher: cloud is not one of local, ray, slurm"),
-            (["slurm={cluster: local}"], "slurm: {'cluster': 'local'} means nothing without launcher=slurm"),
-            (["launcher=slurm", "slurm=cpu"], "slurm: cpu is no mapping such as {slurm_partition: cpu}"),
-            (["score=age"], "score: age is not one of true_return, "),
-            (["policy=best"], "policy: best is not one of sampled, mode"),
-            (["experiment.arms.both.regime=R7"], "experiment.arms.both.regime: R7 is not one of R0, "),
-            (
-                ["experiment.arms.both.delayed=false"],
-                "experiment.arms: ['undelayed', 'both'] are not delayed",
-            ),
-            (["+experiment.delays.none=[]"], "experiment.delays: none cannot name a folder"),
-            (["report_only=true"], "experiment: no run of it is finished in"),
-            (
-                ["+agents=3"],
-                "agents: it is a setting of the runs; all of them get it by \"overrides=['agents=",
-            ),
-            (["overrides=agents"], "overrides: it is a list: [agents]"),
-            (["arms=unaware"], "arms: it is a list: [unaware]"),
-            (["arms=[]"], "arms: [] names none: leave it out, for all of them"),
-            (
-                ["overrides=['delay.obs=3','delay.rew=1']"],
-                "usecase2/none/undelayed: delay.obs, delay.rew: its value delays this arm",
-            ),
-        ]
-    ),
+    [
+        ([listed("framess=3")], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
+        ([listed("delay=papers")], "delay: papers is not one of burst, distance, lag, none, paper"),
+        ([listed("agents=two")], "agents: Value 'two'"),
+        ([listed("delay.loss=0.1", "source.position=[1,2,3]")], "source.position: [1, 2, 3] is not"),
+        (["overrides=[seed=3]"], "a value with = in it needs quotes"),
+        ([listed("seed=3")], "overrides: seed=3 cannot be the same for every run"),
+        (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
+        (["arms=[undelayed,awake]"], "arms: awake is not one of undelayed, unaware, deployed, history"),
+        (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
+        (["seedz=3"], "seedz: no such key; did you mean seeds?"),
+        (["+seedz=3"], "seedz: no such key; did you mean seeds?"),
+        (["seeds=0"], "seeds: 0 is not between 1 and"),
+        (["processes=none"], "processes"),
+        (["launcher=cloud"], "launcher: cloud is not one of local, ray, slurm"),
+        (["slurm={cluster: local}"], "slurm: {'cluster': 'local'} means nothing without launcher=slurm"),
+        (["launcher=slurm", "slurm=cpu"], "slurm: cpu is no mapping such as {slurm_partition: cpu}"),
+        (["score=age"], "score: age is not one of true_return, "),
+        (["policy=best"], "policy: best is not one of sampled, mode"),
+        (["experiment.arms.both.regime=R7"], "experiment.arms.both.regime: R7 is not one of R0, "),
+        (
+            ["experiment.arms.both.delayed=false"],
+            "experiment.arms: ['undelayed', 'both'] are not delayed",
+        ),
+        (["+experiment.delays.none=[]"], "experiment.delays: none cannot name a folder"),
+        (["report_only=true"], "experiment: no run of it is finished in"),
+        (
+            ["+agents=3"],
+            "agents: it is a setting of the runs; all of them get it by \"overrides=['agents=",
+        ),
+        (["overrides=agents"], "overrides: it is a list: [agents]"),
+        (["arms=unaware"], "arms: it is a list: [unaware]"),
+        (["arms=[]"], "arms: [] names none: leave it out, for all of them"),
+        (
+            ["overrides=['delay.obs=3','delay.rew=1']"],
+            "usecase2/none/undelayed: delay.obs, delay.rew: its value delays this arm",
+        ),
+    ],
 )
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
     compare, capsys, tmp_path, overrides, message

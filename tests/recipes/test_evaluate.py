@@ -161,6 +161,7 @@ def test_the_same_seed_gives_the_same_results_and_another_one_others(fly):
     assert results(one) != results(other)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

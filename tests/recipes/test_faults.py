@@ -205,6 +205,7 @@ def make_folder(file: Path) -> None:
     file.mkdir()
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("damage", "message"),
     [

@@ -183,6 +183,7 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
     assert not np.array_equal(one.position, other.position)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -82,6 +82,7 @@ def test_a_setting_that_is_given_replaces_that_of_the_advice(show):
     assert "agents=5" not in episode.about["overrides"]
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -109,6 +109,7 @@ def test_the_table_has_a_row_for_each_set_of_messages_known_on_time(foresee, cap
     assert "what a UAV knows on time" in capsys.readouterr().out
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("word", "message"),
     [

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import check_refused, every_second
+from helpers import check_refused
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -51,26 +51,25 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
     return {f"{key}.{name}": w for key, net in networks.items() for name, w in net.state_dict().items()}
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     "overrides",
-    every_second(
-        [
-            [],
-            ["scenario=tracking", "motion=polynomial", "agents=2"],
-            ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
-            ["scenario=energy", "motion=polynomial", "observation.ctde=true"],
-            ["scenario=mixed", "logger=csv", "agents=1"],
-            ["scenario=spotting", "reward=tracking", "region=usecase", "actions=continuous"],
-            ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
-            ["delay=paper", "aware=both", "motion=polynomial"],
-            ["delay=burst", "aware=backupdate", "scenario=mixed", "delay.order=arrival"],
-            ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
-            ["aware=backupdate"],
-            ["delay=paper", "aware=backupdate", "clock.server=2s", "delay.rew=3", "delay.reward_window=3"],
-            ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
-            ["learner=sac", "delay.rew=3", "aware=backupdate", "settle=true", "clock.server=2s"],
-        ]
-    ),
+    [
+        [],
+        ["scenario=tracking", "motion=polynomial", "agents=2"],
+        ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
+        ["scenario=energy", "motion=polynomial", "observation.ctde=true"],
+        ["scenario=mixed", "logger=csv", "agents=1"],
+        ["scenario=spotting", "reward=tracking", "region=usecase", "actions=continuous"],
+        ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
+        ["delay=paper", "aware=both", "motion=polynomial"],
+        ["delay=burst", "aware=backupdate", "scenario=mixed", "delay.order=arrival"],
+        ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
+        ["aware=backupdate"],
+        ["delay=paper", "aware=backupdate", "clock.server=2s", "delay.rew=3", "delay.reward_window=3"],
+        ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
+        ["learner=sac", "delay.rew=3", "aware=backupdate", "settle=true", "clock.server=2s"],
+    ],
 )
 def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, capsys, overrides):
     folder = run(*TINY, *overrides)

@@ -167,6 +167,7 @@ def test_every_learner_has_a_space(capsys):
     assert {path.stem for path in Path(CONF, "search").glob("*.yaml")} == names
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -156,6 +156,7 @@ def check_corrected(corrected: TensorDictBase, expected: TensorDictBase) -> None
             assert (entry[name] if name else entry).equal(value), (key, name)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 @pytest.mark.parametrize("parts", [1, 3, 13])
 def test_back_updated_steps_equal_undelayed_ones_once_every_message_has_arrived(motion, parts):

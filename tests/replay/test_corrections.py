@@ -109,6 +109,7 @@ def storage_of(env: TransformedEnv, group: tuple[str, ...], n_steps: int) -> Bac
     return storage
 
 
+@pytest.mark.sample(2)
 @both_layouts
 @pytest.mark.parametrize("seed", range(4))
 def test_stored_steps_become_what_a_slow_twin_says(group, seed):

@@ -42,6 +42,7 @@ def law(request, tmp_path):
 # Comparisons with the reference implementations in plain Python.
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "message_sent")])
 def test_every_agent_holds_the_message_that_the_reference_receiver_holds(law, order, loss, sent_key):
@@ -107,6 +108,7 @@ def rewards_of(outputs: Sequence[TensorDictBase]) -> tuple[list, list]:
     return after(outputs, *REWARD), after(outputs, "done")
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("few", [0, 1000], ids=["only ended rows", "all rows"])
 def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law, few, monkeypatch):
     monkeypatch.setattr(reward_delay, "_FEW", few)  # how the rest of an episode is summed
@@ -204,6 +206,7 @@ def test_the_action_history_equals_the_end_of_a_list_of_actions(steps, recorded_
             assert found[2 * t + 2, w, n].equal(torch.tensor(last_actions(recorded, steps, default)) / 6)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("recorded_key", "reflected_after"), [(None, 1), ("ready", 1), ("ready", 2)])
 def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_does_not_reflect(
     law, recorded_key, reflected_after

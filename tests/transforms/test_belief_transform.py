@@ -81,6 +81,7 @@ SCENARIOS = {
 }
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 def test_a_belief_knows_what_has_arrived_and_nothing_else(scenario):
     env = make_env(scenario, 2, extras=["message"])

@@ -51,6 +51,7 @@ IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
 # Specs.
 
 
+@pytest.mark.sample(2)
 @every_case
 def test_the_outputs_match_the_specs_and_every_spec_can_do_without_the_batch(kind, make):
     env = TransformedEnv(kind.make(), make(kind, LATE))
@@ -92,6 +93,7 @@ def test_a_channel_without_delay_shows_current_messages_and_changes_nothing_else
         assert td[group, "received_mask"].all()
 
 
+@pytest.mark.sample(3)
 @every_kind
 @pytest.mark.parametrize("identity", IDENTITIES.values(), ids=IDENTITIES)
 def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(kind, identity):
@@ -176,6 +178,7 @@ def test_after_inference_mode_come_normal_steps(make, first):
 # Graphs.
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("kind", "make"),
     [

@@ -116,6 +116,7 @@ ZERO_DELAY_CASES = [
 """Every law on one environment, and two laws on the others."""
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(("kind", "zero_delay"), ZERO_DELAY_CASES)
 @pytest.mark.parametrize("transform", TRANSFORMS)
 def test_with_delay_0_nothing_changes(kind, transform, zero_delay, tmp_path):
@@ -137,6 +138,7 @@ def test_a_clock_of_period_1_a_sum_of_one_reward_and_a_history_change_nothing(ki
         )
 
 
+@pytest.mark.sample(2)
 @kinds
 @pytest.mark.parametrize("law", [3, Burst(good=PAPER, bad_loss=0.0)], ids=["constant", "burst"])
 def test_the_outputs_of_delayed_environments_match_the_specs(kind, law):

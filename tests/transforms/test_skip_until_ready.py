@@ -158,6 +158,7 @@ def differing(one: TensorDictBase, other: TensorDictBase) -> list[Any]:
     return [k for k in keys if not one[k].equal(other[k])] or [set(one.keys()) ^ set(other.keys())]
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("delays", DELAYS)
 def test_a_merged_step_has_the_outputs_of_the_single_steps(delays):
     durations, _ = check_equal(flights(delays))

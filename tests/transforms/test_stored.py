@@ -89,6 +89,7 @@ def counted(n_steps: int = STEPS, **options: Any) -> TensorDictBase:
     return collect(Counting(WORLDS, **options), n_steps)
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("chain", CHAINS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_stored_steps_are_delayed_as_in_the_environment(kind, chain):

@@ -62,6 +62,7 @@ def test_the_outputs_match_the_specs(case):
     assert env.rollout(12, break_when_any_done=False).shape == (*env.batch_size, 12)
 
 
+@pytest.mark.sample(2)
 @every_case
 def test_a_transform_does_the_same_in_a_compose_appended_or_around_a_transformed_environment(case):
     variants = [
@@ -74,6 +75,7 @@ def test_a_transform_does_the_same_in_a_compose_appended_or_around_a_transformed
     assert all(all_same(one, outputs[0]) for one in outputs[1:])
 
 
+@pytest.mark.sample(2)
 @every_case
 def test_a_transform_works_around_a_vector_of_environments(case):
     env = TransformedEnv(SerialEnv(2, case.env), case.make())
@@ -81,6 +83,7 @@ def test_a_transform_works_around_a_vector_of_environments(case):
     assert env.rollout(12, break_when_any_done=False).shape == (2, *case.env().batch_size, 12)
 
 
+@pytest.mark.sample(2)
 @every_case
 def test_a_transform_works_inside_a_vector_of_environments(case):
     env = SerialEnv(2, case.build)
@@ -202,6 +205,7 @@ def test_before_the_first_reset_a_step_is_refused(case):
 COPIES = {"pickle": lambda env: pickle.loads(pickle.dumps(env)), "deepcopy": copy.deepcopy}
 
 
+@pytest.mark.sample(3)
 @every_case
 @pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
 @pytest.mark.parametrize("n_steps", [0, 5])
@@ -213,6 +217,7 @@ def test_a_copy_made_during_an_episode_continues_like_the_original(case, copied,
     assert all_same(onward(env, td.clone()), outputs)
 
 
+@pytest.mark.sample(2)
 @every_case
 def test_a_clone_shares_no_memory(case):
     env, control = case.build(), case.build()
@@ -235,6 +240,7 @@ def test_a_clone_of_a_transform_without_memory_works(case):
 # Checkpoints.
 
 
+@pytest.mark.sample(4)
 @every_case
 @pytest.mark.parametrize(("n_steps", "used"), [(5, True), (5, False), (0, True)])
 @pytest.mark.parametrize("whole", [True, False], ids=["environment", "transform"])
@@ -293,6 +299,7 @@ CONSTANT = {"chances", "_boundaries", "_delays", "codes", "_law_index", "_loss"}
 # Graphs.
 
 
+@pytest.mark.sample(3)
 @some(CASES, fast=AGENTS)
 def test_a_step_compiles_into_one_graph_that_does_the_same(case):
     env, twin = case.build(), case.build()
