@@ -1,6 +1,8 @@
 """Figures of a comparison: learning curves, J_norm of each arm, and scores over delays."""
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -30,6 +32,7 @@ LABELS = {"episode_return": "return", "success_rate": "success rate", "steps": "
 _STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
 _POINTS = 200
 """Number of points of a learning curve."""
+_NORMS_IN_A_ROW = 4
 
 
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
@@ -111,16 +114,23 @@ def _band(runs: Sequence[Sequence[Mapping[str, float]]], name: str) -> tuple[Flo
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
-    """Draw J_norm of each arm under each delay, with its 95 % interval; a panel for each task."""
+    """Draw J_norm of each arm under each delay, with its 95 % interval, in a panel for each task."""
     tasks = comparison.tasks()
+    width = min(len(tasks), _NORMS_IN_A_ROW)
+    height = math.ceil(len(tasks) / width)
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(3.0 * len(tasks) + 1.2, 3.0), layout="constrained")
-        axes = figure.subplots(1, len(tasks), squeeze=False, sharey=True)[0]
-        for axis, task in zip(axes, tasks, strict=True):
-            _norm_panel(axis, comparison, task)
-        axes[0].set_ylabel("J_norm (dashed: undelayed 1, random 0)")
-        if axes[-1].get_legend_handles_labels()[0]:
-            axes[-1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        figure = Figure(figsize=(3.0 * width + 1.2, 3.0 * height), layout="constrained")
+        axes = figure.subplots(height, width, squeeze=False, sharey=True)
+        for axis, task in zip_longest(axes.flat, tasks):
+            if task is None:
+                axis.set_axis_off()
+            else:
+                _norm_panel(axis, comparison, task)
+        for axis in axes[:, 0]:
+            axis.set_ylabel("J_norm (dashed: undelayed 1, random 0)")
+        last = axes[0, -1]
+        if last.get_legend_handles_labels()[0]:
+            last.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         figure.savefig(path, dpi=150)
 
 
@@ -139,7 +149,8 @@ def _norm_panel(axis: Axes, comparison: Comparison, task: str) -> None:
     for level in (0, 1):
         axis.axhline(level, color="0.5", linestyle="--", linewidth=0.8)
     axis.set_xticks(range(len(delays)), delays)
-    axis.set(title=task, xlabel="delay", xlim=(-0.5, max(len(delays), 1) - 0.5))
+    title = task.replace(HELD_OUT, ", held-out ")
+    axis.set(title=title, xlabel="delay", xlim=(-0.5, max(len(delays), 1) - 0.5))
 
 
 def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], path: Path) -> None:
