@@ -256,9 +256,16 @@ class TrainConfig(ScenarioConfig):
 
 
 _STORE = ConfigStore.instance()
-_SCHEMA = OmegaConf.structured(TrainConfig)
-_SCHEMA.learner = MISSING  # the group ``learner`` fills it in
-_STORE.store(name="schema", node=_SCHEMA)
+
+
+def store_schema(name: str, settings: type[TrainConfig]) -> None:
+    """Give Hydra the settings of a program under the name that its file in conf/ lists."""
+    schema = OmegaConf.structured(settings)
+    schema.learner = MISSING  # the group ``learner`` fills it in, with settings of any class
+    _STORE.store(name=name, node=schema)
+
+
+store_schema("schema", TrainConfig)
 for _name, _config in LEARNERS.items():
     _STORE.store(group="schema/learner", name=_name, node=_config)
 
