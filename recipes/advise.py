@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import hydra
-from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
@@ -49,6 +48,7 @@ from .shared.command_line import is_secret
 from .shared.flown_policy import FlownPolicyConfig
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
+from .shared.settings import store_schema
 from .shared.stored_runs import save_config
 
 FLEET = "main"
@@ -119,7 +119,7 @@ def without_token(config: AdviseConfig) -> AdviseConfig:
     return kept
 
 
-ConfigStore.instance().store(name="advise_schema", node=AdviseConfig)
+store_schema("advise_schema", AdviseConfig)
 
 
 def make_desk(config: AdviseConfig, folder: Path | None, is_locked: bool = False) -> Desk:

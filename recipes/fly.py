@@ -20,7 +20,6 @@ from typing import ClassVar
 
 import hydra
 import numpy as np
-from hydra.core.config_store import ConfigStore
 from matplotlib.animation import FFMpegWriter
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
@@ -50,7 +49,7 @@ from .shared.flown_policy import FlownPolicyConfig
 from .shared.inheritance import key_of, without
 from .shared.known_settings import CONF
 from .shared.launch import checked, composed_with, launch, perform, prepare, reported
-from .shared.settings import TrainConfig
+from .shared.settings import TrainConfig, store_schema
 from .shared.stored_runs import save_config
 
 KEPT = ("all", "extremes")
@@ -107,7 +106,7 @@ class FlyConfig(FlownPolicyConfig):
         checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
 
 
-ConfigStore.instance().store(name="fly_schema", node=FlyConfig)
+store_schema("fly_schema", FlyConfig)
 
 
 def fly(config: FlyConfig) -> list[Episode]:

@@ -46,8 +46,14 @@ def foresee(config: TrainConfig, folder: Path) -> None:
         raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
     should = "is not supported: the rows replace what the server broadcasts; choose links=server"
     checks.require(config.links.kind == "server", "links", config.links.kind, should)
+    should = "is not supported: the rows replace what the server broadcasts at every step; leave it out"
+    checks.require(config.clock.steps("server") == 1, "clock.server", config.clock.server, should)
     should = "is not supported: what a UAV believes follows from more messages than the latest ones"
-    checks.require(not config.observation.belief, "observation.belief", config.observation.belief, should)
+    for key, value in (
+        ("observation.belief", config.observation.belief),
+        ("delay.messages", config.delay.messages),
+    ):
+        checks.require(not value, key, value, should)
     env, actor = stored(config)
     save_config(config, folder)
     env.append_transform(StepCounter())

@@ -29,7 +29,6 @@ from typing import Any
 import hydra
 import numpy as np
 from hydra import compose
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -47,7 +46,7 @@ from .shared.known_settings import CONF
 from .shared.launch import checked, launch, reported, shown
 from .shared.parallel import Run, perform_each
 from .shared.search_space import read_space
-from .shared.settings import TrainConfig
+from .shared.settings import TrainConfig, store_schema
 from .train import train
 
 try:
@@ -101,7 +100,7 @@ class TuneConfig(TrainConfig):
 
 OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields(TrainConfig)}
 """Settings that a training does not have."""
-ConfigStore.instance().store(name="tune_schema", node=TuneConfig)
+store_schema("tune_schema", TuneConfig)
 
 
 class Search:

@@ -7,6 +7,7 @@ from typing import Any
 from damian.common.errors import InputError
 from damian.common.text_files import show
 from damian.envs.scenario import ScenarioConfig
+from damian.learners.predictive_mappo import PredictiveMappoConfig
 
 from .settings import TrainConfig
 
@@ -67,11 +68,14 @@ def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
 def _shape(config: TrainConfig) -> dict[str, Any]:
     """What the sizes of a policy's networks follow from, by setting."""
     observation, actions, model = config.observation, config.actions, config.model
-    discrete = actions.kind == "discrete"
+    discrete, seen = actions.kind == "discrete", observation.actor
     return {
+        "learner=predictive_mappo": isinstance(config.learner, PredictiveMappoConfig),
+        "agents": config.agents if "agent_distances" in seen else "any number of UAVs",
         "observation.ctde": observation.ctde,
         "observation.local_features": [*observation.local_features],
         "observation.global_features": [] if observation.ctde else [*observation.global_features],
+        "observation.belief": [*observation.belief],
         "observation.age": observation.age,
         "delay.history": config.delay.history,
         "delay.messages": config.delay.messages,

@@ -11,6 +11,7 @@ from omegaconf import MISSING, OmegaConf
 from damian import keys
 from damian.common import checks
 from damian.common.threads import available_cores
+from damian.delays.config import DelayConfig
 from damian.delays.laws import law_of
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
@@ -19,7 +20,7 @@ from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.bpql import BpqlConfig  # noqa: F401 (registers the learner, and SacConfig)
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
-from damian.learners.predictive_mappo import PredictiveMappoConfig  # noqa: F401 (registers the learner)
+from damian.learners.predictive_mappo import PredictiveMappoConfig
 from damian.learners.schedule import SystemClock
 
 MAX_BATCH = 100_000_000
@@ -147,8 +148,19 @@ class TrainConfig(ScenarioConfig):
         self._check_skip()
         self._check_backupdate()
         self._check_workers()
-        useless = self.delay.hold == "max" and self.longest_delay == 0
+        self._check_delay()
+
+    def _check_delay(self) -> None:
+        """Check that no setting of the delays is without any effect."""
+        delay, name = self.delay, self.learner.name
+        useless = delay.hold == "max" and self.longest_delay == 0
         checks.require(not useless, "delay.hold", "max", "means nothing without delayed messages (delay.obs)")
+        useless = delay.reward_window == 1 and delay.reward_discount != DelayConfig.reward_discount
+        should = "means nothing with delay.reward_window=1, which sums no rewards; leave it out"
+        checks.require(not useless, "delay.reward_discount", delay.reward_discount, should)
+        unread = delay.messages and ":" not in name and not isinstance(self.learner, PredictiveMappoConfig)
+        should = f"is not read by learner={name}; choose learner=predictive_mappo, or leave it out"
+        checks.require(not unread, "delay.messages", delay.messages, should)
 
     def _check_backupdate(self) -> None:
         """Check what goes with back-updating only, and what it needs."""
@@ -256,9 +268,16 @@ class TrainConfig(ScenarioConfig):
 
 
 _STORE = ConfigStore.instance()
-_SCHEMA = OmegaConf.structured(TrainConfig)
-_SCHEMA.learner = MISSING  # the group ``learner`` fills it in
-_STORE.store(name="schema", node=_SCHEMA)
+
+
+def store_schema(name: str, settings: type[TrainConfig]) -> None:
+    """Give Hydra the settings of a program under the name that its file in conf/ lists."""
+    schema = OmegaConf.structured(settings)
+    schema.learner = MISSING  # the group ``learner`` fills it in, with settings of any class
+    _STORE.store(name=name, node=schema)
+
+
+store_schema("schema", TrainConfig)
 for _name, _config in LEARNERS.items():
     _STORE.store(group="schema/learner", name=_name, node=_config)
 

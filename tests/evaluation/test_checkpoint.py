@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictParams
 from torch import nn
 
 from damian.common.atomic_files import remove_unfinished, write_atomically
@@ -135,6 +135,13 @@ def test_a_foreign_component_is_refused_in_one_line():
         assert "\n" not in str(refused.value)
     with pytest.raises(InputError, match=r"it has no critic, only actor: another learner wrote it"):
         restore({"critic": nn.ReLU()}, stored, Path("x.pt"), "checkpoint")
+
+
+def test_weights_of_other_sizes_in_a_tensordict_are_refused_without_printing_it():
+    weights, stored = (TensorDictParams(TensorDict({"weight": torch.zeros(size)})) for size in (3, 4))
+    problem = "its critic does not fit this run: its networks have other sizes or layers"
+    with pytest.raises(InputError, match=problem):
+        restore({"critic": weights}, {"critic": stored.state_dict()}, Path("x.pt"), "checkpoint")
 
 
 def test_a_segment_of_another_checkpoint_is_refused(file):

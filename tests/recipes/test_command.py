@@ -3,9 +3,11 @@
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+from hydra import initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
@@ -15,7 +17,8 @@ from damian.learners.base import LEARNERS
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.compare import CompareConfig
 from damian.recipes.shared.command_line import prepared
-from damian.recipes.shared.known_settings import groups, known_settings
+from damian.recipes.shared.known_settings import CONF, groups, known_settings
+from damian.recipes.shared.launch import checked, composed_with
 from damian.recipes.shared.misspelt import check_words
 from damian.recipes.shared.settings import TrainConfig
 
@@ -40,6 +43,15 @@ def refusal(capsys, *words: str) -> str:
     assert printed.out == ""
     assert printed.err.count("\n") == 1
     return printed.err.strip()
+
+
+@pytest.mark.parametrize("program", ["train", "tune", "fly", "advise"])
+def test_every_program_takes_every_learner(program):
+    import_module(f"damian.recipes.{program}")  # stores its settings
+    with initialize_config_dir(CONF, version_base=None):
+        for name, settings in LEARNERS.items():
+            config = checked(composed_with(program, [f"learner={name}"]), program)
+            assert type(config.learner) is settings
 
 
 def test_the_settings_read_from_the_source_are_those_of_the_dataclasses():

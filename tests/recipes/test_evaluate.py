@@ -13,8 +13,10 @@ from helpers import check_refused
 from omegaconf import OmegaConf
 
 import damian
+from damian.common.errors import InputError
 from damian.recipes import evaluate, train
-from damian.recipes.shared.launch import launch
+from damian.recipes.shared.inheritance import check_policy_fits
+from damian.recipes.shared.launch import composed_config, launch
 
 TRAINED = [
     "frames=64",
@@ -180,6 +182,26 @@ def test_the_same_seed_gives_the_same_results_and_another_one_others(fly):
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path, overrides, message):
     check_refused(lambda: fly(*overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("agents=5", "agents: the policy was trained with 3, so it cannot fly with 5"),
+        ("learner=predictive_mappo", "learner=predictive_mappo: the policy was trained with False"),
+        ("observation.belief=[belief_moments]", r"observation.belief: the policy was trained with \[\]"),
+    ],
+)
+def test_what_a_policy_needs_to_fly_is_named(word, message):
+    words = ["scenario=coverage", "reward.spotted=1"]
+    trained, other = composed_config(*words), composed_config(*words, word)
+    with pytest.raises(InputError, match=message):
+        check_policy_fits(other, trained)
+    check_policy_fits(trained, trained)
+
+
+def test_a_policy_flies_with_any_number_of_uavs_if_it_observes_no_distance_to_each():
+    check_policy_fits(composed_config("agents=5"), composed_config("agents=3"))
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,11 @@ import torch
 from helpers import both_motions, everything
 from torchrl.envs import StepCounter
 
+from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.recipes import oracle, train
-from damian.recipes.shared.launch import launch
+from damian.recipes.shared.launch import composed_config, launch
 from damian.world.messages import Messages
 
 TINY = ["frames=64", "worlds=4", "learner.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]
@@ -115,6 +116,7 @@ def test_the_table_has_a_row_for_each_set_of_messages_known_on_time(foresee, cap
     [
         ("delay=none", "delay.obs: no message is late or lost"),
         ("links=matrix", "links: matrix is not supported"),
+        ("clock.server=2s", "clock.server: 2s is not supported"),
     ],
 )
 def test_a_scenario_whose_observations_do_not_wait_for_the_server_is_refused(
@@ -125,3 +127,10 @@ def test_a_scenario_whose_observations_do_not_wait_for_the_server_is_refused(
     assert stopped.value.code == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "oracle").exists()
+
+
+@pytest.mark.parametrize("word", ["delay.messages=2", "observation.belief=[belief_moments]"])
+def test_a_policy_that_remembers_messages_is_refused(word, tmp_path):
+    config = composed_config("delay.obs=2", "checkpoint=trained", word)
+    with pytest.raises(InputError, match="follows from more messages than the latest ones"):
+        oracle.foresee(config, tmp_path)

@@ -64,6 +64,11 @@ from damian.recipes.shared.stored_runs import save_config
             "model.rnn: gru does not go with learner=predictive_mappo",
         ),
         (["learner=predictive_mappo", "learner.heads=0"], "learner.heads: 0 is not between 1 and 1024"),
+        (["delay.messages=4"], "delay.messages: 4 is not read by learner=mappo; choose learner=predictive"),
+        (
+            ["delay.reward_discount=0.5"],
+            "delay.reward_discount: 0.5 means nothing with delay.reward_window=1",
+        ),
         (["delay.messages=4", "links=matrix"], "delay.messages: 4 does not go with links=matrix"),
         (
             ["learner=sac", "learner.warm_up=300000"],
