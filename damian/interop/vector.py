@@ -66,7 +66,7 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
 
 
 def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, Any]:
-    """Infos of the worlds [B, ...] by name, each with the mask [B] of the worlds that have it; if none, all."""
+    """Infos of the worlds [B, ...] by name, each with a mask of the worlds [B] that have it (all)."""
     found = {name: each if name == "is_success" else each[:, 0] for name, each in infos.items()}
     mask = np.ones(len(infos["ready"]), bool) if worlds is None else worlds
     return found | {f"_{name}": mask.copy() for name in found}
