@@ -356,7 +356,7 @@ class StatefulTransform(MemoryTransform):
             RuntimeError: it does not, or the TensorDict has other worlds than the memory.
         """
         if not self.has_memory and self._begun is not None:  # it was seeded after the reset
-            outputs = self._begun[0]
+            (outputs, _), self._begun = self._begun, None
             self._init(outputs)
             self.set_memory(self._begin(outputs, None)[0])
         if not self.has_memory or self.container is None:

@@ -41,9 +41,13 @@ def test_the_delays_are_those_of_a_reset_after_the_seed():
     assert ages[0].equal(ages[1])
 
 
-def test_after_a_step_a_seed_needs_a_reset():
+@pytest.mark.parametrize("seeded", [False, True])
+def test_after_a_step_a_seed_needs_a_reset(seeded):
     env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(Uniform(0, 4)))
-    stepped = env.rollout(1)[-1]["next"]
+    begun = env.reset()
+    if seeded:
+        env.set_seed(2)
+    stepped = env.rand_step(begun)["next"]
     env.set_seed(3)
     with pytest.raises(RuntimeError, match="after a reset"):
         env.rand_step(stepped.exclude("reward"))
