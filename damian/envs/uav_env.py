@@ -180,6 +180,9 @@ class UavEnv(EnvBase):
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own random stream; the next reset begins its first episode.
 
+        Until then, a world that has been reset goes on from where it is: TorchRL's collectors reset an
+        environment when they are made, and are seeded afterwards.
+
         Args:
             seeds: integers, one for each world, [B].
 
@@ -188,9 +191,10 @@ class UavEnv(EnvBase):
         """
         checks.integers("seeds", seeds, self.batch_size)
         seeds = seeds.to(self.device, torch.long)
-        row = torch.zeros_like(seeds)
-        first = tree_map(lambda table: table.index_select(0, row), self.simulation.initial)
-        self.state = first._replace(seed=seeds)
+        zero = torch.zeros_like(seeds)
+        if "worlds" not in self.__dict__:
+            self.state = tree_map(lambda table: table.index_select(0, zero), self.simulation.initial)
+        self.state = self.state._replace(seed=seeds, episode=zero)
 
     def _set_seed(self, seed: int | None) -> None:
         self.seed_worlds(counter_rng.world_seeds(seed or 0, self.batch_size[0], self.device))

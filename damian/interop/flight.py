@@ -157,5 +157,6 @@ def one_uav(scenario: ScenarioConfig) -> None:
 
 
 def row(infos: dict[str, Array], world: int, agent: int) -> dict[str, Any]:
-    """The infos of one UAV."""
-    return {name: each[world] if name == "is_success" else each[world, agent] for name, each in infos.items()}
+    """The infos of one UAV; flags are Python's, because Gymnasium's vector environments know no others."""
+    found = {n: each[world] if n == "is_success" else each[world, agent] for n, each in infos.items()}
+    return {name: each if each.ndim else each.item() for name, each in found.items()}

@@ -54,8 +54,8 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
             final = np.full(self.num_envs, None, object)
             for world in done.nonzero()[0]:
                 final[world] = last.observation[world, 0]
-            infos |= {"final_obs": final, "_final_obs": done, "final_info": _infos(last.infos)}
-            infos["_final_info"] = done
+            infos |= {"final_obs": final, "_final_obs": done}
+            infos |= {"final_info": _infos(last.infos, done), "_final_info": done}
         return instant.observation[:, 0], last.reward[:, 0], last.terminated, last.truncated, infos
 
     def _contains(self, actions: Array) -> bool:
@@ -65,7 +65,8 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
         return fits and space.contains(actions.astype(space.dtype))
 
 
-def _infos(infos: dict[str, Array]) -> dict[str, Any]:
-    """Infos of the worlds [B, ...] by name, each with the mask of the worlds that have it."""
+def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, Any]:
+    """Infos of the worlds [B, ...] by name, each with a mask of the worlds [B] that have it (all)."""
     found = {name: each if name == "is_success" else each[:, 0] for name, each in infos.items()}
-    return found | {f"_{name}": np.ones(len(each), bool) for name, each in found.items()}
+    mask = np.ones(len(infos["ready"]), bool) if worlds is None else worlds
+    return found | {f"_{name}": mask.copy() for name in found}

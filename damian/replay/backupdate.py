@@ -120,11 +120,13 @@ class BackupdateStorage(TimeStorage):
         """Write steps [T, B] at the indices ``cursor`` of the first dimension, and back-update.
 
         Raises:
-            InputError: an entry is missing or misshapen, the storage is too small for the batch, or a message
-                or a reward is later than ``longest``.
+            InputError: an entry is missing or misshapen, the storage is too small for the batch, a message or
+                a reward is later than ``longest``, or the steps were joined to n-step returns.
         """
         if data.dim() != 2:
             raise InputError(f"steps: a batch of shape {list(data.shape)} is not [T, B]")
+        should = "joins steps before they are corrected: leave it out, and join the steps that are read"
+        checks.require("steps_to_next_obs" not in data, "transform", "MultiStepTransform", should)
         self._check_once(data[:2])
         self._check_times(data)
         super().set(cursor, self._with_added_entries(data), set_cursor=set_cursor)

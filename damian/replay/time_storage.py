@@ -1,11 +1,16 @@
 """A replay-buffer storage that keeps steps in order of time."""
 
+import json
+from pathlib import Path
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
+
+_LAST = "latest_step.json"
+"""File that tells which of the saved steps is the latest."""
 
 
 class TimeStorage(LazyTensorStorage):
@@ -28,7 +33,30 @@ class TimeStorage(LazyTensorStorage):
 
     def latest(self, n_steps: int | None = None) -> Tensor:
         """Indices of the latest ``n_steps`` steps (all if not given) in order of time, [min(n_steps, T)]."""
-        stored = cast(int, self._len_along_dim0)
+        stored = cast(int, self._len_along_dim0 or 0)
         n_steps = stored if n_steps is None else min(n_steps, stored)
-        last = int(torch.as_tensor(self._last_cursor).view(-1)[-1])
-        return torch.arange(last - n_steps + 1, last + 1, device=self.device) % stored
+        last = self._last or 0  # nothing is stored if there is none
+        return torch.arange(last - n_steps + 1, last + 1, device=self.device) % max(stored, 1)
+
+    @property
+    def _last(self) -> int | None:
+        """Index of the latest step."""
+        last = self._last_cursor
+        return None if last is None else int(torch.as_tensor(last).view(-1)[-1])
+
+    # TorchRL saves the steps, but not which of them is the latest.
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "last": self._last}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self._last_cursor = state_dict["last"]
+
+    def dumps(self, path: str | Path) -> None:
+        super().dumps(path)
+        (Path(path) / _LAST).write_text(json.dumps(self._last))
+
+    def loads(self, path: str | Path) -> None:
+        super().loads(path)
+        self._last_cursor = json.loads((Path(path) / _LAST).read_text())

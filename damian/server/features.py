@@ -131,10 +131,10 @@ def observe_own(known: Messages, context: ServerContext, names: list[str]) -> di
 
 
 def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
-    """Observation vector in the order of ``names``, [*, N, F]."""
+    """Observation vector in the order of ``names``, [*, N, F] float32, whatever the features' types are."""
     single = {name for name in names if FEATURES.get(name, "feature").width == 1}
     columns = [features[name].unsqueeze(-1) if name in single else features[name] for name in names]
-    return torch.cat(columns, -1)
+    return torch.cat(columns, -1).float()
 
 
 def feature_bounds(features: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -138,7 +138,8 @@ class RewardConfig:
         """A term before it is weighted, [*, N]."""
         if name in self._custom:
             term = self._custom[name]
-            return term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
+            value = term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
+            return value.float()
         return _TERMS[name](features[name], counters, self)
 
 

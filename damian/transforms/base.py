@@ -7,7 +7,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs import Compose, EnvBase
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from damian.common import checks
 from damian.common.tensors import expand_mask
@@ -26,7 +26,7 @@ from damian.transforms.entries import (
     select_entries,
 )
 from damian.transforms.memory import MemoryTransform
-from damian.transforms.order import KeyUsage, check_order, leaf_transforms
+from damian.transforms.order import KeyUsage, check_order, check_stepping, leaf_transforms
 from damian.transforms.seeding import all_transforms
 
 
@@ -63,8 +63,6 @@ class StatefulTransform(MemoryTransform):
     """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_reset`` and ``on_step``, if they exist."""
-    memory_setting: tuple[str, Any]
-    """Key and value of the setting on which the size of the memory depends, for errors."""
     dropped_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are removed from the outputs."""
     sent_key: NestedKey | None = None
@@ -129,26 +127,6 @@ class StatefulTransform(MemoryTransform):
         """
         return memory, {}
 
-    def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
-        """The memory if only some worlds have stepped; the other worlds have sent no message.
-
-        Args:
-            before: memory before the step.
-            after: memory after a step of all worlds.
-            stepped: worlds that have stepped, [B] bool.
-        """
-        rows, merged = self.expand_worlds(stepped), {}
-        for name, new in after.items():
-            mask = rows.view(*[1] * self.row_dims.get(name, 0), *rows.shape)
-            old = before[name]
-            merged[name] = new if new is old else torch.where(expand_mask(mask, new), new, old)
-        return merged
-
-    @property
-    def row_dims(self) -> dict[str, int]:
-        """The dimension of a buffer, by name, in which its M rows lie, where that is not the first."""
-        return {}
-
     def skipped_worlds(self, entries: Entries) -> Tensor | None:
         """Worlds that must step once more before the outputs are returned, [B] bool.
 
@@ -184,17 +162,6 @@ class StatefulTransform(MemoryTransform):
             n_rows: number of rows, M.
         """
         return 0
-
-    def require_memory(self, rows: torch.Size, n_bytes: int) -> None:
-        """Require that the memory of rows of this shape fits.
-
-        Raises:
-            InputError: it does not; the error names the setting that ``memory_setting`` tells.
-        """
-        there = " x ".join(map(str, rows))
-        checks.fits(
-            *self.memory_setting, n_bytes, f"take a smaller one, or fewer worlds and agents than {there}"
-        )
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         """The shape of the rows, given the outputs of the first reset."""
@@ -238,22 +205,31 @@ class StatefulTransform(MemoryTransform):
         if self.has_memory:
             self._check_rows(tensordict_reset)
         else:
-            check_order(all_transforms(self.container))  # others may have come since this one
-            require_keys(type(self).__name__, self.required_keys, tensordict_reset)
-            rows = self.find_rows(tensordict_reset)
-            self.require_memory(rows, self.memory_bytes(tensordict_reset, rows.numel()))
-            self._rows = rows
-            with torch.inference_mode(False):  # else the buffers could be written only in inference mode
-                self.set_memory(self.init_memory(tensordict_reset))
+            self._init(tensordict_reset)
+        outputs = tensordict_reset.detach() if mask is None else None
+        # TorchRL restores the entries of the worlds without a reset.
+        written = self._write(tensordict_reset, self._begin(tensordict_reset, mask))
+        self._begun = None if outputs is None else (outputs, self.memory)
+        return written
+
+    def _init(self, outputs: TensorDictBase) -> None:
+        """Allocate the memory, given the outputs of the first reset."""
+        self._check_order(self.container)  # others may have come since this one
+        require_keys(type(self).__name__, self.required_keys, outputs)
+        rows = self.find_rows(outputs)
+        self.require_memory(rows, self.memory_bytes(outputs, rows.numel()))
+        self._rows = rows
+        with torch.inference_mode(False):  # else the buffers could be written only in inference mode
+            self.set_memory(self.init_memory(outputs))
+
+    def _begin(self, outputs: TensorDictBase, mask: Tensor | None) -> Change:
+        """Begin new episodes in the rows of the mask [M], or in all, given the outputs of the reset."""
         memory = self.memory
         if mask is None:
             device = next((value.device for value in memory.values()), None)
             mask = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
             memory = {name: value.detach() for name, value in memory.items()}
-        entries = select_entries(tensordict_reset, self.step_keys, self.gradients)
-        change = self.on_reset(memory, entries, mask)
-        # TorchRL restores the entries of the worlds without a reset.
-        return self._write(tensordict_reset, change)
+        return self.on_reset(memory, select_entries(outputs, self.step_keys, self.gradients), mask)
 
     def _check_rows(self, tensordict: TensorDictBase) -> None:
         rows = self.find_rows(tensordict)
@@ -346,9 +322,17 @@ class StatefulTransform(MemoryTransform):
         super().set_container(container)
         while isinstance(container, Compose):
             check_order(leaf_transforms(container))
+            check_stepping(leaf_transforms(container))
             outer = container.__dict__.get("_container")  # a weak reference
             container = outer() if outer is not None else None
-        check_order(all_transforms(container))
+        self._check_order(container)
+
+    @staticmethod
+    def _check_order(env: EnvBase | None) -> None:
+        """Refuse a wrong order of the transforms of an environment and of those within it."""
+        check_order(all_transforms(env))
+        if isinstance(env, TransformedEnv):
+            check_stepping(leaf_transforms(env.transform))
 
     @property
     def env(self) -> EnvBase:
@@ -371,6 +355,10 @@ class StatefulTransform(MemoryTransform):
         Raises:
             RuntimeError: it does not, or the TensorDict has other worlds than the memory.
         """
+        if not self.has_memory and self._begun is not None:  # it was seeded after the reset
+            (outputs, _), self._begun = self._begun, None
+            self._init(outputs)
+            self.set_memory(self._begin(outputs, None)[0])
         if not self.has_memory or self.container is None:
             self._refuse()
         if batch_size is not None and batch_size != self.rows[: len(batch_size)]:

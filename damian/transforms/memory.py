@@ -4,10 +4,12 @@ import multiprocessing
 from typing import Any, cast
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from damian.common import counter_rng
+from damian.common import checks, counter_rng
+from damian.common.tensors import expand_mask
 from damian.transforms.entries import Memory
 from damian.transforms.seeding import stream_name
 
@@ -19,9 +21,13 @@ class MemoryTransform(Transform):
     """Whether the transform draws random numbers."""
     shared_streams: bool = False
     """Whether all agents of a world draw the same numbers."""
+    memory_setting: tuple[str, Any]
+    """Key and value of the setting on which the size of the memory depends, for errors."""
     _rows: torch.Size | None = None
     _seed: int | None = None
     _world_seeds: Tensor | None = None
+    _begun: tuple[TensorDictBase, Memory] | None = None
+    """Outputs of the latest reset of all worlds, and the memory after it, which a step replaces."""
 
     @property
     def has_memory(self) -> bool:
@@ -38,6 +44,26 @@ class MemoryTransform(Transform):
         """Expand a mask of worlds [B] to a mask of rows [M]."""
         return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
+    def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
+        """The memory if only some worlds have stepped; the other worlds have sent no message.
+
+        Args:
+            before: memory before the step.
+            after: memory after a step of all worlds.
+            stepped: worlds that have stepped, [B] bool.
+        """
+        rows, merged = self.expand_worlds(stepped), {}
+        for name, new in after.items():
+            mask = rows.view(*[1] * self.row_dims.get(name, 0), *rows.shape)
+            old = before[name]
+            merged[name] = new if new is old else torch.where(expand_mask(mask, new), new, old)
+        return merged
+
+    @property
+    def row_dims(self) -> dict[str, int]:
+        """The dimension of a buffer, by name, in which its M rows lie, where that is not the first."""
+        return {}
+
     @property
     def memory(self) -> Memory:
         """The memory of the transform: its buffers by name."""
@@ -47,10 +73,31 @@ class MemoryTransform(Transform):
         """Replace the buffers that have these names."""
         self._buffers.update(memory)
 
+    def require_memory(self, rows: torch.Size, n_bytes: int) -> None:
+        """Require that the memory of rows of this shape fits.
+
+        Raises:
+            InputError: it does not; the error names the setting that ``memory_setting`` tells.
+        """
+        there = " x ".join(map(str, rows))
+        checks.fits(
+            *self.memory_setting, n_bytes, f"take a smaller one, or fewer worlds and agents than {there}"
+        )
+
     def clear_memory(self) -> None:
         """Delete the memory; the next reset counts as the first."""
-        self._rows = None
+        self._rows, self._begun = None, None
         self._buffers.clear()
+
+    def _seeded_anew(self) -> None:
+        """Delete the memory; a step needs no reset if none was taken since the latest reset of all worlds.
+
+        For TorchRL's collectors reset an environment when they are made, and are seeded afterwards.
+        """
+        begun = self._begun
+        stepped = begun is None or any(self._buffers.get(k) is not value for k, value in begun[1].items())
+        self.clear_memory()
+        self._begun = None if begun is None or stepped else (begun[0], {})
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """A copy has memory of its own: what was sent to a worker process would share the sender's."""
@@ -117,16 +164,16 @@ class MemoryTransform(Transform):
     def set_seed(self, seed: int | None) -> None:
         """Set the seed and delete the memory; the next reset counts as the first.
 
-        ``set_seed`` of the environment calls this method. Transforms of one environment draw different
-        numbers from the same seed.
+        If all worlds have just been reset, they need not be reset again. ``set_seed`` of the environment
+        calls this method. Transforms of one environment draw different numbers from the same seed.
         """
         self._seed, self._world_seeds = seed, None
-        self.clear_memory()
+        self._seeded_anew()
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Set a seed for each world, [B] integers: a world's draws then do not depend on the other worlds."""
         self._seed, self._world_seeds = None, seeds.to(torch.long)
-        self.clear_memory()
+        self._seeded_anew()
 
     def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
         """A random stream (a key of the counter-based generator) for each row, [M] int64.

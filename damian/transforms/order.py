@@ -8,7 +8,11 @@ from typing import Any, NamedTuple, cast
 from tensordict import NestedKey
 from torchrl.envs import (
     Compose,
+    ConditionalPolicySwitch,
     ConditionalSkip,
+    FrameSkipTransform,
+    MultiAction,
+    NoopResetEnv,
     RandomTruncationTransform,
     RewardSum,
     StepCounter,
@@ -19,6 +23,8 @@ from torchrl.envs import (
 from damian.common.errors import InputError
 
 _ENDS = ("done", "terminated", "truncated")
+_STEPPING = (FrameSkipTransform, NoopResetEnv, MultiAction, ConditionalPolicySwitch)
+"""TorchRL's transforms that step a copy of what comes before them in their environment."""
 
 
 class KeyUsage(NamedTuple):
@@ -67,6 +73,27 @@ def check_order(transforms: Sequence[Transform]) -> None:
     for (first, a), (second, b) in itertools.combinations(usages, 2):
         if _declares_key_usage(first) or _declares_key_usage(second):
             _check_pair(first, a, second, b)
+
+
+def check_stepping(transforms: Sequence[Transform]) -> None:
+    """Refuse transforms that step a copy of damian's, which has no memory of the episode.
+
+    Args:
+        transforms: transforms of one environment, without those of an environment within it.
+
+    Raises:
+        InputError: one comes after a transform of damian; the message names both.
+    """
+    declaring = [transform for transform in transforms if _declares_key_usage(transform)]
+    stepping = [transform for transform in transforms if isinstance(transform, _STEPPING)]
+    if not (declaring and stepping):
+        return
+    first, last = declaring[0], stepping[-1]
+    names = type(first).__name__, type(last).__name__
+    if any(each is first for each in itertools.takewhile(lambda each: each is not last, transforms)):
+        around = f"TransformedEnv(env, {names[1]}(...), auto_unwrap=False)"
+        why = f"{names[1]} steps a copy of what comes before it, which has no memory; or around: {around}"
+        raise _wrong_order(names, why)
 
 
 def _check_pair(first: Transform, a: KeyUsage, second: Transform, b: KeyUsage) -> None:

@@ -209,6 +209,16 @@ def test_set_seed_repeats_a_rollout_and_worlds_and_episodes_differ():
     assert len({int(env.reset()[0]["state"].sum() * 100) for _ in range(20)}) > 3
 
 
+def test_a_seed_leaves_the_worlds_where_they_are_until_the_next_reset():
+    env, twin = (UavEnv(everything(), num_worlds=8) for _ in range(2))
+    env.reset()
+    where = env.state.position.clone()
+    for each in (env, twin):
+        each.set_seed(3)
+    assert env.state.position.equal(where)
+    assert env.reset()["state"].equal(twin.reset()["state"])
+
+
 # Compilation.
 
 

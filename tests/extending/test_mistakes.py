@@ -6,6 +6,7 @@ import pytest
 import torch
 import wrong
 from helpers import same, square
+from torchrl.envs.utils import check_env_specs
 
 from damian import make_env
 from damian.common.errors import InputError
@@ -147,6 +148,17 @@ def test_a_mistake_in_a_feature_is_one_line(name, message):
 def test_local_features_without_mistakes_are_not_refused(folder):
     names = ["wrong:flag", "features:heading", "sensor:wind_felt"]
     make_env(square(observation=ObservationConfig(names), sensors=["sensor:wind"]))
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+@pytest.mark.parametrize("name", ["flag", "precise"])
+def test_observations_and_rewards_are_float32_whatever_a_component_returns(name, delay):
+    parts = {"observation": ObservationConfig([f"wrong:{name}"], []), "delay": DelayConfig(obs=delay)}
+    env = make_env(square(**parts, reward=RewardConfig(custom=[{"term": "wrong:exact"}])), 2)
+    check_env_specs(env)
+    assert {env.rollout(3)["next", "agents", key].dtype for key in ("observation", "reward")} == {
+        torch.float32
+    }
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,12 @@ def flag(cache: FeatureCache) -> Tensor:
     return cache.messages.spotted
 
 
+@feature("local")
+def precise(cache: FeatureCache) -> Tensor:
+    """No mistake: any type of number will do."""
+    return cache.messages.battery.double() / 100
+
+
 @feature("local", high=100.0)
 def mean_battery(cache: FeatureCache) -> Tensor:
     battery = cache.messages.battery
@@ -115,6 +121,12 @@ def newest(cache: FeatureCache) -> Tensor:
 @reward_term(reads=["spotted"])
 def undeclared(features: dict[str, Tensor], counters: Counters) -> Tensor:
     return features["battery"] + features["spotted"]
+
+
+@reward_term(reads=["spotted"])
+def exact(features: dict[str, Tensor], counters: Counters) -> Tensor:
+    """No mistake: any type of number will do."""
+    return features["spotted"].double()
 
 
 @reward_term(reads=["spotted"])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 
 import damian.interop
@@ -88,6 +89,40 @@ def test_every_world_of_the_vector_environment_equals_a_single_one(actions):
                 observation, info = env.reset()
             assert np.array_equal(observations[world], observation)
             assert infos["ready"][world] == info["ready"]
+
+
+def test_the_infos_of_the_vector_environment_are_those_of_gymnasiums_own():
+    options = {"overrides": ["delay.obs=2", "episode.max_steps=7"]}
+    vector = gymnasium.make_vec("damian/Spotting-v0", num_envs=3, **options)
+    singles = [lambda: gymnasium.make("damian/Spotting-v0", **options)] * 3
+    reference = gymnasium.vector.SyncVectorEnv(singles, autoreset_mode=AutoresetMode.SAME_STEP)
+    _, infos = vector.reset(seed=4)
+    assert same_infos(infos, reference.reset(seed=4)[1])
+    vector.action_space.seed(0)
+    ended = []
+    for _ in range(30):
+        chosen = vector.action_space.sample()
+        (*_, infos), (*_, expected) = vector.step(chosen), reference.step(chosen)
+        ended.append(infos.get("_final_info", np.zeros(3, bool)))
+        assert same_infos(infos, expected)
+    assert any(0 < each.sum() < 3 for each in ended)  # one world ends, another does not
+
+
+def same_infos(infos, others):
+    """Equal names, masks and types, and equal values where the masks are true."""
+    if infos.keys() != others.keys():
+        return False
+    for name, mask in infos.items():
+        if name.startswith("_"):
+            value, other = infos[name[1:]], others[name[1:]]
+            if isinstance(value, dict):
+                equal = same_infos(value, other)
+            else:
+                equal = value.dtype == other.dtype
+                equal = equal and all(map(np.array_equal, value[mask], other[mask]))
+            if not (equal and np.array_equal(mask, others[name])):
+                return False
+    return True
 
 
 def test_gymnasiums_own_vector_wrapper_counts_the_episodes():

@@ -343,13 +343,18 @@ def test_torchrls_samplers_work_on_the_storage(sampler):
     assert replay.sample()["valid"].shape == (8, 1)
 
 
-def test_a_saved_storage_continues_in_the_same_way(tmp_path):
+@pytest.mark.parametrize("as_files", [False, True])
+def test_a_saved_storage_continues_in_the_same_way(tmp_path, as_files):
     scenario = everything("instant", episode=EpisodeConfig(max_steps=9))
     delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 40)
     one, other = buffer(scenario, 64), buffer(scenario, 64)
     one.extend(delayed[:, :25])
-    one.dumps(tmp_path)
-    other.loads(tmp_path)
+    if as_files:
+        one.dumps(tmp_path)
+        other.loads(tmp_path)
+    else:
+        other.load_state_dict(one.state_dict())
+    assert other.storage.latest().equal(one.storage.latest())
     for replay in (one, other):
         replay.extend(delayed[:, 25:])
     original, loaded = in_order(one, 40), in_order(other, 40)

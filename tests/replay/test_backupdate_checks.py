@@ -8,6 +8,8 @@ import torch
 from remote import make_env, make_storage, recompute_of, rollout, stored
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data import ReplayBuffer
+from torchrl.envs import MultiStepTransform
 
 from damian.common.errors import InputError
 from damian.replay.backupdate import BackupdateStorage
@@ -198,3 +200,13 @@ def test_no_messages_change_nothing_and_messages_need_stored_steps(group):
     before = stored(storage, rollout(make_env(group), 8)).clone()
     storage.receive(none, none if group else None, none, torch.zeros(0, 2))
     assert (storage[storage.latest()] == before).all()
+
+
+def test_steps_that_a_transform_has_joined_are_refused():
+    env = make_env(())
+    n_step = MultiStepTransform(n_steps=3, gamma=0.9)
+    buffer = ReplayBuffer(storage=make_storage((), env=env), transform=n_step, batch_size=4)
+    with pytest.raises(
+        InputError, match="transform: MultiStepTransform joins steps before they are corrected"
+    ):
+        buffer.extend(rollout(env, 20))

@@ -14,7 +14,11 @@ from torchrl.envs import (
     CatTensors,
     Compose,
     ConditionalSkip,
+    FrameSkipTransform,
+    GymEnv,
     InitTracker,
+    MultiAction,
+    NoopResetEnv,
     RandomTruncationTransform,
     RewardSum,
     SerialEnv,
@@ -217,3 +221,22 @@ def test_an_end_around_the_workers_loses_the_rewards_of_a_delay_within_them():
     assert paid([RewardDelay(2, key)], [StepCounter(4)]) == [0, 0, 1, 2] * 2
     assert paid([StepCounter(4), RewardDelay(2, key)], []) == [0, 0, 1, 2 + 3 + 4] * 2
     assert paid([], [StepCounter(4), RewardDelay(2, key)]) == [0, 0, 1, 2 + 3 + 4] * 2
+
+
+@pytest.mark.parametrize("stepping", [lambda: FrameSkipTransform(2), lambda: NoopResetEnv(2), MultiAction])
+def test_what_steps_the_environment_itself_comes_first_or_around(stepping):
+    name = type(stepping()).__name__
+    with pytest.raises(InputError, match=f"ObservationDelay must come after {name}"):
+        TransformedEnv(GymEnv("Pendulum-v1"), Compose(delay(), stepping()))
+    appended = TransformedEnv(GymEnv("Pendulum-v1"), delay())
+    appended.append_transform(stepping())
+    with pytest.raises(InputError, match=f"ObservationDelay must come after {name}"):
+        appended.reset()
+
+
+def test_a_frame_skip_before_or_around_a_delay_works():
+    delayed, skip = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(3)), FrameSkipTransform(2)
+    around = TransformedEnv(delayed, skip, auto_unwrap=False)
+    before = TransformedEnv(GymEnv("Pendulum-v1"), Compose(FrameSkipTransform(2), ObservationDelay(3)))
+    ages = [env.rollout(4)["next", "age"].flatten().tolist() for env in (around, before)]
+    assert ages == [[2, 3, 3, 3], [1, 2, 3, 3]]
