@@ -223,11 +223,11 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
 def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> list[str]:
     """Lines above the tables: the command, the number of seeds and episodes, what the columns mean."""
     rows = results.rows
-    seeds, episodes = sorted({row["seed"] for row in rows}), int(min(row["episodes"] for row in rows))
+    seeds, episodes = sorted({row["seed"] for row in rows}), sorted({int(row["episodes"]) for row in rows})
     words = [word for word in typed_words() if not word.startswith("report_only")]
     notes = [
         f"`{command(words)}`",
-        f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {episodes} episodes per evaluation",
+        f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {' or '.join(map(str, episodes))} episodes each",
         "Mean over seeds [95 % interval: stratified bootstrap over seeds, widened for few seeds; none below "
         f"{FEWEST}]; J: {config.score} of the {config.policy} policy; seen: as the server perceived it, else "
         "as it truly was; age in steps; back-updated: share of the messages in training; n: seeds",
@@ -236,7 +236,7 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
         "one of the stronger naive arm; n compared: seeds that all of these have; of ceiling: J over that of "
         "the script which knows all messages on time",
     ]
-    if len(seeds) < SEEDS or episodes < EPISODES:
+    if len(seeds) < SEEDS or episodes[0] < EPISODES:
         notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")
     return notes + ([f"missing: {', '.join(missing)}"] if missing else [])
 

@@ -33,6 +33,7 @@ _STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines
 _POINTS = 200
 """Number of points of a learning curve."""
 _NORMS_IN_A_ROW = 4
+_ARM_COLOURS = (*COLOURS, "#882255", "#999933", "#000000", "#888888")
 
 
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
@@ -84,7 +85,9 @@ def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str,
 def _curve_panel(axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str]) -> None:
     """Draw all arms of a task under a delay, by one measure; ``content`` names these three."""
     task, delay, measure = content
-    for colour, (name, arm) in zip(_colours(comparison), comparison.arms.items(), strict=True):
+    colours = _colours(comparison)
+    for name, arm in comparison.arms.items():
+        colour = colours[name]
         run = (task, delay if arm.delayed else NOT_LATE, name)
         if run in curves:
             episodes, mean, low, high = _band(curves[run], measure)
@@ -136,9 +139,10 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
 
 def _norm_panel(axis: Axes, comparison: Comparison, task: str) -> None:
     delays = comparison.delays(task)
-    arms = [name for name, arm in comparison.arms.items() if arm.delayed and not arm.ceiling]
+    finished = {row["arm"] for row in comparison.rows}
+    arms = [a for a, arm in comparison.arms.items() if a in finished and arm.delayed and not arm.ceiling]
     compared = [comparison.compared(task, delay) for delay in delays]
-    colours = dict(zip(comparison.arms, _colours(comparison), strict=True))
+    colours = _colours(comparison)
     for index, arm in enumerate(arms):
         norms = [(x, estimates[arm].j_norm) for x, estimates in enumerate(compared) if arm in estimates]
         positions = [x + 0.7 * ((index + 0.5) / len(arms) - 0.5) for x, _ in norms]
@@ -219,6 +223,6 @@ def _references(axis: Axes, comparison: Comparison, task: str) -> None:
             axis.annotate(label, (0.01, level), xycoords=("axes fraction", "data"), fontsize=6, va="bottom")
 
 
-def _colours(comparison: Comparison) -> list[str]:
-    """Colour of each arm."""
-    return [COLOURS[index % len(COLOURS)] for index in range(len(comparison.arms))]
+def _colours(comparison: Comparison) -> dict[str, str]:
+    """Colour of each arm; no two are the same of up to ten arms."""
+    return {arm: _ARM_COLOURS[i % len(_ARM_COLOURS)] for i, arm in enumerate(comparison.arms)}

@@ -1,5 +1,7 @@
 """Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables and figures of them."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -205,3 +207,14 @@ def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finis
     plot_curves(one, curves, {"steps": 1.0}, tmp_path / "one.png")
     names = ("curves.png", "norms.png", "delays.png", "one.png")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in names)
+
+
+def test_a_figure_has_a_colour_for_each_arm_and_names_only_those_with_results(tmp_path):
+    names = [f"arm{number}" for number in range(6)]
+    scores = THREE | {name: [2.0, 3.0, 4.0] for name in names}
+    arms = {name: ARMS.get(name, Arm()) for name in ("best", "blind", *names, "unfinished")}
+    comparison = Comparison(rows_of("t", "late", {name: scores[name] for name in [*arms][:-1]}), arms)
+    plot_norms(comparison, tmp_path / "norms.svg")
+    drawn = (tmp_path / "norms.svg").read_text()
+    assert set(re.findall("<!-- (arm.|blind|unfinished) -->", drawn)) == {"blind", *names}
+    assert len(set(re.findall("fill: (#[0-9a-f]{6}); stroke: #", drawn))) == len(names) + 1
