@@ -190,7 +190,7 @@ class Simulation:
         It is 0 where no action leads to another landing point, which no battery can change.
         """
         if self.config.actions.kind == "discrete":
-            length = self.candidates.ranking.distance.view(len(self.points), -1)
+            length = self.candidates.distance  # if this point is out of reach, the UAV holds
             length = length.where(length > 0, torch.inf).amin(-1)
         else:
             length = torch.cat([_nearest_other(points) for points in self.airspace.points])
