@@ -1,6 +1,7 @@
 """Settings of the region, of its landing points, and of the positions where the UAVs start."""
 
 import inspect
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from importlib.resources import files
@@ -16,6 +17,9 @@ from damian.world.regions.geojson import read_geojson
 from damian.world.regions.places import check_places
 from damian.world.regions.polygon import polygon_from_vertices, random_polygon
 from damian.world.regions.region import Region, centred, check_regions
+
+CENTIMETRE = 0.01
+"""Distances to landing points are compared to this [m]."""
 
 
 @dataclass
@@ -69,6 +73,11 @@ class RegionConfig:
         checks.above("region.lattice_step", self.lattice_step, 0.0, "m")
         checks.above("region.lattice_angle", self.lattice_angle, 0.0, "deg")
         checks.in_range("region.lattice_angle", self.lattice_angle, 0.0, 90.0, "deg")
+        apart = self.lattice_step * math.sin(math.radians(self.lattice_angle))
+        problem = (
+            f"lays rows of landing points {apart:g} m apart, but places are told apart to {CENTIMETRE:g} m"
+        )
+        checks.require(apart >= CENTIMETRE, "region.lattice_step", f"{self.lattice_step:g} m", problem)
         if self.n_landing_points is not None:
             checks.in_range("region.n_landing_points", self.n_landing_points, 1)
         required_keys = {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}
