@@ -11,7 +11,7 @@ import shapely
 import torch
 from torch import Tensor
 
-from damian.common import counter_rng
+from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
@@ -38,6 +38,9 @@ class Simulation:
     """
 
     def __init__(self, config: WorldConfig, dt: float, trail: int, seed: int) -> None:
+        dtype, remedy = torch.get_default_dtype(), "call torch.set_default_dtype(torch.float32) first"
+        problem = f"is not torch.float32, in which the worlds compute: {remedy}"
+        checks.require(dtype == torch.float32, "torch.get_default_dtype()", dtype, problem)
         rng = np.random.default_rng(seed)
         self.config, self.dt = config, dt
         self.sensors = sensors_of(config.sensors)

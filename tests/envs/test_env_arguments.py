@@ -109,6 +109,18 @@ def test_settings_may_be_numbers_and_arrays_of_numpy_and_torch():
     assert make_env(made, 2).rollout(2).shape == (2, 2)
 
 
+@pytest.mark.parametrize("make", [make_env, UavEnv])
+def test_floats_of_64_bits_are_refused_before_anything_is_drawn(make):
+    torch.set_default_dtype(torch.float64)
+    try:
+        with pytest.raises(
+            InputError, match=r"float64 is not torch\.float32, in which the worlds compute: call"
+        ):
+            make(square())
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 @pytest.mark.parametrize("agents", [2.0, "2", True])
 def test_a_number_of_uavs_that_is_not_whole_is_refused(agents):
     with pytest.raises(InputError, match=f"agents: {agents} is not a whole number"):
