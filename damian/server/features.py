@@ -73,11 +73,10 @@ class ObservationConfig:
         checks.above("observation.age_scale", self.age_scale, 0.0, "s")
         checks.one_of("observation.estimate", self.estimate, ("mean", "newest"))
         checks.in_range("observation.window", self.window, 1, 16)
+        blind = "actor" if not self.actor else "critic"  # which does not observe ages
+        problem = f"leaves the {blind} blind"
         checks.require(
-            bool(self.actor),
-            "observation.local_features",
-            self.local_features,
-            "leaves the actor blind",
+            bool(self.critic and self.actor), "observation.local_features", self.local_features, problem
         )
 
     @property

@@ -14,6 +14,7 @@ from damian.common.errors import InputError
 from damian.envs.scenario import ScenarioConfig, make_simulation
 from damian.envs.uav_env import UavEnv
 from damian.recipes.shared.launch import unknown_keys
+from damian.server.features import ObservationConfig
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
@@ -78,3 +79,11 @@ def test_every_number_of_the_settings_must_be_finite(section):
     for name, value in itertools.product(numbers, [math.nan, math.inf, -math.inf]):
         with pytest.raises(InputError, match=rf"^{section or name}.*: -?(nan|inf) "):
             replace(config, **{name: value})
+
+
+@pytest.mark.parametrize("age", [False, True])
+def test_a_single_uav_must_observe_more_than_its_distances_to_others(age):
+    observation = ObservationConfig(local_features=[], global_features=["agent_distances"], age=age)
+    with pytest.raises(InputError, match="agent_distances is empty for a single UAV"):
+        ScenarioConfig(agents=1, observation=observation)
+    assert ScenarioConfig(agents=2, observation=observation).observation.critic == ["agent_distances"]
