@@ -48,9 +48,7 @@ def require(condition: bool, key: str, value: Any, should: str) -> None:
 
 
 _KINDS = {
-    int: "a whole number",
     bool: "true or false",
-    str: "a text",
     list: "a list of places such as [[0, 0], [100, 50]]",
 }
 
@@ -59,7 +57,7 @@ def types(section: str, settings: Any) -> None:
     """Require that the fields of a dataclass of settings have the types that they declare.
 
     Arrays and numbers of NumPy and torch become plain ones, and numbers where a text is wanted (a time such
-    as 2) texts, in place. The other checks refuse what is no number, or not in their bounds.
+    as 2) texts, in place. The other checks refuse what is no number or text, or not in their bounds.
 
     Args:
         section: of the settings, such as ``region``, for errors; empty for those of a whole scenario.
@@ -72,11 +70,10 @@ def types(section: str, settings: Any) -> None:
         kind = get_origin(choices[0]) or choices[0]
         value = str(value) if kind is str and _is_number(value) else value
         setattr(settings, field.name, value)
-        if kind in (Any, float) or (value is None and type(None) in choices):
+        if kind in (Any, int, float, str) or (value is None and type(None) in choices):
             continue
-        good = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
         key = f"{section}.{field.name}".lstrip(".")
-        require(good, key, value, f"is not {_KINDS.get(choices[0], f'a {kind.__name__}')}")
+        require(isinstance(value, kind), key, value, f"is not {_KINDS.get(choices[0], f'a {kind.__name__}')}")
 
 
 def _plain(value: Any) -> Any:

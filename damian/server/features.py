@@ -72,7 +72,7 @@ class ObservationConfig:
             checks.above("observation.time_scale", self.time_scale, 0.0, "s")
         checks.above("observation.age_scale", self.age_scale, 0.0, "s")
         checks.one_of("observation.estimate", self.estimate, ("mean", "newest"))
-        checks.in_range("observation.window", self.window, 1, 16)
+        checks.whole("observation.window", self.window, 1, 16)
         blind = "actor" if not self.actor else "critic"  # which does not observe ages
         problem = f"leaves the {blind} blind"
         checks.require(

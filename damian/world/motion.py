@@ -47,7 +47,7 @@ class MotionConfig:
 
     def __post_init__(self) -> None:
         checks.types("motion", self)
-        if ":" not in self.kind:  # ``damian.world.vehicles`` imports one's own
+        if ":" not in str(self.kind):  # ``damian.world.vehicles`` imports one's own
             checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
             problem = f"mean nothing with motion.kind={self.kind}"
             checks.require(self.options is None, "motion.options", self.options, problem)

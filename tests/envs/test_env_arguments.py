@@ -72,7 +72,7 @@ TYPES: dict[str, Callable[[], Any]] = {
     "episode.max_steps: 2.5 is not a whole number": lambda: EpisodeConfig(2.5),  # type: ignore[arg-type]
     "observation.window: True is not a whole number": lambda: ObservationConfig(window=True),
     "battery.enabled: false is not true or false": lambda: BatteryConfig("false"),  # type: ignore[arg-type]
-    "motion.kind: None is not a text": lambda: MotionConfig(None),  # type: ignore[arg-type]
+    "motion.kind: None is not one of instant, polynomial": lambda: MotionConfig(None),  # type: ignore[arg-type]
     "actions.distances: 100.0 is not a list": lambda: ActionConfig(distances=100.0),  # type: ignore[arg-type]
     "sensors: 3 is not a list": lambda: ScenarioConfig(sensors=3),  # type: ignore[arg-type]
     "delay: 3 is not a DelayConfig": lambda: ScenarioConfig(delay=3),  # type: ignore[arg-type]

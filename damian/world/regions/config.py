@@ -68,8 +68,8 @@ class RegionConfig:
         REGION_SOURCES.get(self.kind, "region.kind")
         checks.above("region.min_area", self.min_area, 0.0, "m^2")
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
-        checks.in_range("region.pool", self.pool, 1, 10_000)
-        checks.in_range("region.initial_conditions", self.initial_conditions, self.pool, checks.WORLDS)
+        checks.whole("region.pool", self.pool, 1, 10_000)
+        checks.whole("region.initial_conditions", self.initial_conditions, self.pool, checks.WORLDS)
         checks.above("region.lattice_step", self.lattice_step, 0.0, "m")
         checks.above("region.lattice_angle", self.lattice_angle, 0.0, "deg")
         checks.in_range("region.lattice_angle", self.lattice_angle, 0.0, 90.0, "deg")
@@ -79,7 +79,7 @@ class RegionConfig:
         )
         checks.require(apart >= CENTIMETRE, "region.lattice_step", f"{self.lattice_step:g} m", problem)
         if self.n_landing_points is not None:
-            checks.in_range("region.n_landing_points", self.n_landing_points, 1)
+            checks.whole("region.n_landing_points", self.n_landing_points, 1)
         required_keys = {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}
         for key in required_keys.get(self.kind, []):
             problem = f"is missing: region.kind={self.kind} needs it"
