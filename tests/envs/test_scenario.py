@@ -26,10 +26,14 @@ def test_a_scenario_needs_no_hydra_and_no_yaml():
     assert airspace.n_points.min() >= 5
 
 
-def test_more_uavs_than_landing_points_are_refused():
-    region = RegionConfig(kind="vertices", vertices=[[0, 0], [100, 0], [100, 100], [0, 100]])
+@pytest.mark.parametrize(
+    ("kept", "remedy"), [(None, r"region.lattice_step \(30 m\)"), (4, r"raise region.n_landing_points \(4\)")]
+)
+def test_more_uavs_than_landing_points_are_refused(kept, remedy):
+    vertices = [[0, 0], [100, 0], [100, 100], [0, 100]]
+    region = RegionConfig(kind="vertices", vertices=vertices, n_landing_points=kept)
     config = ScenarioConfig(agents=30, region=region)
-    with pytest.raises(InputError, match="agents: 30 UAVs need as many landing points"):
+    with pytest.raises(InputError, match=f"agents: 30 UAVs need as many landing points, .*{remedy}"):
         config.airspace(np.random.default_rng(0))
 
 
