@@ -51,7 +51,9 @@ class Simulation:
         self.walk = drawn.walk
         self.vehicles = make_model(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
-        self.shortest_flight = self._shortest_flights() if config.battery.enabled else None
+        shortest = self._shortest_flights()
+        self._require_moves(shortest)
+        self.shortest_flight = shortest if config.battery.enabled else None
         self.initial = self._initial_state(drawn, trail, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)
@@ -198,6 +200,25 @@ class Simulation:
         else:
             length = torch.cat([_nearest_other(points) for points in self.airspace.points])
         return length.where(length.isfinite(), 0.0)
+
+    def _require_moves(self, shortest: Tensor) -> None:
+        """Refuse actions none of which leads from any landing point to another one.
+
+        Args:
+            shortest: as ``_shortest_flights`` returns it.
+        """
+        actions = self.config.actions
+        moves = shortest > 0
+        if (
+            actions.kind == "continuous"
+        ):  # beyond half of the way to another landing point, that one is nearer
+            moves = moves & (shortest < 2 * self.candidates.max_distance)
+        problem = (
+            "[m] lead from no landing point to another one: rows of these have a point every "
+            f"{self.config.region.lattice_step:g} m (region.lattice_step), and no target may lie outside"
+        )
+        alone = self.airspace.max_points == 1
+        checks.require(alone or bool(moves.any()), "actions.distances", actions.distances, problem)
 
     def _readings(self, state: State) -> Tensor:
         """Readings of all sensors beside each other, [B, N, K]."""
