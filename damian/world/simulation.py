@@ -209,9 +209,7 @@ class Simulation:
         """
         actions = self.config.actions
         moves = shortest > 0
-        if (
-            actions.kind == "continuous"
-        ):  # beyond half of the way to another landing point, that one is nearer
+        if actions.kind == "continuous":  # a landing point is nearest beyond half of the way to it
             moves = moves & (shortest < 2 * self.candidates.max_distance)
         problem = (
             "[m] lead from no landing point to another one: rows of these have a point every "
