@@ -4,10 +4,12 @@ Every number has a largest sensible value, even where a check names none, becaus
 and time and memory run out, long before a computer refuses a number.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import torch
 
@@ -43,6 +45,42 @@ def require(condition: bool, key: str, value: Any, should: str) -> None:
     text = str(value)
     shown = text if len(text) <= _SHOWN else f"{text[: _SHOWN // 2]}...{text[-_SHOWN // 4 :]}"
     raise InputError(f"{key}: {shown} {should}")
+
+
+_KINDS = {
+    bool: "true or false",
+    list: "a list of places such as [[0, 0], [100, 50]]",
+}
+
+
+def types(section: str, settings: Any) -> None:
+    """Require that the fields of a dataclass of settings have the types that they declare.
+
+    Arrays and numbers of NumPy and torch become plain ones, and numbers where a text is wanted (a time such
+    as 2) texts, in place. The other checks refuse what is no number or text, or not in their bounds.
+
+    Args:
+        section: of the settings, such as ``region``, for errors; empty for those of a whole scenario.
+        settings: instance of the dataclass.
+    """
+    hints = get_type_hints(type(settings))
+    for field in dataclasses.fields(settings):
+        value, declared = _plain(getattr(settings, field.name)), hints[field.name]
+        choices = get_args(declared) if get_origin(declared) is UnionType else (declared,)
+        kind = get_origin(choices[0]) or choices[0]
+        value = str(value) if kind is str and _is_number(value) else value
+        setattr(settings, field.name, value)
+        if kind in (Any, int, float, str) or (value is None and type(None) in choices):
+            continue
+        key = f"{section}.{field.name}".lstrip(".")
+        require(isinstance(value, kind), key, value, f"is not {_KINDS.get(choices[0], f'a {kind.__name__}')}")
+
+
+def _plain(value: Any) -> Any:
+    """A value with Python's own lists and numbers instead of those of NumPy and torch."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [_plain(each) for each in value] if type(value) in (list, tuple) else value
 
 
 def in_range(key: str, value: float, low: float, high: float | None = None, unit: str = "") -> None:

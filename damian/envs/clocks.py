@@ -34,6 +34,7 @@ class ClockConfig:
     """Discount per simulation step of the rewards within a step that ``skip`` makes longer."""
 
     def __post_init__(self) -> None:
+        checks.types("clock", self)
         fast, triggered = ("simulation", "agents", "server"), ("trigger", "shortest", "longest")
         for slower, faster in itertools.permutations((*fast, "system"), 2):
             if self._seconds(slower) >= self._seconds(faster) or faster == "simulation":

@@ -39,7 +39,7 @@ class ScenarioConfig(WorldConfig):
         messages, links = self.delay.messages, self.links.kind
         problem = f"does not go with links={links}: a UAV would get the messages that the server has received"
         checks.require(not messages or links == "server", "delay.messages", messages, problem)
-        empty = self.agents == 1 and self.observation.actor == ["agent_distances"]
+        empty = self.agents == 1 and self.observation.critic == ["agent_distances"]
         problem = "is empty for a single UAV: add another feature"
         checks.require(not empty, "observation", "agent_distances", problem)
 

@@ -58,6 +58,7 @@ class ObservationConfig:
     """Number of each UAV's latest landing points whose footprints the coverage counts."""
 
     def __post_init__(self) -> None:
+        checks.types("observation", self)
         for scope in ("local", "global"):
             for name in getattr(self, f"{scope}_features"):
                 check_feature(f"observation.{scope}_features", name, scope)
@@ -71,12 +72,11 @@ class ObservationConfig:
             checks.above("observation.time_scale", self.time_scale, 0.0, "s")
         checks.above("observation.age_scale", self.age_scale, 0.0, "s")
         checks.one_of("observation.estimate", self.estimate, ("mean", "newest"))
-        checks.in_range("observation.window", self.window, 1, 16)
+        checks.whole("observation.window", self.window, 1, 16)
+        blind = "actor" if not self.actor else "critic"  # which does not observe ages
+        problem = f"leaves the {blind} blind"
         checks.require(
-            bool(self.actor),
-            "observation.local_features",
-            self.local_features,
-            "leaves the actor blind",
+            bool(self.critic and self.actor), "observation.local_features", self.local_features, problem
         )
 
     @property

@@ -70,9 +70,12 @@ def build_airspace(
     lattices = [landing_lattice(r.polygon, step_m, degrees, n_points) for r in regions]
     for region, lattice in zip(regions, lattices, strict=True):
         if len(lattice) < n_agents:
+            remedy = f"lower agents or region.lattice_step ({step_m:g} m)"
+            if n_points is not None:
+                remedy = f"lower agents, or raise region.n_landing_points ({n_points})"
             raise InputError(
                 f"agents: {n_agents} UAVs need as many landing points, but {region.name} has "
-                f"{len(lattice)}; lower agents or region.lattice_step ({step_m:g} m)"
+                f"{len(lattice)}; {remedy}"
             )
     edges = [_edges(region.polygon) for region in regions]
     points = _padded(lattices, torch.inf)

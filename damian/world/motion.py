@@ -46,7 +46,8 @@ class MotionConfig:
     """Settings of a motion model of one's own, as a mapping."""
 
     def __post_init__(self) -> None:
-        if ":" not in self.kind:  # ``damian.world.vehicles`` imports one's own
+        checks.types("motion", self)
+        if ":" not in str(self.kind):  # ``damian.world.vehicles`` imports one's own
             checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
             problem = f"mean nothing with motion.kind={self.kind}"
             checks.require(self.options is None, "motion.options", self.options, problem)

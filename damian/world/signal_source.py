@@ -73,6 +73,7 @@ class SourceConfig:
         return 1.0 if self.emission == "constant" else self.emission_probability
 
     def __post_init__(self) -> None:
+        checks.types("source", self)
         checks.in_range("source.microphone_db", self.microphone_db, 0.0, unit="dB")
         checks.in_range("source.level_db", self.level_db, -300.0, 300.0, "dB")
         checks.require(
@@ -99,9 +100,9 @@ class SourceConfig:
         checks.in_range("source.emission_probability", self.emission_probability, 0.0, 1.0)
         if self.position is not None:
             check_place("source.position", self.position)
-        checks.in_range("source.n_hotspots", self.n_hotspots, 1, 1000)
-        checks.in_range("source.min_stops", self.min_stops, 1)
-        checks.in_range("source.max_stops", self.max_stops, self.min_stops, 1000)
+        checks.whole("source.n_hotspots", self.n_hotspots, 1, 1000)
+        checks.whole("source.min_stops", self.min_stops, 1)
+        checks.whole("source.max_stops", self.max_stops, self.min_stops, 1000)
         for name in ("speed", "local_speed"):
             checks.above(f"source.{name}", getattr(self, name), 0.0, "m/s")
         for name in ("acceleration", "local_acceleration"):

@@ -11,7 +11,7 @@ import shapely
 import torch
 from torch import Tensor
 
-from damian.common import counter_rng
+from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
@@ -38,6 +38,9 @@ class Simulation:
     """
 
     def __init__(self, config: WorldConfig, dt: float, trail: int, seed: int) -> None:
+        dtype, remedy = torch.get_default_dtype(), "call torch.set_default_dtype(torch.float32) first"
+        problem = f"is not torch.float32, in which the worlds compute: {remedy}"
+        checks.require(dtype == torch.float32, "torch.get_default_dtype()", dtype, problem)
         rng = np.random.default_rng(seed)
         self.config, self.dt = config, dt
         self.sensors = sensors_of(config.sensors)
@@ -48,7 +51,9 @@ class Simulation:
         self.walk = drawn.walk
         self.vehicles = make_model(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
-        self.shortest_flight = self._shortest_flights() if config.battery.enabled else None
+        shortest = self._shortest_flights()
+        self._require_moves(shortest)
+        self.shortest_flight = shortest if config.battery.enabled else None
         self.initial = self._initial_state(drawn, trail, seed)
         self.layout = StateLayout(self.initial)
         self.packed_initial = self.layout.pack(self.initial)
@@ -190,11 +195,28 @@ class Simulation:
         It is 0 where no action leads to another landing point, which no battery can change.
         """
         if self.config.actions.kind == "discrete":
-            length = self.candidates.ranking.distance.view(len(self.points), -1)
+            length = self.candidates.distance  # if this point is out of reach, the UAV holds
             length = length.where(length > 0, torch.inf).amin(-1)
         else:
             length = torch.cat([_nearest_other(points) for points in self.airspace.points])
         return length.where(length.isfinite(), 0.0)
+
+    def _require_moves(self, shortest: Tensor) -> None:
+        """Refuse actions none of which leads from any landing point to another one.
+
+        Args:
+            shortest: as ``_shortest_flights`` returns it.
+        """
+        actions = self.config.actions
+        moves = shortest > 0
+        if actions.kind == "continuous":  # a landing point is nearest beyond half of the way to it
+            moves = moves & (shortest < 2 * self.candidates.max_distance)
+        problem = (
+            "[m] lead from no landing point to another one: rows of these have a point every "
+            f"{self.config.region.lattice_step:g} m (region.lattice_step), and no target may lie outside"
+        )
+        alone = self.airspace.max_points == 1
+        checks.require(alone or bool(moves.any()), "actions.distances", actions.distances, problem)
 
     def _readings(self, state: State) -> Tensor:
         """Readings of all sensors beside each other, [B, N, K]."""

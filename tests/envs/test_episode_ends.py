@@ -116,17 +116,19 @@ def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding
 
 @both_motions
 @both_kinds
-def test_a_landed_uav_is_empty_exactly_where_no_action_leads_to_another_point(motion, kind):
+@pytest.mark.parametrize("agents", [1, 3])
+def test_a_landed_uav_is_empty_exactly_where_no_action_leads_to_another_point(motion, kind, agents):
     battery = BatteryConfig(enabled=True, capacity_kwh=0.02, resolution=1e-3, charging_points=CORNER)
     region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0)
-    headings = [10.0 * n for n in range(36)]
-    actions = ActionConfig(kind=kind, distances=[0.0, 10.0, 20.0, 40.0, 60.0], headings=headings)
-    scenario = ScenarioConfig(
-        agents=1, region=region, battery=battery, motion=MOTIONS[motion], actions=actions, episode=KEEPS_GOING
-    )
+    distances, headings = [0.0, 10.0, 20.0, 40.0, 60.0], [10.0 * n for n in range(36)]
+    if kind == "discrete" and agents > 1:  # the second nearest point to a target is often the nearer one
+        distances, headings = [0.0, 60.0], [0.0, 90.0, 180.0, 270.0]
+    actions = ActionConfig(kind=kind, distances=distances, headings=headings)
+    settings = {"region": region, "battery": battery, "motion": MOTIONS[motion], "actions": actions}
     table = actions.table()
-    env = fresh(scenario, num_worlds=len(table))
+    env = fresh(ScenarioConfig(agents=agents, episode=KEEPS_GOING, **settings), num_worlds=len(table))
     moves = torch.arange(len(table)) if kind == "discrete" else table / torch.tensor([60.0, math.tau])
+    moves = torch.stack([moves] * agents, 1)  # all stand on one point, and the first one chooses first
     generator, start = torch.Generator().manual_seed(0), env.state
     seen = []
     for level in torch.linspace(0.5, 40.0, 60).tolist():
@@ -135,8 +137,8 @@ def test_a_landed_uav_is_empty_exactly_where_no_action_leads_to_another_point(mo
         state = start._replace(goal=points, battery=torch.full_like(start.battery, level))
         expected = bool(env.simulation._empty(state, torch.ones_like(start.message_sent))[0, 0])
         env.state = state
-        act(env, moves.unsqueeze(1))
-        assert (env.state.goal == points).all().item() == expected
+        act(env, moves)
+        assert (env.state.goal == points)[:, 0].all().item() == expected
         seen.append(expected)
     assert 5 < sum(seen) < 55
 

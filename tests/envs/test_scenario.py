@@ -14,6 +14,7 @@ from damian.common.errors import InputError
 from damian.envs.scenario import ScenarioConfig, make_simulation
 from damian.envs.uav_env import UavEnv
 from damian.recipes.shared.launch import unknown_keys
+from damian.server.features import ObservationConfig
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
@@ -25,10 +26,14 @@ def test_a_scenario_needs_no_hydra_and_no_yaml():
     assert airspace.n_points.min() >= 5
 
 
-def test_more_uavs_than_landing_points_are_refused():
-    region = RegionConfig(kind="vertices", vertices=[[0, 0], [100, 0], [100, 100], [0, 100]])
+@pytest.mark.parametrize(
+    ("kept", "remedy"), [(None, r"region.lattice_step \(30 m\)"), (4, r"raise region.n_landing_points \(4\)")]
+)
+def test_more_uavs_than_landing_points_are_refused(kept, remedy):
+    vertices = [[0, 0], [100, 0], [100, 100], [0, 100]]
+    region = RegionConfig(kind="vertices", vertices=vertices, n_landing_points=kept)
     config = ScenarioConfig(agents=30, region=region)
-    with pytest.raises(InputError, match="agents: 30 UAVs need as many landing points"):
+    with pytest.raises(InputError, match=f"agents: 30 UAVs need as many landing points, .*{remedy}"):
         config.airspace(np.random.default_rng(0))
 
 
@@ -78,3 +83,11 @@ def test_every_number_of_the_settings_must_be_finite(section):
     for name, value in itertools.product(numbers, [math.nan, math.inf, -math.inf]):
         with pytest.raises(InputError, match=rf"^{section or name}.*: -?(nan|inf) "):
             replace(config, **{name: value})
+
+
+@pytest.mark.parametrize("age", [False, True])
+def test_a_single_uav_must_observe_more_than_its_distances_to_others(age):
+    observation = ObservationConfig(local_features=[], global_features=["agent_distances"], age=age)
+    with pytest.raises(InputError, match="agent_distances is empty for a single UAV"):
+        ScenarioConfig(agents=1, observation=observation)
+    assert ScenarioConfig(agents=2, observation=observation).observation.critic == ["agent_distances"]

@@ -183,6 +183,10 @@ def test_a_feature_cannot_declare_an_impossible_width_or_range(declared, message
             {"local_features": [], "ctde": True},
             "observation.local_features: [] leaves the actor blind",
         ),
+        (
+            {"local_features": [], "global_features": [], "age": True},
+            "observation.local_features: [] leaves the critic blind",
+        ),
     ],
 )
 def test_an_error_names_the_setting_of_the_observation_and_its_value(changed, message):

@@ -8,7 +8,7 @@ import shapely
 import torch
 import twin
 from exact_distance import nearest_by_loop
-from helpers import heading
+from helpers import SQUARE, both_kinds, heading
 from hypothesis import given
 from hypothesis import strategies as st
 from shapely.affinity import scale, translate
@@ -17,6 +17,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from damian.common.errors import InputError
 from damian.world import landing
 from damian.world.airspace import build_airspace, inside
+from damian.world.config import WorldConfig
 from damian.world.landing import (
     ActionConfig,
     Candidates,
@@ -25,7 +26,9 @@ from damian.world.landing import (
     assign_landing_points,
     displacement,
 )
+from damian.world.regions.config import RegionConfig
 from damian.world.regions.region import Region
+from damian.world.simulation import Simulation
 
 
 def random_bookings(seed, n_worlds, n_agents, n_points, together):
@@ -315,3 +318,18 @@ def test_wrong_actions_are_named_with_their_value_and_unit(changed, message):
     with pytest.raises(InputError) as error:
         ActionConfig(**changed)
     assert str(error.value) == message
+
+
+@both_kinds
+def test_actions_that_lead_nowhere_are_refused_unless_there_is_one_landing_point(kind):
+    def build(distance, kept=None):
+        region = RegionConfig("vertices", vertices=SQUARE, n_landing_points=kept, initial_conditions=1)
+        actions = ActionConfig(kind, distances=[0.0, distance], headings=[90.0])
+        return Simulation(WorldConfig(agents=1, region=region, actions=actions), 1.0, trail=1, seed=0)
+
+    with pytest.raises(
+        InputError, match=r"actions.distances: \[0.0, 10.0\] \[m\] lead from no landing point"
+    ):
+        build(10.0)
+    assert build(16.0).candidates.max_distance == 16.0
+    assert build(10.0, kept=1).airspace.max_points == 1

@@ -200,3 +200,12 @@ def test_a_setting_that_the_kind_of_region_does_not_read_is_refused(settings, va
 def test_a_region_that_vanishes_once_rounded_is_refused():
     with pytest.raises(InputError, match=r"^tiny: .* once rounded to 1/65536 m: draw it larger"):
         centred(Region(shapely.Polygon([(0, 0), (1e-6, 0), (0, 1e-6)]), "tiny"))
+
+
+def test_a_lattice_whose_points_cannot_be_told_apart_is_refused():
+    with pytest.raises(InputError) as error:
+        RegionConfig(lattice_step=0.04, lattice_angle=7.0)
+    assert str(error.value) == (
+        "region.lattice_step: 0.04 m lays rows of landing points 0.00487477 m apart, but places are told "
+        "apart to 0.01 m"
+    )

@@ -123,9 +123,9 @@ def test_shifting_a_symmetric_polygon_keeps_the_order_of_its_landing_points():
 @pytest.mark.parametrize(
     ("step", "degrees", "n", "message"),
     [
-        (500, 45, None, "0 lie inside the polygon of 10000 m^2"),
-        (30, 45, 50, "the 50 wanted"),
-        (30, 45, 0, "landing points: 0"),
+        (500, 45, None, "region.lattice_step: 500 m lays no landing point inside the polygon of 10000 m^2"),
+        (30, 45, 50, "region.n_landing_points: 50 is more than the 12 inside the polygon: lower it, or"),
+        (30, 45, 0, "region.n_landing_points: 0"),
         (0, 45, None, "lattice step: 0 m"),
         (-3, 45, None, "lattice step: -3 m"),
         (math.nan, 45, None, "lattice step: nan m"),

@@ -1,6 +1,7 @@
 """Settings of the region, of its landing points, and of the positions where the UAVs start."""
 
 import inspect
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from importlib.resources import files
@@ -16,6 +17,9 @@ from damian.world.regions.geojson import read_geojson
 from damian.world.regions.places import check_places
 from damian.world.regions.polygon import polygon_from_vertices, random_polygon
 from damian.world.regions.region import Region, centred, check_regions
+
+CENTIMETRE = 0.01
+"""Distances to landing points are compared to this [m]."""
 
 
 @dataclass
@@ -60,16 +64,22 @@ class RegionConfig:
     """Settings of a region source of one's own, as a mapping."""
 
     def __post_init__(self) -> None:
+        checks.types("region", self)
         REGION_SOURCES.get(self.kind, "region.kind")
         checks.above("region.min_area", self.min_area, 0.0, "m^2")
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
-        checks.in_range("region.pool", self.pool, 1, 10_000)
-        checks.in_range("region.initial_conditions", self.initial_conditions, self.pool, checks.WORLDS)
+        checks.whole("region.pool", self.pool, 1, 10_000)
+        checks.whole("region.initial_conditions", self.initial_conditions, self.pool, checks.WORLDS)
         checks.above("region.lattice_step", self.lattice_step, 0.0, "m")
         checks.above("region.lattice_angle", self.lattice_angle, 0.0, "deg")
         checks.in_range("region.lattice_angle", self.lattice_angle, 0.0, 90.0, "deg")
+        apart = self.lattice_step * math.sin(math.radians(self.lattice_angle))
+        problem = (
+            f"lays rows of landing points {apart:g} m apart, but places are told apart to {CENTIMETRE:g} m"
+        )
+        checks.require(apart >= CENTIMETRE, "region.lattice_step", f"{self.lattice_step:g} m", problem)
         if self.n_landing_points is not None:
-            checks.in_range("region.n_landing_points", self.n_landing_points, 1)
+            checks.whole("region.n_landing_points", self.n_landing_points, 1)
         required_keys = {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}
         for key in required_keys.get(self.kind, []):
             problem = f"is missing: region.kind={self.kind} needs it"

@@ -131,15 +131,14 @@ def landing_lattice(
     lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
     shapely.prepare(polygon)
     inside = lattice[shapely.contains_xy(polygon, lattice)]
-    n_required = 1 if n_points is None else n_points
-    checks.in_range("landing points", n_required, 1)
-    checks.require(
-        len(inside) >= n_required,
-        "landing points",
-        len(inside),
-        f"lie inside the polygon of {polygon.area:g} m^2, fewer than the {n_required} wanted; take a "
-        f"lattice step below {step_m:g} m",
-    )
+    problem = f"lays no landing point inside the polygon of {polygon.area:g} m^2; take a shorter one"
+    checks.require(len(inside) > 0, "region.lattice_step", f"{step_m:g} m", problem)
+    if n_points is not None:
+        checks.in_range("region.n_landing_points", n_points, 1)
+        problem = f"is more than the {len(inside)} inside the polygon: lower it, or region.lattice_step"
+        checks.require(
+            n_points <= len(inside), "region.n_landing_points", n_points, f"{problem} ({step_m:g} m)"
+        )
     return _by_direction(inside, shapely.get_coordinates(polygon.centroid)[0], n_points)
 
 
