@@ -2,7 +2,10 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 
+from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.comparison import (
     ALL_MESSAGES,
     GREEDY,
@@ -205,3 +208,52 @@ def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finis
     plot_curves(one, curves, {"steps": 1.0}, tmp_path / "one.png")
     names = ("curves.png", "norms.png", "delays.png", "one.png")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in names)
+
+
+def drawn(monkeypatch, draw) -> Figure:
+    """The figure that a function draws instead of saving it."""
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kwargs: figures.append(figure))
+    draw()
+    return figures[-1]
+
+
+def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other_one(monkeypatch, tmp_path):
+    names = [f"arm {i}" for i in range(2 * len(COLOURS) - 2)]
+    arms = {"best": Arm(delayed=False), "blind": Arm(naive=True)} | {name: Arm() for name in names}
+    arms |= {"unfinished": Arm(), "script": Arm(ceiling=True)}
+    scores = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3]} | {name: [6.0, 9, 7] for name in names}
+    comparison = Comparison(rows_of("t", "late", scores), arms)
+    panels = {"all": [*names, "unfinished", "left out"], "none": ["left out"]}
+    path = tmp_path / "figure.png"
+    norms = drawn(monkeypatch, lambda: plot_norms(comparison, path))
+    delays = drawn(monkeypatch, lambda: plot_delays(comparison, panels, path))
+    assert len(delays.axes) == 2
+    for axis, expected in ((norms.axes[0], ["blind", *names]), (delays.axes[0], names)):
+        assert axis.get_legend_handles_labels()[1] == expected
+        lines = [bars[0] for bars in axis.containers]
+        assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(expected)
+
+
+def test_a_figure_has_no_empty_panel_and_an_old_one_is_removed_where_nothing_is_known(monkeypatch, tmp_path):
+    unknown = [each | {"true_return": np.nan} for each in rows_of("u", "late", SCORES)]
+    comparison = Comparison(unknown + rows_of("t", "late", SCORES), ARMS)
+    path = tmp_path / "figure.png"
+    figure = drawn(monkeypatch, lambda: plot_norms(comparison, path))
+    assert [axis.get_title() for axis in figure.axes] == ["t"]
+    for draw in (
+        lambda: plot_norms(Comparison(unknown, ARMS), path),
+        lambda: plot_delays(comparison, {"none": ["left out"]}, path),
+        lambda: plot_curves(Comparison(unknown, ARMS), {}, {}, path),
+    ):
+        path.write_text("of an earlier report")
+        draw()
+        assert not path.exists()
+
+
+def test_an_infinite_end_of_an_interval_is_drawn_to_the_edge_of_the_panel(monkeypatch, tmp_path):
+    scores = {"best": [9.0, -1.0, 10.0], "blind": [1.0, 5.0, 3.0], "aware": [6.0, 9.0, 7.0]}
+    comparison = Comparison(rows_of("t", "late", scores), ARMS)
+    assert np.isinf(comparison.compared("t", "late")["aware"].j_norm[1:]).all()
+    axis = drawn(monkeypatch, lambda: plot_norms(comparison, tmp_path / "figure.png")).axes[0]
+    assert sorted(line.xy[1] for line in axis.findobj(Annotation)) == [0, 0, 1, 1]
