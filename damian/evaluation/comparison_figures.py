@@ -37,6 +37,11 @@ _LINES, _DOTTED, _MARKERS = ("-", "-."), (":", (0, (1, 4))), "os"
 """Of arms that train, of those that train nothing, and of points; the second ones where colours repeat."""
 
 
+_NO_NORMS = (
+    "no J_norm is known: under no delay is there a run of an arm\nwhose undelayed arm beats the random policy"
+)
+
+
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
     """Draw learning curves over episodes (the paper's Figures 5 and 6).
 
@@ -120,11 +125,13 @@ def _band(runs: Sequence[Sequence[Mapping[str, float]]], name: str) -> tuple[Flo
 def plot_norms(comparison: Comparison, path: Path) -> None:
     """Draw J_norm of each arm under each delay, with its 95 % interval, in a panel for each task.
 
-    A task in which no J_norm is known has no panel; without any panel there is no file.
+    A task in which no J_norm is known has no panel; if it is known in none, the figure says so.
     """
     norms = {task: found for task in comparison.tasks() if (found := _known_norms(comparison, task))}
     if not norms:
-        path.unlink(missing_ok=True)  # an older one would show other runs
+        figure = Figure(figsize=(4.2, 1.0))
+        figure.text(0.5, 0.5, _NO_NORMS, ha="center", va="center", fontsize=8)
+        figure.savefig(path, dpi=150)
         return
     width = min(len(norms), _NORMS_IN_A_ROW)
     height = math.ceil(len(norms) / width)
@@ -194,7 +201,7 @@ def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], pat
     panels = {title: [arm for arm in arms if arm in present] for title, arms in panels.items()}
     panels = {title: arms for title, arms in panels.items() if arms}
     if not panels:
-        path.unlink(missing_ok=True)  # an older one would show other runs
+        plot_norms(comparison, path)
         return
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(3.6 * len(panels) + 0.6, 5.0), layout="constrained")

@@ -235,20 +235,20 @@ def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other
         assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(expected)
 
 
-def test_a_figure_has_no_empty_panel_and_an_old_one_is_removed_where_nothing_is_known(monkeypatch, tmp_path):
+def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch, tmp_path):
     unknown = [each | {"true_return": np.nan} for each in rows_of("u", "late", SCORES)]
     comparison = Comparison(unknown + rows_of("t", "late", SCORES), ARMS)
     path = tmp_path / "figure.png"
     figure = drawn(monkeypatch, lambda: plot_norms(comparison, path))
     assert [axis.get_title() for axis in figure.axes] == ["t"]
-    for draw in (
-        lambda: plot_norms(Comparison(unknown, ARMS), path),
-        lambda: plot_delays(comparison, {"none": ["left out"]}, path),
-        lambda: plot_curves(Comparison(unknown, ARMS), {}, {}, path),
-    ):
-        path.write_text("of an earlier report")
-        draw()
-        assert not path.exists()
+    figure = drawn(monkeypatch, lambda: plot_delays(comparison, {"none": ["left out"]}, path))
+    assert [axis.get_title() for axis in figure.axes] == ["t"]
+    figure = drawn(monkeypatch, lambda: plot_norms(Comparison(unknown, ARMS), path))
+    assert not figure.axes
+    assert "no J_norm is known" in figure.texts[0].get_text()
+    path.write_text("of an earlier report")
+    plot_curves(Comparison(unknown, ARMS), {}, {}, path)
+    assert not path.exists()
 
 
 def test_an_infinite_end_of_an_interval_is_drawn_to_the_edge_of_the_panel(monkeypatch, tmp_path):
