@@ -24,8 +24,10 @@ from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
+from damian.evaluation.checkpoint import stored_digest
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.evaluation.run_lock import locked
+from damian.evaluation.run_record import POLICY, read_record
 
 from .composition_errors import one_line
 from .launch import Program, perform
@@ -68,6 +70,10 @@ class Run:
         if not results.exists() or self.policy is None:
             return results.exists()
         source = self.policy / RESULTS
+        flown, stored = read_record(self.folder).get(POLICY), stored_digest(self.policy / CHECKPOINT)
+        if source.exists() and flown and stored:
+            return flown == stored
+        # An older damian did not record it. The times of copied files need not tell which was written first.
         return source.exists() and source.stat().st_mtime_ns <= results.stat().st_mtime_ns
 
     def score(self, policy: str, measure: str) -> float:

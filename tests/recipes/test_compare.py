@@ -1,6 +1,7 @@
 """The comparison recipe, run by its command line: its runs, and its refusals of wrong input."""
 
 import csv
+import json
 import re
 import shlex
 import sys
@@ -140,7 +141,11 @@ def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compar
     source, flown = (folder / name / "seed_8" for name in ("none/undelayed", "paper/deployed"))
     compare(*words)
     before = stamps(folder)
-    (source / "result.csv").touch()
+    (source / "result.csv").touch()  # as in a copy of the folder
+    compare(*words)
+    assert stamps(folder) == before | {str(source / "result.csv"): stamps(folder)[str(source / "result.csv")]}
+    record = json.loads((flown / "run.json").read_text())
+    (flown / "run.json").write_text(json.dumps(record | {"policy_sha256": "of an earlier checkpoint"}))
     compare(*words)
     rewritten = {path for path, stamp in stamps(folder).items() if stamp != before.get(path)}
     assert str(flown / "result.csv") in rewritten
