@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import islice
 from multiprocessing.synchronize import Event
@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
 from damian.evaluation.checkpoint import stored_digest
+from damian.evaluation.metrics import Evaluation
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.evaluation.run_lock import locked
 from damian.evaluation.run_record import POLICY, read_record
@@ -90,10 +91,14 @@ class Run:
         file = self.folder / RESULTS
         try:
             with file.open(newline="") as lines:
-                return [
+                rows = [
                     {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
                     for row in csv.DictReader(lines)
                 ]
+            names = {measure.name for measure in fields(Evaluation)}
+            if missing := [name for name in sorted(names) if not rows or name not in rows[0]]:
+                raise ValueError(f"no {missing[0]}")
+            return rows
         except (KeyError, TypeError, ValueError) as error:
             problem = f"it does not hold the results of a run ({one_line(error)})"
             raise InputError(f"{file}: {problem}; delete the folder") from error
