@@ -129,9 +129,15 @@ class CompareConfig:
         return {name: every[name] for name in every if only is None or name in only}
 
     def includes(self, row: Row) -> bool:
-        """Is a row of results of a task, a delay and an arm that are asked for?"""
+        """Is a row of results of a task, a delay, an arm and a seed that are asked for?"""
         task, delays = row["task"].partition(HELD_OUT)[0], [NOT_LATE, *self.chosen("delays")]
-        return task in self.chosen("tasks") and row["delay"] in delays and row["arm"] in self.chosen("arms")
+        chosen = task in self.chosen("tasks") and row["arm"] in self.chosen("arms")
+        return chosen and row["delay"] in delays and row["seed"] in self.every_seed
+
+    @property
+    def every_seed(self) -> range:
+        """The seeds that are asked for."""
+        return range(self.experiment.first_seed, self.experiment.first_seed + self.seeds)
 
 
 ConfigStore.instance().store(name="compare_schema", node=CompareConfig)
@@ -205,7 +211,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         raise InputError(f"{task}/{delay}/{name}: {one_line(error)}") from error
     if arm.ceiling and not flies_script:
         return  # nothing is won by finding the source, as the script does, or no message is late
-    for seed in range(config.experiment.first_seed, config.experiment.first_seed + config.seeds):
+    for seed in config.every_seed:
         seed_folder = f"seed_{seed}"
         seeded = replace(unseeded, seed=seed, overrides=[*overrides, f"seed={seed}"])
         if source:

@@ -116,7 +116,7 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert stamps(folder) == after
 
 
-def test_a_report_from_stored_results_is_that_from_the_runs(compare, tmp_path):
+def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp_path):
     words = ["experiment=usecase2", "seeds=1", "arms=[undelayed,unaware]", listed(*SMALL, "frames=64")]
     folder, kept = compare(*words), tmp_path / "kept"
     kept.mkdir()
@@ -130,6 +130,11 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, tmp_path):
     assert len({re.sub("`damian compare .*`", "", text) for text in texts}) == 1
     compare(*words[:2], "arms=[undelayed]", "report_only=true", f"hydra.run.dir={kept}")
     assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "greedy"}
+    check_refused(
+        lambda: compare(*words, "experiment.first_seed=9", "report_only=true", f"hydra.run.dir={kept}"),
+        "experiment: no run of it is finished in",
+        capsys,
+    )
     (kept / "results.csv").write_text("seed\nx\n")
     with pytest.raises(SystemExit):
         compare(*words, "report_only=true", f"hydra.run.dir={kept}")
