@@ -1,7 +1,7 @@
 """Figures of a comparison: learning curves, J_norm of each arm, and scores over delays."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
@@ -37,9 +37,7 @@ _LINES, _DOTTED, _MARKERS = ("-", "-."), (":", (0, (1, 4))), "os"
 """Of arms that train, of those that train nothing, and of points; the second ones where colours repeat."""
 
 
-_NO_NORMS = (
-    "no J_norm is known: under no delay is there a run of an arm\nwhose undelayed arm beats the random policy"
-)
+_NO_NORMS = "no J_norm is known:\nthe undelayed arm has no run, or none better than the random policy"
 
 
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
@@ -74,8 +72,16 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
                 axis.set(xlabel="episodes", ylabel=label, title=title)
             for axis in row[len(contents) :]:
                 axis.set_axis_off()
-            row[len(contents) - 1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+            _legend(row[len(contents) - 1], row)
         figure.savefig(path, dpi=150)
+
+
+def _legend(place: Axes, panels: Iterable[Axes]) -> None:
+    """Name what any of the panels shows, to the right of one of them."""
+    drawn: dict[str, Any] = {}
+    for axis in panels:
+        drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    place.legend([*drawn.values()], [*drawn], loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
 def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str, str]]]:
@@ -145,12 +151,7 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
                 _norm_panel(axis, comparison, task, norms[task])
         for axis in axes[:, 0]:
             axis.set_ylabel("J_norm (dashed: undelayed 1, random 0)")
-        drawn: dict[str, Any] = {}
-        for axis in axes.flat:
-            drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-        names = [name for name in comparison.arms if name in drawn]
-        handles = [drawn[name] for name in names]
-        axes[0, -1].legend(handles, names, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        _legend(axes[0, -1], axes.flat)
         figure.savefig(path, dpi=150)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.text import Annotation
+from matplotlib.text import Annotation, Text
 
 from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.comparison import (
@@ -249,6 +249,17 @@ def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch
     path.write_text("of an earlier report")
     plot_curves(Comparison(unknown, ARMS), {}, {}, path)
     assert not path.exists()
+
+
+def test_the_legend_of_learning_curves_names_an_arm_that_ran_under_one_delay_only(monkeypatch, tmp_path):
+    rows = rows_of("t", "late", SCORES)
+    rows += [each for each in rows_of("t", "later", SCORES) if each["arm"] not in ("best", "flown")]
+    curve = [{"episodes": n, "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in range(5)]
+    two = Comparison(rows + [each | {"task": "u"} for each in rows], ARMS)
+    curves = {("t", "none", "best"): [curve]}
+    figure = drawn(monkeypatch, lambda: plot_curves(two, curves, {}, tmp_path / "curves.png"))
+    texts = [text.get_text() for text in figure.axes[1].findobj(Text)]
+    assert {"best", "blind", "flown", "aware", RANDOM} <= {*texts}
 
 
 def test_an_infinite_end_of_an_interval_is_drawn_to_the_edge_of_the_panel(monkeypatch, tmp_path):
