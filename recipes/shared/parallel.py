@@ -7,6 +7,7 @@ import csv
 import multiprocessing
 import os
 import signal
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
@@ -25,6 +26,7 @@ from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
 from damian.evaluation.checkpoint import stored_digest
+from damian.evaluation.interrupt import exit_code
 from damian.evaluation.metrics import Evaluation
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.evaluation.run_lock import locked
@@ -39,6 +41,8 @@ LOG = "log.txt"
 _SPAWN = multiprocessing.get_context("spawn")
 _stop = _SPAWN.Event()
 """Set after Ctrl-C: no further run begins. Worker processes share the event of the main process."""
+_idle = threading.Event()
+"""Not set while this process carries out a run."""
 
 
 @dataclass(frozen=True)
@@ -260,12 +264,27 @@ def _begin(stop: Event) -> None:
     """Initialise a worker process: it shares the stop event of the main process."""
     global _stop  # noqa: PLW0603 (the event cannot be passed to ``_perform`` with a run)
     _stop = stop
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End a worker process whose main process was killed; a training writes its checkpoint before.
+
+    Else it would go on with its run, whose folder it locks, and then wait for another one for ever.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)  # ends at once what does not handle it
+        _idle.wait()
+        os._exit(exit_code(signal.SIGTERM))
 
 
 def _perform(run: Run) -> None:
     """Carry out one run, resuming it if it has a checkpoint."""
     if _stop.is_set():
         raise KeyboardInterrupt
+    _idle.clear()
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
@@ -287,3 +306,4 @@ def _perform(run: Run) -> None:
             # Torch compiles a function at most eight times in a process. Policies with different observations
             # share one, so that the ninth would be slow without saying so.
             torch.compiler.reset()
+            _idle.set()
