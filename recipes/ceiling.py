@@ -42,12 +42,7 @@ from .shared.stored_runs import save_config
 
 def fly(config: TrainConfig, folder: Path) -> None:
     """Evaluate the script with ever more known on time, and fill the run folder."""
-    if not config.seeks_source:
-        raise InputError("reward: nothing is won by finding the source, so that no belief bounds what is won")
-    should = "is not supported: the rows compare what the server can know; choose links=server"
-    checks.require(config.links.kind == "server", "links", config.links.kind, should)
-    if not has_message_delay(config):
-        raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
+    check(config)
     save_config(config, folder)
     on_time = replace(config.delay, obs=0, loss=0.0, hold="none")
     server, own = (_believing(config, own) for own in (False, True))
@@ -59,6 +54,20 @@ def fly(config: TrainConfig, folder: Path) -> None:
     }
     table = save_results(rows, folder, config.episode.success_share is not None, late=True)
     print(f"\nwhat is known on time:\n\n{table}")
+
+
+def check(config: TrainConfig) -> None:
+    """Check that the rows of a ceiling can differ.
+
+    Raises:
+        InputError: the source is not sought, or no message is late, or UAVs hear each other.
+    """
+    if not config.seeks_source:
+        raise InputError("reward: nothing is won by finding the source, so that no belief bounds what is won")
+    should = "is not supported: the rows compare what the server can know; choose links=server"
+    checks.require(config.links.kind == "server", "links", config.links.kind, should)
+    if not has_message_delay(config):
+        raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
 
 
 def _believing(config: TrainConfig, own: bool) -> ScenarioConfig:

@@ -33,6 +33,7 @@ from omegaconf import MISSING, DictConfig
 
 from damian.common import checks
 from damian.common.errors import InputError
+from damian.envs.pipeline import has_message_delay
 from damian.evaluation.comparison import (
     HELD_OUT,
     MODE,
@@ -53,6 +54,7 @@ from .shared.command_line import command, typed_words, whole_laws
 from .shared.comparison_results import ROWS, Results, results_of, stored_results, write_csv
 from .shared.composition_errors import COMPOSITION_ERRORS, one_line
 from .shared.experiment import Experiment
+from .shared.inheritance import check_policy_fits
 from .shared.known_settings import CONF
 from .shared.launch import checked, launch, reported, shown
 from .shared.launchers import LAUNCHERS, RayTasks, SlurmJobs
@@ -127,9 +129,15 @@ class CompareConfig:
         return {name: every[name] for name in every if only is None or name in only}
 
     def includes(self, row: Row) -> bool:
-        """Is a row of results of a task, a delay and an arm that are asked for?"""
+        """Is a row of results of a task, a delay, an arm and a seed that are asked for?"""
         task, delays = row["task"].partition(HELD_OUT)[0], [NOT_LATE, *self.chosen("delays")]
-        return task in self.chosen("tasks") and row["delay"] in delays and row["arm"] in self.chosen("arms")
+        chosen = task in self.chosen("tasks") and row["arm"] in self.chosen("arms")
+        return chosen and row["delay"] in delays and row["seed"] in self.every_seed
+
+    @property
+    def every_seed(self) -> range:
+        """The seeds that are asked for."""
+        return range(self.experiment.first_seed, self.experiment.first_seed + self.seeds)
 
 
 ConfigStore.instance().store(name="compare_schema", node=CompareConfig)
@@ -154,7 +162,26 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
         if arm.delayed == (delay != NOT_LATE) and (arm.tasks is None or task in arm.tasks)
         for run in _seeds(config, folder / place / delay / name, task, [*task_overrides, *delay_overrides])
     ]
+    _check_policies(runs)
+    succeeds = any(run.config.episode.success_share is not None for run in runs)
+    should = "is in none of the tasks anything that can be reached: choose true_return or episode_return"
+    checks.require(succeeds or "success" not in config.score, "score", config.score, should)
     return sorted(runs, key=lambda run: (not run.trains, run.config.seed))
+
+
+def _check_policies(runs: Sequence[Run]) -> None:
+    """Check that every policy fits where other arms, or held-out tasks, fly it.
+
+    Raises:
+        InputError: it has other features, actions or layers.
+    """
+    by_folder = {run.folder: run.config for run in runs}
+    for run in runs:
+        if run.policy is not None:
+            try:
+                check_policy_fits(run.config, by_folder[run.policy])
+            except InputError as error:
+                raise InputError(f"{run.task}/{run.delay}/{run.arm}: {error}") from None
 
 
 def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list[str]) -> Iterator[Run]:
@@ -175,13 +202,16 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         late = [] if arm.delayed else unseeded.late
         should = "delays this arm, with which others are compared: put delays under experiment.delays"
         checks.require(not late, ", ".join(late), "its value", should)
-        if source is None and not arm.ceiling:
+        flies_script = arm.ceiling and unseeded.seeks_source and has_message_delay(unseeded)
+        if flies_script:
+            ceiling.check(unseeded)
+        elif source is None and not arm.ceiling:
             unseeded.check_learning()
     except COMPOSITION_ERRORS as error:
         raise InputError(f"{task}/{delay}/{name}: {one_line(error)}") from error
-    if arm.ceiling and not unseeded.seeks_source:
-        return  # the script finds the source, by which nothing is won in this task
-    for seed in range(config.experiment.first_seed, config.experiment.first_seed + config.seeds):
+    if arm.ceiling and not flies_script:
+        return  # nothing is won by finding the source, as the script does, or no message is late
+    for seed in config.every_seed:
         seed_folder = f"seed_{seed}"
         seeded = replace(unseeded, seed=seed, overrides=[*overrides, f"seed={seed}"])
         if source:

@@ -102,6 +102,9 @@ class FlyConfig(FlownPolicyConfig):
             checks.one_of("formats", each, FORMATS)
         for each in self.views:
             checks.one_of("views", each, VIEWS)
+        films = [kind for kind in self.formats if kind in FILMS]
+        should = f"names no view for the films that formats={films} asks for: choose 2d or 3d"
+        checks.require(bool(self.views) or not films, "views", [], should)
         films = "mp4" not in self.formats or FFMpegWriter.isAvailable()
         checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
 

@@ -89,6 +89,9 @@ class TuneConfig(TrainConfig):
         checks.whole("processes", self.processes, 1, 1024)
         checks.one_of("score", self.score, SCORES)
         checks.one_of("policy", self.policy, POLICIES)
+        succeeds = self.episode.success_share is not None or "success" not in self.score
+        should = "is the same for every policy: in this task nothing can be reached; choose true_return"
+        checks.require(succeeds, "score", self.score, should)
         should = "is not for a search, which trains every policy from the beginning: leave it out"
         checks.require(self.checkpoint is None, "checkpoint", self.checkpoint, should)
 

@@ -80,6 +80,16 @@ def read_checkpoint(path: Path, key: str, digest: str | None = None) -> dict[str
     return content
 
 
+def stored_digest(path: Path) -> str | None:
+    """The SHA-256 in the first line of a checkpoint file; None if there is none that can be read."""
+    try:
+        with path.open("rb") as file:
+            match = _FIRST_LINE.match(file.read(_LONGEST_LINE))
+    except OSError:
+        return None
+    return match and match[4].decode()
+
+
 def _payload(data: bytes) -> tuple[memoryview, str]:
     """What follows the first line of a file, and its SHA-256."""
     if not data:

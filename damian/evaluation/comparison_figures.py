@@ -1,7 +1,7 @@
 """Figures of a comparison: learning curves, J_norm of each arm, and scores over delays."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
@@ -33,7 +33,9 @@ _STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines
 _POINTS = 200
 """Number of points of a learning curve."""
 _NORMS_IN_A_ROW = 4
-_ARM_COLOURS = (*COLOURS, "#882255", "#999933", "#000000", "#888888")
+_LINES, _DOTTED, _MARKERS = ("-", "-."), (":", (0, (1, 4))), "os"
+"""Of arms that train, of those that train nothing, and of points; the second ones where colours repeat."""
+_NO_NORMS = "no J_norm is known:\nthe undelayed arm has no run, or none better than the random policy"
 
 
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
@@ -52,6 +54,7 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
     """
     grid = [row for row in _panels(comparison, curves) if row]
     if not grid:
+        path.unlink(missing_ok=True)  # an older one would show other runs
         return
     width = max(map(len, grid))
     with matplotlib.rc_context(_STYLE):
@@ -67,8 +70,16 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
                 axis.set(xlabel="episodes", ylabel=label, title=title)
             for axis in row[len(contents) :]:
                 axis.set_axis_off()
-            row[len(contents) - 1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+            _legend(row[len(contents) - 1], row)
         figure.savefig(path, dpi=150)
+
+
+def _legend(place: Axes, panels: Iterable[Axes]) -> None:
+    """Name what any of the panels shows, to the right of one of them."""
+    drawn: dict[str, Any] = {}
+    for axis in panels:
+        drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    place.legend([*drawn.values()], [*drawn], loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
 def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str, str]]]:
@@ -85,16 +96,15 @@ def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str,
 def _curve_panel(axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str]) -> None:
     """Draw all arms of a task under a delay, by one measure; ``content`` names these three."""
     task, delay, measure = content
-    colours = _colours(comparison)
-    for name, arm in comparison.arms.items():
-        colour = colours[name]
-        run = (task, delay if arm.delayed else NOT_LATE, name)
+    for index, (name, arm) in enumerate(comparison.arms.items()):
+        run, colour = (task, delay if arm.delayed else NOT_LATE, name), _colour(index)
         if run in curves:
             episodes, mean, low, high = _band(curves[run], measure)
-            axis.plot(episodes, mean, color=colour, linewidth=1.2, label=name)
+            axis.plot(episodes, mean, color=colour, ls=_again(_LINES, index), linewidth=1.2, label=name)
             axis.fill_between(episodes, low, high, color=colour, alpha=0.2, linewidth=0)
         elif values := comparison.values(*run, comparison.policy, measure):
-            axis.axhline(fmean(values.values()), color=colour, linestyle=":", label=name)
+            level = fmean(values.values())
+            axis.axhline(level, color=colour, linestyle=_again(_DOTTED, index), label=name)
     random = comparison.values(task, NOT_LATE, comparison.undelayed, RANDOM, measure)
     if random:
         axis.axhline(fmean(random.values()), color="0.5", linestyle="--", linewidth=0.8, label=RANDOM)
@@ -117,39 +127,52 @@ def _band(runs: Sequence[Sequence[Mapping[str, float]]], name: str) -> tuple[Flo
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
-    """Draw J_norm of each arm under each delay, with its 95 % interval, in a panel for each task."""
-    tasks = comparison.tasks()
-    width = min(len(tasks), _NORMS_IN_A_ROW)
-    height = math.ceil(len(tasks) / width)
+    """Draw J_norm of each arm under each delay, with its 95 % interval, in a panel for each task.
+
+    A task in which no J_norm is known has no panel; if it is known in none, the figure says so.
+    """
+    norms = {task: found for task in comparison.tasks() if (found := _known_norms(comparison, task))}
+    if not norms:
+        figure = Figure(figsize=(4.2, 1.0))
+        figure.text(0.5, 0.5, _NO_NORMS, ha="center", va="center", fontsize=8)
+        figure.savefig(path, dpi=150)
+        return
+    width = min(len(norms), _NORMS_IN_A_ROW)
+    height = math.ceil(len(norms) / width)
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(3.0 * width + 1.2, 3.0 * height), layout="constrained")
         axes = figure.subplots(height, width, squeeze=False, sharey=True)
-        for axis, task in zip_longest(axes.flat, tasks):
+        for axis, task in zip_longest(axes.flat, norms):
             if task is None:
                 axis.set_axis_off()
             else:
-                _norm_panel(axis, comparison, task)
+                _norm_panel(axis, comparison, task, norms[task])
         for axis in axes[:, 0]:
             axis.set_ylabel("J_norm (dashed: undelayed 1, random 0)")
-        last = axes[0, -1]
-        if last.get_legend_handles_labels()[0]:
-            last.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        _legend(axes[0, -1], axes.flat)
         figure.savefig(path, dpi=150)
 
 
-def _norm_panel(axis: Axes, comparison: Comparison, task: str) -> None:
+def _known_norms(comparison: Comparison, task: str) -> dict[str, dict[int, Estimate]]:
+    """J_norm by arm and number of the delay, where it is known."""
+    found: dict[str, dict[int, Estimate]] = {}
+    for x, delay in enumerate(comparison.delays(task)):
+        for arm, compared in comparison.compared(task, delay).items():
+            if not np.isnan(compared.j_norm.value):
+                found.setdefault(arm, {})[x] = compared.j_norm
+    return found
+
+
+def _norm_panel(
+    axis: Axes, comparison: Comparison, task: str, norms: Mapping[str, Mapping[int, Estimate]]
+) -> None:
     delays = comparison.delays(task)
-    finished = {row["arm"] for row in comparison.rows}
-    arms = [a for a, arm in comparison.arms.items() if a in finished and arm.delayed and not arm.ceiling]
-    compared = [comparison.compared(task, delay) for delay in delays]
-    colours = _colours(comparison)
-    for index, arm in enumerate(arms):
-        norms = [(x, estimates[arm].j_norm) for x, estimates in enumerate(compared) if arm in estimates]
-        positions = [x + 0.7 * ((index + 0.5) / len(arms) - 0.5) for x, _ in norms]
-        errors = [(norm.value - norm.low, norm.high - norm.value) for _, norm in norms]
-        values = [norm.value for _, norm in norms]
-        bars = np.array(errors).T if errors else None
-        axis.errorbar(positions, values, yerr=bars, fmt="o", color=colours[arm], markersize=4, label=arm)
+    arms = [name for name, arm in comparison.arms.items() if arm.delayed and not arm.ceiling]
+    for index, arm in enumerate(comparison.arms):
+        if arm in norms:
+            place = 0.7 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
+            known = [(x + place, norm) for x, norm in norms[arm].items()]
+            _error_bars(axis, known, index, fmt=_again(_MARKERS, index), label=arm)
     for level in (0, 1):
         axis.axhline(level, color="0.5", linestyle="--", linewidth=0.8)
     axis.set_xticks(range(len(delays)), delays)
@@ -173,39 +196,67 @@ def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], pat
     """
     task = comparison.tasks()[0]
     delays = comparison.delays(task)
+    present = {arm for delay in delays for arm in comparison.present(task, delay)}
+    panels = {title: [arm for arm in arms if arm in present] for title, arms in panels.items()}
+    panels = {title: arms for title, arms in panels.items() if arms}
+    if not panels:
+        plot_norms(comparison, path)
+        return
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(3.6 * len(panels) + 0.6, 5.0), layout="constrained")
         axes = figure.subplots(2, len(panels), squeeze=False, sharex=True)
         for (title, arms), (scores, below) in zip(panels.items(), axes.T, strict=True):
             scores.sharey(axes[0, 0])
             has_naive = any(comparison.arms[arm].naive for arm in arms)
-            for arm, colour in zip(arms, COLOURS, strict=False):
+            for index, arm in enumerate(arms):
                 found = [comparison.compared(task, delay).get(arm, NOT_COMPARED) for delay in delays]
                 won = [each.recovery if has_naive else each.of_ceiling for each in found]
-                _estimates_over(scores, [comparison.mean(task, delay, arm) for delay in delays], colour, arm)
+                _estimates_over(scores, [comparison.mean(task, delay, arm) for delay in delays], index, arm)
                 if not comparison.arms[arm].naive:
-                    _estimates_over(below, won, colour, arm)
+                    _estimates_over(below, won, index, arm)
             _references(scores, comparison, task)
             for level in (0, 1):
                 below.axhline(level, color="0.5", linestyle="--", linewidth=0.8)
             scores.set_title(title)
             scores.legend(frameon=False)
             below.set_xticks(range(len(delays)), delays)
-            below.set_xlabel("delay of the observations [steps]")
             below.set_ylabel(
                 "recovery (0: naive, 1: undelayed)" if has_naive else "share of the script's return"
             )
+            lowest = below if below.containers else scores
+            if lowest is scores:  # no recovery or share is known
+                below.set_visible(False)
+                scores.tick_params(labelbottom=True)
+            lowest.set_xlabel("delay of the observations [steps]")
         axes[0, 0].set_ylabel(f"{comparison.score.replace('_', ' ')}, {comparison.policy}")
         figure.savefig(path, dpi=150)
 
 
-def _estimates_over(axis: Axes, estimates: Sequence[Estimate], colour: str, label: str) -> None:
-    """Draw estimates, one for each delay, as a line with bars; unknown ones are left out."""
+def _estimates_over(axis: Axes, estimates: Sequence[Estimate], index: int, label: str) -> None:
+    """Draw estimates of an arm, one for each delay, as a line with bars; unknown ones are left out."""
     known = [(x, estimate) for x, estimate in enumerate(estimates) if not np.isnan(estimate.value)]
     if known:
-        positions, values = [x for x, _ in known], [estimate.value for _, estimate in known]
-        bars = np.array([(e.value - e.low, e.high - e.value) for _, e in known]).T
-        axis.errorbar(positions, values, yerr=bars, color=colour, marker="o", markersize=4, label=label)
+        _error_bars(axis, known, index, marker=_again(_MARKERS, index), ls=_again(_LINES, index), label=label)
+
+
+def _error_bars(axis: Axes, known: Sequence[tuple[float, Estimate]], index: int, **style: Any) -> None:
+    """Draw known estimates at their places, in the colour of the arm with a number.
+
+    A bar whose end is infinite goes to the edge of the panel: matplotlib would leave it out.
+    """
+    bars = np.array([(each.value - each.low, each.high - each.value) for _, each in known]).T
+    places, values = [x for x, _ in known], [each.value for _, each in known]
+    drawn = axis.errorbar(places, values, yerr=bars, color=_colour(index), markersize=4, **style)
+    for place, value, *ends in zip(places, values, *bars, strict=True):
+        for edge, length in enumerate(ends):
+            if np.isinf(length):
+                line = {
+                    "arrowstyle": "-",
+                    "color": _colour(index),
+                    "linewidth": drawn[2][0].get_linewidth()[0],
+                }
+                line |= {"shrinkA": 0, "shrinkB": 0}
+                axis.annotate("", (place, edge), (place, value), ("data", "axes fraction"), "data", line)
 
 
 def _references(axis: Axes, comparison: Comparison, task: str) -> None:
@@ -223,6 +274,11 @@ def _references(axis: Axes, comparison: Comparison, task: str) -> None:
             axis.annotate(label, (0.01, level), xycoords=("axes fraction", "data"), fontsize=6, va="bottom")
 
 
-def _colours(comparison: Comparison) -> dict[str, str]:
-    """Colour of each arm; no two are the same of up to ten arms."""
-    return {arm: _ARM_COLOURS[i % len(_ARM_COLOURS)] for i, arm in enumerate(comparison.arms)}
+def _colour(index: int) -> str:
+    """Colour of the arm with a number."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def _again(looks: Sequence[Any], index: int) -> Any:
+    """Which of several looks the arm with a number has, so that two of one colour differ."""
+    return looks[index // len(COLOURS) % len(looks)]

@@ -18,6 +18,8 @@ from damian.common.atomic_files import write_atomically
 RECORD = "run.json"
 OF_FIRST_PART = ("command", "started")
 """Entries of ``new_record`` that the list ``resumed`` repeats each time that a run is resumed."""
+POLICY = "policy_sha256"
+"""Entry of a run that begins with a stored policy: the SHA-256 of its checkpoint."""
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy", "shapely")
 """Packages whose versions a record names."""
 
@@ -80,7 +82,7 @@ def write_record(folder: Path, record: dict[str, Any]) -> None:
     first = read_record(folder)
     if first:
         part = {name: record[name] for name in OF_FIRST_PART}
-        record |= {name: first[name] for name in (*OF_FIRST_PART, "config_dir") if first.get(name)}
+        record |= {name: first[name] for name in (*OF_FIRST_PART, "config_dir", POLICY) if first.get(name)}
         parts = first.get("resumed")
         record["resumed"] = [*(parts if isinstance(parts, list) else []), part]
     record["wall_time_s"] = _wall_time(first)

@@ -81,6 +81,10 @@ def prepared(words: Sequence[str]) -> list[str]:
             raise InputError(f"{word!r}: a NUL byte is not text")
         if re.fullmatch(r"hydra\.(run|sweep)\.dir=(['\"]?)\s*\2", word):
             raise InputError(f"{word.partition('=')[0]}: it is empty: name a folder, or leave it out")
+        if named := re.fullmatch(r"(hydra\.(?:run|sweep)\.dir)=(['\"]?)(.+)\2", word):
+            for path in (Path(named[3]), *Path(named[3]).parents):
+                if os.path.isfile(path):
+                    raise InputError(f"{named[1]}: {show(str(path))} is a file: name a folder")
         _check_folder(word)
     overrides = whole_laws([_quoted(word) for word in options.pop("overrides")])
     options["config_dir"] = options["config_dir"] or _config_dir(overrides)

@@ -14,7 +14,7 @@ from typing import Any
 from damian.common.errors import InputError
 from damian.evaluation.comparison import MODE, SAMPLED, Arm, Row, regime
 from damian.evaluation.comparison_figures import LABELS
-from damian.evaluation.metrics_log import read_metrics
+from damian.evaluation.metrics_log import METRICS, read_metrics
 from damian.evaluation.run_record import read_record
 
 from .composition_errors import one_line
@@ -62,6 +62,8 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
         succeeds = run.config.episode.success_share is not None
         label = {"task": run.task, "delay": run.delay, "arm": run.arm, "seed": run.config.seed}
         metrics = read_metrics(run.folder) if run.trains else []
+        if missing := [name for name in ("episodes", *LABELS) if metrics and name not in metrics[0]]:
+            raise InputError(f"{run.folder / METRICS}, line 1: no column {missing[0]}; delete the folder")
         points += [label | _point(row, succeeds) for row in _thinned(metrics)]
         of_run = {
             "regime": regime(arms, run.arm),

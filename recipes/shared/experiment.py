@@ -64,6 +64,9 @@ class Experiment:
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
         should = "are not delayed: exactly one arm must have delayed=false"
         checks.require(len(undelayed) == 1, "experiment.arms", undelayed, should)
+        never = [name for name, arm in self.arms.items() if arm.delayed and not self.delays]
+        should = "run under no delay: name some under experiment.delays, or leave these arms out"
+        checks.require(not never, "experiment.arms", never, should)
         for name, arm in self.arms.items():
             if arm.regime:
                 checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))

@@ -71,11 +71,12 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
     discrete, seen = actions.kind == "discrete", observation.actor
     return {
         "learner=predictive_mappo": isinstance(config.learner, PredictiveMappoConfig),
-        "agents": config.agents if "agent_distances" in seen else "any number of UAVs",
         "observation.ctde": observation.ctde,
         "observation.local_features": [*observation.local_features],
         "observation.global_features": [] if observation.ctde else [*observation.global_features],
         "observation.belief": [*observation.belief],
+        # After the features, from which it follows: a policy with other features does not lack UAVs.
+        "agents": config.agents if "agent_distances" in seen else "any number of UAVs",
         "observation.age": observation.age,
         "delay.history": config.delay.history,
         "delay.messages": config.delay.messages,

@@ -7,12 +7,13 @@ import csv
 import multiprocessing
 import os
 import signal
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import islice
 from multiprocessing.synchronize import Event
@@ -24,8 +25,12 @@ from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
+from damian.evaluation.checkpoint import stored_digest
+from damian.evaluation.interrupt import exit_code
+from damian.evaluation.metrics import Evaluation
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.evaluation.run_lock import locked
+from damian.evaluation.run_record import POLICY, read_record
 
 from .composition_errors import one_line
 from .launch import Program, perform
@@ -36,6 +41,8 @@ LOG = "log.txt"
 _SPAWN = multiprocessing.get_context("spawn")
 _stop = _SPAWN.Event()
 """Set after Ctrl-C: no further run begins. Worker processes share the event of the main process."""
+_idle = threading.Event()
+"""Not set while this process carries out a run."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,10 @@ class Run:
         if not results.exists() or self.policy is None:
             return results.exists()
         source = self.policy / RESULTS
+        flown, stored = read_record(self.folder).get(POLICY), stored_digest(self.policy / CHECKPOINT)
+        if source.exists() and flown and stored:
+            return flown == stored
+        # An older damian did not record it. The times of copied files need not tell which was written first.
         return source.exists() and source.stat().st_mtime_ns <= results.stat().st_mtime_ns
 
     def score(self, policy: str, measure: str) -> float:
@@ -84,10 +95,14 @@ class Run:
         file = self.folder / RESULTS
         try:
             with file.open(newline="") as lines:
-                return [
+                rows = [
                     {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
                     for row in csv.DictReader(lines)
                 ]
+            names = {measure.name for measure in fields(Evaluation)}
+            if missing := [name for name in sorted(names) if not rows or name not in rows[0]]:
+                raise ValueError(f"no {missing[0]}")
+            return rows
         except (KeyError, TypeError, ValueError) as error:
             problem = f"it does not hold the results of a run ({one_line(error)})"
             raise InputError(f"{file}: {problem}; delete the folder") from error
@@ -249,12 +264,27 @@ def _begin(stop: Event) -> None:
     """Initialise a worker process: it shares the stop event of the main process."""
     global _stop  # noqa: PLW0603 (the event cannot be passed to ``_perform`` with a run)
     _stop = stop
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End a worker process whose main process was killed; a training writes its checkpoint before.
+
+    Else it would go on with its run, whose folder it locks, and then wait for another one for ever.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)  # ends at once what does not handle it
+        _idle.wait()
+        os._exit(exit_code(signal.SIGTERM))
 
 
 def _perform(run: Run) -> None:
     """Carry out one run, resuming it if it has a checkpoint."""
     if _stop.is_set():
         raise KeyboardInterrupt
+    _idle.clear()
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
@@ -276,3 +306,4 @@ def _perform(run: Run) -> None:
             # Torch compiles a function at most eight times in a process. Policies with different observations
             # share one, so that the ninth would be slow without saying so.
             torch.compiler.reset()
+            _idle.set()

@@ -10,9 +10,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
+from damian.evaluation.checkpoint import stored_digest
 from damian.evaluation.run_folder import CONFIG
 from damian.evaluation.run_lock import is_folder
-from damian.evaluation.run_record import new_record, write_record
+from damian.evaluation.run_record import POLICY, new_record, write_record
 from damian.evaluation.training_state import checkpoint_file, stored_progress
 from damian.learners.base import LEARNERS
 
@@ -31,7 +32,10 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     write_atomically(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(config)))
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    write_record(folder, new_record(typed_command(), device, config.learning_threads, own_folder()))
+    record = new_record(typed_command(), device, config.learning_threads, own_folder())
+    if config.checkpoint:
+        record[POLICY] = stored_digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
+    write_record(folder, record)
 
 
 def stored_run(written: Path) -> TrainConfig:

@@ -1,10 +1,11 @@
 """Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables and figures of them."""
 
-import re
-
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation, Text
 
+from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.comparison import (
     ALL_MESSAGES,
     GREEDY,
@@ -209,12 +210,61 @@ def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finis
     assert all((tmp_path / name).stat().st_size > 10_000 for name in names)
 
 
-def test_a_figure_has_a_colour_for_each_arm_and_names_only_those_with_results(tmp_path):
-    names = [f"arm{number}" for number in range(6)]
-    scores = THREE | {name: [2.0, 3.0, 4.0] for name in names}
-    arms = {name: ARMS.get(name, Arm()) for name in ("best", "blind", *names, "unfinished")}
-    comparison = Comparison(rows_of("t", "late", {name: scores[name] for name in [*arms][:-1]}), arms)
-    plot_norms(comparison, tmp_path / "norms.svg")
-    drawn = (tmp_path / "norms.svg").read_text()
-    assert set(re.findall("<!-- (arm.|blind|unfinished) -->", drawn)) == {"blind", *names}
-    assert len(set(re.findall("fill: (#[0-9a-f]{6}); stroke: #", drawn))) == len(names) + 1
+def drawn(monkeypatch, draw) -> Figure:
+    """The figure that a function draws instead of saving it."""
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kwargs: figures.append(figure))
+    draw()
+    return figures[-1]
+
+
+def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other_one(monkeypatch, tmp_path):
+    names = [f"arm {i}" for i in range(2 * len(COLOURS) - 2)]
+    arms = {"best": Arm(delayed=False), "blind": Arm(naive=True)} | {name: Arm() for name in names}
+    arms |= {"unfinished": Arm(), "script": Arm(ceiling=True)}
+    scores = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3]} | {name: [6.0, 9, 7] for name in names}
+    comparison = Comparison(rows_of("t", "late", scores), arms)
+    panels = {"all": [*names, "unfinished", "left out"], "none": ["left out"]}
+    path = tmp_path / "figure.png"
+    norms = drawn(monkeypatch, lambda: plot_norms(comparison, path))
+    delays = drawn(monkeypatch, lambda: plot_delays(comparison, panels, path))
+    assert len(delays.axes) == 2
+    for axis, expected in ((norms.axes[0], ["blind", *names]), (delays.axes[0], names)):
+        assert axis.get_legend_handles_labels()[1] == expected
+        lines = [bars[0] for bars in axis.containers]
+        assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(expected)
+
+
+def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch, tmp_path):
+    unknown = [each | {"true_return": np.nan} for each in rows_of("u", "late", SCORES)]
+    comparison = Comparison(unknown + rows_of("t", "late", SCORES), ARMS)
+    path = tmp_path / "figure.png"
+    figure = drawn(monkeypatch, lambda: plot_norms(comparison, path))
+    assert [axis.get_title() for axis in figure.axes] == ["t"]
+    figure = drawn(monkeypatch, lambda: plot_delays(comparison, {"none": ["left out"]}, path))
+    assert [axis.get_title() for axis in figure.axes] == ["t"]
+    figure = drawn(monkeypatch, lambda: plot_norms(Comparison(unknown, ARMS), path))
+    assert not figure.axes
+    assert "no J_norm is known" in figure.texts[0].get_text()
+    path.write_text("of an earlier report")
+    plot_curves(Comparison(unknown, ARMS), {}, {}, path)
+    assert not path.exists()
+
+
+def test_the_legend_of_learning_curves_names_an_arm_that_ran_under_one_delay_only(monkeypatch, tmp_path):
+    rows = rows_of("t", "late", SCORES)
+    rows += [each for each in rows_of("t", "later", SCORES) if each["arm"] not in ("best", "flown")]
+    curve = [{"episodes": n, "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in range(5)]
+    two = Comparison(rows + [each | {"task": "u"} for each in rows], ARMS)
+    curves = {("t", "none", "best"): [curve]}
+    figure = drawn(monkeypatch, lambda: plot_curves(two, curves, {}, tmp_path / "curves.png"))
+    texts = [text.get_text() for text in figure.axes[1].findobj(Text)]
+    assert {"best", "blind", "flown", "aware", RANDOM} <= {*texts}
+
+
+def test_an_infinite_end_of_an_interval_is_drawn_to_the_edge_of_the_panel(monkeypatch, tmp_path):
+    scores = {"best": [9.0, -1.0, 10.0], "blind": [1.0, 5.0, 3.0], "aware": [6.0, 9.0, 7.0]}
+    comparison = Comparison(rows_of("t", "late", scores), ARMS)
+    assert np.isinf(comparison.compared("t", "late")["aware"].j_norm[1:]).all()
+    axis = drawn(monkeypatch, lambda: plot_norms(comparison, tmp_path / "figure.png")).axes[0]
+    assert sorted(line.xy[1] for line in axis.findobj(Annotation)) == [0, 0, 1, 1]

@@ -148,6 +148,14 @@ def test_a_misspelt_word_is_answered_without_loading_torch():
     assert done.returncode == 2
 
 
+@pytest.mark.parametrize("word", ["hydra.run.dir={}", "hydra.run.dir='{}/deeper'", "hydra.sweep.dir={}"])
+def test_a_file_is_no_run_folder(tmp_path, word):
+    (tmp_path / "a b").write_text("")
+    key = word.partition("=")[0]
+    with pytest.raises(InputError, match=rf"{key}: .*a b'? is a file: name a folder"):
+        prepared([word.format(tmp_path / "a b")])
+
+
 def test_words_are_prepared_for_hydra():
     words = ["agents=2", "-m", "-cd", "conf", "seed=0,1", "--cfg", "job"]
     options = {"--multirun", "--config-dir=conf", "--cfg=job"}

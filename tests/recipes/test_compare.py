@@ -1,6 +1,7 @@
 """The comparison recipe, run by its command line: its runs, and its refusals of wrong input."""
 
 import csv
+import json
 import re
 import shlex
 import sys
@@ -115,7 +116,7 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert stamps(folder) == after
 
 
-def test_a_report_from_stored_results_is_that_from_the_runs(compare, tmp_path):
+def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp_path):
     words = ["experiment=usecase2", "seeds=1", "arms=[undelayed,unaware]", listed(*SMALL, "frames=64")]
     folder, kept = compare(*words), tmp_path / "kept"
     kept.mkdir()
@@ -129,6 +130,11 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, tmp_path):
     assert len({re.sub("`damian compare .*`", "", text) for text in texts}) == 1
     compare(*words[:2], "arms=[undelayed]", "report_only=true", f"hydra.run.dir={kept}")
     assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "greedy"}
+    check_refused(
+        lambda: compare(*words, "experiment.first_seed=9", "report_only=true", f"hydra.run.dir={kept}"),
+        "experiment: no run of it is finished in",
+        capsys,
+    )
     (kept / "results.csv").write_text("seed\nx\n")
     with pytest.raises(SystemExit):
         compare(*words, "report_only=true", f"hydra.run.dir={kept}")
@@ -140,7 +146,11 @@ def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compar
     source, flown = (folder / name / "seed_8" for name in ("none/undelayed", "paper/deployed"))
     compare(*words)
     before = stamps(folder)
-    (source / "result.csv").touch()
+    (source / "result.csv").touch()  # as in a copy of the folder
+    compare(*words)
+    assert stamps(folder) == before | {str(source / "result.csv"): stamps(folder)[str(source / "result.csv")]}
+    record = json.loads((flown / "run.json").read_text())
+    (flown / "run.json").write_text(json.dumps(record | {"policy_sha256": "of an earlier checkpoint"}))
     compare(*words)
     rewritten = {path for path, stamp in stamps(folder).items() if stamp != before.get(path)}
     assert str(flown / "result.csv") in rewritten
@@ -260,12 +270,31 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
             "tasks: {spotting: []}\narms: {undelayed: {delayed: false, polcy_of: x}}",
             "experiment.arms.undelayed.polcy_of: no such key",
         ),
+        (
+            "tasks: {spotting: []}\narms: {undelayed: {delayed: false}, naive: {naive: true}}",
+            "experiment.arms: ['naive'] run under no delay: name some under experiment.delays",
+        ),
+        (
+            "tasks: {spotting: []}\ndelays: {late: [delay.obs=2]}\narms: {undelayed: {delayed: false}, "
+            "both: {overrides: [aware=both]}, flown: {policy_of: both}}",
+            "spotting/late/flown: observation.age: the policy was trained with True, so it cannot fly with",
+        ),
+        (
+            "tasks: {coverage: [scenario=coverage]}\narms: {undelayed: {delayed: false}}\n",
+            "score: true_success_rate is in none of the tasks anything that can be reached",
+        ),
+        (
+            "tasks: {a: [scenario=tracking]}\ndelays: {up: [links=updown, delay.obs=2]}\n"
+            "arms: {undelayed: {delayed: false}, script: {ceiling: true}}",
+            "a/up/script: links: updown is not supported",
+        ),
     ],
 )
 def test_a_mistake_in_an_experiment_of_ones_own_is_one_line(compare, capsys, tmp_path, text, message):
     (tmp_path / "own" / "experiment").mkdir(parents=True)
     (tmp_path / "own" / "experiment" / "mine.yaml").write_text(text)
-    check_refused(lambda: compare("--config-dir=own", "experiment=mine"), message, capsys)
+    score = ["score=true_success_rate"] * message.startswith("score")
+    check_refused(lambda: compare("--config-dir=own", "experiment=mine", *score), message, capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
 
@@ -306,6 +335,32 @@ def test_runs_go_seed_by_seed_and_an_arm_does_its_tasks_only():
         f"{name}/seed_{seed}" for seed in (3, 4) for name in ("a/none/best", "a/late/naive", "b/none/best")
     ]
     assert [run.name for run in runs] == [*trained, "b/late/flown/seed_3", "b/late/flown/seed_4"]
+
+
+def test_the_script_flies_only_where_messages_are_late():
+    arms = {"best": Arm(delayed=False), "script": Arm(ceiling=True)}
+    delays = {"late": ["delay.obs=2"], "act": ["delay.act=2"]}
+    experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms)
+    with initialize_config_dir(CONF, version_base=None):
+        runs = plan(CompareConfig(experiment, seeds=1), Path("runs"))
+    assert [run.name for run in runs] == ["a/none/best/seed_0", "a/late/script/seed_0"]
+
+
+@pytest.mark.slow
+def test_a_run_with_a_damaged_file_is_refused_and_not_left_out_of_the_report(compare, capsys):
+    words = ["experiment=usecase2", "seeds=1", "arms=[undelayed]", listed(*SMALL)]
+    run = compare(*words) / "usecase2" / "none" / "undelayed" / "seed_8"
+    for file, text, message in (
+        ("result.csv", "", "it does not hold the results of a run (no age); delete the folder"),
+        ("result.csv", "policy,episodes\nx,3\n", "it does not hold the results of a run (no age)"),
+        ("metrics.csv", "frames,episodes\n8,1\n", "metrics.csv, line 1: no column episode_return"),
+    ):
+        whole = (run / file).read_text()
+        (run / file).write_text(text)
+        capsys.readouterr()
+        check_refused(lambda: compare(*words, "report_only=true"), message, capsys)
+        (run / file).write_text(whole)
+    compare(*words, "report_only=true")
 
 
 @pytest.mark.parametrize("name", [path.stem for path in sorted((Path(CONF) / "experiment").iterdir())])

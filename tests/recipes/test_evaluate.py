@@ -200,6 +200,11 @@ def test_what_a_policy_needs_to_fly_is_named(word, message):
     check_policy_fits(trained, trained)
 
 
+def test_a_policy_with_other_features_does_not_lack_uavs():
+    with pytest.raises(InputError, match=r"observation\.global_features: the policy was trained with"):
+        check_policy_fits(composed_config("scenario=coverage"), composed_config())
+
+
 def test_a_policy_flies_with_any_number_of_uavs_if_it_observes_no_distance_to_each():
     check_policy_fits(composed_config("agents=5"), composed_config("agents=3"))
 

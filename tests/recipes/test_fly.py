@@ -197,6 +197,10 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
         (["policy=mode"], "policy: mode needs checkpoint"),
         (["keep=last"], "keep: last is not one of all, extremes"),
         (["views=[4d]"], "views: 4d is not one of 2d, 3d"),
+        (
+            ["views=[]", "formats=[gif]"],
+            "views: [] names no view for the films that formats=['gif'] asks for",
+        ),
         (["formats=[avi]"], "formats: avi is not one of gif, mp4, png, html, geojson"),
         (["formats=[geojson]", "region=usecase"], "geojson: its region has no latitude and longitude"),
         (["region.id=Nope"], "Nope"),

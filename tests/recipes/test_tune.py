@@ -174,6 +174,7 @@ def test_every_learner_has_a_space(capsys):
         (["resume=x"], "resume: the same command"),
         (["trials=0"], "trials: 0"),
         (["checkpoint=first"], "checkpoint: first is not for a search, which trains every policy from"),
+        (["score=success_rate", "scenario=coverage"], "score: success_rate is the same for every policy"),
         (["policy=greedy"], "policy: greedy is not one of sampled, mode"),
         (["+search.learner.lrr.low=1", "+search.learner.lrr.high=2"], "search: "),
         (["-m", "seed=0,1"], "-m: "),
