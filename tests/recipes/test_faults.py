@@ -129,10 +129,10 @@ def test_rows_and_events_that_cannot_be_written_are_one_error(tmp_path):
             write()
 
 
-@pytest.mark.parametrize("folder", ["file/run", "/proc/run"])
-def test_a_folder_that_cannot_be_made_is_one_line(run, capsys, tmp_path, folder):
+@pytest.mark.parametrize(("folder", "named"), [("file/run", "'file' is a file"), ("/proc/run", "/proc/run")])
+def test_a_folder_that_cannot_be_made_is_one_line(run, capsys, tmp_path, folder, named):
     (tmp_path / "file").touch()
-    check_refused(lambda: run(*TINY, folder=folder), folder, capsys)
+    check_refused(lambda: run(*TINY, folder=folder), named, capsys)
 
 
 # Learners that diverge.
