@@ -23,6 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from damian.common import checks
 from damian.common.atomic_files import remove_unfinished, writing
 from damian.common.errors import InputError, RunError
 from damian.evaluation.interrupt import exit_code
@@ -106,6 +107,9 @@ def composed_config(*overrides: str) -> TrainConfig:
     Raises:
         InputError: an override is misspelt, or its value is impossible.
     """
+    for override in overrides:
+        should = "is not a text such as agents=5: write one argument for each override"
+        checks.require(isinstance(override, str), "override", override, should)
     running = GlobalHydra.instance().hydra  # of a Hydra application that calls this
     GlobalHydra.instance().clear()
     try:

@@ -185,6 +185,8 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
         compose_scenario("scenari=tracking")
     with pytest.raises(InputError, match=r"delay\.loss: 2\.0"):
         compose_scenario("delay.loss=2")
+    with pytest.raises(InputError, match=r"override: \['agents=1'\] is not a text"):
+        compose_scenario(["agents=1"])
     env = UavGymEnv(compose_scenario("agents=1"))
     with pytest.raises(RuntimeError, match="call reset before step"):
         env.step(0)
