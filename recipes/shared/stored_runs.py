@@ -33,7 +33,7 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
     record = new_record(typed_command(), device, config.learning_threads, own_folder())
-    if config.checkpoint:
+    if config.checkpoint and not config.resume:  # a resumed run no longer needs that policy
         record[POLICY] = stored_digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
     write_record(folder, record)
 
