@@ -247,15 +247,11 @@ def _error_bars(axis: Axes, known: Sequence[tuple[float, Estimate]], index: int,
     bars = np.array([(each.value - each.low, each.high - each.value) for _, each in known]).T
     places, values = [x for x, _ in known], [each.value for _, each in known]
     drawn = axis.errorbar(places, values, yerr=bars, color=_colour(index), markersize=4, **style)
+    line = {"arrowstyle": "-", "color": _colour(index), "shrinkA": 0, "shrinkB": 0}
+    line["linewidth"] = drawn[2][0].get_linewidth()[0]
     for place, value, *ends in zip(places, values, *bars, strict=True):
         for edge, length in enumerate(ends):
             if np.isinf(length):
-                line = {
-                    "arrowstyle": "-",
-                    "color": _colour(index),
-                    "linewidth": drawn[2][0].get_linewidth()[0],
-                }
-                line |= {"shrinkA": 0, "shrinkB": 0}
                 axis.annotate("", (place, edge), (place, value), ("data", "axes fraction"), "data", line)
 
 

@@ -16,6 +16,8 @@ from damian.common.tensors import gather_rows
 
 _ID_BITS = 24
 """Bits of a landing point's id below its distance; a message cannot number more points either."""
+RESOLUTION = 0.01
+"""Landing points whose distances differ by less are not told apart [m]."""
 _NEVER = torch.iinfo(torch.int64).max
 _SLOTS, _SLOTS_LARGE = 2**18, 2**24
 """Distances computed at once, which bounds the memory: a few arrays of 2 MB, to stay in a CPU's cache; 128 MB

@@ -12,14 +12,12 @@ import numpy as np
 from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry
+from damian.world.nearest import RESOLUTION
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geojson import read_geojson
 from damian.world.regions.places import check_places
 from damian.world.regions.polygon import polygon_from_vertices, random_polygon
 from damian.world.regions.region import Region, centred, check_regions
-
-CENTIMETRE = 0.01
-"""Distances to landing points are compared to this [m]."""
 
 
 @dataclass
@@ -75,9 +73,9 @@ class RegionConfig:
         checks.in_range("region.lattice_angle", self.lattice_angle, 0.0, 90.0, "deg")
         apart = self.lattice_step * math.sin(math.radians(self.lattice_angle))
         problem = (
-            f"lays rows of landing points {apart:g} m apart, but places are told apart to {CENTIMETRE:g} m"
+            f"lays rows of landing points {apart:g} m apart, but places are told apart to {RESOLUTION:g} m"
         )
-        checks.require(apart >= CENTIMETRE, "region.lattice_step", f"{self.lattice_step:g} m", problem)
+        checks.require(apart >= RESOLUTION, "region.lattice_step", f"{self.lattice_step:g} m", problem)
         if self.n_landing_points is not None:
             checks.whole("region.n_landing_points", self.n_landing_points, 1)
         required_keys = {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}
