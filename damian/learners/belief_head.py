@@ -74,6 +74,10 @@ class MessageEncoder(nn.Module):
 
     def forward(self, observation: Tensor, history: Tensor, codes: Tensor) -> Tensor:
         """Encode observations [*, F] and histories [*, L, C], for Q codes each [*, Q, K], into [*, Q, H]."""
+        if observation.dim() > 2:  # a compiler replaces attention in four dimensions by a slower kernel
+            batch = observation.shape[:-1]
+            rows = (part.flatten(0, len(batch) - 1) for part in (observation, history, codes))
+            return self(*rows).unflatten(0, batch)
         message, known = history[..., : self.n_message], history[..., self.n_message]
         newest = known.argmax(-1, keepdim=True).unsqueeze(-1)  # the first of the known ones
         reference = message.gather(-2, newest.expand(*newest.shape[:-1], self.n_message))
