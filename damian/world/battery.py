@@ -54,6 +54,9 @@ class BatteryConfig:
             "is not a list of places; leave it out to charge anywhere",
         )
         check_places("battery.charging_points", self.charging_points or [])
+        should = "needs battery.enabled=true: the batteries stay full"
+        alone = self.charging_points and not self.enabled
+        checks.require(not alone, "battery.charging_points", self.charging_points, should)
 
 
 def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:

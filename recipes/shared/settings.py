@@ -153,8 +153,16 @@ class TrainConfig(ScenarioConfig):
     def _check_delay(self) -> None:
         """Check that no setting of the delays is without any effect."""
         delay, name = self.delay, self.learner.name
-        useless = delay.hold == "max" and self.longest_delay == 0
-        checks.require(not useless, "delay.hold", "max", "means nothing without delayed messages (delay.obs)")
+        at_once, should = self.longest_delay == 0, "means nothing without delayed messages (delay.obs)"
+        for key, value, useless in (
+            ("hold", "max", at_once),
+            (
+                "order",
+                "arrival",
+                at_once and self.links.kind == "server",
+            ),  # other links have a delay of their own
+        ):
+            checks.require(not useless or getattr(delay, key) != value, f"delay.{key}", value, should)
         useless = delay.reward_window == 1 and delay.reward_discount != DelayConfig.reward_discount
         should = "means nothing with delay.reward_window=1, which sums no rewards; leave it out"
         checks.require(not useless, "delay.reward_discount", delay.reward_discount, should)

@@ -280,6 +280,7 @@ def test_a_reference_arm_is_trained_and_evaluated(train, overrides):
     [
         ("delay.hold=longest", "delay.hold: longest is not one of none, max"),
         ("delay.hold=max", "delay.hold: max means nothing without delayed messages (delay.obs)"),
+        ("delay.order=arrival", "delay.order: arrival means nothing without delayed messages (delay.obs)"),
         ("critic=oracle", "critic: oracle is not one of server, privileged"),
     ],
 )

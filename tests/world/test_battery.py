@@ -181,6 +181,11 @@ def test_float32_levels_stay_float32():
             [],
             "battery.charging_points: [] is not a list of places; leave it out to charge anywhere",
         ),
+        (
+            "charging_points",
+            [[1.0, 2.0]],
+            "battery.charging_points: [[1.0, 2.0]] needs battery.enabled=true: the batteries stay full",
+        ),
     ],
 )
 def test_a_wrong_battery_setting_is_named_with_its_value_and_unit(field, value, message):

@@ -83,7 +83,9 @@ def test_every_region_of_a_pool_must_contain_a_given_place():
     pool = RegionConfig(pool=3, initial_conditions=6)
     middle = [0.0, 0.0]
     worlds = build(
-        pool, source=SourceConfig(position=middle), battery=BatteryConfig(charging_points=[middle])
+        pool,
+        source=SourceConfig(position=middle),
+        battery=BatteryConfig(enabled=True, charging_points=[middle]),
     )
     for index, region in enumerate(worlds.airspace.regions):
         local = -torch.tensor(region.offset)
@@ -130,7 +132,7 @@ def test_a_wrong_place_is_refused_with_one_line_that_names_it(key, place, proble
         "region.start_positions": lambda: build(SQUARE, start_positions=[[10.0, 10.0], [90.0, 90.0], place]),
         "source.position": lambda: build(SQUARE, source=SourceConfig(position=place)),
         "battery.charging_points": lambda: build(
-            SQUARE, battery=BatteryConfig(charging_points=[[1, 9], place])
+            SQUARE, battery=BatteryConfig(enabled=True, charging_points=[[1, 9], place])
         ),
     }
     with pytest.raises(InputError) as error:
@@ -151,7 +153,9 @@ def test_a_place_in_degrees_outside_the_region_is_shown_in_both_units(park):
 @pytest.mark.parametrize("key", ["region.start_positions", "battery.charging_points"])
 def test_places_that_are_no_list_are_refused(key, places):
     with pytest.raises(InputError) as error:
-        RegionConfig(start_positions=places) if key[0] == "r" else BatteryConfig(charging_points=places)
+        RegionConfig(start_positions=places) if key[0] == "r" else BatteryConfig(
+            enabled=True, charging_points=places
+        )
     assert str(error.value) == f"{key}: {places} is not a list of places such as [[0, 0], [100, 50]]"
 
 
@@ -170,7 +174,10 @@ def test_two_start_positions_lead_to_one_landing_point_only_if_uavs_start_togeth
 
 def test_a_charging_point_is_listed_once():
     with pytest.raises(InputError) as error:
-        build(SQUARE, battery=BatteryConfig(charging_points=[[10.0, 10.0], [50, 50], [50.0, 50.0]]))
+        build(
+            SQUARE,
+            battery=BatteryConfig(enabled=True, charging_points=[[10.0, 10.0], [50, 50], [50.0, 50.0]]),
+        )
     assert (
         str(error.value)
         == "battery.charging_points: [50, 50] and [50.0, 50.0] are the same place: list each once"
