@@ -88,6 +88,9 @@ def stored_config(folder: Path, key: str) -> DictConfig:
         saved = cast(DictConfig, OmegaConf.load(file))
         if "algo" in saved:
             raise InputError("damian 0.1 wrote it, and settings have other names since: train again")
+        if "policy" in saved:
+            flown = f"the one of {saved.checkpoint}" if saved.checkpoint else "a script"
+            raise InputError(f"it holds no policy: {flown} was flown there")
         missing = [name for name in _ALWAYS_STORED if name not in saved]
         if missing:
             raise InputError(f"it has no {missing[0]}, so it is not the whole configuration of a run")
