@@ -32,6 +32,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING, DictConfig
 
 from damian.common import checks
+from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.envs.pipeline import has_message_delay
 from damian.evaluation.comparison import (
@@ -248,7 +249,7 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
     """
     comparison = Comparison(results.rows, config.chosen("arms"), config.score, POLICIES[config.policy])
     write_csv(folder / TABLE, [line.cells() for line in comparison.lines])
-    (folder / MARKDOWN).write_text(markdown(comparison, _notes(config, results, missing)))
+    write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results, missing)))
     plot_curves(comparison, results.curves, config.experiment.best, folder / CURVES)
     if config.experiment.panels:
         plot_delays(comparison, config.experiment.panels, folder / FIGURE)

@@ -12,7 +12,6 @@ results.md and results.csv, and a JSON file for each arm and seed; an arm and se
 trained again.
 """
 
-import csv
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,6 +38,8 @@ from tqdm import tqdm
 
 from damian import keys
 from damian.common import checks
+from damian.common.atomic_files import write_atomically
+from damian.common.csv_table import csv_table
 from damian.common.markdown import markdown_table
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
@@ -212,11 +213,10 @@ def table(runs: Sequence[Run], folder: Path) -> str:
             values = [result[delay] for result in results]
             numbers = [f"{value:.0f}" for value in (statistics.mean(values), *values)]
             rows.append([arm, delay, *numbers, str(REFERENCE.get((arm, int(delay)), ""))])
-    with (folder / "results.csv").open("w", newline="") as file:
-        csv.writer(file).writerows(rows)
+    write_atomically(folder / "results.csv", csv_table(rows))
     title = f"# Pendulum-v1, SAC, {runs[0].steps} steps: return, mean of {runs[0].episodes} episodes"
     text = f"{title}\n\n{markdown_table(rows[0], rows[1:])}\n"
-    (folder / "results.md").write_text(text)
+    write_atomically(folder / "results.md", text)
     return text
 
 
@@ -247,7 +247,7 @@ def main(words: Sequence[str] | None = None) -> None:
     with exits_with_one_line():
         runs, folder, jobs = parse(words)
         run_all(runs, folder, jobs, run_arm, is_good)
-    print(f"{table(runs, folder)}\nresults: {folder}")
+        print(f"{table(runs, folder)}\nresults: {folder}")
 
 
 def run() -> None:

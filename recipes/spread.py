@@ -18,7 +18,6 @@ Compensation", arXiv 2505.03586), and a JSON file for each arm and seed; an arm 
 not trained again.
 """
 
-import csv
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,6 +33,8 @@ from tqdm import tqdm
 
 from damian import keys
 from damian.common import checks
+from damian.common.atomic_files import write_atomically
+from damian.common.csv_table import csv_table
 from damian.common.markdown import markdown_table
 from damian.delays.laws import Constant, Law, Uniform
 from damian.keys import next_key
@@ -206,13 +207,12 @@ def is_good(returns: Any) -> bool:
 def table(runs: Sequence[Run], folder: Path) -> str:
     """Write the results as results.csv and table.md; returns the latter's text."""
     results: dict[Run, Returns] = {run: read_result(run, folder, is_good)["returns"] for run in runs}
-    with (folder / "results.csv").open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["arm", "delay", "seed", *ACTING])
-        for run, returns in results.items():
-            for delay in EVALUATED:
-                numbers = [f"{returns[delay][name]:.2f}" for name in ACTING]
-                rows.writerow([run.arm, delay, run.seed, *numbers])
+    rows = [
+        [run.arm, delay, run.seed, *(f"{returns[delay][name]:.2f}" for name in ACTING)]
+        for run, returns in results.items()
+        for delay in EVALUATED
+    ]
+    write_atomically(folder / "results.csv", csv_table([["arm", "delay", "seed", *ACTING], *rows]))
     n_seeds = len({run.seed for run in runs})
     parts = [
         f"# simple_spread_v3, MAPPO, {runs[0].frames} steps: returns",
@@ -229,7 +229,7 @@ def table(runs: Sequence[Run], folder: Path) -> str:
         lines += [[f"{arm}, published", *map(str, known), ""] for arm, known in PUBLISHED.items()]
         parts += [f"## Actions: {name}", markdown_table(["arm", *EVALUATED, "recovery"], lines)]
     text = "\n\n".join(parts) + "\n"
-    (folder / "table.md").write_text(text)
+    write_atomically(folder / "table.md", text)
     return text
 
 
@@ -274,7 +274,7 @@ def main(words: Sequence[str] | None = None) -> None:
     with exits_with_one_line():
         runs, folder, jobs = parse(words)
         run_all(runs, folder, jobs, run_arm, is_good)
-    print(f"{table(runs, folder)}\nresults: {folder}")
+        print(f"{table(runs, folder)}\nresults: {folder}")
 
 
 def run() -> None:

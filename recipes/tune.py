@@ -15,7 +15,6 @@ All trials have the same seed and are compared in the same episodes: what was se
 other seeds (damian compare).
 """
 
-import csv
 import functools
 import math
 import shlex
@@ -34,6 +33,8 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from damian.common import checks
+from damian.common.atomic_files import write_atomically
+from damian.common.csv_table import csv_table
 from damian.common.errors import InputError, RunError
 from damian.common.markdown import markdown_table
 from damian.evaluation.comparison import LESS_IS_BETTER, SCORES
@@ -257,8 +258,7 @@ def report(found: Search) -> None:
         raise RunError(f"no trial of {found.folder} has a value: see the log.txt of each")
     complete.sort(key=lambda trial: -found.config.sign * (trial.value or 0.0))
     head = ["trial", "state", found.config.score, *found.space]
-    with (found.folder / TRIALS).open("w", newline="") as file:
-        csv.writer(file).writerows([head, *(row(found, trial) for trial in trials)])
+    write_atomically(found.folder / TRIALS, csv_table([head, *(row(found, trial) for trial in trials)]))
     lines = [
         f"`{command(typed_words())}`",
         f"{len(trials)} trials: {len(complete)} with a value, "
@@ -269,7 +269,7 @@ def report(found: Search) -> None:
         f"The best: `damian train {shlex.join(found.words(complete[0].user_attrs[CHOSEN]))}`",
     ]
     text = "\n\n".join(lines) + "\n"
-    (found.folder / TABLE).write_text(text)
+    write_atomically(found.folder / TABLE, text)
     plot(found)
     print(text)
 

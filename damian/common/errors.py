@@ -15,10 +15,14 @@ class InputError(ValueError):
     """
 
 
+RUN_ERROR = 3
+"""Exit code of a recipe whose run cannot go on."""
+
+
 class RunError(RuntimeError):
     """A run that cannot go on: a full disk, or numbers that are not finite; ``str(error)`` is one line.
 
-    A recipe prints that line and exits with code 3.
+    A recipe prints that line and exits with code ``RUN_ERROR``.
     """
 
 

@@ -18,6 +18,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 from torch.utils.tensorboard import summary
 
 from damian.common.atomic_files import write_atomically, writing
+from damian.common.csv_table import csv_table
 from damian.common.errors import InputError, naming_errors
 from damian.evaluation.loggers import BINS, Logger
 
@@ -94,7 +95,8 @@ class MetricsLog:
         self.rows.append(row)
         if self._path:
             with writing(self._path), self._path.open("a", newline="") as file:
-                file.write((_line(row) if file.tell() == 0 else "") + _values(row))
+                head = [row] if file.tell() == 0 else []
+                file.write(csv_table([*head, row.values()]))
 
     def add_histogram(self, frames: int, name: str, values: NDArray[np.floating]) -> None:
         """Log a distribution of values [K], after so many environment steps over all worlds."""
@@ -210,17 +212,6 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         raise InputError(f"{line}: not a row of numbers ({error})") from None
 
 
-def _line(cells: Sequence[object] | Mapping[str, float]) -> str:
-    """Cells, or the names of numbers, as a line of a CSV file."""
-    text = io.StringIO(newline="")
-    csv.writer(text).writerow(list(cells))
-    return text.getvalue()
-
-
 def _table(rows: Sequence[Mapping[str, float]]) -> str:
     """Rows with the same columns, and the line of their names, as a CSV file."""
-    return "".join([_line(rows[0]), *map(_values, rows)])
-
-
-def _values(row: Mapping[str, float]) -> str:
-    return _line(list(row.values()))
+    return csv_table([rows[0], *(row.values() for row in rows)])

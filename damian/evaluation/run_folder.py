@@ -1,12 +1,12 @@
 """Files of a run folder: their names, the learning curve, and the table of results."""
 
-import csv
 import io
 import math
 from dataclasses import asdict, fields
 from pathlib import Path
 
 from damian.common.atomic_files import write_atomically
+from damian.common.csv_table import csv_table
 from damian.common.markdown import markdown_table
 from damian.evaluation.metrics import Evaluation
 
@@ -69,11 +69,9 @@ def save_results(
     below = "\n".join(filter(None, [note, SEEN if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, ["policy", *(field.name for field in fields(Evaluation))])
-    writer.writeheader()
-    writer.writerows({"policy": name, **asdict(row)} for name, row in rows.items())
-    write_atomically(folder / RESULTS, text.getvalue())  # last: with it, a run counts as finished
+    head = ["policy", *(field.name for field in fields(Evaluation))]
+    results = csv_table([head, *([name, *asdict(row).values()] for name, row in rows.items())])
+    write_atomically(folder / RESULTS, results)  # last: with it, a run counts as finished
     return table
 
 

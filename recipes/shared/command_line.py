@@ -15,7 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
-from damian.common.errors import InputError
+from damian.common.errors import RUN_ERROR, InputError, RunError
 from damian.common.text_files import one_line, show
 from damian.evaluation.run_record import read_record
 
@@ -24,12 +24,15 @@ from .known_settings import RECIPES
 
 @contextmanager
 def exits_with_one_line() -> Iterator[None]:
-    """End the program with one line on stderr and exit code 2 where wrong input is found inside."""
+    """End the program with one line on stderr where wrong input is found inside, or a file cannot be written.
+
+    The exit code is 2, or ``RUN_ERROR``.
+    """
     try:
         yield
-    except InputError as error:
+    except (InputError, RunError) as error:
         print(f"error: {one_line(str(error))}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(2 if isinstance(error, InputError) else RUN_ERROR)
 
 
 class Parser(ArgumentParser):

@@ -11,6 +11,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from damian.common.atomic_files import write_atomically
+from damian.common.csv_table import csv_table
 from damian.common.errors import InputError
 from damian.evaluation.comparison import MODE, SAMPLED, Arm, Row, regime
 from damian.evaluation.comparison_figures import LABELS
@@ -90,10 +92,8 @@ def stored_results(folder: Path) -> Results:
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write rows, which all have the same columns; without a row the file is empty."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]) if rows else [])
-        writer.writeheader()
-        writer.writerows(rows)
+    names = list(rows[0]) if rows else []
+    write_atomically(path, csv_table([names, *([row[name] for name in names] for row in rows)]))
 
 
 def _read(path: Path) -> list[Row]:

@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from damian.common import checks
 from damian.common.atomic_files import remove_unfinished, writing
-from damian.common.errors import InputError, RunError
+from damian.common.errors import RUN_ERROR, InputError, RunError
 from damian.evaluation.interrupt import exit_code
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG
 from damian.evaluation.run_lock import is_folder, locked
@@ -47,8 +47,6 @@ ALREADY_MANY = {
     "tune": "a search runs all of its trials",
 }
 """Programs that carry out many runs by themselves."""
-RUN_ERROR = 3
-"""Exit code of a run that could not go on: a full disk, or a learner that has diverged."""
 
 
 def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from tqdm import tqdm
 
 from damian.common import checks
+from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named, read_text, show
 
@@ -107,11 +108,12 @@ def file_of(run: OutsideRun, folder: Path) -> Path:
 
 
 def save_result(run: OutsideRun, folder: Path, returns: dict[str, Any]) -> None:
-    """Write the returns of a run; an interrupt must not leave half a result."""
-    file = file_of(run, folder)
-    partial = file.with_suffix(".part")
-    partial.write_text(json.dumps({**run._asdict(), "returns": returns}))
-    partial.replace(file)
+    """Write the returns of a run.
+
+    Raises:
+        RunError: the file cannot be written, such as on a full disk.
+    """
+    write_atomically(file_of(run, folder), json.dumps({**run._asdict(), "returns": returns}))
 
 
 def check_results(runs: Sequence[OutsideRun], folder: Path, is_good: Callable[[Any], bool]) -> None:

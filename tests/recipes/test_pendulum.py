@@ -11,6 +11,7 @@ from torch import nn
 from tqdm import tqdm
 
 from damian import keys
+from damian.common.errors import RUN_ERROR
 from damian.learners.sac import Sac
 from damian.recipes import pendulum
 from damian.recipes.pendulum import ARMS, Run, draw, evaluate_under, main, make_env, make_learner, train
@@ -99,16 +100,29 @@ def test_a_folder_with_results_of_other_settings_is_refused(tmp_path, capsys):
     assert "--delay: 3 is not the 6 of" in capsys.readouterr().err
 
 
-def test_some_arms_only_have_a_table_of_their_own(tmp_path):
-    words = [*TINY, "--arms", "bpql,naive", "--out", str(tmp_path)]
-    runs, folder, _ = pendulum.parse(words)
-    assert [run.arm for run in runs] == ["bpql", "naive"]
-    for run in runs:
+def finished(folder: Path, arms: str) -> list[str]:
+    """The words of a comparison of arms whose results a folder has already."""
+    words = [*TINY, "--arms", arms, "--out", str(folder)]
+    for run in pendulum.parse(words)[0]:
         file_of(run, folder).write_text(json.dumps({**run._asdict(), "returns": {"3": -10.0 * len(run.arm)}}))
-    main(words)
+    return words
+
+
+def test_some_arms_only_have_a_table_of_their_own(tmp_path):
+    main(finished(tmp_path, "bpql,naive"))
     with (tmp_path / "results.csv").open(newline="") as file:
         rows = [(row["arm"], row["mean"], row["seed 4"]) for row in csv.DictReader(file)]
     assert rows == [("bpql", "-40", "-40"), ("naive", "-50", "-50")]
+
+
+def test_a_table_that_cannot_be_written_is_one_line(tmp_path, capsys):
+    (tmp_path / "results.csv").mkdir()
+    with pytest.raises(SystemExit) as stopped:
+        main(finished(tmp_path, "naive"))
+    error = capsys.readouterr().err
+    assert stopped.value.code == RUN_ERROR
+    assert error.startswith(f"error: {tmp_path}/results.csv: it cannot be written: Is a directory")
+    assert error.count("\n") == 1
 
 
 # What the learners of the arms read.
