@@ -5,8 +5,9 @@
     damian oracle checkpoint=runs/undelayed delay.obs=4 agents=5
 
 The policy acts on messages that have not arrived yet, so its results are a reference that no real system can
-reach (regime R3). The overrides of the training run apply too, unless the command line gives others. The run
-folder gets config.yaml, result.csv and result.md: one row for each set of messages that a UAV knows on time.
+reach (regime R3, docs/protocol.md). The overrides of the training run apply too, unless the command line
+gives others. The run folder gets config.yaml, result.csv and result.md: one row for each set of messages that
+a UAV knows on time.
 """
 
 from collections.abc import Sequence

@@ -60,7 +60,7 @@ class TrainConfig(ScenarioConfig):
     """Networks of actor and critic."""
     critic: str = "server"
     """The critic observes the messages that the ``server`` holds, or (``privileged``) the true state without
-    delay (regime R1)."""
+    delay (regime R1, docs/protocol.md)."""
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = 0
     """Seed of all random draws."""
