@@ -12,14 +12,17 @@ import torch
 import yaml
 
 import damian
+import damian.transforms
 from damian import Constant
 from damian.delays.delay_line import DelayLine
 from damian.delays.laws import LAWS
 from damian.delays.samplers import Sampler
 from damian.evaluation.episode import COLUMNS
 from damian.recipes.command import PROGRAMS, SETTINGS
+from damian.recipes.shared.known_settings import known_settings
 from damian.recipes.shared.misspelt import check_words
 from damian.replay.hindsight import MessageLog, latest_arrived
+from damian.server.features import GLOBAL, LOCAL
 
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "RESULTS.md", "CHANGELOG.md")]
@@ -98,6 +101,18 @@ def test_the_table_of_delay_laws_has_every_parameter_and_its_default():
         for field in fields:
             if type(field.default) in (int, float):
                 assert float(written[field.name]) == field.default, (law, field.name)
+
+
+def test_the_documents_name_every_feature_every_transform_and_every_file_of_their_folders():
+    readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
+    concepts, delays = ((docs / name).read_text() for name in ("concepts.md", "transforms.md"))
+    assert [name for name in (*LOCAL, *GLOBAL) if f"`{name}`" not in concepts] == []
+    said = known_settings("train")["observation.global_features"].text
+    assert [name for name in GLOBAL if name not in said] == []
+    others = {"StatefulTransform", "check_order", "delay_trajectories"}
+    assert [name for name in {*damian.transforms.__all__} - others if f"`{name}`" not in delays] == []
+    files = [*docs.glob("*.md"), *(ROOT / "examples").glob("*.py")]
+    assert [file.name for file in files if file.name not in readme] == []
 
 
 def test_the_figure_of_the_delay_model_shows_what_back_updating_knows():
