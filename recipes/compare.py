@@ -1,7 +1,7 @@
 """Train and evaluate several arms with several seeds over tasks and delays, and compare their results.
 
     damian compare experiment=usecase2 seeds=10 processes=2
-    damian compare experiment=delaybench "tasks=[tracking]" "arms=[undelayed,naive,both]"
+    damian compare experiment=delaybench "tasks=[tracking]" "arms=[undelayed,own_naive,own]"
     damian compare experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
     damian compare experiment=usecase2 seeds=10 processes=40 launcher=slurm "slurm={slurm_partition: cpu}"
     damian compare experiment=usecase2 report_only=true
