@@ -61,7 +61,7 @@ pictures: $(VENV)/base
 
 # The documentation site, in build/site.
 docs: $(VENV)/docs
-	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 
 # The libraries of the replay page, in one file that is committed; only a change of their versions or of what is taken needs it.
 PAGE := damian/evaluation/page

@@ -75,9 +75,10 @@ STEP_COUNT = "step_count"
 EPISODE_REWARD = (AGENTS, "episode_reward")
 """Return of the episode so far, [B, N, 1] (TorchRL's ``RewardSum``)."""
 ACTION_LOG_PROB = (AGENTS, "action_log_prob")
-"""Log-probability of the action when it was chosen."""
+"""Log-probability of the action when it was chosen, [B, N]."""
 LOGITS, LOC, SCALE = (AGENTS, "logits"), (AGENTS, "loc"), (AGENTS, "scale")
-"""Parameters of the actor's distribution."""
+"""Parameters of the actor's distribution: logits of discrete actions, [B, N, A]; place and scale of
+continuous ones, [B, N, 2] each."""
 HIDDEN, HIDDEN_BEFORE = (AGENTS, "hidden"), (AGENTS, "hidden_before")
 """Recurrent state of the actor after and before a step, [B, N, H]."""
 ENCODING = (AGENTS, "encoding")
@@ -87,9 +88,9 @@ PREDICTION = (AGENTS, "prediction")
 IS_INIT = "is_init"
 """Does an episode begin with this step, [B, 1] bool (TorchRL's ``InitTracker``)."""
 STATE_VALUE, VALUE_TARGET = (AGENTS, "state_value"), (AGENTS, "value_target")
-"""The critic's estimate of the return, and the target that it is trained on."""
+"""The critic's estimate of the return, and the target that it is trained on, [B, N, 1] each."""
 ADVANTAGE = (AGENTS, "advantage")
-"""Advantage of the action."""
+"""Advantage of the action, [B, N, 1]."""
 BACKUPDATED = (AGENTS, "backupdated")
 """Did back-updating replace the message that the server held at this step, [T, B, N, 1] bool; if only rewards
 are late: did it credit the step with a late reward."""

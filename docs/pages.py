@@ -156,12 +156,14 @@ def package(name: str) -> str:
 def examples() -> list[str]:
     """The files of examples/, relative to it."""
     folder = ROOT / "examples"
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.py"))
+    files = [*folder.rglob("*.py"), *folder.rglob("*.yaml")]
+    return sorted(path.relative_to(folder).as_posix() for path in files)
 
 
 def example(path: str) -> str:
     """The page of an example."""
-    return f"# {path}\n\n```python\n{(ROOT / 'examples' / path).read_text()}```\n"
+    language = "yaml" if path.endswith(".yaml") else "python"
+    return f"# {path}\n\n```{language}\n{(ROOT / 'examples' / path).read_text()}```\n"
 
 
 def notebook(path: Path) -> str:

@@ -7,8 +7,8 @@ Nothing is trained. The script (``damian.baselines.greedy.Searcher``) flies each
 detects the source next, as the belief says. Its returns with ever more known on time are the information
 ceiling of a task under a delay; a policy that plans further ahead may win more. The run folder gets
 config.yaml, result.csv and result.md, with one row for what is known: the messages that have arrived at the
-server (regime R0), with each UAV's own messages at once (R0), all messages at once (R3), the source's true
-place (R3).
+server (regime R0, docs/protocol.md), with each UAV's own messages at once (R0), all messages at once (R3),
+the source's true place (R3).
 """
 
 from dataclasses import replace

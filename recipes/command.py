@@ -6,6 +6,7 @@
 A misspelt setting is answered before TorchRL, which takes seconds to import, is loaded.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -51,7 +52,7 @@ def main(words: Sequence[str] | None = None) -> None:
     """
     name, *words = (sys.argv[1:] if words is None else words) or ["--help"]
     if name in ("-h", "--help"):
-        print(usage())
+        _show(usage())
         return
     if name == "--version":
         print(import_module("damian").__version__)
@@ -74,7 +75,7 @@ def _answered(name: str, words: Sequence[str]) -> bool:
         given = parsed(words)
         if given.help:
             keys = [word for word in given.overrides if "=" not in word]
-            print(help_text(name, SETTINGS[name], keys, given.config_dir))
+            _show(help_text(name, SETTINGS[name], keys, given.config_dir))
             return True
         problem = check_words(SETTINGS[name], prepared(words))
     except InputError as error:
@@ -82,6 +83,14 @@ def _answered(name: str, words: Sequence[str]) -> bool:
     if problem:
         sys.exit(_refuse(problem))
     return False
+
+
+def _show(text: str) -> None:
+    """Print, also to a reader that stops early, as in ``damian train --help learner | head``."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the exit would write once more
 
 
 def usage() -> str:

@@ -1,7 +1,7 @@
 """Train and evaluate several arms with several seeds over tasks and delays, and compare their results.
 
     damian compare experiment=usecase2 seeds=10 processes=2
-    damian compare experiment=delaybench "tasks=[tracking]" "arms=[undelayed,naive,both]"
+    damian compare experiment=delaybench "tasks=[tracking]" "arms=[undelayed,own_naive,own]"
     damian compare experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
     damian compare experiment=usecase2 seeds=10 processes=40 launcher=slurm "slurm={slurm_partition: cpu}"
     damian compare experiment=usecase2 report_only=true
@@ -74,7 +74,7 @@ class CompareConfig:
     """All settings of ``damian compare``."""
 
     experiment: Experiment = MISSING
-    seeds: int = SEEDS
+    seeds: int = 10
     """Number of seeds, counted from ``experiment.first_seed``."""
     processes: int = 1
     """Number of runs at the same time; each has one thread unless ``overrides`` sets ``threads``."""
@@ -94,7 +94,8 @@ class CompareConfig:
     overrides: list[str] = field(default_factory=list)
     """Further overrides of ``damian train`` for every run."""
     score: str = "true_return"
-    """The measure J that J_norm and recovery are computed from."""
+    """The measure J that J_norm and recovery are computed from: true_return, true_success_rate or true_steps,
+    of what truly happened; episode_return, success_rate or steps, as the server perceived it."""
     policy: str = "sampled"
     """The evaluation that J comes from: actions ``sampled`` from the policy, or its ``mode``."""
     report_only: bool = False

@@ -25,7 +25,7 @@ def main(words: Sequence[str] | None = None) -> None:
         parser = Parser(description="Fit a trace law to the delays of real reports.")
         parser.add_argument("log", type=Path, help="journal of damian advise, or table of reports")
         parser.add_argument("--out", type=Path, default=Path("trace.csv"), help="the trace")
-        parser.add_argument("--dt", type=float, help="length of a step [s]")
+        parser.add_argument("--dt", type=float, help="length of a step [s]: delays are whole steps")
         args = parser.parse_args(words)
         if args.dt is not None:
             checks.above("--dt", args.dt, 0.0, "s")

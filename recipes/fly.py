@@ -8,8 +8,9 @@
 Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
 The run folder gets config.yaml, and for each episode that is kept episode_N.json (docs/episodes.md explains
 it), the film episode_N.gif (and episode_N_3d.gif), and episode_N.png: a map, the positions over time, and the
-age of information. "formats=[html]" makes episode_N.html, which plays the episode; damian replay makes such a
-page of several. With a journal of damian advise nothing is flown: the episode is the flight that it tells.
+age of information; with keep=extremes they are called best, median and worst. "formats=[html]" makes
+episode_N.html, which plays the episode; damian replay makes such a page of several. With a journal of damian
+advise nothing is flown: the episode is the flight that it tells.
 """
 
 from dataclasses import dataclass, field, fields

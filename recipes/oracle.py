@@ -5,8 +5,9 @@
     damian oracle checkpoint=runs/undelayed delay.obs=4 agents=5
 
 The policy acts on messages that have not arrived yet, so its results are a reference that no real system can
-reach (regime R3). The overrides of the training run apply too, unless the command line gives others. The run
-folder gets config.yaml, result.csv and result.md: one row for each set of messages that a UAV knows on time.
+reach (regime R3, docs/protocol.md). The overrides of the training run apply too, unless the command line
+gives others; a policy with a belief is refused. The run folder gets config.yaml, result.csv and result.md:
+one row for each set of messages that a UAV knows on time.
 """
 
 from collections.abc import Sequence
@@ -48,7 +49,8 @@ def foresee(config: TrainConfig, folder: Path) -> None:
     checks.require(config.links.kind == "server", "links", config.links.kind, should)
     should = "is not supported: the rows replace what the server broadcasts at every step; leave it out"
     checks.require(config.clock.steps("server") == 1, "clock.server", config.clock.server, should)
-    should = "is not supported: what a UAV believes follows from more messages than the latest ones"
+    follows = "what a UAV believes follows from more messages than the latest ones"
+    should = f"is not supported: {follows}; choose a policy that was trained without it"
     for key, value in (
         ("observation.belief", config.observation.belief),
         ("delay.messages", config.delay.messages),

@@ -28,7 +28,7 @@ def parse(words: Sequence[str] | None) -> tuple[list[Path], Path]:
     """
     parser = Parser("damian replay", description="Make one page that plays stored episodes side by side.")
     parser.add_argument("episodes", type=Path, nargs="+", metavar="EPISODE.json", help="files of damian fly")
-    parser.add_argument("--out", type=Path, default=Path("replay.html"), help="the page (replay.html)")
+    parser.add_argument("--out", type=Path, default=Path("replay.html"), help="the page")
     args = parser.parse_args(words)
     checks.in_range("EPISODE.json", len(args.episodes), 1, MOST)
     page = args.out.suffix.lower() in (".html", ".htm")  # else a forgotten name would cost an episode

@@ -80,7 +80,9 @@ class TuneConfig(TrainConfig):
     prune: bool = True
     """Whether to stop trainings that are worse than the median."""
     score: str = "true_return"
-    """The measure of the evaluation that is to be best: least, if it counts steps."""
+    """The measure of the evaluation that is to be best (least, if it counts steps): true_return,
+    true_success_rate or true_steps, of what truly happened; episode_return, success_rate or steps, as the
+    server perceived it."""
     policy: str = "sampled"
     """The policy that is evaluated: actions ``sampled`` from it, or its ``mode``."""
 

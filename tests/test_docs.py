@@ -4,22 +4,29 @@ import dataclasses
 import re
 import runpy
 import shlex
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from hydra import initialize_config_dir
 
 import damian
+import damian.transforms
 from damian import Constant
 from damian.delays.delay_line import DelayLine
 from damian.delays.laws import LAWS
 from damian.delays.samplers import Sampler
 from damian.evaluation.episode import COLUMNS
 from damian.recipes.command import PROGRAMS, SETTINGS
+from damian.recipes.shared.known_settings import CONF, known_settings
+from damian.recipes.shared.launch import checked, composed_with
 from damian.recipes.shared.misspelt import check_words
 from damian.replay.hindsight import MessageLog, latest_arrived
+from damian.server.features import GLOBAL, LOCAL
 
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "RESULTS.md", "CHANGELOG.md")]
@@ -38,16 +45,35 @@ def test_the_readmes_python_runs(capsys):
     assert 3 < age < 8
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
-def test_every_command_that_a_file_names_exists(file):
+def commands(file: Path) -> Iterator[tuple[str, list[str]]]:
+    """The commands that a file names: program and words."""
     text = file.read_text().replace("\\\n", "")
     for line in re.findall(r"(?:^[ #]*|`)damian ([a-z]+ [^`\n|]*)", text, re.MULTILINE):
         command = re.split(r"  +[#(]", line)[0]  # an explanation stands behind some spaces
         name, *words = shlex.split(command, comments=True)
+        yield name, words
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
+def test_every_command_that_a_file_names_exists(file):
+    for name, words in commands(file):
+        line = shlex.join([name, *words])
         assert name in PROGRAMS, line
         own = [word for word in words if "FOLDER" not in word and "NAME" not in word]
         if name in SETTINGS and "--help" not in words:
             assert check_words(SETTINGS[name], own) is None, line
+
+
+def test_every_comparison_that_a_file_names_has_its_tasks_delays_and_arms():
+    found = [words for file in FILES for name, words in commands(file) if name == "compare"]
+    found = [
+        words for words in found if any(word.split("=")[0] in ("tasks", "delays", "arms") for word in words)
+    ]
+    assert len(found) > 2
+    import_module("damian.recipes.compare")  # stores its settings
+    with initialize_config_dir(CONF, version_base=None):
+        for words in found:
+            checked(composed_with("compare", [word for word in words if "hydra" not in word]), "compare")
 
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: file.name)
@@ -98,6 +124,18 @@ def test_the_table_of_delay_laws_has_every_parameter_and_its_default():
         for field in fields:
             if type(field.default) in (int, float):
                 assert float(written[field.name]) == field.default, (law, field.name)
+
+
+def test_the_documents_name_every_feature_every_transform_and_every_file_of_their_folders():
+    readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
+    concepts, delays = ((docs / name).read_text() for name in ("concepts.md", "transforms.md"))
+    assert [name for name in (*LOCAL, *GLOBAL) if f"`{name}`" not in concepts] == []
+    said = known_settings("train")["observation.global_features"].text
+    assert [name for name in GLOBAL if name not in said] == []
+    others = {"StatefulTransform", "check_order", "delay_trajectories"}
+    assert [name for name in {*damian.transforms.__all__} - others if f"`{name}`" not in delays] == []
+    files = [*docs.glob("*.md"), *(ROOT / "examples").glob("*.py")]
+    assert [file.name for file in files if file.name not in readme] == []
 
 
 def test_the_figure_of_the_delay_model_shows_what_back_updating_knows():

@@ -18,7 +18,7 @@ class ClockConfig:
     server: str | None = None
     """Period at which the server node broadcasts observations; that of the simulation if not given."""
     system: str | None = None
-    """Period at which the learner receives a batch of steps; ``steps`` of the algorithm if not given."""
+    """Period at which the learner receives a batch of steps; ``learner.steps`` if not given."""
     trigger: str | None = None
     """Change of the system clock's period at each tick: the period shrinks if, in half of the worlds or more,
     a UAV spots the source, and grows otherwise. The period is fixed if this is not given."""

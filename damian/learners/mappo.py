@@ -86,7 +86,7 @@ class MappoConfig(LearnerConfig):
         recurrent, shortest, longest = setup.model.recurrent, setup.shortest_period, setup.longest_delay
         most_minibatches = setup.worlds if recurrent else setup.worlds * shortest
         checks.in_range("learner.minibatches", self.minibatches, 1, most_minibatches)
-        should = f"needs more than {longest} steps (the longest delay) between two updates, not {shortest}"
+        should = f"needs more than {longest} steps (longest delay) per update (learner.steps), not {shortest}"
         checks.require(not setup.settle or longest < shortest, "settle", True, should)
         should = "does not go with model.rnn: hidden states are not recomputed from corrected observations"
         checks.require(not (recurrent and setup.recompute_actor), "recompute_actor", True, should)

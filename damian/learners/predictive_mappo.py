@@ -35,7 +35,7 @@ class PredictiveMappoConfig(MappoConfig):
     prediction_buffer: int = 32_000
     """Environment steps, over all worlds, from which predictions are learnt."""
     heads: int = 4
-    """Number of questions that an actor asks about the messages it knows."""
+    """Number of attention heads over the messages that an actor knows."""
     width: int = 32
     """Size of the embedding of a message."""
 

@@ -30,7 +30,9 @@ class ObservationConfig:
     global_features: list[str] = field(
         default_factory=lambda: ["source_distance", "source_bearing", "source_time"]
     )
-    """Features that the server computes from the messages of all UAVs (Table 2, or of one's own)."""
+    """Features that the server computes from the messages of all UAVs (Table 2): source_distance,
+    source_bearing, source_drift, source_time, agent_distances, coverage, mean_distance,
+    mean_distance_not_spotting, mean_distance_spotting, spotting_agents, or one's own."""
     ctde: bool = False
     """Centralised training, decentralised execution: the actor observes only the local features."""
     time_scale: float | None = None

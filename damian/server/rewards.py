@@ -36,31 +36,35 @@ class RewardConfig:
     """The task, as weights of the reward terms (eq. 5-8). A term with weight 0 is not computed."""
 
     coverage: float = 0.0
-    """w_ca of R1^a (eq. 7)."""
+    """Weight of the share of the UAV's latest footprints that is new, in the region and in no other UAV's
+    footprint (w_ca of R1^a, eq. 7)."""
     spotted: float = 1.0
-    """w_k of R2^a (eq. 7); the term is divided by the motions since the UAV last spotted."""
+    """Weight of spotting the source, over the motions since the UAV last spotted it (w_k of R2^a, eq. 7)."""
     battery: float = 0.0
-    """w_b of R3^a (eq. 7)."""
+    """Weight of the battery level, in [0, 1] (w_b of R3^a, eq. 7)."""
     source_distance: float = 0.0
-    """w_ds of R1^s (eq. 6); the term is divided by the motions since the UAV last spotted."""
+    """Weight of being near the source, as estimated from detections, over the motions since the UAV last
+    spotted it (w_ds of R1^s, eq. 6)."""
     source_time: float = 0.0
-    """w_ts of R2^s (eq. 6)."""
+    """Weight of a recent detection by any UAV (w_ts of R2^s, eq. 6)."""
     source_bearing: float = 0.0
-    """w_bs of R3^s (eq. 6)."""
+    """Weight of a small bearing of the source, clockwise from north (w_bs of R3^s, eq. 6)."""
     source_drift: float = 0.0
-    """w_th of R4^s (eq. 6)."""
+    """Weight of a heading towards the source (w_th of R4^s, eq. 6); ``drift`` says how it is paid."""
     spotting_agents: float = 0.0
-    """w_ss of R5^s (eq. 6)."""
+    """Weight of a share of spotting UAVs near ``desired_spotting`` (w_ss of R5^s, eq. 6)."""
     mean_distance: float = 0.0
-    """w_avg of R6^s (eq. 6)."""
+    """Weight of a mean distance to the other UAVs near ``desired_distance`` (w_avg of R6^s, eq. 6)."""
     mean_distance_not_spotting: float = 0.0
-    """w_nss of R7^s (eq. 6)."""
+    """Weight of a mean distance between UAVs that do not spot near ``desired_distance_not_spotting`` (w_nss
+    of R7^s, eq. 6)."""
     mean_distance_spotting: float = 0.0
-    """w_ss of R8^s (eq. 6)."""
+    """Weight of a mean distance of the spotting UAVs to the source near ``desired_distance_spotting`` (w_ss
+    of R8^s, eq. 6)."""
     individual: float = 1.0
-    """w_a (eq. 8), the weight of the individual reward."""
+    """Weight of the individual reward, the terms coverage, spotted and battery (w_a, eq. 8)."""
     system: float = 1.0
-    """w_s (eq. 8), the weight of the system reward."""
+    """Weight of the system reward, the terms from source_distance to mean_distance_spotting (w_s, eq. 8)."""
     drift: str = "smooth"
     """R4^s for a drift theta. ``smooth``: 1 - |2 theta - 1|; ``printed``: 2 theta up to 1/2, then
     1 - theta, as eq. 6 is printed."""

@@ -4,11 +4,11 @@ import os
 import re
 import shlex
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import Action, ArgumentDefaultsHelpFormatter, ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -35,8 +35,18 @@ def exits_with_one_line() -> Iterator[None]:
         sys.exit(2 if isinstance(error, InputError) else RUN_ERROR)
 
 
+class _WithDefaults(ArgumentDefaultsHelpFormatter):
+    """Names the default of each option that has one."""
+
+    def _get_help_string(self, action: Action) -> str | None:
+        return action.help if action.default in (None, False) else super()._get_help_string(action)
+
+
 class Parser(ArgumentParser):
-    """Raises an ``InputError`` instead of printing its usage."""
+    """Raises an ``InputError`` instead of printing its usage; its help names the defaults."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, formatter_class=_WithDefaults, **options)
 
     def error(self, message: str) -> NoReturn:
         raise InputError(message)

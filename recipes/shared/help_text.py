@@ -1,10 +1,14 @@
 """What ``--help`` prints: a page on a program, or the meaning of settings and groups."""
 
 import ast
+import itertools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import OmegaConf
+
+from damian.common.text_files import read_text
 
 from .known_settings import CONF, RECIPES, default_options, groups, known_settings
 from .misspelt import no_such_key
@@ -36,9 +40,21 @@ def _options(program: str, group: str, own_folder: str | None) -> list[str]:
     """How to choose an option of a group, with all options, the default one in brackets; or nothing."""
     if group not in default_options(program):
         return []
-    default = default_options(program)[group]
-    options = [f"[{option}]" if option == default else option for option in groups(own_folder)[group]]
-    return [f"choose one with {group}=OPTION: {', '.join(options)}"]
+    default, options = default_options(program)[group], groups(own_folder)[group]
+    shown = [f"[{option}]" if option == default else option for option in options]
+    said = {option: _comment(group, option, own_folder) for option in options}
+    lines = [f"    {option}: {text}" for option, text in said.items() if text]
+    return [f"choose one with {group}=OPTION: {', '.join(shown)}", *lines]
+
+
+def _comment(group: str, option: str, own_folder: str | None) -> str:
+    """What the comment at the top of an option's file says, without the command in it."""
+    files = (Path(root, group, f"{option}.yaml") for root in filter(None, (own_folder, CONF)))
+    text = next((read_text(file) for file in files if file.is_file()), "")
+    lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+    comment = [line.lstrip("# ") for line in lines]
+    words = (re.sub(r"^@package.*|^(cd \S+; )?damian .*?(  +|$)", "", line) for line in comment)
+    return " ".join(filter(None, (re.sub(r"^\((.*)\)$", r"\1", line) for line in words)))
 
 
 def _meaning(program: str, key: str) -> list[str]:

@@ -33,8 +33,8 @@ class OutsideRun(Protocol):
 
 def add_options(parser: Parser, arms: Sequence[str], folder: str) -> None:
     """Add the options that all of these programs have."""
-    parser.add_argument("--arms", default=",".join(arms), help=f"arms, such as {','.join(arms[:2])}")
-    parser.add_argument("--seeds", default="0,1,2", help="seeds of each arm, such as 0,1,2")
+    parser.add_argument("--arms", default=",".join(arms), help="arms (ways to learn), all or some of these")
+    parser.add_argument("--seeds", default="0,1,2", help="seeds of each arm")
     parser.add_argument("--out", type=Path, default=Path(folder), help="run folder")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes, each with one thread")
 

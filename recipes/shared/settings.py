@@ -60,7 +60,7 @@ class TrainConfig(ScenarioConfig):
     """Networks of actor and critic."""
     critic: str = "server"
     """The critic observes the messages that the ``server`` holds, or (``privileged``) the true state without
-    delay (regime R1)."""
+    delay (regime R1, docs/protocol.md)."""
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     seed: int = 0
     """Seed of all random draws."""
@@ -85,10 +85,10 @@ class TrainConfig(ScenarioConfig):
     """With ``backupdate``, the original authors' variant: late messages correct the actor's observations too,
     and the log-probabilities of its actions follow from these."""
     checkpoint: str | None = None
-    """Run folder of the policy to start from, or the ``best.pt`` in it; that run's overrides apply too,
-    unless others are given."""
+    """Run folder of a policy, or the ``best.pt`` in it: the one with which a training begins, or that another
+    program flies. That run's overrides apply too, unless others are given."""
     overrides: list[str] = field(default_factory=list)
-    """Overrides on the command line; filled in by the recipe."""
+    """Overrides on the command line; the program fills them in."""
     resume: str | None = None
     """Run folder of the run to continue."""
     device: str = "cpu"

@@ -2,12 +2,16 @@
 
 import csv
 import json
+import re
+import textwrap
 from pathlib import Path
 
 import pytest
 from extensions import TINY
 from helpers import check_refused
 from omegaconf import OmegaConf
+
+import damian
 
 OWN = ["--config-dir=conf", "scenario=windy"]
 READER = """
@@ -158,6 +162,16 @@ def test_a_learner_gets_what_it_reads_and_what_was_held_before_and_after_back_up
     metrics = last_metrics(run(*TINY, "learner=reader:ReaderConfig", "delay.obs=3", "aware=backupdate"))
     assert float(metrics["state"]) == 1
     assert 0.5 < float(metrics["changed"]) == float(metrics["marked"]) < 1
+
+
+def test_every_run_of_the_experiment_in_the_document_is_accepted(run, folder, capsys):
+    text = (Path(damian.__file__).parents[1] / "docs" / "extending.md").read_text()
+    (shown,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    (folder / "conf" / "experiment").mkdir()
+    (folder / "conf" / "experiment" / "mine.yaml").write_text(textwrap.dedent(shown))
+    words = ["--config-dir=conf", "experiment=mine", "seeds=1", "report_only=true"]
+    accepted = "experiment: no run of it is finished"
+    check_refused(lambda: run(*words, program="compare", name="compared"), accepted, capsys)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """The command ``damian``: its programs, its help, and its quick answers to misspelt settings."""
 
 import json
+import os
 import subprocess
 import sys
 from importlib import import_module
@@ -277,6 +278,22 @@ def test_a_valid_command_is_never_refused(words):
     assert check_words("train", words) is None
 
 
+def test_every_option_of_a_group_says_what_it_is(capsys):
+    for group in {*groups()} - {"experiment", "search", "tuning"}:
+        main(["train", "--help", group])
+        printed = capsys.readouterr().out
+        assert all(f"\n    {option}: " in printed for option in groups()[group]), group
+
+
+def test_help_for_a_reader_that_stops_early_ends_quietly():
+    code = "from damian.recipes.command import main; main(['train', '--help', 'learner'])"
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([sys.executable, "-c", code], stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 def test_help_may_stand_anywhere_and_explains_groups_and_experiments(capsys):
     def printed(*words: str) -> str:
         main(words)
@@ -288,6 +305,8 @@ def test_help_may_stand_anywhere_and_explains_groups_and_experiments(capsys):
     scenarios = printed("train", "--help", "scenario")
     assert scenarios.startswith("choose one with scenario=OPTION: coverage, ")
     assert "[spotting]" in scenarios
+    assert "\n    spotting: A static source at an unknown place;" in scenarios
+    assert "\n    paper: the paper's section 5: 15 % of the messages" in printed("train", "--help", "delay")
     learner = printed("train", "--help", "learner")
     assert "choose one with learner=OPTION: bpql, [mappo], predictive_mappo, sac\n" in learner
     assert (
