@@ -104,9 +104,9 @@ class Compared(NamedTuple):
     j_norm: Estimate
     """0: the random policy; 1: the undelayed arm."""
     recovery: Estimate = UNKNOWN
-    """0: the stronger naive arm; 1: the undelayed arm."""
+    """0: the strongest naive arm; 1: the undelayed arm."""
     improvement: Estimate = UNKNOWN
-    """Probability that a run of the arm beats one of the stronger naive arm."""
+    """Probability that a run of the arm beats one of the strongest naive arm."""
     of_ceiling: Estimate = UNKNOWN
     """Score over that of the script which knows all messages on time, if an arm flies it."""
 
