@@ -215,14 +215,20 @@ class BackupdateStorage(TimeStorage):
         """Correct the latest ``n_steps`` steps with all that has arrived by the last step."""
         # Earlier steps too, whose messages may be the newest ones of the steps to correct.
         index = self.latest(n_steps + self.longest + self.lookback)
-        recomputed = self.recomputed(self._storage[index])
         rows = index[-n_steps:]
+        recomputed = self.recomputed(self._storage[index], len(index) - len(rows))
         for key, value in recomputed.items():
             self._storage.get(key)[rows] = value[-len(rows) :]
         self._bump_mutation_revision()
 
-    def recomputed(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
-        """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step."""
+    def recomputed(self, steps: TensorDictBase, n_right: int = 0) -> dict[NestedKey, Tensor]:
+        """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step.
+
+        Args:
+            steps: stored steps, the last of which is the latest one.
+            n_right: how many of the first steps are stored as they should be. What is recomputed for these
+                may be wrong, because a message that came late may have been sent before all of the steps.
+        """
         begins = steps[self.step_keys.step_count].squeeze(-1) == 0
         entries, added = self._recompute_latest(steps)
         after = self._correct(entries, steps)
@@ -232,7 +238,9 @@ class BackupdateStorage(TimeStorage):
             after[truncated] = after[truncated] | (reset & ~after[terminated])
             after[done] = after[done] | reset
         already_ended = ~steps[keys.VALID][0].squeeze(-1) & ~begins[0]
-        ended = after[done] if done in after else steps[done]
+        ended = steps[done]
+        if done in after:
+            ended = torch.cat([ended[:n_right], after[done][n_right:]])
         over = ended_before(ended.squeeze(-1), begins, already_ended)
         return {**after, **_before(steps, after, begins), **added, keys.VALID: ~over.unsqueeze(-1)}
 
