@@ -19,6 +19,8 @@ from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.replay.backupdate import BackupdateStorage
 
+_NEEDS = "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
+
 
 @LEARNERS.register("predictive_mappo")
 @dataclass
@@ -51,10 +53,7 @@ class PredictiveMappoConfig(MappoConfig):
     def check(self, setup: LearningSetup) -> None:
         super().check(setup)
         name, model = "learner=predictive_mappo", setup.model
-        should = (
-            "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
-        )
-        checks.require(setup.backupdate, "learner", "predictive_mappo", should)
+        checks.require(setup.backupdate, "learner", "predictive_mappo", _NEEDS)
         for key, value, good in (
             ("model.rnn", model.rnn, not model.recurrent),
             ("model.skip", model.skip, not model.skip),
@@ -70,6 +69,8 @@ class PredictiveMappoConfig(MappoConfig):
         return None if least is None else max(least, self.prediction_buffer // setup.worlds * setup.worlds)
 
     def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "PredictiveMappo":
+        late = keys.DELAY in env.observation_spec.keys(True, True)  # rewards alone may be late
+        checks.require(late, "learner", "predictive_mappo", _NEEDS)
         return PredictiveMappo(env, self, setup, buffer)
 
     def make_actor(self, env: EnvBase, model: ModelConfig) -> ProbabilisticActor:

@@ -72,7 +72,7 @@ class ReturnScale(nn.Module):
     """
 
     returns: Tensor
-    """Sum of the rewards of the episode so far, each discounted by the steps since then, [B, N, 1]."""
+    """Sum of the rewards of the episode so far, each discounted by the simulation steps since, [B, N, 1]."""
 
     def __init__(self, like: Tensor, gamma: float) -> None:
         super().__init__()
@@ -89,16 +89,18 @@ class ReturnScale(nn.Module):
     def update(self, batch: TensorDictBase) -> None:
         """Add the discounted returns at every step of the next batch [B, T] of the same worlds."""
         rewards, done = (cast(Tensor, batch[keys.next_key(key)]) for key in (keys.REWARD, keys.DONE))
-        rewards, done = rewards.clone(), done.unsqueeze(-2).expand_as(rewards)
-        rewards[:, 0] += self.gamma * self.returns
+        # Only with ``clock.skip`` do steps have durations other than 1.
+        durations = cast(Tensor, batch.get(keys.next_key(keys.DURATION), torch.ones_like(done).long()))
+        gamma, done = (x.unsqueeze(-2).expand_as(rewards) for x in (self.gamma**durations, done))
+        rewards = rewards.clone()
+        rewards[:, 0] += gamma[:, 0] * self.returns
         begins = torch.cat([torch.ones_like(done[:, :1]), done[:, :-1]], 1)
         # With lambda 1 and values of 0, the estimate is the sum of the rewards that follow, discounted: here
         # of those before, as time is reversed.
         zero = torch.zeros_like(rewards)
+        discount: Any = gamma.flip(1)  # TorchRL says float, but broadcasts tensors
         reversed_time = (rewards.flip(1), begins.flip(1))
-        following, _ = generalized_advantage_estimate(
-            self.gamma, 1.0, zero, zero, *reversed_time, time_dim=-3
-        )
+        following, _ = generalized_advantage_estimate(discount, 1.0, zero, zero, *reversed_time, time_dim=-3)
         returns = following.flip(1)
         self.norm.update(returns)
         self.returns.copy_(returns[:, -1] * ~done[:, -1])

@@ -17,7 +17,7 @@ from damian import keys
 from damian.common import checks
 from damian.keys import next_key
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
-from damian.learners.networks import ModelConfig, make_actor
+from damian.learners.networks import ModelConfig
 from damian.learners.reward_scale import ReturnScale
 from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
@@ -121,7 +121,7 @@ class Sac:
 
     def __init__(self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer) -> None:
         self.config, self.setup, self.buffer = config, setup, buffer
-        self.actor = make_actor(env, setup.model)
+        self.actor = config.make_actor(env, setup.model)
         read = config.critic_keys(setup)
         critics = [make_action_value(env, setup.model, read) for _ in range(N_CRITICS)]
         self.loss = sac_loss(self.actor, critics, env, config)

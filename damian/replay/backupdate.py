@@ -14,7 +14,7 @@ from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.keys import next_key
 from damian.replay.corrections import Correction, CreditLateRewards
-from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
+from damian.replay.hindsight import MessageLog, ended_before, latest_with_age
 from damian.replay.step_keys import (
     ENDS,
     Recompute,
@@ -43,7 +43,7 @@ class BackupdateStorage(TimeStorage):
     now; ``reset_after`` [T, B, 1], true where the environment was reset (such a step is truncated if the task
     had not ended after all); ``backupdated`` beside ``delay_key``, [T, B, 1] or [T, B, N, 1], true where a
     late message replaced the one that the receiver held (without messages: where a late reward has been
-    paid); and the messages of ``hindsight_key``.
+    paid); and the messages of ``hindsight_key`` with their ages.
 
     The entries of messages are at the root (one sender in each world: [T, B, M], delay and age [T, B, 1]) or
     in a group of N agents ([T, B, N, M], delay and age [T, B, N, 1]). ``ObservationDelay`` writes all but the
@@ -64,7 +64,9 @@ class BackupdateStorage(TimeStorage):
         age_key: age of the message that the receiver held [steps].
         step_count_key: earlier steps of the episode, [T, B, 1] (``StepCounter``); 0 where it begins.
         hindsight_key: if given, the entry ``("next", hindsight_key)`` is added: the newest message sent by
-            that step that has arrived by now, as ``received_key`` in shape.
+            that step that has arrived by now, as ``received_key`` in shape; and its age ``hindsight_age``
+            beside ``delay_key``, as the delay in shape. Give it with ``order="arrival"``, or with messages
+            from elsewhere, if a sender may be silent for more than ``longest`` steps.
         options: of ``LazyTensorStorage``.
 
     Raises:
@@ -173,6 +175,7 @@ class BackupdateStorage(TimeStorage):
         data[self.step_keys.backupdated] = torch.zeros_like(delay, dtype=torch.bool)
         if self.step_keys.hindsight is not None:
             data[next_key(self.step_keys.hindsight)] = data[next_key(self.step_keys.received)].clone()
+            data[self.step_keys.hindsight_age] = data[next_key(self.step_keys.age)].long()
         return data
 
     def receive(self, world: Tensor, agent: Tensor | None, steps_ago: Tensor, message: Tensor) -> None:
@@ -215,14 +218,20 @@ class BackupdateStorage(TimeStorage):
         """Correct the latest ``n_steps`` steps with all that has arrived by the last step."""
         # Earlier steps too, whose messages may be the newest ones of the steps to correct.
         index = self.latest(n_steps + self.longest + self.lookback)
-        recomputed = self.recomputed(self._storage[index])
         rows = index[-n_steps:]
+        recomputed = self.recomputed(self._storage[index], len(index) - len(rows))
         for key, value in recomputed.items():
             self._storage.get(key)[rows] = value[-len(rows) :]
         self._bump_mutation_revision()
 
-    def recomputed(self, steps: TensorDictBase) -> dict[NestedKey, Tensor]:
-        """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step."""
+    def recomputed(self, steps: TensorDictBase, n_right: int = 0) -> dict[NestedKey, Tensor]:
+        """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step.
+
+        Args:
+            steps: stored steps, the last of which is the latest one.
+            n_right: how many of the first steps are stored as they should be. What is recomputed for these
+                may be wrong, because a message that came late may have been sent before all of the steps.
+        """
         begins = steps[self.step_keys.step_count].squeeze(-1) == 0
         entries, added = self._recompute_latest(steps)
         after = self._correct(entries, steps)
@@ -232,7 +241,9 @@ class BackupdateStorage(TimeStorage):
             after[truncated] = after[truncated] | (reset & ~after[terminated])
             after[done] = after[done] | reset
         already_ended = ~steps[keys.VALID][0].squeeze(-1) & ~begins[0]
-        ended = after[done] if done in after else steps[done]
+        ended = steps[done]
+        if done in after:
+            ended = torch.cat([ended[:n_right], after[done][n_right:]])
         over = ended_before(ended.squeeze(-1), begins, already_ended)
         return {**after, **_before(steps, after, begins), **added, keys.VALID: ~over.unsqueeze(-1)}
 
@@ -243,16 +254,18 @@ class BackupdateStorage(TimeStorage):
         if self.recompute is None:
             paid = self._late_rewards[0].paid(steps, steps[names.step_count].squeeze(-1))
             return {}, {names.backupdated: paid & (delay > 0)}
-        log = MessageLog(
-            sent=steps[next_key(names.message)],
-            delay=delay.squeeze(-1),
-            held=steps[next_key(names.received)],
-            age=steps[next_key(names.age)].squeeze(-1).long(),
-        )
-        latest = latest_arrived(log)
-        added: Entries = {names.backupdated: (latest != log.held).any(-1, keepdim=True)}
+        held, age = steps[next_key(names.received)], steps[next_key(names.age)].long()
+        log = MessageLog(steps[next_key(names.message)], delay.squeeze(-1), held, age.squeeze(-1))
         if names.hindsight is not None:
-            added[next_key(names.hindsight)] = latest
+            # What is known at the first step may be newer than what is held, and sent before all of them.
+            known, known_age = steps[next_key(names.hindsight)], steps[names.hindsight_age]
+            held, age = _first_of(known, held), _first_of(known_age, age)
+            log = log._replace(held=held, age=age.squeeze(-1))
+        latest, age = latest_with_age(log)
+        replaced = latest != steps[next_key(names.received)]
+        added: Entries = {names.backupdated: replaced.any(-1, keepdim=True)}
+        if names.hindsight is not None:
+            added |= {next_key(names.hindsight): latest, names.hindsight_age: age.unsqueeze(-1)}
         return self.recompute(steps, latest), added
 
     def _correct(self, entries: Entries, steps: TensorDictBase) -> Entries:
@@ -262,6 +275,11 @@ class BackupdateStorage(TimeStorage):
         for correction in self.corrections:
             entries = correction(entries, steps, count)
         return entries
+
+
+def _first_of(first: Tensor, others: Tensor) -> Tensor:
+    """Row 0 of one tensor [T, ...], then the other rows of another one."""
+    return torch.cat([first[:1], others[1:]])
 
 
 def _before(steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor) -> dict[NestedKey, Tensor]:

@@ -33,6 +33,11 @@ def latest_arrived(log: MessageLog, now: int | None = None) -> Tensor:
         log: messages sent and held.
         now: index of a step, the last one if not given; no message that arrives later is used.
     """
+    return latest_with_age(log, now)[0]
+
+
+def latest_with_age(log: MessageLog, now: int | None = None) -> tuple[Tensor, Tensor]:
+    """The messages of ``latest_arrived``, and the age of each at its step [steps], [T, *]."""
     steps = _steps(log.delay)
     arrived = (log.delay >= 0) & (steps + log.delay <= (len(steps) - 1 if now is None else now))
     none = torch.iinfo(steps.dtype).min  # older than any held message, even one older than these steps
@@ -41,7 +46,8 @@ def latest_arrived(log: MessageLog, now: int | None = None) -> Tensor:
     newest_held, held_at = (steps - log.age).cummax(0)
     # A message of an earlier episode is never newer than the held one.
     came_late = newest > newest_held
-    return torch.where(came_late.unsqueeze(-1), _at(log.sent, newest.clamp(min=0)), _at(log.held, held_at))
+    latest = torch.where(came_late.unsqueeze(-1), _at(log.sent, newest.clamp(min=0)), _at(log.held, held_at))
+    return latest, steps - torch.maximum(newest, newest_held)
 
 
 def paid_by_now(delay: Tensor, begins: Tensor, reset_after: Tensor) -> Tensor:

@@ -40,6 +40,11 @@ class StepKeys(NamedTuple):
         """The flag beside ``delay`` that the storage adds, but not under ``"next"``."""
         return cast(NestedKey, sibling_key(self.delay, "backupdated"))
 
+    @property
+    def hindsight_age(self) -> NestedKey:
+        """The age of the messages of ``hindsight``, which the storage adds, but not under ``"next"``."""
+        return cast(NestedKey, sibling_key(self.delay, "hindsight_age"))
+
 
 def example_steps(env: EnvBase) -> TensorDictBase:
     """Two steps [2, B] of zeros with the entries that ``env`` outputs; B is 1 if it has no batch size.

@@ -7,16 +7,19 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import everything
+from torchrl.data import ReplayBuffer
 
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
+from damian.learners.bpql import BpqlConfig
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.recipes.shared.settings import LoggerConfig, TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer, train
 from damian.replay.backupdate import BackupdateStorage
+from damian.replay.time_storage import TimeStorage
 
 AWARE = {
     "none": {},
@@ -91,6 +94,22 @@ def build_learner(name: str, aware: str = "backupdate", **changed) -> tuple[Mapp
 def test_a_learner_waits_for_the_longest_delay_only_with_settle(name, settle):
     learner, _ = build_learner(name, settle=settle)
     assert learner.setup.settle_steps == (3 if settle else 0)
+
+
+@pytest.mark.parametrize("kind", [MappoConfig, SacConfig, BpqlConfig])
+def test_a_learner_trains_the_actor_that_evaluations_make(kind):
+    class OwnActor(kind):
+        """Settings with an actor of one's own."""
+
+        def make_actor(self, env, model):
+            return super().make_actor(env, replace(model, activation="relu"))
+
+    settings = replace(config("mappo", "none", "discrete", "instant", "none"), delay=DelayConfig())
+    env = learning_env(settings)
+    buffer = ReplayBuffer(storage=TimeStorage(400))
+    learner = OwnActor().make(env, settings.learning_setup, None if kind is MappoConfig else buffer)
+    activations = {type(module) for module in learner.actor.modules()} & {torch.nn.ReLU, torch.nn.Tanh}
+    assert activations == {torch.nn.ReLU}
 
 
 @both_learners

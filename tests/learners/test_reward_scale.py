@@ -137,21 +137,27 @@ def test_a_critic_without_rewards_stays_finite():
 def slow_returns(batches: list[TensorDictBase], gamma: float) -> list[float]:
     """Discounted sums of the rewards so far in each episode, world by world and step by step."""
     flight = torch.cat(batches, 1)
+    durations = flight.get(("next", "duration"), torch.ones_like(flight["next", "done"]).long())
     found = []
     for world in range(flight.shape[0]):
         for agent in range(3):
             so_far = 0.0
             for t in range(flight.shape[1]):
-                so_far = gamma * so_far + flight[REWARD][world, t, agent].item()
+                discount = gamma ** durations[world, t].item()
+                so_far = discount * so_far + flight[REWARD][world, t, agent].item()
                 found.append(so_far)
                 if flight["next", "done"][world, t].item():
                     so_far = 0.0
     return found
 
 
-def test_rewards_are_divided_by_the_root_mean_square_of_discounted_returns_over_all_batches():
+@pytest.mark.parametrize("skips", [False, True])
+def test_rewards_are_divided_by_the_root_mean_square_of_discounted_returns_over_all_batches(skips):
     learner, env = sac(False, "discrete")
     batches = flights(env, learner.actor, 6, 6)
+    if skips:  # as with ``clock.skip``
+        for i, batch in enumerate(batches):
+            batch["next", "duration"] = (torch.arange(24).view(4, 6, 1) + i) % 4 + 1
     done = torch.cat([batch["next", "done"] for batch in batches], 1)
     assert done[:, 5:-1:6].any()  # between two batches
     assert done[:, 8].any()  # within a batch

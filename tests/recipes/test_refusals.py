@@ -56,6 +56,10 @@ from damian.recipes.shared.stored_runs import save_config
             "learner: predictive_mappo needs backupdate=true and a",
         ),
         (
+            ["learner=predictive_mappo", "delay.messages=4", "delay.rew=3", "aware=backupdate"],
+            "learner: predictive_mappo needs backupdate=true and a message delay",
+        ),
+        (
             ["learner=predictive_mappo", "delay=paper", "aware=backupdate"],
             "learner: predictive_mappo reads no messages: set delay.messages",
         ),

@@ -323,6 +323,20 @@ def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happe
     assert corrected["next", "done"][corrected["reset_after"]].all()
 
 
+def test_which_steps_are_after_an_end_does_not_depend_on_the_size_of_the_batches():
+    # A message that was sent before the steps that are recomputed still decides whether they ended.
+    scenario = square(episode=EpisodeConfig(max_steps=30, success_share=0.6))
+    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, loss=0.4)), 60, 48)
+    valid = []
+    for size in (60, 2, 5):
+        replay = buffer(scenario, 80, 48)
+        for part in delayed.split(size, 1):
+            replay.extend(part)
+        valid.append(in_order(replay, 60)["valid"])
+    assert (~valid[0]).sum() > 50
+    assert all(each.equal(valid[0]) for each in valid)
+
+
 def test_batches_and_delays_that_are_too_long_are_refused():
     scenario = everything("instant", episode=PERSISTENT)
     delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 20)
