@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.comparison import (
@@ -29,6 +30,8 @@ Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 
 LABELS = {"episode_return": "return", "success_rate": "success rate", "steps": "steps per episode"}
 """Axis labels of the measures in training, all as the server perceived them."""
+PROGRESS = {"frames": "environment steps", "episodes": "episodes"}
+"""Axis labels of how far a training has come."""
 _STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
 _POINTS = 200
 """Number of points of a learning curve."""
@@ -39,8 +42,9 @@ _NO_NORMS = "no J_norm is known:\nthe undelayed arm has no run, or none better t
 
 
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
-    """Draw learning curves over episodes (the paper's Figures 5 and 6).
+    """Draw learning curves: over environment steps, or over episodes if runs are limited by these.
 
+    The latter are the paper's Figures 5 and 6.
     One task has a row of panels for each delay, with return, success rate and steps; of several tasks, each
     has a row with its returns under each delay. A curve is the mean over seeds of the smoothed measures of
     the runs, with its 95 % band. Dashed lines: the random policy and, where known, the best possible value;
@@ -56,18 +60,19 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
     if not grid:
         path.unlink(missing_ok=True)  # an older one would show other runs
         return
-    width = max(map(len, grid))
+    width, progress = max(map(len, grid)), _progress(curves)
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(3.2 * width + 1.2, 2.6 * len(grid)), layout="constrained")
         axes = figure.subplots(len(grid), width, squeeze=False)
         for row, contents in zip(axes, grid, strict=True):
             for axis, (task, delay, name) in zip(row, contents, strict=False):
-                _curve_panel(axis, comparison, curves, (task, delay, name))
+                _curve_panel(axis, comparison, curves, (task, delay, name), progress)
                 if name in best:
                     style = {"color": "0.2", "linestyle": "--", "linewidth": 0.8}
                     axis.axhline(best[name], label="best possible", **style)
                 title, label = f"{task}, delay {delay}", f"{LABELS[name]}, perceived"
-                axis.set(xlabel="episodes", ylabel=label, title=title)
+                axis.set(xlabel=PROGRESS[progress], ylabel=label, title=title)
+                axis.xaxis.set_major_formatter(EngFormatter(sep=""))
             for axis in row[len(contents) :]:
                 axis.set_axis_off()
             _legend(row[len(contents) - 1], row)
@@ -93,15 +98,23 @@ def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str,
     return [[(task, delay, name) for name in measures] for task in tasks for delay in delays[task]]
 
 
-def _curve_panel(axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str]) -> None:
-    """Draw all arms of a task under a delay, by one measure; ``content`` names these three."""
+def _progress(curves: Curves) -> str:
+    """What learning curves are drawn over, a key of ``PROGRESS``: steps, if all runs have made as many."""
+    ends = {run[-1].get("frames") for runs in curves.values() for run in runs}
+    return "frames" if len(ends) == 1 and None not in ends else "episodes"
+
+
+def _curve_panel(
+    axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str], progress: str
+) -> None:
+    """Draw all arms of a task under a delay, by one measure, which ``content`` names, over ``progress``."""
     task, delay, measure = content
     for index, (name, arm) in enumerate(comparison.arms.items()):
         run, colour = (task, delay if arm.delayed else NOT_LATE, name), _colour(index)
         if run in curves:
-            episodes, mean, low, high = _band(curves[run], measure)
-            axis.plot(episodes, mean, color=colour, ls=_again(_LINES, index), linewidth=1.2, label=name)
-            axis.fill_between(episodes, low, high, color=colour, alpha=0.2, linewidth=0)
+            place, mean, low, high = _band(curves[run], measure, progress)
+            axis.plot(place, mean, color=colour, ls=_again(_LINES, index), linewidth=1.2, label=name)
+            axis.fill_between(place, low, high, color=colour, alpha=0.2, linewidth=0)
         elif values := comparison.values(*run, comparison.policy, measure):
             level = fmean(values.values())
             axis.axhline(level, color=colour, linestyle=_again(_DOTTED, index), label=name)
@@ -110,20 +123,22 @@ def _curve_panel(axis: Axes, comparison: Comparison, curves: Curves, content: tu
         axis.axhline(fmean(random.values()), color="0.5", linestyle="--", linewidth=0.8, label=RANDOM)
 
 
-def _band(runs: Sequence[Sequence[Mapping[str, float]]], name: str) -> tuple[Floats, Floats, Floats, Floats]:
-    """Numbers of episodes that all seeds reached, mean over seeds, and the ends of its 95 % interval.
+def _band(
+    runs: Sequence[Sequence[Mapping[str, float]]], name: str, progress: str
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Steps or episodes (``progress``) that all seeds reached, mean over seeds, ends of its 95 % interval.
 
     Each is [_POINTS]; ``name`` is the measure.
     """
-    points = [np.array([(r["episodes"], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
+    points = [np.array([(r[progress], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
     points = [run for run in points if len(run)]
     if not points:
         unknown = np.full(_POINTS, np.nan)
         return unknown, unknown, unknown, unknown
-    episodes = np.linspace(max(run[0, 0] for run in points), min(run[-1, 0] for run in points), _POINTS)
-    values = np.stack([np.interp(episodes, *run.T) for run in points], -1)
+    place = np.linspace(max(run[0, 0] for run in points), min(run[-1, 0] for run in points), _POINTS)
+    values = np.stack([np.interp(place, *run.T) for run in points], -1)
     low, high = bootstrap(lambda scores: scores.mean(-1), values[None], draws=500)
-    return episodes, values.mean(-1), low[0], high[0]
+    return place, values.mean(-1), low[0], high[0]
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:

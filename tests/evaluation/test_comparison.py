@@ -262,6 +262,21 @@ def test_the_legend_of_learning_curves_names_an_arm_that_ran_under_one_delay_onl
     assert {"best", "blind", "flown", "aware", RANDOM} <= {*texts}
 
 
+@pytest.mark.parametrize(("last", "label"), [(500.0, "environment steps"), (400.0, "episodes")])
+def test_curves_are_over_steps_if_all_runs_made_as_many_and_else_over_episodes(
+    last, label, monkeypatch, tmp_path
+):
+    measures = {"episode_return": 1.0, "success_rate": 0.5, "steps": 9.0}
+    fast, slow = (
+        [{"frames": end * n / 4, "episodes": many * n, **measures} for n in range(5)]
+        for end, many in ((500.0, 90), (last, 9))
+    )
+    one, curves = Comparison(rows_of("t", "late", SCORES), ARMS), {("t", "none", "best"): [fast, slow]}
+    figure = drawn(monkeypatch, lambda: plot_curves(one, curves, {}, tmp_path / "curves.png"))
+    assert {axis.get_xlabel() for axis in figure.axes} == {label}
+    assert max(figure.axes[0].lines[0].get_xdata()) == (500 if label != "episodes" else 36)
+
+
 def test_an_infinite_end_of_an_interval_is_drawn_to_the_edge_of_the_panel(monkeypatch, tmp_path):
     scores = {"best": [9.0, -1.0, 10.0], "blind": [1.0, 5.0, 3.0], "aware": [6.0, 9.0, 7.0]}
     comparison = Comparison(rows_of("t", "late", scores), ARMS)
