@@ -98,7 +98,8 @@ def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer
     recompute = server_recompute(env.server, actor=actor) if has_message_delay(config) else None
     observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor] if recompute else []
     corrections = corrections_of(env.transform, [keys.REWARD, *observed])
-    # What arrived last may be older than what was known before, and nothing else may come for a whole flight.
+    # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
+    # The storage then has to keep the newest one.
     hindsight = "hindsight" in config.learner.reads or (bool(recompute) and config.delay.order == "arrival")
     size += sum(correction.lookback for correction in corrections) * setup.worlds
     storage = BackupdateStorage(

@@ -29,8 +29,8 @@ class ClockConfig:
     skip: bool = False
     """Let a step of the environment last until some UAV of its world can choose again, or the episode ends;
     ``duration`` counts the simulation steps that it lasted (``SkipUntilReady``). A training log then counts
-    these longer steps and frames, and its returns are discounted within each step; and the period of
-    ``system``, divided by that of ``simulation``, is a number of these longer steps."""
+    these longer steps and frames, and its returns are discounted within each step. The learner gets a batch
+    every ``system`` / ``simulation`` of these longer steps."""
     skip_discount: float = 1.0
     """Discount per simulation step of the rewards within a step that ``skip`` makes longer."""
 

@@ -42,13 +42,12 @@ _NO_NORMS = "no J_norm is known:\nthe undelayed arm has no run, or none better t
 
 
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
-    """Draw learning curves: over environment steps, or over episodes if runs are limited by these.
+    """Draw learning curves over environment steps; over episodes if not all runs made as many steps.
 
-    The latter are the paper's Figures 5 and 6.
-    One task has a row of panels for each delay, with return, success rate and steps; of several tasks, each
-    has a row with its returns under each delay. A curve is the mean over seeds of the smoothed measures of
-    the runs, with its 95 % band. Dashed lines: the random policy and, where known, the best possible value;
-    dotted lines: arms that train nothing.
+    The paper's Figures 5 and 6 are over episodes. One task has a row of panels for each delay, with return,
+    success rate and steps; of several tasks, each has a row with its returns under each delay. A curve is the
+    mean over seeds of the smoothed measures of the runs, with its 95 % band. Dashed lines: the random policy
+    and, where known, the best possible value; dotted lines: arms that train nothing.
 
     Args:
         comparison: comparison to draw.

@@ -257,7 +257,8 @@ class BackupdateStorage(TimeStorage):
         held, age = steps[next_key(names.received)], steps[next_key(names.age)].long()
         log = MessageLog(steps[next_key(names.message)], delay.squeeze(-1), held, age.squeeze(-1))
         if names.hindsight is not None:
-            # What is known at the first step may be newer than what is held, and sent before all of them.
+            # At the first step, the storage may know a newer message than the receiver held; its sender may
+            # have sent it before that step, so that it is in no row of these steps.
             known, known_age = steps[next_key(names.hindsight)], steps[names.hindsight_age]
             held, age = _first_of(known, held), _first_of(known_age, age)
             log = log._replace(held=held, age=age.squeeze(-1))

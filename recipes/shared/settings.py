@@ -154,15 +154,10 @@ class TrainConfig(ScenarioConfig):
         """Check that no setting of the delays is without any effect."""
         delay, name = self.delay, self.learner.name
         at_once, should = self.longest_delay == 0, "means nothing without delayed messages (delay.obs)"
-        for key, value, useless in (
-            ("hold", "max", at_once),
-            (
-                "order",
-                "arrival",
-                at_once and self.links.kind == "server",
-            ),  # other links have a delay of their own
-        ):
-            checks.require(not useless or getattr(delay, key) != value, f"delay.{key}", value, should)
+        checks.require(not (at_once and delay.hold == "max"), "delay.hold", "max", should)
+        # Links other than the server's have a delay of their own, to which the order applies too.
+        useless = at_once and self.links.kind == "server" and delay.order == "arrival"
+        checks.require(not useless, "delay.order", "arrival", should)
         useless = delay.reward_window == 1 and delay.reward_discount != DelayConfig.reward_discount
         should = "means nothing with delay.reward_window=1, which sums no rewards; leave it out"
         checks.require(not useless, "delay.reward_discount", delay.reward_discount, should)
