@@ -77,7 +77,7 @@ def default_options(program: str) -> dict[str, str]:
 
 
 def groups(own_folder: str | None = None) -> dict[str, list[str]]:
-    """Options of every group of conf/, by the group's name.
+    """Options of every group of conf/, by the group's name; a file _NAME.yaml is a part of others, and no option.
 
     Args:
         own_folder: a folder with configuration files of the user's own, whose options come first.
@@ -85,7 +85,7 @@ def groups(own_folder: str | None = None) -> dict[str, list[str]]:
     options: dict[str, list[str]] = {}
     for root in map(Path, filter(None, [own_folder, CONF])):
         for folder in (path for path in root.glob("*") if path.is_dir() and path.name != "hydra"):
-            files = sorted(folder.rglob("*.yaml"))
+            files = sorted(folder.rglob("[!_]*.yaml"))
             names = [str(file.relative_to(folder).with_suffix("")) for file in files]
             options.setdefault(folder.name, []).extend(names)
     return options

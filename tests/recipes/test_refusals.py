@@ -100,7 +100,7 @@ from damian.recipes.shared.stored_runs import save_config
         (["reward=foo"], "reward: foo is not one of coverage, energy"),
         (
             ["scenario=paper/usecase3"],
-            "scenario: paper/usecase3 is not one of coverage, delaybench/common",
+            "scenario: paper/usecase3 is not one of coverage, delaybench/coverage",
         ),
         (["motion.degree=4"], "motion.degree: 4 is not one of 3, 5, 7"),
         (["clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
