@@ -11,6 +11,7 @@ import torch
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "backupdating.py"
+DOCUMENT = (ROOT / "docs" / "backupdating.md").read_text()
 
 
 def test_back_updated_rewards_and_ends_are_the_true_ones_wherever_the_message_has_arrived(capsys):
@@ -45,11 +46,20 @@ def test_the_example_runs_as_a_program_from_another_folder(tmp_path):
     assert "mean error of the reward after back-updating" in done.stdout
 
 
+def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):
+    code, printed = re.findall(r"```(?:python)?\n(.*?\n)```", DOCUMENT, re.DOTALL)[:2]
+    exec(code, {})
+    lines = capsys.readouterr().out.splitlines()
+    assert [
+        line for line in lines if "torchrl" not in line
+    ] == printed.splitlines()  # TorchRL logs there, too
+
+
 def test_the_document_shows_the_examples_code():
     def lines(text: str) -> str:
         return "\n".join(line.strip() for line in text.splitlines())
 
-    blocks = re.findall(r"```python\n(.*?)\n```", (ROOT / "docs" / "backupdating.md").read_text(), re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)\n```", DOCUMENT, re.DOTALL)[1:]
     assert len(blocks) == 3
     assert all(lines(block) in lines(EXAMPLE.read_text()) for block in blocks)
 

@@ -77,7 +77,9 @@ def default_options(program: str) -> dict[str, str]:
 
 
 def groups(own_folder: str | None = None) -> dict[str, list[str]]:
-    """Options of every group of conf/, by the group's name; a file _NAME.yaml is a part of others, and no option.
+    """Options of every group of conf/, by the group's name.
+
+    A file _NAME.yaml is no option, but what several options share.
 
     Args:
         own_folder: a folder with configuration files of the user's own, whose options come first.

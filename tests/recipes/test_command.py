@@ -304,7 +304,9 @@ def test_help_may_stand_anywhere_and_explains_groups_and_experiments(capsys):
     assert printed("train", "--help", "--config-dir", "own", "-m") == page
     scenarios = printed("train", "--help", "scenario")
     assert scenarios.startswith("choose one with scenario=OPTION: coverage, ")
-    assert "[spotting]" in scenarios and "delaybench/tracking" in scenarios and "/_" not in scenarios
+    assert "[spotting]" in scenarios
+    assert "delaybench/tracking" in scenarios
+    assert "/_" not in scenarios
     assert "\n    spotting: A static source at an unknown place;" in scenarios
     assert "\n    paper: the paper's section 5: 15 % of the messages" in printed("train", "--help", "delay")
     learner = printed("train", "--help", "learner")
