@@ -20,7 +20,7 @@ from damian.envs.pipeline import observation_transforms, remembering_transforms,
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Features
-from damian.transforms import ServerNode
+from damian.transforms import ActionHistory, ServerNode
 from damian.transforms.base import StatefulTransform
 from damian.transforms.belief import Belief
 from damian.transforms.entries import Memory, drop_keys
@@ -199,6 +199,8 @@ class Node:
                 later = {"elapsed": memory["elapsed"] + n_steps}
             elif isinstance(transform, SampleAndHold):
                 later = {"elapsed": (memory["elapsed"] + n_steps) % transform.period}
+            elif isinstance(transform, ActionHistory) and transform.age_key:
+                later = {"since": memory["since"] + n_steps}
             skipped.append(memory | later)
         return skipped
 

@@ -53,8 +53,8 @@ class UavEnv(EnvBase):
       ``message_sent``: whether it was sent in this step, [B, N];
     - ``position``: true position of each UAV, east and north in the coordinates of the settings [m], which
       delay laws may read, [B, N, 2];
-    - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, and the true
-      offset from the UAV to the source (east, north, over the region's size, in [-1, 1]), [B, N, G + 2];
+    - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, with the belief
+      that the source is in its cell, and the offset to it (over the region's size, [-1, 1]), [B, N, G + 2];
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
     At the root lie ``state`` (the simulator's truth, for drawing and reference experiments, never for an
@@ -305,9 +305,9 @@ class UavEnv(EnvBase):
 
     def _privileged(self, state: State, features: Features | None) -> Tensor:
         """Observation of a critic that knows the simulator's true state, [B, N, G + 2]."""
-        _, global_observation = self.server.observations(
-            features or self.server.features(state.sent, state.steps)
-        )
+        if features is None or self.server.grid is not None:
+            features = self.server.privileged_features(state.sent, state.steps, state.source)
+        _, global_observation = self.server.observations(features)
         scale = gather_rows(self.simulation.airspace.scale, state.region).view(-1, 1, 1)
         to_source = (state.source.unsqueeze(-2) - state.position[..., :2]) / scale
         return torch.cat([global_observation, to_source.clamp(-1, 1)], -1)

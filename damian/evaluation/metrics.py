@@ -11,7 +11,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
 from damian.envs.delayed_env import DelayedEnv
+from damian.keys import next_key
 from damian.learners.recurrent import add_recurrent_state
+from damian.replay.recompute import beliefs_in_hindsight
+from damian.server.features import FEATURES
 from damian.server.server import Server
 
 
@@ -63,7 +66,8 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
     horizon, next_step = rollout.shape[1], cast(TensorDictBase, rollout["next"])
     elapsed = torch.arange(1, horizon + 1, device=rollout.device).expand(rollout.shape)
     message = next_step[keys.MESSAGE]
-    truth = server(server.messages(message), elapsed, next_step.get(keys.SOURCE_OVER, None))
+    over, belief = next_step.get(keys.SOURCE_OVER, None), _true_belief(rollout, server, elapsed)
+    truth = server(server.messages(message), elapsed, over, belief=belief)
     in_episode = _up_to_first_end(next_step[keys.DONE].squeeze(-1))
     in_true_episode = in_episode & _up_to_first_end(truth.status.terminated)
     success, true_success = (
@@ -90,6 +94,17 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
         late=late,
         lost=lost,
     )
+
+
+def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Tensor | None:
+    """The belief from undelayed messages in first episodes, [B, T, K]; None if no reward term reads it."""
+    if not any(FEATURES.get(name, "feature").scope == "belief" for name in server.reward.features):
+        return None
+    steps = rollout.select(keys.MESSAGE, keys.BELIEF, next_key(keys.MESSAGE), next_key(keys.BELIEF))
+    sent = cast(Tensor, rollout[next_key(keys.MESSAGE_SENT)])
+    steps[next_key(keys.DELAY)] = sent.long().unsqueeze(-1) - 1  # 0, or -1 where none was sent
+    steps[keys.STEP_COUNT] = elapsed.unsqueeze(-1) - 1
+    return beliefs_in_hindsight(server, steps.transpose(0, 1)).transpose(0, 1)
 
 
 def _up_to_first_end(ended: Tensor) -> Tensor:

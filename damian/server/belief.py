@@ -8,7 +8,7 @@ over all steps since the oldest of those that came in late (``damian.transforms.
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
+from torch.nn.functional import embedding_bag, one_hot
 
 from damian.common.tensors import gather_rows
 from damian.server.source_grid import SourceGrid
@@ -93,6 +93,16 @@ def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
         region: index of the region, [*].
     """
     return weigh(gather_rows(grid.prior, region), likelihood(grid, rows))
+
+
+def certain_belief(grid: SourceGrid, source: Tensor) -> Tensor:
+    """The belief of somebody who knows the cell in which the source is, [*, K].
+
+    Args:
+        grid: cells and tables.
+        source: position of the source, east, north [m], [*, 2].
+    """
+    return one_hot(torch.cdist(source, grid.centres).argmin(-1), len(grid.centres)).to(source.dtype)
 
 
 def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:

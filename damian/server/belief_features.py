@@ -36,7 +36,7 @@ def _belief_gain(v: FeatureCache) -> Tensor:
     chance = chance.scatter(-1, (standing % n_points).unsqueeze(-1), stays)
     goals = v.context.goals
     nearest, second = (chance.gather(-1, gather_rows(each, standing)) for each in (goals[0], goals[-1]))
-    return torch.where(nearest < 0, second.abs(), nearest)
+    return torch.where(nearest < 0, second.abs(), nearest).clamp(max=1)
 
 
 @FEATURES.register("belief_moments")

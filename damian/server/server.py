@@ -15,6 +15,7 @@ from torch import Tensor
 from damian.common.errors import InputError
 from damian.common.tensors import gather_rows
 from damian.server import belief_features  # noqa: F401 (it registers its features)
+from damian.server.belief import certain_belief
 from damian.server.feature_cache import ServerContext
 from damian.server.features import ObservationConfig, observe, observe_own, stack
 from damian.server.reward_terms import Counters
@@ -197,6 +198,11 @@ class Server:
         """
         context = self._context(messages, steps)._replace(coverage=coverage, belief=belief)
         return observe(messages, context, names or self._names)
+
+    def privileged_features(self, messages: Messages, steps: Tensor, source: Tensor) -> Features:
+        """The features of somebody who knows where the source is, [*, 2] metres; other arguments as above."""
+        belief = None if self.grid is None else certain_belief(self.grid, source)
+        return self.features(messages, steps, belief=belief)
 
     def known_coverage(self, messages: Messages, features: Features) -> KnownCoverage | None:
         """What the next step may need of this one's features; None if that would not save time."""

@@ -118,7 +118,7 @@ def charge_gain(seconds: Tensor, battery: BatteryConfig) -> Tensor:
 def observed(level: Tensor, battery: BatteryConfig) -> Tensor:
     """Observed battery level: [*] percent, rounded down to a multiple of the resolution."""
     # The small offset keeps a level on its multiple where float error left it just below.
-    return torch.floor(level / battery.resolution + 1e-4) * battery.resolution
+    return (torch.floor(level / battery.resolution + 1e-4) * battery.resolution).clamp(max=100)
 
 
 def _full_power_drain(battery: BatteryConfig) -> float:

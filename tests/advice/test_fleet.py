@@ -124,6 +124,21 @@ def test_after_a_long_silence_it_does_not_matter_when_somebody_asked(task, monke
     assert fleets[0].step == fleets[1].step == 3 * SILENT + 9
 
 
+def test_after_a_long_silence_the_history_holds_no_action_that_had_been_reflected(monkeypatch):
+    """As in a fleet that takes every step."""
+    observed = []
+    for silent in (SILENT, 1000):
+        monkeypatch.setattr("damian.advice.fleet.SILENT_STEPS", silent)
+        fleet = fleet_of(**TASKS["history"])
+        for i, uav in enumerate(fleet.uavs):
+            told(fleet, uav, START, 30 * i)
+        fleet.advise(START + 3, ["a"])
+        told(fleet, "a", START + 8, fleet.decision(0).goal)
+        fleet.advance(START + 3 * SILENT)
+        observed.append(fleet.observe([0])[keys.OBSERVATION])
+    assert torch.equal(*observed)
+
+
 def test_a_missing_uav_keeps_its_last_message_and_grows_old():
     fleet = fleet_of(observation=replace(SEEN, age_scale=100.0))
     for i, uav in enumerate(fleet.uavs):

@@ -20,6 +20,8 @@ from damian.envs.scenario import ScenarioConfig
 from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate, evaluation
 from damian.evaluation.metrics_log import MetricsLog, read_metrics
 from damian.evaluation.run_folder import results_table, save_results
+from damian.server.features import ObservationConfig
+from damian.server.reward_terms import reward_term
 from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig
@@ -161,6 +163,22 @@ def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion)
         )
         assert (row.late, row.lost) == (0.0, 0.0)
         assert (row.age == 0) == (motion == "instant")
+
+
+unsure = reward_term(reads=["belief_moments"])(lambda features, counters: features["belief_moments"][..., -1])
+
+
+@both_motions
+def test_a_reward_of_the_belief_is_truly_that_of_the_belief_without_delay(motion):
+    task = {"custom": [{"term": f"{__name__}:unsure"}], "spotted": 0.0}
+    sections = {"reward": RewardConfig(**task), "episode": EpisodeConfig(max_steps=20)}
+    sections["observation"] = ObservationConfig(belief=["belief_moments"])
+    rows = [
+        evaluation(*fly(joint_spotting(motion, DELAYS[name], **sections))) for name in ("none", "constant")
+    ]
+    expected = pytest.approx(rows[0].episode_return, rel=1e-5)
+    assert [row.true_return for row in rows] == [expected, expected]
+    assert rows[1].episode_return != expected
 
 
 def test_an_episode_without_an_end_counts_the_horizon():

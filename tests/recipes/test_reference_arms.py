@@ -22,6 +22,7 @@ from helpers import (
     random_actions,
     same,
     square,
+    walking,
 )
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -41,6 +42,7 @@ from damian.learners.sac import Sac, SacConfig
 from damian.recipes.shared.launch import launch
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import learning_env, main, make_learner, replay_buffer
+from damian.server.features import ObservationConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 
@@ -148,6 +150,16 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
         from_centre = torch.tensor(position) - 100.0  # the middle of the square
         to_source = (from_centre - uavs) / (200 * math.sqrt(2))
         torch.testing.assert_close(td[PRIVILEGED][..., -2:], to_source, atol=1e-6, rtol=0)
+
+
+def test_a_belief_in_the_privileged_observation_is_that_the_source_is_where_it_is():
+    observation = ObservationConfig(global_features=[], local_features=[], belief=["belief_moments"])
+    env = make_env(square(observation=observation, source=walking()), 3, extras=["privileged"])
+    cell = math.hypot(*(env.server.grid.centres[1] - env.server.grid.centres[0]).tolist())
+    for td in play(env, actions_for(env, 12)):
+        way, spread, to_source = td[PRIVILEGED][..., :2], td[PRIVILEGED][..., 2:4], td[PRIVILEGED][..., -2:]
+        assert (spread < 1e-3).all()
+        assert ((way - to_source).abs() <= cell / 2 / (200 * math.sqrt(2)) + 1e-6).all()
 
 
 def test_the_vector_to_a_source_far_beyond_the_region_is_clamped():

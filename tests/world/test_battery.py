@@ -83,6 +83,12 @@ def test_float_error_does_not_change_the_observed_level(multiple, error):
     assert observed(level, BATTERY).item() == 5.0 * multiple
 
 
+def test_a_full_battery_is_never_observed_above_100_percent():
+    for resolution in (16.6667, 14.2858):  # rounded up, 100 / 6 and 100 / 7
+        battery = BatteryConfig(resolution=resolution)
+        assert observed(torch.tensor(100.0), battery).item() == 100
+
+
 def test_the_odd_recorded_run_is_left_out_because_it_subtracts_charging():
     # In this run, the original drains a flight by three parts: takeoff and landing, as in this
     # project; a cruise whose speed is the length over 10 000 s (its placeholder for the duration of
