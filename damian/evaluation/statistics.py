@@ -117,13 +117,15 @@ def bootstrap(
     draws: int = 2000,
     level: float = 0.95,
     seed: int = 0,
+    bounds: tuple[float, float] = (-math.inf, math.inf),
 ) -> tuple[Floats, Floats]:
     """Stratified bootstrap interval of a statistic over seeds: its low and high ends.
 
     For the mean of few seeds, the interval of the resampled statistics (``interval``) is too narrow: of those
     for 95 %, only 83 % contain the truth with 5 seeds, and 88 % with 10. So both ends are moved away from the
     statistic by the factor by which Student's interval of a mean is wider than the normal one without
-    correction for bias. With fewer than ``FEWEST`` seeds both ends are nan.
+    correction for bias, but not beyond ``bounds``, where the truth cannot lie. With fewer than ``FEWEST``
+    seeds both ends are nan.
 
     Args:
         statistic: function from scores [*, strata, ..., seeds] to [*, ...], for any leading dimensions *.
@@ -131,6 +133,7 @@ def bootstrap(
         draws: number of resamples.
         level: share of the resampled statistics inside the interval, before it is widened.
         seed: seed of the random draws.
+        bounds: smallest and largest value that the statistic can have, such as 0 and 1 for a mean of shares.
     """
     value = np.asarray(statistic(scores), dtype=float)
     strata, n_seeds = scores.shape[0], scores.shape[-1]
@@ -140,7 +143,7 @@ def bootstrap(
     quantile, many = student_quantile((1 + level) / 2, strata * (n_seeds - 1)), 100_000
     factor = math.sqrt(n_seeds / (n_seeds - 1)) * quantile / student_quantile((1 + level) / 2, many)
     low, high = interval(statistic(resampled(scores, draws, seed)), level)
-    return value - factor * (value - low), value + factor * (high - value)
+    return np.clip(value - factor * (value - low), *bounds), np.clip(value + factor * (high - value), *bounds)
 
 
 @cache

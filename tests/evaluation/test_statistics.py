@@ -126,6 +126,15 @@ def test_95_percent_intervals_contain_the_truth_in_95_percent_of_all_experiments
     assert 0.94 < covered < 0.97, covered
 
 
+def test_an_interval_ends_at_the_bounds_of_its_statistic():
+    shares = np.array([[[1.0, 0.99, 0.9], [0.0, 0.02, 0.01], [0.4, 0.5, 0.6]]])
+    wide, within = bootstrap(means, shares), bootstrap(means, shares, bounds=(0.0, 1.0))
+    assert wide[1][0, 0] > 1
+    assert wide[0][0, 1] < 0
+    np.testing.assert_array_equal(within, np.clip(wide, 0, 1))
+    np.testing.assert_array_equal(np.stack(within)[:, 0, 2], np.stack(wide)[:, 0, 2])
+
+
 def test_fewer_than_three_seeds_give_no_interval():
     low, high = bootstrap(means, np.array([[[1.0, 2.0], [3.0, 9.0]]]))
     assert np.isnan([low, high]).all()
