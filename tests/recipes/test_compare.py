@@ -114,9 +114,7 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     text = (folder / "table.md").read_text()
     assert "missing: usecase2/none/undelayed/seed_10, usecase2/paper/unaware/seed_10" in text
     compare(*TWO[:1], *TWO[2:], "report_only=true")
-    text = (folder / "table.md").read_text()
-    assert "2 seeds (8 to 9)" in text
-    assert "missing" not in text
+    assert not re.search("missing|seed_10| to 10", (folder / "table.md").read_text())
     assert stamps(folder) == after
 
     with pytest.raises(SystemExit) as stopped:
