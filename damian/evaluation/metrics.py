@@ -12,6 +12,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from damian import keys
 from damian.envs.delayed_env import DelayedEnv
 from damian.learners.recurrent import add_recurrent_state
+from damian.replay.recompute import beliefs_in_hindsight
+from damian.server.belief import first_belief, report_rows
 from damian.server.server import Server
 
 
@@ -63,7 +65,8 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
     horizon, next_step = rollout.shape[1], cast(TensorDictBase, rollout["next"])
     elapsed = torch.arange(1, horizon + 1, device=rollout.device).expand(rollout.shape)
     message = next_step[keys.MESSAGE]
-    truth = server(server.messages(message), elapsed, next_step.get(keys.SOURCE_OVER, None))
+    over, belief = next_step.get(keys.SOURCE_OVER, None), _true_belief(rollout, server)
+    truth = server(server.messages(message), elapsed, over, belief=belief)
     in_episode = _up_to_first_end(next_step[keys.DONE].squeeze(-1))
     in_true_episode = in_episode & _up_to_first_end(truth.status.terminated)
     success, true_success = (
@@ -90,6 +93,24 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
         late=late,
         lost=lost,
     )
+
+
+def _true_belief(rollout: TensorDictBase, server: Server) -> Tensor | None:
+    """The belief after each step of a rollout [B, T], had no message been late or lost, [B, T, K].
+
+    None if no reward can depend on it: only terms of one's own read the belief.
+    """
+    if server.grid is None or not server.reward.custom_terms:
+        return None
+    by_step = cast(TensorDictBase, rollout.transpose(0, 1).select(keys.MESSAGE, "next"))
+    steps = by_step.clone(False)
+    first, done = server.messages(steps[keys.MESSAGE]), steps["next", keys.DONE]
+    rows = report_rows(server.grid, first, torch.ones_like(first.spotted))
+    steps[keys.BELIEF] = first_belief(server.grid, rows, server.region_of(first))
+    begins = torch.cat([torch.ones_like(done[:1]), done[:-1]])
+    steps[keys.STEP_COUNT] = (~begins).long()  # 0 where an episode begins, as ``beliefs_in_hindsight`` reads
+    steps["next", keys.DELAY] = steps["next", keys.MESSAGE_SENT].long().unsqueeze(-1) - 1  # 0: on time
+    return beliefs_in_hindsight(server, steps).transpose(0, 1)
 
 
 def _up_to_first_end(ended: Tensor) -> Tensor:
