@@ -11,6 +11,7 @@ from damian.evaluation.statistics import (
     LEAST_GAP,
     Floats,
     bootstrap,
+    improvement_interval,
     interquartile_mean,
     normalised,
     probability_of_improvement,
@@ -222,8 +223,9 @@ class Comparison:
         (norm,) = _estimates(_norms, array)
         if arm in naive or not naive:
             return Compared(seeds, norm)
-        (probability,) = _estimates(_improvement, array, SHARE)
-        return Compared(seeds, norm, _recovery(array), probability)
+        probability = float(_improvement(array))
+        improvement = Estimate(probability, *improvement_interval(probability, len(seeds)))
+        return Compared(seeds, norm, _recovery(array), improvement)
 
     def overall(self) -> dict[str, tuple[int, Estimate]]:
         """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.

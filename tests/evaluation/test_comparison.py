@@ -146,7 +146,8 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert low < value < high
     assert cells["J_norm"] == pytest.approx(22 / 30)
     assert cells["recovery"] == pytest.approx((22 / 3 - 4) / 6)
-    assert cells["improvement"] == 1
+    assert cells["improvement"] == cells["improvement_high"] == 1
+    assert cells["improvement_low"] == pytest.approx(0.5, abs=0.01)
     assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
