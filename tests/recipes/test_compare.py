@@ -132,22 +132,20 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     kept.mkdir()
     for name in ("results.csv", "curves.csv"):
         (kept / name).write_bytes((folder / name).read_bytes())
-    compare(*words, "report_only=true", f"hydra.run.dir={kept}")
+    stored = ["report_only=true", f"hydra.run.dir={kept}"]
+    compare(*words, *stored)
     assert {path.name for path in kept.iterdir()} == {path.name for path in folder.iterdir()} - {"usecase2"}
     for name in ("table.csv", "figure.png", "curves.png"):
         assert (kept / name).read_bytes() == (folder / name).read_bytes()
     texts = [(place / "table.md").read_text() for place in (folder, kept)]
     assert len({re.sub("`damian compare .*`", "", text) for text in texts}) == 1
-    compare(*words[:2], "arms=[undelayed]", "report_only=true", f"hydra.run.dir={kept}")
+    compare(*words[:2], "arms=[undelayed]", *stored)
     assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "greedy"}
-    check_refused(
-        lambda: compare(*words, "experiment.first_seed=9", "report_only=true", f"hydra.run.dir={kept}"),
-        "experiment: no run of it is finished in",
-        capsys,
-    )
-    (kept / "results.csv").write_text("seed\nx\n")
-    with pytest.raises(SystemExit):
-        compare(*words, "report_only=true", f"hydra.run.dir={kept}")
+    late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
+    check_refused(lambda: compare(*words, *late), problem, capsys)
+    for text, problem in ("seed\nx\n", "it does not hold"), ("seed\n8\n", "(no column task)"):
+        (kept / "results.csv").write_text(text)
+        check_refused(lambda: compare(*words[:1], *stored), problem, capsys)
 
 
 @pytest.mark.parametrize("n_seeds", [2, 12])
