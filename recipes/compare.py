@@ -65,7 +65,7 @@ from .train import train
 
 TABLE, MARKDOWN, FIGURE, CURVES = "table.csv", "table.md", "figure.png", "curves.png"
 SEEDS, EPISODES = 10, 100
-"""A report with fewer seeds, or fewer episodes per evaluation, is marked as developing."""
+"""A report with an arm of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
 POLICIES = {"sampled": SAMPLED, "mode": MODE}
 
 
@@ -74,8 +74,9 @@ class CompareConfig:
     """All settings of ``damian compare``."""
 
     experiment: Experiment = MISSING
-    seeds: int = 10
-    """Number of seeds, counted from ``experiment.first_seed``."""
+    seeds: int | None = None
+    """Number of seeds, counted from ``experiment.first_seed``. If it is not given: 10, and with
+    ``report_only`` as many as are stored."""
     processes: int = 1
     """Number of runs at the same time; each has one thread unless ``overrides`` sets ``threads``."""
     launcher: str = "local"
@@ -102,7 +103,8 @@ class CompareConfig:
     """Train and fly nothing; write tables and figures from the finished or the stored results."""
 
     def __post_init__(self) -> None:
-        checks.whole("seeds", self.seeds, 1, 10_000)
+        if self.seeds is not None:
+            checks.whole("seeds", self.seeds, 1, 10_000)
         checks.whole("processes", self.processes, 1, 1024)
         checks.one_of("launcher", self.launcher, LAUNCHERS)
         should = "means nothing without launcher=slurm"
@@ -139,7 +141,8 @@ class CompareConfig:
     @property
     def every_seed(self) -> range:
         """The seeds that are asked for."""
-        return range(self.experiment.first_seed, self.experiment.first_seed + self.seeds)
+        n_seeds = SEEDS if self.seeds is None else self.seeds
+        return range(self.experiment.first_seed, self.experiment.first_seed + n_seeds)
 
 
 ConfigStore.instance().store(name="compare_schema", node=CompareConfig)
@@ -260,8 +263,10 @@ def report(config: CompareConfig, results: Results, missing: Sequence[str], fold
 
 def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> list[str]:
     """Lines above the tables: the command, the number of seeds and episodes, what the columns mean."""
-    rows = results.rows
-    seeds, episodes = sorted({row["seed"] for row in rows}), sorted({int(row["episodes"]) for row in rows})
+    rows, by_arm = results.rows, dict[tuple[str, ...], set[int]]()
+    for row in rows:
+        by_arm.setdefault((row["task"], row["delay"], row["arm"]), set()).add(row["seed"])
+    seeds, episodes = sorted(set().union(*by_arm.values())), sorted({int(row["episodes"]) for row in rows})
     words = [word for word in typed_words() if not word.startswith("report_only")]
     notes = [
         f"`{command(words)}`",
@@ -271,10 +276,10 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
         "as it truly was; age in steps; back-updated: share of the messages in training; n: seeds",
         "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive arm, 1 undelayed, not shown where "
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
-        "one of the strongest naive arm; n compared: seeds that all of these have; of ceiling: J over that "
-        "of the script which knows all messages on time",
+        "one of the strongest naive arm, with its score interval; n compared: seeds that all of these have; "
+        "of ceiling: J over that of the script which knows all messages on time",
     ]
-    if len(seeds) < SEEDS or episodes[0] < EPISODES:
+    if min(map(len, by_arm.values())) < SEEDS or episodes[0] < EPISODES:
         notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")
     return notes + ([f"missing: {', '.join(missing)}"] if missing else [])
 
@@ -284,6 +289,8 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
 def main(composed: DictConfig) -> None:
     config: CompareConfig = checked(composed, "compare")
     folder, failed = Path(HydraConfig.get().runtime.output_dir), []
+    if config.report_only and config.seeds is None:
+        config = replace(config, seeds=_stored_seeds(config, folder))
     if config.report_only and _stores_results(config, folder):
         results, missing = stored_results(folder), []
         results = results.only(config.includes)
@@ -301,6 +308,17 @@ def main(composed: DictConfig) -> None:
 def _stores_results(config: CompareConfig, folder: Path) -> bool:
     """Has a folder the results of a comparison, but none of its runs?"""
     return (folder / ROWS).exists() and not any((folder / task).exists() for task in config.experiment.tasks)
+
+
+def _stored_seeds(config: CompareConfig, folder: Path) -> int | None:
+    """Number of seeds from the experiment's first one to the last one in a folder; None if it has none."""
+    if _stores_results(config, folder):
+        stored = [row["seed"] for row in stored_results(folder).rows]
+    else:
+        names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))
+        stored = [int(name) for name in names if name.isdecimal()]
+    first = config.experiment.first_seed
+    return max((seed - first + 1 for seed in stored if seed >= first), default=None)
 
 
 def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list[str], list[Run]]:

@@ -11,6 +11,7 @@ from damian.evaluation.statistics import (
     LEAST_GAP,
     Floats,
     bootstrap,
+    improvement_interval,
     interquartile_mean,
     normalised,
     probability_of_improvement,
@@ -34,6 +35,10 @@ SEEN = ("episode_return", "success_rate", "steps")
 MEASURES = (*TRUE, *SEEN, "age", "late", "lost", "backupdated")
 SCORES = (*TRUE, *SEEN)
 """Measures by which arms can be compared."""
+ANY, SHARE, TIME = (-np.inf, np.inf), (0.0, 1.0), (0.0, np.inf)
+_BOUNDS = (ANY, SHARE, TIME, ANY, SHARE, TIME, TIME, SHARE, SHARE, SHARE)
+BOUNDS: dict[str, tuple[float, float]] = dict(zip(MEASURES, _BOUNDS, strict=True))
+"""Smallest and largest possible value of each of ``MEASURES``."""
 COMPARED = ("J_norm", "recovery", "improvement", "of_ceiling")
 """Columns of the estimates of ``Compared``."""
 LESS_IS_BETTER = ("true_steps", "steps")
@@ -119,9 +124,12 @@ def _short(number: float) -> str:
     return f"{number:.3f}" if abs(number) < 10 else f"{number:.1f}"
 
 
-def _estimates(statistic: Any, scores: Floats) -> list[Estimate]:
-    """Estimates, K in number, of a statistic that maps ``scores`` [strata, ..., seeds] to [K]."""
-    low, high = bootstrap(statistic, scores)
+def _estimates(statistic: Any, scores: Floats, bounds: tuple[float, float] = ANY) -> list[Estimate]:
+    """Estimates, K in number, of a statistic that maps ``scores`` [strata, ..., seeds] to [K].
+
+    ``bounds`` are its smallest and its largest possible value.
+    """
+    low, high = bootstrap(statistic, scores, bounds=bounds)
     ends = (np.ravel(statistic(scores)), np.ravel(low), np.ravel(high))
     return [Estimate(*map(float, numbers)) for numbers in zip(*ends, strict=True)]
 
@@ -180,7 +188,7 @@ class Comparison:
     def mean(self, task: str, delay: str, arm: str) -> Estimate:
         """Mean score of an arm over its seeds."""
         scores = list(self.values(task, delay, arm, self.policy, self.score).values())
-        return _estimates(lambda drawn: drawn.mean(-1), np.array([scores]))[0] if scores else UNKNOWN
+        return _mean(scores, self.score) if scores else UNKNOWN
 
     def scores(self, task: str, delay: str) -> dict[str, dict[int, float]]:
         """Scores by arm and seed, with the sign that makes higher ones better.
@@ -215,8 +223,9 @@ class Comparison:
         (norm,) = _estimates(_norms, array)
         if arm in naive or not naive:
             return Compared(seeds, norm)
-        probability = Estimate(*np.clip(_estimates(_improvement, array)[0], 0.0, 1.0).tolist())
-        return Compared(seeds, norm, _recovery(array), probability)
+        probability = float(_improvement(array))
+        improvement = Estimate(probability, *improvement_interval(probability, len(seeds)))
+        return Compared(seeds, norm, _recovery(array), improvement)
 
     def overall(self) -> dict[str, tuple[int, Estimate]]:
         """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.
@@ -243,6 +252,11 @@ class Comparison:
         return found
 
 
+def _mean(values: Sequence[float], measure: str) -> Estimate:
+    """Mean of the values of a measure by seed."""
+    return _estimates(lambda drawn: drawn.mean(-1), np.array([values]), BOUNDS[measure])[0]
+
+
 def _paired(runs: Sequence[Mapping[int, float]]) -> tuple[list[int], Floats]:
     """Seeds that all runs have, and their scores, [1, runs, seeds]."""
     seeds = sorted(set.intersection(*map(set, runs)))
@@ -251,10 +265,10 @@ def _paired(runs: Sequence[Mapping[int, float]]) -> tuple[list[int], Floats]:
 
 def _ratio(scores: Mapping[int, float], others: Mapping[int, float]) -> Estimate:
     """Mean score over the mean of others, over the seeds of both; unknown unless both are positive."""
-    seeds, array = _paired([scores, others])
-    if not seeds or array.mean(-1).min() <= 0:
+    seeds, array = _paired([others, dict.fromkeys(others, 0.0), scores])
+    if not seeds or array.mean(-1)[0, -1] <= 0:
         return UNKNOWN
-    return _estimates(lambda drawn: drawn.mean(-1)[..., 0, 0] / drawn.mean(-1)[..., 0, 1], array)[0]
+    return _estimates(_norms, array)[0]
 
 
 def _norms(scores: Floats) -> Floats:
@@ -341,9 +355,6 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
 
 def _line(comparison: Comparison, task: str, delay: str, arm: str, policy: str) -> Line:
     found = {name: comparison.values(task, delay, arm, policy, name) for name in MEASURES}
-    means = {
-        name: _estimates(lambda scores: scores.mean(-1), np.array([list(runs.values())]))[0]
-        for name, runs in found.items()
-    }
+    means = {name: _mean(list(runs.values()), name) for name, runs in found.items()}
     information = regime(comparison.arms, arm)
     return Line(task, delay, arm, information, policy, sorted(found["age"]), means)

@@ -16,6 +16,7 @@ from matplotlib.ticker import EngFormatter
 from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.comparison import (
     ALL_MESSAGES,
+    BOUNDS,
     HELD_OUT,
     NOT_COMPARED,
     NOT_LATE,
@@ -136,7 +137,7 @@ def _band(
         return unknown, unknown, unknown, unknown
     place = np.linspace(max(run[0, 0] for run in points), min(run[-1, 0] for run in points), _POINTS)
     values = np.stack([np.interp(place, *run.T) for run in points], -1)
-    low, high = bootstrap(lambda scores: scores.mean(-1), values[None], draws=500)
+    low, high = bootstrap(lambda scores: scores.mean(-1), values[None], draws=500, bounds=BOUNDS[name])
     return place, values.mean(-1), low[0], high[0]
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from damian.common.atomic_files import write_atomically
 from damian.common.csv_table import csv_table
 from damian.common.errors import InputError
-from damian.evaluation.comparison import MODE, SAMPLED, Arm, Row, regime
+from damian.evaluation.comparison import MEASURES, MODE, SAMPLED, Arm, Row, regime
 from damian.evaluation.comparison_figures import LABELS
 from damian.evaluation.metrics_log import METRICS, read_metrics
 from damian.evaluation.run_record import read_record
@@ -87,7 +87,9 @@ def stored_results(folder: Path) -> Results:
     Raises:
         InputError: a file cannot be read.
     """
-    return Results(_read(folder / ROWS), _read(folder / CURVES))
+    labels = ("task", "delay", "arm", "seed", "episodes")
+    rows = _read(folder / ROWS, [*labels, "regime", "policy", "frames", "seconds", *MEASURES])
+    return Results(rows, _read(folder / CURVES, [*labels, *LABELS]))
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -96,10 +98,13 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     write_atomically(path, csv_table([names, *([row[name] for name in names] for row in rows)]))
 
 
-def _read(path: Path) -> list[Row]:
+def _read(path: Path, columns: Sequence[str]) -> Sequence[Row]:
     try:
         with path.open(newline="") as file:
-            return [{name: _value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
+            rows = [{name: _value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
+        if missing := [name for name in columns if rows and name not in rows[0]]:
+            raise ValueError(f"no column {missing[0]}")
+        return rows
     except (OSError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: it does not hold the results of a comparison ({one_line(error)})"

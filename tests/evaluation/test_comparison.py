@@ -146,7 +146,8 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert low < value < high
     assert cells["J_norm"] == pytest.approx(22 / 30)
     assert cells["recovery"] == pytest.approx((22 / 3 - 4) / 6)
-    assert cells["improvement"] == 1
+    assert cells["improvement"] == cells["improvement_high"] == 1
+    assert cells["improvement_low"] == pytest.approx(0.5, abs=0.01)
     assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
@@ -157,6 +158,18 @@ def test_the_table_lists_the_greedy_policy_where_it_was_evaluated():
     cells = [line.split(" |")[:5] for line in table.splitlines() if "greedy" in line]
     names = ("greedy (undelayed)", "greedy")
     assert cells == [[f"| {name}", " ", " greedy", " 1", " 7.000"] for name in names]
+
+
+def test_the_interval_of_a_share_lies_between_0_and_1_and_that_of_a_length_is_not_negative():
+    scores = {arm: [1.0, 0.99, 0.9] for arm in THREE} | {"aware": [0.0, 0.02, 0.01]}
+    comparison = Comparison(rows_of("t", "late", scores), ARMS, "true_success_rate")
+    best, aware = (comparison.mean("t", *place) for place in (("none", "best"), ("late", "aware")))
+    assert (best.high, aware.low) == (1, 0)
+    for line in comparison.lines:
+        for name in ("true_success_rate", "success_rate", "late", "lost", "backupdated"):
+            assert 0 <= line.measures[name].low <= line.measures[name].high <= 1, name
+        assert min(line.measures[name].low for name in ("true_steps", "steps", "age")) >= 0
+    assert comparison.lines[0].measures["true_return"].high > 1
 
 
 def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
@@ -171,6 +184,15 @@ def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
     assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
     assert comparison.compared("t", "late")["aware"].recovery.value == pytest.approx((22 / 3 - 4) / 6)
+
+
+def test_the_share_of_a_script_that_may_win_nothing_has_no_end():
+    arms = ARMS | {"script": Arm(ceiling=True)}
+    rows = rows_of("t", "late", THREE)
+    rows += [row("t", "late", "script", seed, x, ALL_MESSAGES) for seed, x in enumerate((-4.0, 10.0, 12.0))]
+    share = Comparison(rows, arms).compared("t", "late")["aware"].of_ceiling
+    assert share.value == pytest.approx((22 / 3) / 6)
+    assert np.isinf(share[1:]).all()  # one of 27 draws has the first seed only
 
 
 def test_arms_are_listed_where_no_arm_without_delay_ran(tmp_path):

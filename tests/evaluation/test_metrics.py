@@ -9,8 +9,10 @@ import pytest
 import torch
 from helpers import MOTIONS, both_motions, everything, square, walking
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torchrl.envs import RewardSum, StepCounter
 
+from damian import keys
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
@@ -21,7 +23,6 @@ from damian.evaluation.metrics import EpisodeLog, Evaluation, evaluate, evaluati
 from damian.evaluation.metrics_log import MetricsLog, read_metrics
 from damian.evaluation.run_folder import results_table, save_results
 from damian.server.features import ObservationConfig
-from damian.server.reward_terms import reward_term
 from damian.server.rewards import RewardConfig
 from damian.server.server import Server
 from damian.server.termination import EpisodeConfig
@@ -165,20 +166,21 @@ def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion)
         assert (row.age == 0) == (motion == "instant")
 
 
-unsure = reward_term(reads=["belief_moments"])(lambda features, counters: features["belief_moments"][..., -1])
-
-
 @both_motions
-def test_a_reward_of_the_belief_is_truly_that_of_the_belief_without_delay(motion):
-    task = {"custom": [{"term": f"{__name__}:unsure"}], "spotted": 0.0}
-    sections = {"reward": RewardConfig(**task), "episode": EpisodeConfig(max_steps=20)}
-    sections["observation"] = ObservationConfig(belief=["belief_moments"])
-    rows = [
-        evaluation(*fly(joint_spotting(motion, DELAYS[name], **sections))) for name in ("none", "constant")
-    ]
-    expected = pytest.approx(rows[0].episode_return, rel=1e-5)
-    assert [row.true_return for row in rows] == [expected, expected]
-    assert rows[1].episode_return != expected
+def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_on_time(motion):
+    sections = {
+        "observation": ObservationConfig(belief=["belief_moments"]),
+        "reward": RewardConfig(spotted=0.3, custom=[{"term": "extensions:certainty", "weight": 1.0}]),
+        "episode": EpisodeConfig(max_steps=20),
+    }
+    flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.1), **sections))
+    actions = iter(flight[keys.ACTION].unbind(1))
+    again = TensorDictModule(lambda _: next(actions), [keys.READY], [keys.ACTION])
+    env = make_env(joint_spotting(motion, DelayConfig(), **sections), 24, seed=2, extras=["message"])
+    same = env.rollout(HORIZON, again, break_when_any_done=False)
+    late, on_time = evaluation(flight, server), evaluation(same, env.server)
+    assert on_time.true_return == on_time.episode_return == pytest.approx(late.true_return, rel=1e-6)
+    assert late.episode_return != pytest.approx(late.true_return, rel=0.01)
 
 
 def test_an_episode_without_an_end_counts_the_horizon():

@@ -9,6 +9,7 @@ import pytest
 from damian.common.errors import InputError
 from damian.evaluation.statistics import (
     bootstrap,
+    improvement_interval,
     interquartile_mean,
     interval,
     normalised,
@@ -126,6 +127,15 @@ def test_95_percent_intervals_contain_the_truth_in_95_percent_of_all_experiments
     assert 0.94 < covered < 0.97, covered
 
 
+def test_an_interval_ends_at_the_bounds_of_its_statistic():
+    shares = np.array([[[1.0, 0.99, 0.9], [0.0, 0.02, 0.01], [0.4, 0.5, 0.6]]])
+    wide, within = bootstrap(means, shares), bootstrap(means, shares, bounds=(0.0, 1.0))
+    assert wide[1][0, 0] > 1
+    assert wide[0][0, 1] < 0
+    np.testing.assert_array_equal(within, np.clip(wide, 0, 1))
+    np.testing.assert_array_equal(np.stack(within)[:, 0, 2], np.stack(wide)[:, 0, 2])
+
+
 def test_fewer_than_three_seeds_give_no_interval():
     low, high = bootstrap(means, np.array([[[1.0, 2.0], [3.0, 9.0]]]))
     assert np.isnan([low, high]).all()
@@ -146,6 +156,26 @@ def test_the_probability_of_improvement_is_the_share_of_pairs_of_runs():
         for mine, other in zip(ours, theirs, strict=True)
     ]
     np.testing.assert_allclose(probability_of_improvement(ours, theirs), expected)
+
+
+@pytest.mark.parametrize("n_seeds", [3, 5, 10])
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 3.0])
+def test_the_interval_of_an_improvement_contains_the_truth_in_95_percent_of_all_experiments(n_seeds, shift):
+    ours, theirs = np.random.default_rng(1).normal(size=(2, 2000, n_seeds))
+    found = probability_of_improvement(ours + shift, theirs)
+    truth = (1 + math.erf(shift / 2)) / 2  # of two normal scores whose means differ by ``shift``
+    ends = {each: improvement_interval(each, n_seeds) for each in np.unique(found)}
+    covered = np.mean([ends[each][0] < truth < ends[each][1] for each in found])
+    assert 0.93 < covered < 0.98, covered
+
+
+def test_the_interval_of_an_improvement_has_a_width_even_if_every_run_beats_every_other_one():
+    # Its end t solves (1 - t)^2 = z^2 t (1 - t) (1 + 9 ((1 - t) / (2 - t) + t / (1 + t))) / 100.
+    low, high = improvement_interval(1.0, 10)
+    other_low, other_high = improvement_interval(0.0, 10)
+    assert (low, high) == pytest.approx((0.8002, 1.0), abs=1e-4)
+    assert (other_low, other_high) == pytest.approx((1 - high, 1 - low), abs=1e-12)
+    assert np.isnan(improvement_interval(1.0, 2)).all()
 
 
 RLIABLE = [

@@ -112,7 +112,7 @@ def test_any_words_are_refused_in_one_line_or_fly(given_words):
 def test_any_words_of_a_comparison_are_refused_in_one_line_or_make_a_plan(given_words):
     def compare(given_words):
         config: CompareConfig = checked(composed("compare", given_words, ("experiment=usecase2",)), "compare")
-        assert config.seeds <= 10_000
+        assert len(config.every_seed) <= 10_000
 
     refusal(given_words, compare, "compare")
 

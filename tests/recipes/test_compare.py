@@ -20,6 +20,7 @@ from damian.recipes.shared.launch import launch
 from damian.recipes.shared.parallel import Run, perform_all
 from damian.recipes.shared.settings import TrainConfig
 
+STORED = Path(__file__).parents[2] / "docs" / "results"
 SMALL = [
     "frames=16",
     "worlds=2",
@@ -54,6 +55,13 @@ def compare(tmp_path, monkeypatch):
 def table(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def store_results(folder: Path, rows: list[dict]) -> None:
+    """Store results of a comparison, without learning curves."""
+    for name, lines in ("results.csv", [[*rows[0]], *(row.values() for row in rows)]), ("curves.csv", []):
+        with (folder / name).open("w", newline="") as file:
+            csv.writer(file).writerows(lines)
 
 
 def measured(folder: Path) -> list[dict[str, str]]:
@@ -105,6 +113,8 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     compare(*TWO[:1], "seeds=3", *TWO[2:], "report_only=true")
     text = (folder / "table.md").read_text()
     assert "missing: usecase2/none/undelayed/seed_10, usecase2/paper/unaware/seed_10" in text
+    compare(*TWO[:1], *TWO[2:], "report_only=true")
+    assert not re.search("missing|seed_10| to 10", (folder / "table.md").read_text())
     assert stamps(folder) == after
 
     with pytest.raises(SystemExit) as stopped:
@@ -122,22 +132,39 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     kept.mkdir()
     for name in ("results.csv", "curves.csv"):
         (kept / name).write_bytes((folder / name).read_bytes())
-    compare(*words, "report_only=true", f"hydra.run.dir={kept}")
+    stored = ["report_only=true", f"hydra.run.dir={kept}"]
+    compare(*words, *stored)
     assert {path.name for path in kept.iterdir()} == {path.name for path in folder.iterdir()} - {"usecase2"}
     for name in ("table.csv", "figure.png", "curves.png"):
         assert (kept / name).read_bytes() == (folder / name).read_bytes()
     texts = [(place / "table.md").read_text() for place in (folder, kept)]
     assert len({re.sub("`damian compare .*`", "", text) for text in texts}) == 1
-    compare(*words[:2], "arms=[undelayed]", "report_only=true", f"hydra.run.dir={kept}")
+    compare(*words[:2], "arms=[undelayed]", *stored)
     assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "greedy"}
-    check_refused(
-        lambda: compare(*words, "experiment.first_seed=9", "report_only=true", f"hydra.run.dir={kept}"),
-        "experiment: no run of it is finished in",
-        capsys,
-    )
-    (kept / "results.csv").write_text("seed\nx\n")
-    with pytest.raises(SystemExit):
-        compare(*words, "report_only=true", f"hydra.run.dir={kept}")
+    late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
+    check_refused(lambda: compare(*words, *late), problem, capsys)
+    for text, problem in ("seed\nx\n", "it does not hold"), ("seed\n8\n", "(no column task)"):
+        (kept / "results.csv").write_text(text)
+        check_refused(lambda: compare(*words[:1], *stored), problem, capsys)
+
+
+@pytest.mark.parametrize("n_seeds", [2, 12])
+def test_a_report_counts_every_stored_seed_unless_a_number_of_seeds_is_given(compare, tmp_path, n_seeds):
+    words, results = ["report_only=true", "hydra.run.dir=kept"], table(STORED / "delays/results.csv")
+    first = [row for row in results if row["seed"] == "8" and row["delay"] in ("none", "paper")]
+    rows = [{**row, "seed": 8 + n} for n in range(n_seeds) for row in first]
+    rows += [{**row, "seed": 7} for row in first]  # the experiment counts from seed 8
+    (tmp_path / "kept").mkdir()
+    store_results(tmp_path / "kept", rows)
+    for more, counted in ([], n_seeds), (["seeds=1"], 1):
+        compare("experiment=delays", *words, *more)
+        assert {line["seeds"] for line in table(tmp_path / "kept/table.csv")} == {str(counted)}
+        text = (tmp_path / "kept/table.md").read_text()
+        assert f"\n- {counted} seeds (8 to {7 + counted})" in "\n" + text
+        assert text.startswith("- **developing**") == (counted < 10)
+    store_results(tmp_path / "kept", [row for row in rows if row["arm"] != "own" or row["seed"] == 8])
+    compare("experiment=delays", *words)
+    assert (tmp_path / "kept/table.md").read_text().startswith("- **developing**")  # own has too few
 
 
 def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compare, capsys):
