@@ -50,6 +50,9 @@ def main(words: Sequence[str] | None = None) -> None:
     Args:
         words: the command line without ``damian``; ``sys.argv`` if not given.
     """
+    # Threads that wait for each other soon sleep: where other programs run, a training whose threads keep
+    # spinning takes several times as long. OpenMP reads this when torch is loaded.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     name, *words = (sys.argv[1:] if words is None else words) or ["--help"]
     if name in ("-h", "--help"):
         _show(usage())

@@ -294,6 +294,15 @@ def test_help_for_a_reader_that_stops_early_ends_quietly():
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+@pytest.mark.parametrize("chosen", [None, "7"])
+def test_threads_that_wait_sleep_soon_unless_the_user_chooses(chosen, monkeypatch, capsys):
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    if chosen:
+        monkeypatch.setenv("GOMP_SPINCOUNT", chosen)
+    main(["--version"])
+    assert os.environ["GOMP_SPINCOUNT"] == (chosen or "1000")
+
+
 def test_help_may_stand_anywhere_and_explains_groups_and_experiments(capsys):
     def printed(*words: str) -> str:
         main(words)
