@@ -136,7 +136,8 @@ class CompareConfig:
         """Is a row of results of a task, a delay, an arm and a seed that are asked for?"""
         task, delays = row["task"].partition(HELD_OUT)[0], [NOT_LATE, *self.chosen("delays")]
         chosen = task in self.chosen("tasks") and row["arm"] in self.chosen("arms")
-        return chosen and row["delay"] in delays and row["seed"] in self.every_seed
+        seeds = range(self.experiment.first_seed, sys.maxsize) if self.seeds is None else self.every_seed
+        return chosen and row["delay"] in delays and row["seed"] in seeds
 
     @property
     def every_seed(self) -> range:
@@ -289,12 +290,12 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
 def main(composed: DictConfig) -> None:
     config: CompareConfig = checked(composed, "compare")
     folder, failed = Path(HydraConfig.get().runtime.output_dir), []
-    if config.report_only and config.seeds is None:
-        config = replace(config, seeds=_stored_seeds(config, folder))
     if config.report_only and _stores_results(config, folder):
         results, missing = stored_results(folder), []
         results = results.only(config.includes)
     else:
+        if config.report_only and config.seeds is None:
+            config = replace(config, seeds=_seeds_of_runs(config, folder))
         results, missing, failed = _results_of_runs(config, folder)
     if not results.rows:
         raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")
@@ -310,15 +311,11 @@ def _stores_results(config: CompareConfig, folder: Path) -> bool:
     return (folder / ROWS).exists() and not any((folder / task).exists() for task in config.experiment.tasks)
 
 
-def _stored_seeds(config: CompareConfig, folder: Path) -> int | None:
-    """Number of seeds from the experiment's first one to the last one in a folder; None if it has none."""
-    if _stores_results(config, folder):
-        stored = [row["seed"] for row in stored_results(folder).rows]
-    else:
-        names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))
-        stored = [int(name) for name in names if name.isdecimal()]
-    first = config.experiment.first_seed
-    return max((seed - first + 1 for seed in stored if seed >= first), default=None)
+def _seeds_of_runs(config: CompareConfig, folder: Path) -> int | None:
+    """Number of seeds from the experiment's first one to the last one with a run; None if there is no run."""
+    names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))
+    later = (int(name) - config.experiment.first_seed for name in names if name.isdecimal())
+    return max((n + 1 for n in later if n >= 0), default=None)
 
 
 def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list[str], list[Run]]:

@@ -50,9 +50,7 @@ def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):
     code, printed = re.findall(r"```(?:python)?\n(.*?\n)```", DOCUMENT, re.DOTALL)[:2]
     exec(code, {})
     lines = capsys.readouterr().out.splitlines()
-    assert [
-        line for line in lines if "torchrl" not in line
-    ] == printed.splitlines()  # TorchRL logs there, too
+    assert [line for line in lines if "torchrl" not in line] == printed.splitlines()  # it logs there, too
 
 
 def test_the_document_shows_the_examples_code():

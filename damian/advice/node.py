@@ -20,12 +20,11 @@ from damian.envs.pipeline import observation_transforms, remembering_transforms,
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Features
-from damian.transforms import ActionHistory, ServerNode
+from damian.transforms import ServerNode
 from damian.transforms.base import StatefulTransform
 from damian.transforms.belief import Belief
 from damian.transforms.entries import Memory, drop_keys
 from damian.transforms.message_history import MessageHistory
-from damian.transforms.sample_and_hold import SampleAndHold
 from damian.world.state import State
 
 REMEMBERED_STEPS = 32
@@ -192,17 +191,8 @@ class Node:
 
     def skip(self, memories: Memories, n_steps: int) -> Memories:
         """The memories after steps in which nothing was reported and nobody chose; beliefs stay the same."""
-        skipped = []
-        for transform, memory in zip(self.transforms, memories, strict=True):
-            later = {}
-            if isinstance(transform, ServerNode):
-                later = {"elapsed": memory["elapsed"] + n_steps}
-            elif isinstance(transform, SampleAndHold):
-                later = {"elapsed": (memory["elapsed"] + n_steps) % transform.period}
-            elif isinstance(transform, ActionHistory) and transform.age_key:
-                later = {"since": memory["since"] + n_steps}
-            skipped.append(memory | later)
-        return skipped
+        pairs = zip(self.transforms, memories, strict=True)
+        return [transform.after_idle_steps(memory, n_steps) for transform, memory in pairs]
 
     def to_tensordict(self, outputs: Outputs) -> TensorDict:
         """The outputs of a step, as a policy reads them."""

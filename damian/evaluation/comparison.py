@@ -35,9 +35,14 @@ SEEN = ("episode_return", "success_rate", "steps")
 MEASURES = (*TRUE, *SEEN, "age", "late", "lost", "backupdated")
 SCORES = (*TRUE, *SEEN)
 """Measures by which arms can be compared."""
-ANY, SHARE, TIME = (-np.inf, np.inf), (0.0, 1.0), (0.0, np.inf)
-_BOUNDS = (ANY, SHARE, TIME, ANY, SHARE, TIME, TIME, SHARE, SHARE, SHARE)
-BOUNDS: dict[str, tuple[float, float]] = dict(zip(MEASURES, _BOUNDS, strict=True))
+_SHARES = ("true_success_rate", "success_rate", "late", "lost", "backupdated")
+_TIMES = ("true_steps", "steps", "age")
+_ANY = (-np.inf, np.inf)
+BOUNDS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(MEASURES, _ANY),
+    **dict.fromkeys(_SHARES, (0.0, 1.0)),
+    **dict.fromkeys(_TIMES, (0.0, np.inf)),
+}
 """Smallest and largest possible value of each of ``MEASURES``."""
 COMPARED = ("J_norm", "recovery", "improvement", "of_ceiling")
 """Columns of the estimates of ``Compared``."""
@@ -124,7 +129,7 @@ def _short(number: float) -> str:
     return f"{number:.3f}" if abs(number) < 10 else f"{number:.1f}"
 
 
-def _estimates(statistic: Any, scores: Floats, bounds: tuple[float, float] = ANY) -> list[Estimate]:
+def _estimates(statistic: Any, scores: Floats, bounds: tuple[float, float] = _ANY) -> list[Estimate]:
     """Estimates, K in number, of a statistic that maps ``scores`` [strata, ..., seeds] to [K].
 
     ``bounds`` are its smallest and its largest possible value.

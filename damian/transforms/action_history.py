@@ -147,6 +147,9 @@ class ActionHistory(ActionTransform):
             return memory, {key: history.clone()}  # others may change it in place, but not the memory
         return memory, {key: torch.cat([entries[key], history.to(entries[key].dtype)], -1)}
 
+    def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
+        return memory | {"since": memory["since"] + n_steps} if self.age_key else memory
+
     def _encode(self, scale: Memory, action: Tensor) -> Tensor:
         """Represent actions [M, ...] by vectors [M, A] float32."""
         if self.codes is not None:

@@ -127,6 +127,10 @@ class StatefulTransform(MemoryTransform):
         """
         return memory, {}
 
+    def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
+        """The memory after steps in which no message arrived and no agent chose an action."""
+        return memory
+
     def skipped_worlds(self, entries: Entries) -> Tensor | None:
         """Worlds that must step once more before the outputs are returned, [B] bool.
 

@@ -134,6 +134,9 @@ class SampleAndHold(StatefulTransform):
             held[self.ready_key] = ready & ticks.view_as(ready)
         return memory, held
 
+    def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
+        return memory | {"elapsed": (memory["elapsed"] + n_steps) % self.period}
+
     def _hold(
         self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, sampled: Tensor
     ) -> Change:

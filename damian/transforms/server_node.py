@@ -103,6 +103,9 @@ class ServerNode(StatefulTransform):
             memory |= {"trail": outputs.coverage.trail, "coverage": outputs.coverage.share}
         return memory, written | outputs.status.entries()
 
+    def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
+        return memory | {"elapsed": memory["elapsed"] + n_steps}
+
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         for key in self.dropped_keys:
             del observation_spec[key]
