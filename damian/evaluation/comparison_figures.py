@@ -128,14 +128,16 @@ def _band(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Steps or episodes (``progress``) that all seeds reached, mean over seeds, ends of its 95 % interval.
 
-    Each is [_POINTS]; ``name`` is the measure.
+    Each is [_POINTS], NaN if there is none that all have reached; ``name`` is the measure.
     """
     points = [np.array([(r[progress], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
     points = [run for run in points if len(run)]
-    if not points:
+    first = max((run[0, 0] for run in points), default=np.inf)
+    last = min((run[-1, 0] for run in points), default=-np.inf)
+    if first > last:
         unknown = np.full(_POINTS, np.nan)
         return unknown, unknown, unknown, unknown
-    place = np.linspace(max(run[0, 0] for run in points), min(run[-1, 0] for run in points), _POINTS)
+    place = np.linspace(first, last, _POINTS)
     values = np.stack([np.interp(place, *run.T) for run in points], -1)
     low, high = bootstrap(lambda scores: scores.mean(-1), values[None], draws=500, bounds=BOUNDS[name])
     return place, values.mean(-1), low[0], high[0]

@@ -2,7 +2,8 @@
 
 Under delay a receiver holds a set of messages with ages, of its own and of others, and its own latest
 actions. The actor asks this set questions, by attention: one for each action that it might choose. From the
-answers it predicts what the messages of the next step will have said, once they have arrived, and chooses.
+answers it predicts what the messages will have said when that action has ended, once they have arrived, and
+chooses.
 Nothing here depends on what the messages mean.
 """
 
@@ -142,8 +143,9 @@ class BeliefHead(TensorDictModuleBase):
     """Predicts what arrives later, for every discrete action, and encodes what is known for a policy.
 
     The predictions tell, in units of their running standard deviation, what the G numbers of the targets will
-    have been after the next step, once the messages of that step have arrived. Code 0 asks what will have
-    been whatever the action; its encoding is for the policy.
+    have been when the action ends (after the next step; with real flight times after the landing), once the
+    messages of that step have arrived. Code 0 asks what will have been whatever the action; its encoding is
+    for the policy.
 
     While acting it writes ``("agents", "encoding")`` [*, H] and, with discrete actions,
     ``("agents", "prediction")`` [*, A G]. In TorchRL's recurrent mode, which the losses of a policy switch
@@ -281,11 +283,25 @@ def prediction_loss(predicted: Tensor, target: Tensor, counts: Tensor) -> Tensor
     return error.sum() / counts.expand_as(error).sum().clamp(min=1)
 
 
+def next_true(flags: Tensor) -> Tensor:
+    """Index of the next true flag, which may be the flag itself; T if there is none.
+
+    Args:
+        flags: in order of time, [T, ...] bool.
+
+    Returns:
+        as ``flags``, int64.
+    """
+    n_flags = len(flags)
+    index = expand_mask(torch.arange(n_flags, device=flags.device), flags)
+    return torch.where(flags, index, n_flags).flip(0).cummin(0).values.flip(0)
+
+
 def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:
     """Whether messages have arrived by now, as ``delay``, bool.
 
     Args:
         delay: of the messages [steps], -1 if they never arrive, [K, ...].
-        since: steps since each was sent, [K].
+        since: steps since each was sent, one for each delay or the first dimensions of them, [K, ...].
     """
     return (delay >= 0) & (delay <= expand_mask(since, delay))

@@ -14,7 +14,13 @@ from damian import keys
 from damian.common import checks
 from damian.keys import next_key
 from damian.learners.base import LEARNERS, LearningSetup
-from damian.learners.belief_head import arrived_by_now, belief_head, make_belief_actor, prediction_loss
+from damian.learners.belief_head import (
+    arrived_by_now,
+    belief_head,
+    make_belief_actor,
+    next_true,
+    prediction_loss,
+)
 from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.replay.backupdate import BackupdateStorage
@@ -80,9 +86,10 @@ class PredictiveMappoConfig(MappoConfig):
 class PredictiveMappo(Mappo):
     """MAPPO that after each update also learns to predict, from random steps of the replay buffer.
 
-    The target of a step is the critic's observation after it, as the back-updating storage knows it by now. A
-    step whose message has not arrived by now has no weight. What follows from an action does not depend on
-    the policy, so that steps of earlier policies serve too.
+    The target of a decision is the critic's observation when its action has ended (after the step; with real
+    flight times after the landing), as the back-updating storage knows it by now. A decision whose last
+    message has not arrived by now has no weight. What follows from an action does not depend on the policy,
+    so that steps of earlier policies serve too.
     """
 
     config: PredictiveMappoConfig
@@ -109,12 +116,17 @@ class PredictiveMappo(Mappo):
         """
         # What is known after a step is what is known before the next one: it need not be stored twice.
         numbers = super().learn(batch.exclude(next_key(keys.HISTORY)))
-        errors = [self.learn_prediction() for _ in range(self.config.prediction_steps)]
+        last = self.last_steps()
+        errors = [self.learn_prediction(last) for _ in range(self.config.prediction_steps)]
         return {**numbers, "prediction_error": torch.stack(errors).mean().item()}
 
-    def learn_prediction(self) -> Tensor:
-        """Make one step of gradient descent on random steps of the replay buffer; the error before it, []."""
-        before, target, counts = self.sample()
+    def learn_prediction(self, last: Tensor) -> Tensor:
+        """Make one step of gradient descent on random steps of the replay buffer; the error before it, [].
+
+        Args:
+            last: what ``last_steps`` returns.
+        """
+        before, target, counts = self.sample(last)
         self.head.norm.update(target, counts)
         wanted = self.head.norm.normalize(target)
         error = prediction_loss(self.head.predict(*before), wanted.unsqueeze(-2), counts.unsqueeze(-2))
@@ -123,19 +135,45 @@ class PredictiveMappo(Mappo):
         self.head_optimizer.step()
         return error.detach()
 
-    def sample(self) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Draw K stored steps: what predictions are made from, what came after, and what of it counts.
+    @property
+    def storage(self) -> BackupdateStorage:
+        return cast(BackupdateStorage, self.buffer.storage)
+
+    def last_steps(self) -> Tensor:
+        """The last step of the action that each UAV carries out in each stored step.
 
         Returns:
-            observations, histories and actions of the steps, [K, N, ...]; the critic's observation after
-            them, [K, N, G]; and whether it counts, [K, N, 1] bool: the UAV could choose, and its message has
-            arrived by now.
+            index among the T stored steps in order of time, [T, B, N]; T if the action has not ended yet.
         """
-        storage = cast(BackupdateStorage, self.buffer.storage)
-        rows, n_samples = storage.latest(), self.config.prediction_batch
-        since = torch.randint(len(rows), (n_samples,), device=rows.device)
-        index = rows[-1 - since], torch.randint(self.setup.worlds, (n_samples,), device=rows.device)
-        after = (next_key(keys.GLOBAL_OBSERVATION), next_key(keys.DELAY))
-        read = (keys.OBSERVATION, keys.HISTORY, keys.ACTION, keys.READY, *after)
-        *before, ready, target, delay = (cast(Tensor, storage.steps[key])[index] for key in read)
-        return before, target, arrived_by_now(delay, since) & ready.unsqueeze(-1)
+        steps, rows = self.storage.steps, self.storage.latest()
+        ready, reset = (cast(Tensor, steps[key])[rows] for key in (next_key(keys.READY), keys.RESET_AFTER))
+        return next_true(ready | reset)
+
+    def sample(self, last: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Draw K stored steps: what predictions are made from, what came after, and what of it counts.
+
+        Args:
+            last: what ``last_steps`` returns.
+
+        Returns:
+            observations, histories and actions of the steps, [K, N, ...]; the critic's observation when these
+            actions had ended, [K, N, G]; and whether it counts, [K, N, 1] bool: the UAV could choose in this
+            step and has completed its action, and its last message has arrived by now.
+        """
+        steps, rows, n_samples = self.storage.steps, self.storage.latest(), self.config.prediction_batch
+        n_rows, device = len(rows), rows.device
+        since = torch.randint(n_rows, (n_samples,), device=device)
+        world = torch.randint(self.setup.worlds, (n_samples,), device=device)
+        first = n_rows - 1 - since
+        read = (keys.OBSERVATION, keys.HISTORY, keys.ACTION, keys.READY)
+        *before, ready = (cast(Tensor, steps[key])[rows[first], world] for key in read)
+        end = last[first, world]
+        index = (
+            rows[end.clamp(max=n_rows - 1)],
+            world.unsqueeze(-1),
+            torch.arange(end.shape[-1], device=device),
+        )
+        after = (keys.READY, keys.DELAY, keys.GLOBAL_OBSERVATION)
+        completed, delay, target = (cast(Tensor, steps[next_key(key)])[index] for key in after)
+        arrived = arrived_by_now(delay, n_rows - 1 - end)
+        return before, target, arrived & (ready & completed).unsqueeze(-1)

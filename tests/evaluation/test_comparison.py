@@ -284,6 +284,20 @@ def test_the_legend_of_learning_curves_names_an_arm_that_ran_under_one_delay_onl
     assert {"best", "blind", "flown", "aware", RANDOM} <= {*texts}
 
 
+@pytest.mark.parametrize(("first", "drawn_over"), [(3, [3.0, 4.0]), (5, [])])
+def test_a_learning_curve_is_drawn_where_all_of_its_runs_have_been(first, drawn_over, monkeypatch, tmp_path):
+    runs = [
+        [{"episodes": float(n), "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in episodes]
+        for episodes in (range(5), range(first, 9))
+    ]
+    comparison = Comparison(rows_of("t", "late", SCORES), ARMS)
+    path = tmp_path / "curves.png"
+    figure = drawn(monkeypatch, lambda: plot_curves(comparison, {("t", "none", "best"): runs}, {}, path))
+    line = next(line for line in figure.axes[0].lines if line.get_label() == "best")
+    place = np.asarray(line.get_xdata())
+    assert [*place[~np.isnan(place)][[0, -1]]] == drawn_over if drawn_over else np.isnan(place).all()
+
+
 @pytest.mark.parametrize(("last", "label"), [(500.0, "environment steps"), (400.0, "episodes")])
 def test_curves_are_over_steps_if_all_runs_made_as_many_and_else_over_episodes(
     last, label, monkeypatch, tmp_path

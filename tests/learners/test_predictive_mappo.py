@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import pytest
 import torch
-from helpers import square, walking
+from helpers import FLYING, square, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
@@ -19,17 +19,27 @@ from damian.learners.networks import ModelConfig
 from damian.learners.predictive_mappo import PredictiveMappo, PredictiveMappoConfig
 from damian.recipes.shared.settings import LoggerConfig, TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
+from damian.replay.backupdate import BackupdateStorage
+from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
+from damian.world.motion import MotionConfig
 
 SMALL = ModelConfig(hidden=[16, 8])
+Built = tuple[PredictiveMappo, DelayedEnv, TrainConfig]
 LATE = {"law": "uniform", "low": 0, "high": 3}
 
 
-def build(kind: str = "discrete", **learner) -> tuple[PredictiveMappo, DelayedEnv, TrainConfig]:
+def build(
+    kind: str = "discrete", flights: bool = False, **learner
+) -> tuple[PredictiveMappo, DelayedEnv, TrainConfig]:
     """A learner of few prediction steps, and an environment whose messages are up to 3 steps late or lost."""
     few: dict[str, Any] = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
     scenario = square(
-        source=walking(), actions=ActionConfig(kind=kind), delay=DelayConfig(obs=LATE, loss=0.1, messages=4)
+        source=walking(),
+        actions=ActionConfig(kind=kind),
+        delay=DelayConfig(obs=LATE, loss=0.1, messages=4),
+        motion=FLYING if flights else MotionConfig(),
+        episode=EpisodeConfig(max_steps=7),
     )
     config = TrainConfig(
         **vars(scenario),
@@ -138,7 +148,7 @@ def test_what_has_arrived_by_now_is_counted_as_by_hand():
 def test_targets_use_nothing_that_has_not_arrived_by_now():
     learner, env, _ = build()
     learner.learn(collected(learner, env))
-    storage = learner.buffer.storage
+    storage = learner.storage
     n_steps = len(storage.latest())
     steps = storage.steps[:n_steps]
     late = steps[next_key(keys.DELAY)].squeeze(-1)
@@ -146,27 +156,53 @@ def test_targets_use_nothing_that_has_not_arrived_by_now():
     missing = (late < 0) | (late > since)
     assert missing[-3:].any()
     torch.manual_seed(4)
-    before = learner.sample()
+    before = learner.sample(learner.last_steps())
     steps[next_key(keys.MESSAGE)][missing] += 50.0  # in place: a slice of the storage
     storage.backupdate(n_steps)
     torch.manual_seed(4)
-    after = learner.sample()
+    after = learner.sample(learner.last_steps())
     assert before[1].equal(after[1])
     assert before[2].equal(after[2])
     assert not before[2].all()
 
 
-def test_a_step_counts_if_its_uav_could_choose_and_its_message_has_arrived():
-    learner, env, _ = build(prediction_batch=4000)
-    learner.learn(collected(learner, env))
-    storage, counts = learner.buffer.storage, learner.sample()[2]
-    delay, ready = (storage.steps[key] for key in (next_key(keys.DELAY), keys.READY))
-    held, share = len(storage.latest()), 0.0
-    for t in range(held):
-        for i in range(4):
-            for j in range(3):
-                share += float(0 <= int(delay[t, i, j]) <= held - 1 - t and bool(ready[t, i, j]))
-    assert abs(counts.float().mean().item() - share / (held * 4 * 3)) < 0.02
+def ends_of_actions(storage: BackupdateStorage) -> dict[tuple[int, int, int], int]:
+    """The last step of each action that was completed, for its first step, world and UAV, by loops."""
+    steps = storage.steps[storage.latest()]
+    ready, next_ready, reset = (steps[key] for key in (keys.READY, next_key(keys.READY), keys.RESET_AFTER))
+    found, n_steps = {}, len(steps)
+    for t, i, j in ready.nonzero().tolist():
+        end = t
+        while end < n_steps - 1 and not next_ready[end, i, j] and not reset[end, i]:
+            end += 1
+        if next_ready[end, i, j]:
+            found[t, i, j] = end
+    return found
+
+
+@pytest.mark.parametrize("flights", [False, True])
+def test_a_decision_counts_if_its_action_was_completed_and_the_last_message_of_it_has_arrived(flights):
+    learner, env, _ = build(flights=flights, prediction_batch=3000)
+    for _ in range(6):
+        learner.learn(collected(learner, env))
+    storage = learner.storage
+    steps, ends = storage.steps[storage.latest()], ends_of_actions(storage)
+    delay, seen = steps[next_key(keys.DELAY)], steps[next_key(keys.GLOBAL_OBSERVATION)]
+    n_steps = len(steps)
+    arrived = {key: end for key, end in ends.items() if 0 <= delay[end, *key[1:]] <= n_steps - 1 - end}
+    durations = {end - key[0] for key, end in ends.items()}
+    assert durations == {0} or (flights and max(durations) > 1)
+    last = learner.last_steps()
+    assert {key: int(last[key]) for key in ends} == ends
+    (observation, *_), target, counts = learner.sample(last)
+    assert abs(counts.float().mean().item() - len(arrived) / (n_steps * 4 * 3)) < 0.02
+    sampled = {tuple(row) for row in torch.cat([observation, target], -1)[counts.squeeze(-1)].tolist()}
+    expected = {
+        (*steps[keys.OBSERVATION][key].tolist(), *seen[end, *key[1:]].tolist())
+        for key, end in arrived.items()
+    }
+    assert sampled <= expected
+    assert len(sampled) > 0.9 * len(expected)
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
@@ -174,7 +210,7 @@ def test_the_gradient_of_the_prediction_reaches_all_of_the_head_and_the_errors_f
     learner, env, _ = build(kind, prediction_lr=1e-2, prediction_batch=64)
     learner.learn(collected(learner, env))
     learner.head_optimizer.zero_grad()
-    errors = [learner.learn_prediction() for _ in range(60)]
+    errors = [learner.learn_prediction(learner.last_steps()) for _ in range(60)]
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in learner.head.parameters())
     assert torch.stack(errors[-10:]).mean() < 0.8 * torch.stack(errors[:10]).mean()
 
@@ -192,7 +228,7 @@ def test_learning_to_predict_does_not_change_what_the_policy_has_done(kind):
     before = log_prob()
     learner.buffer.extend(batch)
     for _ in range(5):
-        learner.learn_prediction()
+        learner.learn_prediction(learner.last_steps())
     assert log_prob().equal(before)
 
 
@@ -208,7 +244,7 @@ def test_a_learner_goes_on_from_its_components_as_if_it_had_not_stopped():
     results = []
     for each in (learner, other):
         torch.manual_seed(6)
-        results.append([float(each.learn_prediction()) for _ in range(3)])
+        results.append([float(each.learn_prediction(each.last_steps())) for _ in range(3)])
     assert results[0] == results[1]
 
 
