@@ -222,31 +222,36 @@ def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], pat
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(3.6 * len(panels) + 0.6, 5.0), layout="constrained")
         axes = figure.subplots(2, len(panels), squeeze=False, sharex=True)
-        for (title, arms), (scores, below) in zip(panels.items(), axes.T, strict=True):
-            scores.sharey(axes[0, 0])
-            has_naive = any(comparison.arms[arm].naive for arm in arms)
-            for index, arm in enumerate(arms):
-                found = [comparison.compared(task, delay).get(arm, NOT_COMPARED) for delay in delays]
-                won = [each.recovery if has_naive else each.of_ceiling for each in found]
-                _estimates_over(scores, [comparison.mean(task, delay, arm) for delay in delays], index, arm)
-                if not comparison.arms[arm].naive:
-                    _estimates_over(below, won, index, arm)
-            _references(scores, comparison, task)
-            for level in (0, 1):
-                below.axhline(level, color="0.5", linestyle="--", linewidth=0.8)
-            scores.set_title(title)
-            scores.legend(frameon=False)
-            below.set_xticks(range(len(delays)), delays)
-            below.set_ylabel(
-                "recovery (0: naive, 1: undelayed)" if has_naive else "share of the script's return"
-            )
-            lowest = below if below.containers else scores
-            if lowest is scores:  # no recovery or share is known
-                below.set_visible(False)
-                scores.tick_params(labelbottom=True)
-            lowest.set_xlabel("delay of the observations [steps]")
+        for (title, arms), column in zip(panels.items(), axes.T, strict=True):
+            column[0].sharey(axes[0, 0])
+            column[0].set_title(title)
+            _delay_column(column, comparison, task, arms)
         axes[0, 0].set_ylabel(f"{comparison.score.replace('_', ' ')}, {comparison.policy}")
         figure.savefig(path, dpi=150)
+
+
+def _delay_column(column: Sequence[Axes], comparison: Comparison, task: str, arms: Sequence[str]) -> None:
+    """Draw the scores of arms over the delays of a task, and below what they won back, if it is known."""
+    scores, below = column
+    delays = comparison.delays(task)
+    has_naive = any(comparison.arms[arm].naive for arm in arms)
+    for index, arm in enumerate(arms):
+        _estimates_over(scores, [comparison.mean(task, delay, arm) for delay in delays], index, arm)
+        if not comparison.arms[arm].naive:
+            found = [comparison.compared(task, delay).get(arm, NOT_COMPARED) for delay in delays]
+            won = [each.recovery if has_naive else each.of_ceiling for each in found]
+            _estimates_over(below, won, index, arm)
+    _references(scores, comparison, task)
+    for level in (0, 1):
+        below.axhline(level, color="0.5", linestyle="--", linewidth=0.8)
+    scores.legend(frameon=False)
+    below.set_xticks(range(len(delays)), delays)
+    below.set_ylabel("recovery (0: naive, 1: undelayed)" if has_naive else "share of the script's return")
+    lowest = below if below.containers else scores
+    if lowest is scores:  # no recovery or share is known
+        below.set_visible(False)
+        scores.tick_params(labelbottom=True)
+    lowest.set_xlabel("delay of the observations [steps]")
 
 
 def _estimates_over(axis: Axes, estimates: Sequence[Estimate], index: int, label: str) -> None:
