@@ -172,16 +172,11 @@ def check_against_twin(
     def follow(outputs: TensorDictBase, inputs: TensorDictBase | None, mask: list[bool]) -> None:
         source = outputs if sent in outputs.keys(True) else inputs
         for b in worlds:
-            n = len(twins[b].agents)
             if mask[b]:
-                contents = source[sent][b].tolist() if source is not None else [[0.0]] * n
+                no_content = [[0.0]] * len(twins[b].agents)
+                contents = source[sent][b].tolist() if source is not None else no_content
                 twins[b].step(contents, wants(outputs, inputs, b), begins=inputs is None)
-            got = [outputs["agents", name][b].tolist() for name in ("received", *FLAGS)]
-            zeros = [0.0] * len(got[0][0][0])
-            for i in range(n):
-                for j in range(n):
-                    expected = twins[b].seen(i, j, zeros)
-                    assert tuple(part[i][j] for part in got) == tuple(expected), (b, i, j)
+            assert_same(twins[b], outputs[b])
 
     follow(td, None, [True] * len(worlds))
     seen = [td]
@@ -197,6 +192,15 @@ def check_against_twin(
             follow(td, None, mask)
         seen += [stepped["next"], td]
     return seen
+
+
+def assert_same(twin: World, outputs: TensorDictBase) -> None:
+    """Every agent holds of every other one what it holds in the twin."""
+    got = [outputs["agents", name].tolist() for name in ("received", *FLAGS)]
+    zeros = [0.0] * len(got[0][0][0])
+    for i in twin.agents:
+        for j in twin.agents:
+            assert tuple(part[i][j] for part in got) == tuple(twin.seen(i, j, zeros)), (i, j)
 
 
 FLAGS = ("received_age", "received_mask")
