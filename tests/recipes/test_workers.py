@@ -19,6 +19,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from damian import keys
 from damian.common.errors import InputError
 from damian.evaluation.metrics_log import MetricsLog
 from damian.recipes.shared.collecting import collecting
@@ -82,10 +83,18 @@ def collected(
 
 
 def unequal(one: TensorDictBase, other: TensorDictBase) -> list:
-    """Keys whose entries differ; each worker counts its episodes by itself."""
-    keys = {key for key in one.keys(True, True) if "traj_ids" not in key}
-    assert keys == {key for key in other.keys(True, True) if "traj_ids" not in key}
-    return [key for key in keys if not one[key].equal(other[key])]
+    """Keys whose entries differ; each worker counts its episodes by itself.
+
+    What the actor computes may differ in its last bits: with fewer rows, some processors round the product of
+    matrices in another way.
+    """
+    names = {key for key in one.keys(True, True) if "traj_ids" not in key}
+    assert names == {key for key in other.keys(True, True) if "traj_ids" not in key}
+    rounded = {keys.ACTION_LOG_PROB, (keys.AGENTS, "logits")}
+    assert rounded <= names
+    tolerance = {key: 1e-6 * (key in rounded) for key in names}
+    apart = {key: (one[key].double() - other[key].double()).abs() for key in names}
+    return [key for key in names if not (apart[key] <= tolerance[key]).all()]
 
 
 def test_one_process_is_torchrls_collector_on_the_environment_itself():
