@@ -137,6 +137,7 @@ class PredictiveMappo(Mappo):
 
     @property
     def storage(self) -> BackupdateStorage:
+        """The stored steps, from which predictions are learnt."""
         return cast(BackupdateStorage, self.buffer.storage)
 
     def last_steps(self) -> Tensor:
