@@ -195,7 +195,7 @@ def check_against_twin(
 
 
 def assert_same(twin: World, outputs: TensorDictBase) -> None:
-    """Every agent holds of every other one what it holds in the twin."""
+    """The messages that each agent has received from each other one are those of the twin."""
     got = [outputs["agents", name].tolist() for name in ("received", *FLAGS)]
     zeros = [0.0] * len(got[0][0][0])
     for i in twin.agents:

@@ -19,6 +19,20 @@ def expand_mask(mask: Tensor, like: Tensor) -> Tensor:
     return mask.view((*mask.shape, *[1] * (like.dim() - mask.dim())))
 
 
+def next_true(flags: Tensor) -> Tensor:
+    """Index of the next true flag at or after each place, T if there is none.
+
+    Args:
+        flags: in order of time, [T, ...] bool.
+
+    Returns:
+        as ``flags``, int64.
+    """
+    n_flags = len(flags)
+    index = expand_mask(torch.arange(n_flags, device=flags.device), flags)
+    return torch.where(flags, index, n_flags).flip(0).cummin(0).values.flip(0)
+
+
 def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
     """Apply a function to the corresponding tensors of nested named tuples."""
     values: list[Any] = [

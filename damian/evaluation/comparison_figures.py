@@ -231,7 +231,7 @@ def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], pat
 
 
 def _delay_column(column: Sequence[Axes], comparison: Comparison, task: str, arms: Sequence[str]) -> None:
-    """Draw the scores of arms over the delays of a task, and below what they won back, if it is known."""
+    """Draw the scores of arms over the delays of a task; below, their recovery or share of the ceiling."""
     scores, below = column
     delays = comparison.delays(task)
     has_naive = any(comparison.arms[arm].naive for arm in arms)

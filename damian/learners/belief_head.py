@@ -283,20 +283,6 @@ def prediction_loss(predicted: Tensor, target: Tensor, counts: Tensor) -> Tensor
     return error.sum() / counts.expand_as(error).sum().clamp(min=1)
 
 
-def next_true(flags: Tensor) -> Tensor:
-    """Index of the next true flag, which may be the flag itself; T if there is none.
-
-    Args:
-        flags: in order of time, [T, ...] bool.
-
-    Returns:
-        as ``flags``, int64.
-    """
-    n_flags = len(flags)
-    index = expand_mask(torch.arange(n_flags, device=flags.device), flags)
-    return torch.where(flags, index, n_flags).flip(0).cummin(0).values.flip(0)
-
-
 def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:
     """Whether messages have arrived by now, as ``delay``, bool.
 

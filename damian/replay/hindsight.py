@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from damian.common.tensors import next_true
+
 
 class MessageLog(NamedTuple):
     """Messages sent and held at T consecutive steps."""
@@ -61,9 +63,8 @@ def paid_by_now(delay: Tensor, begins: Tensor, reset_after: Tensor) -> Tensor:
         reset_after: whether the environment was done with this step, [T, *].
     """
     steps = _steps(delay)
-    later_begins = torch.where(begins, steps, len(steps))[1:]
     none_later = torch.full_like(steps[:1], len(steps))
-    last = torch.cat([later_begins, none_later]).flip(0).cummin(0).values.flip(0) - 1
+    last = torch.cat([next_true(begins)[1:], none_later]) - 1
     return (steps + delay <= last) | reset_after.expand_as(steps).gather(0, last)
 
 

@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from damian import keys
+from damian.common.tensors import next_true
 from damian.keys import next_key
 
 
@@ -44,10 +45,8 @@ def find_decisions(
             where the episode ends earlier.
     """
     n_steps = len(ready)
-    steps = torch.arange(n_steps, device=ready.device).view(-1, 1, 1)
     ended = done.unsqueeze(-1).expand_as(ready)
-    end_here = torch.where(ready_next | ended, steps, n_steps)  # n_steps: no decision ends here
-    next_end = end_here.flip(0).cummin(0).values.flip(0)
+    next_end = next_true(ready_next | ended)  # n_steps: none has ended yet
     next_end = torch.cat([next_end, torch.full_like(next_end[:1], n_steps)])
     end = next_end[:-1]
     for _ in range(n_decisions - 1):

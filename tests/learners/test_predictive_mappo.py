@@ -25,7 +25,6 @@ from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
 
 SMALL = ModelConfig(hidden=[16, 8])
-Built = tuple[PredictiveMappo, DelayedEnv, TrainConfig]
 LATE = {"law": "uniform", "low": 0, "high": 3}
 
 
