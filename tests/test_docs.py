@@ -108,7 +108,7 @@ def test_the_delay_models_table_is_what_the_delay_line_and_back_updating_do():
         torch.tensor([*held[1:], 7]).float().view(7, 1, 1),
         torch.tensor([*age[1:], 0]).view(7, 1),
     )
-    known = [f"m{int(m)}" for m in latest_arrived(log).flatten()[:6]]
+    known = [f"m{int(m)}" for m in latest_arrived(log)[0].flatten()[:6]]
     assert known == cells["back-updated at step 7"][1:]
 
 

@@ -123,7 +123,7 @@ class Fleet:
         received = self.clock
         uav = self.number[report.uav]
         log = self.logs[uav]
-        log.received, log.latest_receipt = log.received + 1, received
+        log.received += 1
         if log.has(report.time):
             log.duplicates += 1
             return "duplicate"

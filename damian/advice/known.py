@@ -63,7 +63,6 @@ class UavLog:
         self.ground, self.window, self.n_readings = ground, window, n_readings
         self.known: list[Known] = []
         self.received = self.late = self.duplicates = 0
-        self.latest_receipt = 0.0
 
     @property
     def newest(self) -> Known | None:

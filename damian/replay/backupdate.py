@@ -14,7 +14,7 @@ from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.keys import next_key
 from damian.replay.corrections import Correction, CreditLateRewards
-from damian.replay.hindsight import MessageLog, ended_before, latest_with_age
+from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
 from damian.replay.step_keys import (
     ENDS,
     Recompute,
@@ -262,7 +262,7 @@ class BackupdateStorage(TimeStorage):
             known, known_age = steps[next_key(names.hindsight)], steps[names.hindsight_age]
             held, age = _first_of(known, held), _first_of(known_age, age)
             log = log._replace(held=held, age=age.squeeze(-1))
-        latest, age = latest_with_age(log)
+        latest, age = latest_arrived(log)
         replaced = latest != steps[next_key(names.received)]
         added: Entries = {names.backupdated: replaced.any(-1, keepdim=True)}
         if names.hindsight is not None:

@@ -25,8 +25,8 @@ class MessageLog(NamedTuple):
     """Age of the message held [steps], [T, *]."""
 
 
-def latest_arrived(log: MessageLog, now: int | None = None) -> Tensor:
-    """For each step, the newest message sent in its episode by then that has arrived by ``now``, [T, *, M].
+def latest_arrived(log: MessageLog, now: int | None = None) -> tuple[Tensor, Tensor]:
+    """For each step, the newest message sent in its episode by then that has arrived by ``now``.
 
     The function finds messages that were held at some step of the log, and messages sent within it. To miss
     none, the log must begin earlier than the first step of interest, by the longest delay.
@@ -34,12 +34,10 @@ def latest_arrived(log: MessageLog, now: int | None = None) -> Tensor:
     Args:
         log: messages sent and held.
         now: index of a step, the last one if not given; no message that arrives later is used.
+
+    Returns:
+        the messages, [T, *, M], and the age of each at its step [steps], [T, *].
     """
-    return latest_with_age(log, now)[0]
-
-
-def latest_with_age(log: MessageLog, now: int | None = None) -> tuple[Tensor, Tensor]:
-    """The messages of ``latest_arrived``, and the age of each at its step [steps], [T, *]."""
     steps = _steps(log.delay)
     arrived = (log.delay >= 0) & (steps + log.delay <= (len(steps) - 1 if now is None else now))
     none = torch.iinfo(steps.dtype).min  # older than any held message, even one older than these steps
