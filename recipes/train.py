@@ -164,7 +164,8 @@ def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, int
     due = finished or state.progress.updates % config.checkpoint_every == 0
     if due or asked:
         log.sync()
-        if due:
+        # Before the first episodes of all worlds can have ended, only the short ones have.
+        if due and state.progress.frames >= config.worlds * (config.episode.max_steps or 1):
             state.save_best()
         state.save()
     return finished or asked

@@ -328,6 +328,12 @@ def test_sigterm_stops_a_run_after_its_update(run, capsys, monkeypatch):
 # The best policy.
 
 
+def test_no_policy_is_the_best_while_only_short_episodes_can_have_ended(run):
+    folder = run(*TINY, "scenario=spotting", "episode.success_share=0.3", "episode.max_steps=100")
+    assert read_metrics(folder)[-1]["success_rate"] == 1  # because failed episodes go on
+    assert not (folder / "best.pt").exists()
+
+
 @pytest.mark.slow
 def test_the_best_policy_of_a_run_can_be_flown(run, monkeypatch):
     folder = run(*TINY, "frames=640")
