@@ -11,7 +11,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from damian.common import checks
 from damian.common.tensors import expand_mask
-from damian.keys import STEPPED
+from damian.keys import DONE, STEPPED
 from damian.transforms.entries import (
     Change,
     Entries,
@@ -67,6 +67,8 @@ class StatefulTransform(MemoryTransform):
     """Keys of the entries that are removed from the outputs."""
     sent_key: NestedKey | None = None
     """Key of the flag that tells which rows send a message in this step; None if all do."""
+    per_world: bool = False
+    """Whether the memory has a row for each world, and not for each element that ``in_keys`` tell of."""
     optional_keys: Sequence[str] = ()
     """Names of those arguments whose key is that of an entry to create, or None to leave it out."""
     after_skipping: bool = False
@@ -179,7 +181,7 @@ class StatefulTransform(MemoryTransform):
     @property
     def row_key(self) -> NestedKey:
         """Key of an entry whose innermost TensorDict has one element for each row."""
-        return self.in_keys[0]
+        return DONE if self.per_world else self.in_keys[0]
 
     @property
     def key_usage(self) -> KeyUsage:
@@ -302,6 +304,12 @@ class StatefulTransform(MemoryTransform):
         return tensordict
 
     # The place of the transform in an environment.
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        """The spec of the observations without ``dropped_keys``."""
+        for key in self.dropped_keys:
+            del observation_spec[key]
+        return observation_spec
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         """The specs with those of what the transform writes.

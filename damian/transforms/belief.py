@@ -39,15 +39,13 @@ class Belief(StatefulTransform):
         >>> env = TransformedEnv(env, Compose(uplink, believe, ServerNode(env.server)))
     """
 
+    per_world = True
+
     def __init__(self, server: Server, longest: int, *, delayed: bool, own: bool = False) -> None:
         reads: list[NestedKey] = [keys.MESSAGE, keys.MESSAGE_SENT, *([keys.DELAY] if delayed else [])]
         super().__init__(reads, [keys.BELIEF, *([keys.OWN_BELIEF] if own else [])])
         self.server, self.longest, self.delayed, self.own = server, longest, delayed, own
         self.step_keys = reads
-
-    @property
-    def row_key(self) -> NestedKey:
-        return keys.DONE
 
     @property
     def key_usage(self) -> KeyUsage:

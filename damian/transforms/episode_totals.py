@@ -30,6 +30,7 @@ class EpisodeTotals(StatefulTransform):
     """
 
     after_skipping = True
+    per_world = True
 
     def __init__(
         self,
@@ -40,10 +41,6 @@ class EpisodeTotals(StatefulTransform):
         super().__init__(reward_key, [return_key, count_key])
         self.return_key, self.count_key = self.out_keys
         self.step_keys = self.in_keys
-
-    @property
-    def row_key(self) -> NestedKey:
-        return keys.DONE
 
     @property
     def key_usage(self) -> KeyUsage:

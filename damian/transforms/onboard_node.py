@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
 
 from damian import keys
 from damian.server.server import Server
@@ -33,6 +32,8 @@ class OnboardNode(StatefulTransform):
         >>> env = TransformedEnv(env, Compose(channel, OnboardNode(env.server)))
     """
 
+    per_world = True
+
     def __init__(
         self,
         server: Server,
@@ -42,10 +43,6 @@ class OnboardNode(StatefulTransform):
     ) -> None:
         super().__init__(linked_key, keys.OBSERVATION)
         self.server, self.dropped_keys, self.step_keys = server, list(dropped_keys), self.in_keys
-
-    @property
-    def row_key(self) -> NestedKey:
-        return keys.DONE
 
     @property
     def key_usage(self) -> KeyUsage:
@@ -63,8 +60,3 @@ class OnboardNode(StatefulTransform):
         known = self.server.messages(entries[self.in_keys[0]])
         observation = self.server.observe_each(known, elapsed.view(self.rows))
         return {"elapsed": elapsed}, {keys.OBSERVATION: observation}
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        for key in self.dropped_keys:
-            del observation_spec[key]
-        return observation_spec

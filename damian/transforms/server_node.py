@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
 
 from damian import keys
 from damian.common.tensors import expand_mask
@@ -36,6 +35,8 @@ class ServerNode(StatefulTransform):
         >>> env = TransformedEnv(env, Compose(uplink, ServerNode(env.server)))
     """
 
+    per_world = True
+
     def __init__(
         self,
         server: Server,
@@ -58,10 +59,6 @@ class ServerNode(StatefulTransform):
     def _read_keys(self) -> list[NestedKey]:
         """Keys of the entries that other transforms may delay or create."""
         return [*self.in_keys, *([self.own_key] if self.own_key else []), *self.belief_keys]
-
-    @property
-    def row_key(self) -> NestedKey:
-        return keys.DONE
 
     @property
     def key_usage(self) -> KeyUsage:
@@ -105,8 +102,3 @@ class ServerNode(StatefulTransform):
 
     def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
         return memory | {"elapsed": memory["elapsed"] + n_steps}
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        for key in self.dropped_keys:
-            del observation_spec[key]
-        return observation_spec

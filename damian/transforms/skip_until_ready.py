@@ -41,6 +41,8 @@ class SkipUntilReady(StatefulTransform):
         >>> env = make_env(ScenarioConfig(motion=MotionConfig("polynomial"), clock=clock))
     """
 
+    per_world = True
+
     def __init__(
         self,
         gamma: float = 1.0,
@@ -51,10 +53,6 @@ class SkipUntilReady(StatefulTransform):
         super().__init__(out_keys=[keys.DURATION])
         self.gamma, self.reward_keys, self.ready_key = gamma, list(reward_keys), ready_key
         self.step_keys = [keys.DONE]
-
-    @property
-    def row_key(self) -> NestedKey:
-        return keys.DONE
 
     @property
     def key_usage(self) -> KeyUsage:
