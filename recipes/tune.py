@@ -260,14 +260,14 @@ def report(found: Search) -> None:
         raise RunError(f"no trial of {found.folder} has a value: see the log.txt of each")
     complete.sort(key=lambda trial: -found.config.sign * (trial.value or 0.0))
     head = ["trial", "state", found.config.score, *found.space]
-    write_atomically(found.folder / TRIALS, csv_table([head, *(row(found, trial) for trial in trials)]))
+    write_atomically(found.folder / TRIALS, csv_table([head, *(row(trial) for trial in trials)]))
     lines = [
         f"`{command(typed_words())}`",
         f"{len(trials)} trials: {len(complete)} with a value, "
         f"{sum(trial.state == TrialState.PRUNED for trial in trials)} pruned, "
         f"{sum(trial.state == TrialState.FAIL for trial in trials)} failed or interrupted. All have the seed "
         f"{found.config.seed}, and the value of the best is flattered by having been chosen.",
-        markdown_table(head, [row(found, trial) for trial in complete[:SHOWN]]),
+        markdown_table(head, [row(trial) for trial in complete[:SHOWN]]),
         f"The best: `damian train {shlex.join(found.words(complete[0].user_attrs[CHOSEN]))}`",
     ]
     text = "\n\n".join(lines) + "\n"
@@ -276,7 +276,7 @@ def report(found: Search) -> None:
     print(text)
 
 
-def row(found: Search, trial: FrozenTrial) -> list[str]:
+def row(trial: FrozenTrial) -> list[str]:
     """A trial in the tables."""
     value = "" if trial.state != TrialState.COMPLETE else f"{trial.value:.4g}"
     return [str(trial.number), trial.state.name.lower(), value, *trial.user_attrs[CHOSEN].values()]

@@ -92,7 +92,7 @@ def episode_of(
     """
     known, reports = _knowledge(path, fleet, span or (0.0, math.inf), progress)
     steps = np.array(known.steps)
-    truth = [_hindsight(fleet, uav, reports[uav], steps) for uav in range(len(fleet.uavs))]
+    truth = [_hindsight(fleet, reports[uav], steps) for uav in range(len(fleet.uavs))]
     columns = {name: np.stack([each[name] for each in truth], 1) for name in truth[0]}
     columns["target"] = _targets(fleet, known.told, columns["position"][0, :, :2], steps)
     columns["sent"], columns["delay"] = _messages(fleet, known, reports, steps)
@@ -193,9 +193,7 @@ def _note(fleet: Fleet, known: Known) -> None:
     known.success = bool(outputs[keys.SUCCESS])
 
 
-def _hindsight(
-    fleet: Fleet, uav: int, reports: Sequence[Report], steps: NDArray[np.int64]
-) -> dict[str, NDArray[Any]]:
+def _hindsight(fleet: Fleet, reports: Sequence[Report], steps: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """Columns of a UAV that follow from its reports by the time when they were generated, [S, ...]."""
     ordered = sorted(reports, key=lambda report: report.time)
     at = np.clip([fleet.step_of(report.time) for report in ordered], fleet.first_step, None)

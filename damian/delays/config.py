@@ -66,10 +66,6 @@ class DelayConfig:
         """Names of the entries that the laws read in the contexts of messages."""
         return {name for sampler in self._samplers(dt).values() for name in sampler.reads}
 
-    def sees_context(self, dt: float) -> bool:
-        """Whether a law computes delays from the contexts of messages."""
-        return any(sampler.sees_context for sampler in self._samplers(dt).values())
-
     def check(self, dt: float) -> None:
         """Check that every law is valid for steps of ``dt`` seconds.
 

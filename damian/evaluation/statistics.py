@@ -20,6 +20,8 @@ LEAST_GAP = 0.1
 """Smallest cost of the delay, as a share of undelayed - random, for which a recovery is reported."""
 FEWEST = 3
 """Smallest number of seeds for which there is an interval."""
+LEVEL = 0.95
+"""Share of the resampled statistics inside an interval, before it is widened."""
 
 
 def normalised(score: Floats, undelayed: Floats, random: Floats) -> Floats:
@@ -86,13 +88,13 @@ def resampled(scores: Floats, draws: int, seed: int = 0) -> Floats:
     return np.take_along_axis(scores[None], drawn.reshape(draws, strata, *between, n_seeds), -1)
 
 
-def interval(values: Floats, level: float = 0.95) -> tuple[Floats, Floats]:
+def interval(values: Floats) -> tuple[Floats, Floats]:
     """Percentile interval of resampled statistics, [draws, *]: its low and high ends, [*] each.
 
     A nan (a ratio without meaning) counts both as the lowest and as the highest value: an end of the interval
     that falls on a nan is infinite.
     """
-    unknown, tail = np.isnan(values), (1 - level) / 2
+    unknown, tail = np.isnan(values), (1 - LEVEL) / 2
     low = np.quantile(np.where(unknown, -np.inf, values), tail, 0, method="inverted_cdf")
     high = np.quantile(np.where(unknown, np.inf, values), 1 - tail, 0, method="inverted_cdf")
     return low, high
@@ -111,7 +113,7 @@ def probability_of_improvement(scores: Floats, others: Floats) -> Floats:
     return ((np.sign(difference) + 1) / 2).mean((-2, -1))
 
 
-def improvement_interval(probability: float, n_seeds: int, level: float = 0.95) -> tuple[float, float]:
+def improvement_interval(probability: float, n_seeds: int) -> tuple[float, float]:
     """Score interval of a ``probability_of_improvement`` between two methods with as many seeds each.
 
     It has every probability from which the one that was found differs by no more than chance allows (Newcombe
@@ -123,7 +125,7 @@ def improvement_interval(probability: float, n_seeds: int, level: float = 0.95) 
         return math.nan, math.nan
     truth = np.linspace(0, 1, 10_001)
     variance = truth * (1 - truth) * (1 + (n_seeds - 1) * ((1 - truth) / (2 - truth) + truth / (1 + truth)))
-    chance = student_quantile((1 + level) / 2, 100_000) * np.sqrt(variance) / n_seeds
+    chance = student_quantile((1 + LEVEL) / 2, 100_000) * np.sqrt(variance) / n_seeds
     likely = truth[np.abs(truth - probability) <= chance]
     return float(likely.min()), float(likely.max())
 
@@ -132,7 +134,6 @@ def bootstrap(
     statistic: Callable[[Floats], Floats],
     scores: Floats,
     draws: int = 2000,
-    level: float = 0.95,
     seed: int = 0,
     bounds: tuple[float, float] = (-math.inf, math.inf),
 ) -> tuple[Floats, Floats]:
@@ -148,7 +149,6 @@ def bootstrap(
         statistic: function from scores [*, strata, ..., seeds] to [*, ...], for any leading dimensions *.
         scores: scores by seed, [strata, ..., seeds].
         draws: number of resamples.
-        level: share of the resampled statistics inside the interval, before it is widened.
         seed: seed of the random draws.
         bounds: smallest and largest value that the statistic can have, such as 0 and 1 for a mean of shares.
     """
@@ -157,9 +157,9 @@ def bootstrap(
     if n_seeds < FEWEST:
         checks.whole("draws", draws, 1)
         return np.full_like(value, np.nan), np.full_like(value, np.nan)
-    quantile, many = student_quantile((1 + level) / 2, strata * (n_seeds - 1)), 100_000
-    factor = math.sqrt(n_seeds / (n_seeds - 1)) * quantile / student_quantile((1 + level) / 2, many)
-    low, high = interval(statistic(resampled(scores, draws, seed)), level)
+    quantile, many = student_quantile((1 + LEVEL) / 2, strata * (n_seeds - 1)), 100_000
+    factor = math.sqrt(n_seeds / (n_seeds - 1)) * quantile / student_quantile((1 + LEVEL) / 2, many)
+    low, high = interval(statistic(resampled(scores, draws, seed)))
     return np.clip(value - factor * (value - low), *bounds), np.clip(value + factor * (high - value), *bounds)
 
 

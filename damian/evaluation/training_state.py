@@ -3,7 +3,7 @@
 import math
 import os
 import random
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -136,14 +136,14 @@ def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> Non
     restore(components, _content(path, key)["components"], path, key)
 
 
-def stored_progress(folder: Path, names: Collection[str] = ("progress", "episodes")) -> dict[str, Any]:
+def stored_progress(folder: Path) -> dict[str, Any]:
     """How far the stored training of a run folder has come, as its checkpoint says.
 
     Raises:
         InputError: the checkpoint is missing or damaged.
     """
     path = checkpoint_file(folder, "resume")
-    training = _content(path, "resume")["training"]
+    training, names = _content(path, "resume")["training"], ("progress", "episodes")
     if missing := [name for name in names if name not in training]:
         raise InputError(f"resume: {path}: it has no {missing[0]}, so it is not the checkpoint of a training")
     return {name: training[name] for name in names}

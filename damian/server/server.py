@@ -176,7 +176,8 @@ class Server:
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         features = self.features(messages, steps, coverage=coverage, belief=belief)
         result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
-        return ServerOutputs(*self.observations(features), *result, self.known_coverage(messages, features))
+        known = KnownCoverage(messages.trail, features["coverage"]) if self.remembers_coverage else None
+        return ServerOutputs(*self.observations(features), *result, known)
 
     def features(
         self,
@@ -203,12 +204,6 @@ class Server:
         """The features of somebody who knows where the source is, [*, 2] metres; other arguments as above."""
         belief = None if self.grid is None else certain_belief(self.grid, source)
         return self.features(messages, steps, belief=belief)
-
-    def known_coverage(self, messages: Messages, features: Features) -> KnownCoverage | None:
-        """What the next step may need of this one's features; None if that would not save time."""
-        if not self.remembers_coverage:
-            return None
-        return KnownCoverage(messages.trail, features["coverage"])
 
     def checked_features(self, messages: Messages, steps: Tensor) -> Features:
         """The features of ``features``; those of one's own, and one's own reward terms, are tried first.

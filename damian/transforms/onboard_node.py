@@ -18,12 +18,11 @@ class OnboardNode(StatefulTransform):
 
     Rewards, the task's status and the critic's observation stay those of the server node. After a reset every
     UAV knows the first message of every other, so the outputs of the environment's reset stay as they are.
+    What each UAV holds of each other is in ``("agents", "linked")``, as ``Channel`` writes it.
     ``damian.make_env`` adds the transform with ``links=matrix``.
 
     Args:
         server: server node whose features are computed.
-        linked_key: key of the packed messages that each UAV holds of each other, [B, N, N, M] (receiver,
-            sender), as ``Channel`` writes them.
         dropped_keys: keys of entries to remove from the outputs, because nothing reads them later.
 
     Examples:
@@ -34,14 +33,8 @@ class OnboardNode(StatefulTransform):
 
     per_world = True
 
-    def __init__(
-        self,
-        server: Server,
-        linked_key: NestedKey = keys.LINKED,
-        *,
-        dropped_keys: Sequence[NestedKey] = (),
-    ) -> None:
-        super().__init__(linked_key, keys.OBSERVATION)
+    def __init__(self, server: Server, *, dropped_keys: Sequence[NestedKey] = ()) -> None:
+        super().__init__(keys.LINKED, keys.OBSERVATION)
         self.server, self.dropped_keys, self.step_keys = server, list(dropped_keys), self.in_keys
 
     @property

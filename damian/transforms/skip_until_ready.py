@@ -31,7 +31,6 @@ class SkipUntilReady(StatefulTransform):
     Args:
         gamma: discount per merged step, in [0, 1]; with 1, returns are those of the single steps.
         reward_keys: keys of the rewards to sum.
-        ready_key: key of the flag that tells whether an agent can choose an action now, [B, N] bool.
 
     Raises:
         InputError: gamma is not in [0, 1].
@@ -43,15 +42,10 @@ class SkipUntilReady(StatefulTransform):
 
     per_world = True
 
-    def __init__(
-        self,
-        gamma: float = 1.0,
-        reward_keys: Sequence[NestedKey] = (keys.REWARD,),
-        ready_key: NestedKey = keys.READY,
-    ) -> None:
+    def __init__(self, gamma: float = 1.0, reward_keys: Sequence[NestedKey] = (keys.REWARD,)) -> None:
         checks.in_range("gamma", gamma, 0.0, 1.0)
         super().__init__(out_keys=[keys.DURATION])
-        self.gamma, self.reward_keys, self.ready_key = gamma, list(reward_keys), ready_key
+        self.gamma, self.reward_keys = gamma, list(reward_keys)
         self.step_keys = [keys.DONE]
 
     @property
@@ -66,7 +60,7 @@ class SkipUntilReady(StatefulTransform):
 
     def skipped_worlds(self, entries: Entries) -> Tensor:
         """Worlds in which no agent is ready and the episode goes on, [B] bool."""
-        ready, done = entries[self.ready_key], entries[keys.DONE]
+        ready, done = entries[keys.READY], entries[keys.DONE]
         return ~(ready.flatten(1).any(-1) | done.view(-1))
 
     def merge_steps(self, entries: Entries, later: Entries, stepped: Tensor) -> Entries:

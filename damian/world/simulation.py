@@ -78,11 +78,6 @@ class Simulation:
             setattr(self, name, tree_map(lambda t: t.to(device), getattr(self, name)))
         return self
 
-    @property
-    def n_initial_conditions(self) -> int:
-        """Number of initial conditions (Q)."""
-        return len(self.initial.initial_condition)
-
     def reset(self, worlds: PackedState, mask: Tensor) -> PackedState:
         """Begin a new episode in the worlds of the mask [B]; the others stay as they are."""
         chosen = mask.nonzero().squeeze(-1)  # usually few worlds
@@ -92,7 +87,7 @@ class Simulation:
     def next_episode(self, worlds: PackedState) -> PackedState:
         """Begin a new episode in all of the given worlds."""
         seed, episode = worlds.integers[:, SEED], worlds.integers[:, EPISODE] + 1
-        condition = counter_rng.bits(seed, episode) % self.n_initial_conditions
+        condition = counter_rng.bits(seed, episode) % len(self.initial.initial_condition)
         kept = torch.stack([seed, episode, condition], 1)  # the first three columns
         condition = kept[:, INITIAL_CONDITION]  # or else a graph computes it anew for every column
         fresh = tree_map(lambda table: table.index_select(0, condition), self.packed_initial)

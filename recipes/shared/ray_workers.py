@@ -128,7 +128,7 @@ class RayWorkers:
         strategies = import_module("ray.util.scheduling_strategies")
         return strategies.PlacementGroupSchedulingStrategy(placement_group=group)
 
-    def lost(self, error: Exception) -> tuple[int, str] | None:
+    def lost(self) -> tuple[int, str] | None:
         """The worker whose end has caused an error, and how it ended; None if all are there.
 
         What sends the weights has errors of its own, so that every worker is asked whether it lives. After an

@@ -142,7 +142,7 @@ class Processes:
             )
         weights.processes = self.batches.procs
 
-    def lost(self, error: Exception) -> tuple[int, str] | None:
+    def lost(self) -> tuple[int, str] | None:
         """The worker whose end has caused an error, and how it ended; None if all are there."""
         codes: dict[int, int] = {}
         for number, process in enumerate(self.batches.procs):
@@ -221,7 +221,7 @@ class Workers:
         try:
             yield
         except Exception as error:
-            if not (lost := self._kind.lost(error)):
+            if not (lost := self._kind.lost()):
                 raise
             number, how = lost
             which = (
