@@ -92,7 +92,7 @@ def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer
     if not config.backupdates:
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
     setup, actor = config.learning_setup, config.recompute_actor
-    least = (setup.longest_period + 2 * setup.longest_delay) * setup.worlds
+    least = setup.least_buffer
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
     checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
     recompute = server_recompute(env.server, actor=actor) if has_message_delay(config) else None

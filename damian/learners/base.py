@@ -77,6 +77,11 @@ class LearningSetup(NamedTuple):
         """Number of steps by which learning from a step is postponed."""
         return self.longest_delay if self.settle else 0
 
+    @property
+    def least_buffer(self) -> int:
+        """Environment steps that back-updating needs in the buffer: a period and twice the longest delay."""
+        return (self.longest_period + 2 * self.longest_delay) * self.worlds
+
 
 READABLE = ("message", "state", "reward_terms", "privileged", "hindsight")
 """What a learner may name in ``LearnerConfig.reads``."""

@@ -92,9 +92,7 @@ class MappoConfig(LearnerConfig):
         checks.require(not (recurrent and setup.recompute_actor), "recompute_actor", True, should)
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
-        if not setup.backupdate:
-            return None
-        return (setup.longest_period + 2 * setup.longest_delay) * setup.worlds
+        return setup.least_buffer if setup.backupdate else None
 
     def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "Mappo":
         return Mappo(env, self, setup, buffer)

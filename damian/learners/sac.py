@@ -82,10 +82,7 @@ class SacConfig(LearnerConfig):
         checks.require(not setup.model.shared_value, "model.shared_value", True, should)
         should = "is for learner=mappo only: SAC has no importance ratios"
         checks.require(not setup.recompute_actor, "recompute_actor", True, should)
-        steps_per_world = setup.longest_period + 2 * setup.longest_delay
-        checks.in_range(
-            "learner.buffer_steps", self.buffer_steps, setup.worlds * steps_per_world, unit="steps"
-        )
+        checks.in_range("learner.buffer_steps", self.buffer_steps, setup.least_buffer, unit="steps")
         checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")
 
     def critic_keys(self, setup: LearningSetup) -> list[NestedKey]:

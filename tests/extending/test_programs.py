@@ -26,7 +26,7 @@ class ReaderConfig(ReinforceConfig):
     reads: ClassVar = ("state", "hindsight")
 
     def buffer_size(self, setup):
-        return (setup.longest_period + 2 * setup.longest_delay) * setup.worlds
+        return setup.least_buffer
 
     def make(self, env, setup, buffer):
         return Reader(env, self, setup, buffer)
