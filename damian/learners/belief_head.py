@@ -19,7 +19,7 @@ from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import expand_mask, gather_rows
+from damian.common.tensors import gather_rows
 from damian.learners.networks import POLICY_GAIN, ModelConfig, with_distribution
 
 FLAGS = 3
@@ -281,13 +281,3 @@ def prediction_loss(predicted: Tensor, target: Tensor, counts: Tensor) -> Tensor
     """
     error = torch.where(counts, predicted - target, 0.0).square()
     return error.sum() / counts.expand_as(error).sum().clamp(min=1)
-
-
-def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:
-    """Whether messages have arrived by now, as ``delay``, bool.
-
-    Args:
-        delay: of the messages [steps], -1 if they never arrive, [K, ...].
-        since: steps since each was sent, one for each delay or the first dimensions of them, [K, ...].
-    """
-    return (delay >= 0) & (delay <= expand_mask(since, delay))

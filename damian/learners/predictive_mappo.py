@@ -15,10 +15,11 @@ from damian.common import checks
 from damian.common.tensors import next_true
 from damian.keys import next_key
 from damian.learners.base import LEARNERS, LearningSetup
-from damian.learners.belief_head import arrived_by_now, belief_head, make_belief_actor, prediction_loss
+from damian.learners.belief_head import belief_head, make_belief_actor, prediction_loss
 from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.replay.backupdate import BackupdateStorage
+from damian.replay.hindsight import arrived_by_now
 
 _NEEDS = "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
 

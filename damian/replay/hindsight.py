@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.common.tensors import next_true
+from damian.common.tensors import expand_mask, next_true
 
 
 class MessageLog(NamedTuple):
@@ -39,7 +39,7 @@ def latest_arrived(log: MessageLog, now: int | None = None) -> tuple[Tensor, Ten
         the messages, [T, *, M], and the age of each at its step [steps], [T, *].
     """
     steps = _steps(log.delay)
-    arrived = (log.delay >= 0) & (steps + log.delay <= (len(steps) - 1 if now is None else now))
+    arrived = arrived_by_now(log.delay, (len(steps) - 1 if now is None else now) - steps)
     none = torch.iinfo(steps.dtype).min  # older than any held message, even one older than these steps
     newest = torch.where(arrived, steps, none).cummax(0).values
     # With ``order=arrival`` the server may have held a newer message at an earlier step.
@@ -48,6 +48,16 @@ def latest_arrived(log: MessageLog, now: int | None = None) -> tuple[Tensor, Ten
     came_late = newest > newest_held
     latest = torch.where(came_late.unsqueeze(-1), _at(log.sent, newest.clamp(min=0)), _at(log.held, held_at))
     return latest, steps - torch.maximum(newest, newest_held)
+
+
+def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:
+    """Whether messages have arrived by now, as ``delay``, bool.
+
+    Args:
+        delay: of the messages [steps], -1 if they never arrive, [K, ...].
+        since: steps since each was sent, one for each delay or the first dimensions of them, [K, ...].
+    """
+    return (delay >= 0) & (delay <= expand_mask(since, delay))
 
 
 def paid_by_now(delay: Tensor, begins: Tensor, reset_after: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from damian import keys
 from damian.keys import next_key
+from damian.replay.hindsight import arrived_by_now
 from damian.replay.step_keys import Recompute
 from damian.server.belief import likelihood, predict, repeated, report_rows, weigh
 from damian.server.server import Server
@@ -67,7 +68,7 @@ def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
     grid, messages = server.grid, server.messages(steps[next_key(keys.MESSAGE)])
     delay = steps[next_key(keys.DELAY)].squeeze(-1)
     step = torch.arange(len(delay), device=delay.device).view(-1, 1, 1)
-    arrived = (delay >= 0) & (step + delay < len(delay))
+    arrived = arrived_by_now(delay, len(delay) - 1 - step)
     begins = steps[keys.STEP_COUNT] == 0
     before, after = steps[keys.BELIEF], steps[next_key(keys.BELIEF)]
     rows, first = report_rows(grid, messages, arrived), server.messages(steps[keys.MESSAGE])

@@ -14,12 +14,13 @@ from damian import keys
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.keys import next_key
-from damian.learners.belief_head import MessageEncoder, TargetScale, arrived_by_now, prediction_loss
+from damian.learners.belief_head import MessageEncoder, TargetScale, prediction_loss
 from damian.learners.networks import ModelConfig
 from damian.learners.predictive_mappo import PredictiveMappo, PredictiveMappoConfig
 from damian.recipes.shared.settings import LoggerConfig, TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.replay.backupdate import BackupdateStorage
+from damian.replay.hindsight import arrived_by_now
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
