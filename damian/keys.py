@@ -64,6 +64,7 @@ SUCCESS = "success"
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 """TorchRL's flags of the end of an episode, [B, 1] bool each; only at the root, as TorchRL's transforms
 expect one reset key."""
+ENDS = (DONE, TERMINATED, TRUNCATED)
 STEPPED = "_step"
 """TorchRL's flag of the worlds that take this step, [B] bool; all of them if there is no such entry."""
 DURATION = "duration"
@@ -106,3 +107,8 @@ RESET_AFTER = "reset_after"
 def next_key(key: NestedKey) -> NestedKey:
     """The key under which TorchRL stores an entry's value after the step: ``("next", *key)``."""
     return ("next", *((key,) if isinstance(key, str) else key))
+
+
+def last_part(key: NestedKey) -> NestedKey:
+    """The last part of a key, which is its name within the innermost TensorDict."""
+    return key if isinstance(key, str) else key[-1]

@@ -73,7 +73,7 @@ BATCH, LR, GAMMA, TAU = 256, 1e-3, 0.99, 0.005
 OBSERVED = (keys.OBSERVATION, keys.GLOBAL_OBSERVATION)  # of the actor, and the state for critics
 OUTPUTS = (*OBSERVED, "observation", "received", "age", "delay", "step_count", keys.REWARD)
 STORED = [*OBSERVED, "step_count", keys.ACTION]
-STORED += map(next_key, (*OUTPUTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED))
+STORED += map(next_key, (*OUTPUTS, *keys.ENDS))
 
 
 class Run(NamedTuple):

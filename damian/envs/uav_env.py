@@ -34,8 +34,6 @@ EXTRAS = ("message", "state", "reward_terms")
 ALL_EXTRAS = (*EXTRAS, "position", "privileged")
 """All optional outputs; ``position`` is for delay laws, ``privileged`` for reference experiments only."""
 
-_DONE = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
-
 
 class UavEnv(EnvBase):
     """B worlds, in each of which N UAVs search for and track a source or cover a region, without any delay.
@@ -324,7 +322,7 @@ class UavEnv(EnvBase):
             zero = torch.zeros_like(initial.track)
             outputs |= {(*keys.REWARD_TERMS, name): zero for name in self.scenario.reward.terms}
         false = torch.zeros_like(initial.source_over).unsqueeze(-1)
-        return outputs | dict.fromkeys((*_DONE, keys.SUCCESS), false)
+        return outputs | dict.fromkeys((*keys.ENDS, keys.SUCCESS), false)
 
     # TensorDicts and specs.
 
@@ -351,7 +349,7 @@ class UavEnv(EnvBase):
 
     def _make_specs(self, bounds: Bounds) -> None:
         worlds, agents = self.batch_size, torch.Size((*self.batch_size, self.n_agents))
-        ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in _DONE}
+        ends: Outputs = {key: table for key, table in self._reset_outputs.items() if key in keys.ENDS}
         observations: Outputs = {key: table for key, table in self._reset_outputs.items() if key not in ends}
         self.observation_spec = self._specs_of(observations, bounds)
         config = self.scenario.actions

@@ -21,7 +21,7 @@ Each entry has the shape and dtype of the stored one. ``("next", "done")``, ``("
 ``("next", "truncated")`` [T, B, 1] are all among them, or none of them: then the stored ends stay.
 """
 
-ENDS = tuple(map(next_key, (keys.DONE, keys.TERMINATED, keys.TRUNCATED)))
+ENDS = tuple(map(next_key, keys.ENDS))
 """Keys of the flags that end an episode after a step."""
 
 

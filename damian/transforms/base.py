@@ -11,7 +11,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from damian.common import checks
 from damian.common.tensors import expand_mask
-from damian.keys import DONE, STEPPED
+from damian.keys import DONE, STEPPED, last_part
 from damian.transforms.entries import (
     Change,
     Entries,
@@ -327,7 +327,7 @@ class StatefulTransform(MemoryTransform):
     def _other_name(self, key: NestedKey) -> str:
         """How to name an entry of ``optional_keys`` in another way, as the end of an error."""
         argument = next((name for name in self.optional_keys if getattr(self, name) == key), None)
-        old, new = (one if isinstance(one, str) else one[-1] for one in (self.row_key, key))
+        old, new = (last_part(one) for one in (self.row_key, key))
         return f", such as {argument}='{old}_{new}', or None to leave it out" if argument else ""
 
     def set_container(self, container: Any) -> None:

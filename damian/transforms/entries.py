@@ -11,6 +11,7 @@ from torchrl.data import Composite
 from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.common.text_files import listed
+from damian.keys import last_part
 
 Memory = dict[str, Tensor]
 """The memory of a transform: its buffers by name."""
@@ -138,7 +139,7 @@ def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[N
         present: all keys that exist.
     """
     path = path_of(key)
-    flags = [flag for flag in present if (flag if isinstance(flag, str) else flag[-1]) == name]
+    flags = [flag for flag in present if last_part(flag) == name]
     around = [flag for flag in flags if path[: len(path_of(flag))] == path_of(flag)]
     if around:
         return sorted(around, key=lambda flag: len(path_of(flag)))

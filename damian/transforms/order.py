@@ -21,8 +21,8 @@ from torchrl.envs import (
 )
 
 from damian.common.errors import InputError
+from damian.keys import ENDS, last_part
 
-_ENDS = ("done", "terminated", "truncated")
 _STEPPING = (FrameSkipTransform, NoopResetEnv, MultiAction, ConditionalPolicySwitch)
 """TorchRL's transforms that step a copy of what comes before them in their environment."""
 
@@ -137,7 +137,7 @@ def _usage_of(transform: Transform) -> KeyUsage:
         read, written = ["reward"], ["episode_reward"]
     others = [key for key in written if key not in read]
     return KeyUsage(
-        may_end=ends or any((key if isinstance(key, str) else key[-1]) in _ENDS for key in others),
+        may_end=ends or any(last_part(key) in ENDS for key in others),
         derives=[(key, other) for key in read for other in others],
         skips=isinstance(transform, ConditionalSkip),
     )

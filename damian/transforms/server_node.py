@@ -48,8 +48,7 @@ class ServerNode(StatefulTransform):
         names = server.reward.terms if reward_terms else []
         created = [keys.OBSERVATION, keys.GLOBAL_OBSERVATION, keys.REWARD]
         created += [(*keys.REWARD_TERMS, name) for name in names]
-        ends = [keys.SUCCESS, keys.DONE, keys.TERMINATED, keys.TRUNCATED]
-        super().__init__([message_key], [*created, *ends])
+        super().__init__([message_key], [*created, keys.SUCCESS, *keys.ENDS])
         self.server, self.dropped_keys, self.reward_terms = server, list(dropped_keys), reward_terms
         self.own_key = keys.MESSAGE if server.observation.own else None
         self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + server.observation.own] if server.grid else []

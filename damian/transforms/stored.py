@@ -12,13 +12,11 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.text_files import show
+from damian.keys import ENDS, last_part
 from damian.transforms.action_specs import ActionTransform
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import require_keys
 from damian.transforms.order import leaf_transforms
-
-_ENDS = ("done", "terminated", "truncated")
-"""Names of the flags that tell where episodes end."""
 
 _TRAJECTORY = ("collector", "traj_ids")
 """Key under which TorchRL's collectors store the number of each step's episode."""
@@ -99,7 +97,7 @@ class _Playback(EnvBase):
         self._steps, self._time, self._done = data.unbind(-1), 0, data.get(("next", "done"))
         first, after = self._steps[0], self._steps[0]["next"]
         self._outputs = _output_keys(first)
-        ends = [key for key in _leaves(after) if _name(key) in _ENDS]
+        ends = [key for key in _leaves(after) if last_part(key) in ENDS]
         self._inputs = [key for key in _leaves(first.exclude("next")) if key not in [*self._outputs, *ends]]
         rewards = [key for key in _leaves(after) if key not in [*self._outputs, *ends]]
         self.observation_spec = _specs_of(first, self._outputs)
@@ -153,7 +151,7 @@ def _find_starts(data: TensorDictBase, start_key: NestedKey | None) -> Tensor:
         starts = _any(after, after.get(start_key))
     else:
         starts = _any(before, before.get(("next", "done")))
-        for key in [key for key in _leaves(data) if _name(key) == "is_init"]:
+        for key in [key for key in _leaves(data) if last_part(key) == "is_init"]:
             starts = starts | _any(after, after.get(key))
         if _TRAJECTORY in _leaves(data):
             starts = starts | _any(after, after.get(_TRAJECTORY) != before.get(_TRAJECTORY))
@@ -172,16 +170,11 @@ def _any(data: TensorDictBase, flag: Tensor) -> Tensor:
 def _output_keys(data: TensorDictBase) -> list[NestedKey]:
     """Keys of the entries, ends excepted, that the data has both before and after each step."""
     after = _leaves(data["next"])
-    return [key for key in _leaves(data.exclude("next")) if key in after and _name(key) not in _ENDS]
+    return [key for key in _leaves(data.exclude("next")) if key in after and last_part(key) not in ENDS]
 
 
 def _leaves(tensordict: TensorDictBase) -> list[NestedKey]:
     return list(tensordict.keys(True, True))
-
-
-def _name(key: NestedKey) -> NestedKey:
-    """The last part of a key."""
-    return key if isinstance(key, str) else key[-1]
 
 
 # The transforms, and the specs that they read.
@@ -199,7 +192,7 @@ def _check_transform(transform: Transform) -> None:
             f"the stored ones; {remedy}"
         )
     skips = type(transform).skipped_worlds is not StatefulTransform.skipped_worlds
-    if skips or any(_name(key) in _ENDS for key in [*usage.creates, *usage.overwrites]):
+    if skips or any(last_part(key) in ENDS for key in [*usage.creates, *usage.overwrites]):
         raise InputError(
             f"transform: {name} changes how long steps or episodes last, but stored steps are over; {remedy}"
         )

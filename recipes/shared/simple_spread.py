@@ -98,8 +98,7 @@ class SimpleSpread(EnvBase):
         self.action_spec = composite({"agents": action})
         self.reward_spec = composite({"agents": composite({"reward": numbers(1)}, group)})
         flag = Categorical(2, shape=torch.Size([worlds, 1]), dtype=torch.bool)
-        ends = (keys.DONE, keys.TERMINATED, keys.TRUNCATED)
-        self.done_spec = composite({name: flag.clone() for name in ends})
+        self.done_spec = composite({name: flag.clone() for name in keys.ENDS})
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator.manual_seed(seed or 0)
