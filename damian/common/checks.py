@@ -186,11 +186,11 @@ def place(key: str, value: Any) -> None:
     require(all(abs(v) <= METRES for v in value), key, value, f"is not within {METRES:g} m of the origin")
 
 
-def seconds(key: str, value: str | float) -> float:
+def seconds(key: str, value: str | float, zero: bool = False) -> float:
     """Convert a time to seconds: ``"2s"``, ``"0.5m"``, ``"1h"``, or a bare number of seconds.
 
     Raises:
-        InputError: the value is no time, not above 0 s, or longer than ``SECONDS``.
+        InputError: the value is no time, below 0 s, 0 s unless ``zero``, or longer than ``SECONDS``.
     """
     text = str(value).strip()
     number, unit = (text[:-1], text[-1]) if text[-1:] in _SECONDS else (text, "s")
@@ -198,7 +198,8 @@ def seconds(key: str, value: str | float) -> float:
         time = float(number) * _SECONDS[unit]
     except ValueError:
         raise InputError(f"{key}: {value} is not a time such as 2s, 0.5m or 1h") from None
-    above(key, time, 0.0, "s")
+    if not (zero and time == 0):
+        above(key, time, 0.0, "s")
     return time
 
 

@@ -108,15 +108,13 @@ class Uniform(Law):
         checks.in_range(f"{key}.probability", self.probability, 0.0, 1.0)
         low, high = in_steps(f"{key}.low", self.low, dt), in_steps(f"{key}.high", self.high, dt)
         in_time = isinstance(self.low, str), isinstance(self.high, str)
-        ordered = low <= high and in_time[0] == in_time[1]
+        first, last = low, high
         if all(in_time):
-            ordered = seconds(f"{key}.low", self.low) <= seconds(f"{key}.high", self.high)
+            first, last = seconds(f"{key}.low", self.low), seconds(f"{key}.high", self.high)
         problem = f"and high={self.high} are not two steps or two times in order"
-        checks.require(ordered, f"{key}.low", self.low, problem)
+        checks.require(first <= last and in_time[0] == in_time[1], f"{key}.low", self.low, problem)
         if all(in_time):
-            chances = _rounded_up(
-                seconds(f"{key}.low", self.low) / dt, seconds(f"{key}.high", self.high) / dt
-            )
+            chances = _rounded_up(first / dt, last / dt)
         else:
             chances = [float(low <= k) / (high - low + 1) for k in range(high + 1)]
         weighted = [self.probability * chance for chance in chances]

@@ -36,19 +36,11 @@ def in_steps(key: str, delay: Delay, dt: float) -> int:
 
 
 def seconds(key: str, delay: Delay) -> float:
-    """Convert a time with its unit to seconds; unlike ``checks.seconds``, zero (``0s``) is allowed.
+    """Convert a time with its unit to seconds; it may be zero (``0s``).
 
     Raises:
         InputError: the delay is no time.
     """
-    number, unit = str(delay)[:-1], str(delay)[-1:]
     problem = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
-    checks.require(unit in ("s", "m", "h"), key, delay, problem)
-    return 0.0 if _is_zero(number) else checks.seconds(key, str(delay))
-
-
-def _is_zero(text: str) -> bool:
-    try:
-        return float(text) == 0
-    except ValueError:
-        return False
+    checks.require(str(delay)[-1:] in ("s", "m", "h"), key, delay, problem)
+    return checks.seconds(key, str(delay), zero=True)
