@@ -1,5 +1,7 @@
 """Which times a fleet can count: the clocks of UAVs must be set, and no fleet lasts for ever."""
 
+import math
+
 from damian.advice.reports import Report
 from damian.common.checks import SECONDS
 from damian.common.errors import InputError
@@ -10,6 +12,13 @@ FIRST = 3600.0
 """How old a report may be when it comes in, while its fleet has not begun [s]: the fleet would begin then."""
 LIFE = SECONDS
 """How long a fleet lasts [s]."""
+_ROUNDING = 1e-3
+"""Share of a step by which times may be rounded."""
+
+
+def step_at(time: float, start: float, dt: float) -> int:
+    """The step of ``dt`` seconds since ``start`` [s] in which a time [s] lies."""
+    return math.floor((time - start) / dt + _ROUNDING)
 
 
 def check_ahead(report: Report, received: float) -> None:

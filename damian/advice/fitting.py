@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from damian.advice.clocks import step_at
 from damian.advice.journal import SUFFIX, entries, reports_of
 from damian.advice.reports import Report, read_rows
 from damian.advice.tables import read_file
@@ -23,7 +24,6 @@ MOST = 0.8
 """Share of the times between reports that must be whole periods, for the reports to count as regular."""
 LONGEST_GAP = 1000
 """Most messages that are taken as lost between two that came in: longer gaps are pauses."""
-_ROUNDING = 1e-3
 
 
 class Message(NamedTuple):
@@ -170,9 +170,7 @@ def trace_rows(fitted: Fit, dt: float | None = None) -> list[str]:
         if dt is None:
             rows.append(f"{delay:.6f}s" if delay >= 1e-6 else "0")
             continue
-        generated, came_in = (
-            math.floor((time - fitted.start) / dt + _ROUNDING) for time in (message.time, message.received)
-        )
+        generated, came_in = (step_at(time, fitted.start, dt) for time in (message.time, message.received))
         steps = max(came_in - generated, 0)
         if steps > LONGEST:
             raise InputError(f"--dt: a delay of {delay:.6g} s is {steps} steps, more than {LONGEST}")

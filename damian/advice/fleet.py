@@ -6,7 +6,6 @@ in which it was generated, and counts from the step in which it came in; its age
 the former.
 """
 
-import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -17,7 +16,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
-from damian.advice.clocks import LIFE, check_ahead, check_first, check_life
+from damian.advice.clocks import LIFE, check_ahead, check_first, check_life, step_at
 from damian.advice.decisions import TOLD, Choices, Decision, Told
 from damian.advice.ground import Ground
 from damian.advice.known import Known, UavLog, messages_of
@@ -32,8 +31,6 @@ from damian.world.state import State
 
 SILENT_STEPS = 1000
 """Steps without any report after which beliefs stand still."""
-_ROUNDING = 1e-3
-"""Share of a step by which times may be rounded."""
 
 
 class Waiting(Exception):
@@ -86,7 +83,7 @@ class Fleet:
 
     def step_of(self, time: float) -> int:
         """The step in which an instant lies."""
-        return math.floor((time - (self.start or 0.0)) / self.node.dt + _ROUNDING)
+        return step_at(time, self.start or 0.0, self.node.dt)
 
     def check(self, report: Report, received: float, now: float | None = None) -> None:
         """Check a report before it is added.

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from damian.common.tensors import expand_mask
-from damian.delays.delay_line import DelayLine, Memory
+from damian.delays.delay_line import DelayLine, Memory, slot_rows
 from damian.delays.samplers import MessageContext, Sampler
 
 
@@ -59,7 +59,7 @@ class BroadcastLine:
 
     def write(self, memory: Memory, contents: list[Tensor]) -> None:
         """Write what the senders send in the next step, [S, ...] each; a step may send it or not."""
-        rows = self._ring_rows(memory, memory["clock"][memory["link"]] + 1)
+        rows = slot_rows((memory["clock"][memory["link"]] + 1) % self._n_slots)
         for i, content in enumerate(contents):
             memory[f"contents_{i}"].flatten(0, 1).index_copy_(0, rows, content)
 
@@ -81,7 +81,7 @@ class BroadcastLine:
 
     def newest(self, memory: Memory) -> list[Tensor]:
         """What the senders wrote for the latest step, [S, ...] each."""
-        rows = self._ring_rows(memory, memory["clock"][memory["link"]])
+        rows = slot_rows(memory["clock"][memory["link"]] % self._n_slots)
         ring = [memory[f"contents_{i}"] for i in range(self._n_contents(memory))]
         return [contents.flatten(0, 1).index_select(0, rows) for contents in ring]
 
@@ -97,11 +97,6 @@ class BroadcastLine:
             new = memory[f"contents_{i}"].flatten(0, 1).index_select(0, rows)
             updated[f"held_{i}"] = torch.where(expand_mask(mask, old), new, old)
         return memory | updated
-
-    def _ring_rows(self, memory: Memory, clock: Tensor) -> Tensor:
-        """Rows of the ring, seen as [K * S, ...], for the messages generated at a clock [S]."""
-        n_senders = len(clock)
-        return clock % self._n_slots * n_senders + torch.arange(n_senders, device=clock.device)
 
     def _n_contents(self, memory: Memory) -> int:
         return sum(name.startswith("held_") for name in memory)

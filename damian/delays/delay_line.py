@@ -149,3 +149,8 @@ def advance_slot(slot: Tensor, steps: Tensor | int, n_slots: int) -> Tensor:
     """Slot that is ``steps`` < ``n_slots`` later in the ring; a modulo would cost a division per element."""
     later = slot + steps
     return torch.where(later < n_slots, later, later - n_slots)
+
+
+def slot_rows(slot: Tensor) -> Tensor:
+    """Rows of [K * M, ...] that hold one slot [M] of each of the M rows."""
+    return slot * len(slot) + torch.arange(len(slot), device=slot.device)

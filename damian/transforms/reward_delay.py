@@ -11,7 +11,7 @@ from torchrl.data import Composite, Unbounded
 from damian.common import checks, devices
 from damian.common.tensors import expand_mask
 from damian.common.text_files import show
-from damian.delays.delay_line import advance_slot
+from damian.delays.delay_line import advance_slot, slot_rows
 from damian.delays.laws import LOSES, law_of, sampler_of
 from damian.transforms.base import StatefulTransform
 from damian.transforms.batches import expand_to_rows, rows_of_batch
@@ -244,7 +244,7 @@ class RewardDelay(RewardTransform):
         """
         past, arrival = memory["past"], memory["time"] + delay
         flat, due = past.flatten(0, 1), memory["due"].view(-1)
-        row = _slot_rows(advance_slot(memory["slot"], delay, self.n_past))
+        row = slot_rows(advance_slot(memory["slot"], delay, self.n_past))
         there, old = flat.index_select(0, row), due.index_select(0, row)
         added = torch.where(expand_mask(old == arrival, there), there, 0) + reward
         # ``old`` is never later; a compiler that sees that it is read before writes the new times in place.
@@ -260,7 +260,7 @@ class RewardDelay(RewardTransform):
 
     def _received(self, memory: Memory) -> Tensor:
         """The rewards that arrive in this step, [M, ...]."""
-        row = _slot_rows(memory["slot"])
+        row = slot_rows(memory["slot"])
         here, due = (memory[name].flatten(0, 1).index_select(0, row) for name in ("past", "due"))
         return torch.where(expand_mask(due == memory["time"], here), here, 0)
 
@@ -293,11 +293,6 @@ class RewardDelay(RewardTransform):
             earned = rewards[self.reward_key]
             observation_spec[self.earned_key] = Unbounded(earned.shape, dtype=earned.dtype, device=device)
         return observation_spec
-
-
-def _slot_rows(slot: Tensor) -> Tensor:
-    """Rows of [K * M, ...] that hold one slot [M] of each of the M rows."""
-    return slot * len(slot) + torch.arange(len(slot), device=slot.device)
 
 
 def _sum_due_later(past: Tensor, due: Tensor, time: Tensor) -> Tensor:
