@@ -181,16 +181,11 @@ def draw_walks(
 
     Args:
         polygon: operative region, local metres.
-        config: settings of the source.
+        config: settings of the source; a given position is inside the polygon.
         n_walks: number of walks.
         rng: random generator.
-
-    Raises:
-        InputError: the given position is not inside the polygon.
     """
     shapely.prepare(polygon)
-    if config.position is not None:
-        _check_inside(polygon, config.position)
     if config.motion == "static":
         return _static_walk(_hotspots(polygon, config, n_walks, 1, rng))
     stops = _draw_stops(polygon, config, n_walks, rng)
@@ -257,16 +252,6 @@ def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tenso
     rising = torch.minimum(from_end, ramp)
     near = acceleration * rising * (from_end - rising / 2)
     return torch.where(2 * elapsed > duration, length - near, near)
-
-
-def _check_inside(polygon: _Polygon, position: list) -> None:
-    west, south, east, north = shapely.bounds(polygon)
-    checks.require(
-        bool(shapely.contains_xy(polygon, *position)),
-        "source.position",
-        f"{list(position)} m",
-        f"is not inside the polygon (x {west:g} to {east:g} m, y {south:g} to {north:g} m)",
-    )
 
 
 def _hotspots(

@@ -140,6 +140,15 @@ def test_a_wrong_place_is_refused_with_one_line_that_names_it(key, place, proble
     assert str(error.value) == key + problem
 
 
+def test_a_place_in_a_hole_of_the_region_is_refused():
+    region = Region(shapely.box(-100, -100, 100, 100) - shapely.box(-60, -60, 60, 60), "park")
+    with pytest.raises(InputError) as error:
+        local_places("source.position", [[80.0, 10.0], [0.0, 10.0]], region)
+    assert str(error.value) == (
+        "source.position: [0.0, 10.0] m is not inside park (x -100 to 100 m, y -100 to 100 m)"
+    )
+
+
 def test_a_place_in_degrees_outside_the_region_is_shown_in_both_units(park):
     with pytest.raises(InputError) as error:
         build(park, source=SourceConfig(position={"lat": 45.003, "lon": 8.0015}))

@@ -163,14 +163,6 @@ def test_a_walk_begins_at_the_configured_position():
     assert (walk.stop[0, 1] != walk.stop[1, 1]).any()
 
 
-def test_a_position_outside_the_polygon_is_refused():
-    with pytest.raises(InputError) as error:
-        dynamic_walks(HOLE, position=[0.0, 10.0])
-    assert str(error.value) == (
-        "source.position: [0.0, 10.0] m is not inside the polygon (x -100 to 100 m, y -100 to 100 m)"
-    )
-
-
 def test_waits_and_legs_alternate_without_gaps():
     walk = in_double(dynamic_walks(n=20))
     for w, n in enumerate(n_stops(walk).tolist()):
