@@ -55,7 +55,7 @@ class Desk:
         durable: bool = False,
         is_locked: bool = False,
     ) -> None:
-        self._make_fleet, self._folder, self._durable = make_fleet, folder, durable
+        self.make, self._folder, self._durable = make_fleet, folder, durable
         self.about = dict(about or {})
         self.fleets: dict[str, Fleet] = {}
         self._journals: dict[str, Journal] = {}
@@ -113,10 +113,6 @@ class Desk:
             self._journals[name] = journal
         self.fleets[name] = made
         return True
-
-    def make(self, uavs: list[str]) -> Fleet:
-        """A fleet of its own, which the desk does not know yet."""
-        return self._make_fleet(uavs)
 
     def end(self, name: str, now: float) -> None:
         """End a fleet; its journal stays, under another name.
@@ -255,7 +251,7 @@ class Desk:
             if path.name != f"{name}{SUFFIX}":
                 remedy = f"name it {name}{SUFFIX}, or move it to another folder"
                 raise InputError(f"it is the journal of the fleet {name}, or a copy of it: {remedy}")
-            fleet = self._make_fleet(uavs)
+            fleet = self.make(uavs)
         for number, entry in enumerate(others, 2):
             with named(f"{path}: line {number}"):
                 replay(fleet, entry)

@@ -318,7 +318,7 @@ class Fleet:
         outputs = dict(self._observe())
         if keys.ACTION_MASK in outputs:
             outputs[keys.ACTION_MASK] = self.node.simulation.action_mask(self._state(asking))
-        tensordict = self.node.to_tensordict(outputs)
+        tensordict = self.node.worlds.to_tensordict(outputs)
         if self.hidden is not None:
             tensordict[keys.HIDDEN] = self.hidden.clone()
         return tensordict

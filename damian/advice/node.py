@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import NamedTuple, cast
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import Compose
 
@@ -68,19 +67,12 @@ class ReportedEnv(UavEnv):
     Args:
         scenario: all settings; its delays are not simulated.
         seed: of the region, if the region is random.
-        device: of all tensors.
         reward_terms: whether a transform writes the weighted terms of the reward.
     """
 
-    def __init__(
-        self,
-        scenario: ScenarioConfig,
-        seed: int = 0,
-        device: torch.device | str = "cpu",
-        reward_terms: bool = False,
-    ) -> None:
+    def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         extras = {"message", "reward_terms"} if reward_terms else {"message"}
-        super().__init__(scenario, 1, seed, device, extras, messages_only=True)
+        super().__init__(scenario, 1, seed, extras=extras, messages_only=True)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
         outputs = super()._outputs_at_reset(initial, features)
@@ -111,11 +103,6 @@ class ReportedEnv(UavEnv):
         features = self.server.features(state.sent, state.steps)
         return self._outputs_at_reset(state, features) | self.outputs_of(state, reported)
 
-    def blank_state(self) -> State:
-        """The state of the world at the beginning."""
-        first = torch.zeros(1, dtype=torch.long)
-        return tree_map(lambda table: table.index_select(0, first).clone(), self.simulation.initial)
-
 
 class Node:
     """The server node of a fleet: what it remembers, and what it tells the UAVs in each step.
@@ -131,7 +118,7 @@ class Node:
 
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         scenario = served(scenario)
-        self.worlds = ReportedEnv(scenario, seed, reward_terms=reward_terms)
+        self.worlds = ReportedEnv(scenario, seed, reward_terms)
         self.scenario, self.dt = scenario, scenario.clock.dt
         self.server, self.simulation = self.worlds.server, self.worlds.simulation
         longest = uplink_transform(scenario, False, reads_delay=False).sampler.longest
@@ -144,7 +131,7 @@ class Node:
         self.env = DelayedEnv(self.worlds, Compose(*transforms))  # type: ignore[arg-type]
         self.env.reset()  # allocates the memories of the transforms
         self.transforms = cast(list[StatefulTransform], transforms)
-        self.blank = self.worlds.blank_state()
+        self.blank = tree_map(lambda table: table[:1].clone(), self.simulation.initial)
 
     def begin(self, state: State, reported: Reported) -> tuple[Memories, Outputs]:
         """The memories and the outputs of the first step.
@@ -193,10 +180,6 @@ class Node:
         """The memories after steps in which nothing was reported and nobody chose; beliefs stay the same."""
         pairs = zip(self.transforms, memories, strict=True)
         return [transform.after_idle_steps(memory, n_steps) for transform, memory in pairs]
-
-    def to_tensordict(self, outputs: Outputs) -> TensorDict:
-        """The outputs of a step, as a policy reads them."""
-        return self.worlds.to_tensordict(outputs)
 
 
 def served(scenario: ScenarioConfig) -> ScenarioConfig:

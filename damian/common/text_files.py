@@ -51,20 +51,6 @@ class Row(NamedTuple):
     cells: dict[str, str]
 
 
-def read_table(file: Path, columns: Iterable[str]) -> list[Row]:
-    """Read a whole CSV file with a header; empty rows are left out.
-
-    Args:
-        file: the file.
-        columns: that it must have; it may have others.
-
-    Raises:
-        InputError: the file is no text, a quote stays open, a column is missing or doubled, or a row has more
-            or fewer cells than the header.
-    """
-    return parse_table(read_text(file), columns)
-
-
 def parse_table(text: str, columns: Iterable[str]) -> list[Row]:
     """Parse a CSV table with a header; empty rows are left out.
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry
-from damian.common.text_files import named, read_table, show
+from damian.common.text_files import named, parse_table, read_text, show
 from damian.delays.lag_sampler import LagSampler
 from damian.delays.samplers import ContextSampler, HeldSampler, MessageContext, Recorded, Sampler
 from damian.delays.times import LONGEST, Delay, check_dt, in_steps, seconds  # noqa: F401 (others import all of them here)
@@ -187,7 +187,7 @@ class Trace(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.require(bool(self.path), f"{key}.path", "it", "is missing: the file with the delays")
         with named(self.path):
-            table = read_table(Path(self.path), ["delay"])
+            table = parse_table(read_text(Path(self.path)), ["delay"])
             delays = [self._read(row.cells["delay"], f"line {row.line}: delay", dt) for row in table]
             if not delays:
                 raise InputError("line 2: there is no delay under the header")

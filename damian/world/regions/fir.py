@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from damian.common.errors import InputError
-from damian.common.text_files import Row, named, near, read_table, show
+from damian.common.text_files import Row, named, near, parse_table, read_text, show
 from damian.world.regions.region import Region, local_region
 
 _ID, _SEQUENCE = "Airspace ID", "Sequence Number"
@@ -33,7 +33,7 @@ def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
         InputError: the file cannot be read, its table is malformed, or the airspace is missing or invalid.
     """
     with named(path):
-        table = read_table(Path(path), _COLUMNS)
+        table = parse_table(read_text(Path(path)), _COLUMNS)
         rows = [row for row in table if row.cells[_ID] == airspace_id]
         if not rows:
             known_ids = {row.cells[_ID] for row in table}
