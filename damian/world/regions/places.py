@@ -42,10 +42,8 @@ def check_place(key: str, place: Any) -> None:
     return None
 
 
-def check_places(key: str, places: Any) -> None:
-    """Require a list of places, each as ``check_place`` has it."""
-    is_list = isinstance(places, Sequence) and not isinstance(places, str)
-    checks.require(is_list, key, places, "is not a list of places such as [[0, 0], [100, 50]]")
+def check_places(key: str, places: Sequence[Any]) -> None:
+    """Require places, each as ``check_place`` has it."""
     for place in places:
         check_place(key, place)
 

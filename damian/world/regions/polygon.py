@@ -125,7 +125,6 @@ def landing_lattice(
         InputError: an invalid step, slant or number of points; no point, or fewer than ``n_points``, inside.
     """
     checks.above("lattice step", step_m, 0.0, "m")
-    checks.in_range("lattice step", step_m, 0.0, MAX_COORDINATE_M, "m")
     checks.above("lattice angle", degrees, 0.0, "deg")
     checks.in_range("lattice angle", degrees, 0.0, 90.0, "deg")
     lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
