@@ -31,7 +31,7 @@ from damian.transforms import (
 from damian.transforms.belief import Belief
 from damian.transforms.onboard_node import OnboardNode
 from damian.transforms.skip_until_ready import SkipUntilReady
-from damian.world.landing import ActionConfig
+from damian.world.landing import ActionConfig, displacement
 from damian.world.vehicles import MOTION_MODELS
 
 _SENT = [keys.MESSAGE, keys.MESSAGE_SENT]
@@ -363,6 +363,4 @@ def action_codes(actions: ActionConfig) -> Tensor | None:
     if actions.kind == "continuous":
         return None
     distance, heading = actions.table().unbind(-1)
-    direction = torch.stack([heading.sin(), heading.cos()], -1)
-    displacement = direction * (distance / distance.max()).unsqueeze(-1)
-    return (displacement + 1) / 2
+    return (displacement(distance / distance.max(), heading) + 1) / 2
