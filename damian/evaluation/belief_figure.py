@@ -17,6 +17,8 @@ from damian.evaluation.episode import Episode, Floats
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours that colour-blind readers can also tell apart (Okabe and Ito, 2008)."""
+STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
+"""Settings of Matplotlib for figures."""
 DASHES = ("-", "--", ":", "-.")
 MOST_PANELS = len(COLOURS)
 """Largest number of UAVs with a panel of their own; in a larger fleet the others are only on the map."""
@@ -38,7 +40,7 @@ _RIGHT_OF_AXES: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1
 def plot_beliefs(flight: Episode, path: Path) -> None:
     """Draw a map, the east coordinate of each UAV and the ages of information, and save the figure."""
     instant = _instant_of_largest_error(flight)
-    with matplotlib.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
+    with matplotlib.rc_context(STYLE):
         figure, (map_axis, *time_axes) = _layout(min(flight.n_agents, MOST_PANELS))
         _draw_map(map_axis, flight, instant)
         for uav, axis in enumerate(time_axes[:-1]):

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from damian.evaluation.belief_figure import COLOURS
+from damian.evaluation.belief_figure import COLOURS, STYLE
 from damian.evaluation.comparison import (
     ALL_MESSAGES,
     BOUNDS,
@@ -33,7 +33,6 @@ LABELS = {"episode_return": "return", "success_rate": "success rate", "steps": "
 """Axis labels of the measures in training, all as the server perceived them."""
 PROGRESS = {"frames": "environment steps", "episodes": "episodes"}
 """Axis labels of how far a training has come."""
-_STYLE: dict[Any, Any] = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}
 _POINTS = 200
 """Number of points of a learning curve."""
 _NORMS_IN_A_ROW = 4
@@ -61,7 +60,7 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
         path.unlink(missing_ok=True)  # an older one would show other runs
         return
     width, progress = max(map(len, grid)), _progress(curves)
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.2 * width + 1.2, 2.6 * len(grid)), layout="constrained")
         axes = figure.subplots(len(grid), width, squeeze=False)
         for row, contents in zip(axes, grid, strict=True):
@@ -156,7 +155,7 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
         return
     width = min(len(norms), _NORMS_IN_A_ROW)
     height = math.ceil(len(norms) / width)
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.0 * width + 1.2, 3.0 * height), layout="constrained")
         axes = figure.subplots(height, width, squeeze=False, sharey=True)
         for axis, task in zip_longest(axes.flat, norms):
@@ -219,7 +218,7 @@ def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], pat
     if not panels:
         plot_norms(comparison, path)
         return
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.6 * len(panels) + 0.6, 5.0), layout="constrained")
         axes = figure.subplots(2, len(panels), squeeze=False, sharex=True)
         for (title, arms), column in zip(panels.items(), axes.T, strict=True):
