@@ -14,7 +14,6 @@ no obstacles, and somebody else is responsible for safety.
 
 import copy
 import gc
-import json
 import os
 import secrets
 import socket
@@ -33,12 +32,11 @@ from tensordict.nn import TensorDictModuleBase
 
 from damian.advice.desk import Desk
 from damian.advice.fleet import Fleet, Waiting
-from damian.advice.inbox import read_inbox
+from damian.advice.inbox import read_inbox, write_answer
 from damian.advice.node import Node, for_uavs, served
-from damian.advice.tables import as_csv, read_file
+from damian.advice.tables import read_file
 from damian.baselines.greedy import greedy_policy
 from damian.common import checks
-from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.evaluation.run_lock import is_folder, locked
@@ -178,9 +176,7 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
         except Waiting as error:
             raise InputError(str(error)) from None
     save_config(without_token(config), folder)
-    write_atomically(folder / "advice.json", json.dumps(answer, indent=1))
-    write_atomically(folder / "advice.csv", table := as_csv(answer))
-    print(table, end="")
+    print(write_answer(folder, answer), end="")
 
 
 def note(config: AdviseConfig) -> None:

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from damian.advice.answers import Answer
 from damian.advice.desk import Desk
 from damian.advice.fleet import Waiting
 from damian.advice.tables import as_csv, read_file
@@ -45,9 +46,19 @@ def read_inbox(desk: Desk, name: str, folder: Path, now: float) -> bool:
             answer = desk.advise(name, now)
         except Waiting:
             return True
-        write_atomically(folder / "advice.json", json.dumps(answer, indent=1))
-        write_atomically(folder / "advice.csv", as_csv(answer))
+        write_answer(folder, answer)
     return bool(paths)
+
+
+def write_answer(folder: Path, answer: list[Answer]) -> str:
+    """Write the advice of a fleet into a folder, as ``ANSWERS``; returns its table.
+
+    Raises:
+        RunError: it cannot be written.
+    """
+    write_atomically(folder / "advice.json", json.dumps(answer, indent=1))
+    write_atomically(folder / "advice.csv", table := as_csv(answer))
+    return table
 
 
 def _is_table(path: Path) -> bool:
