@@ -71,6 +71,8 @@ class LearningSetup(NamedTuple):
     """Whether to compile the loss, so that updates are faster once it is compiled."""
     frames: int = 300_000
     """Environment steps of the run, over all worlds."""
+    action_delay: int | None = 0
+    """Delay of every action [steps]; None if it differs between actions."""
 
     @property
     def settle_steps(self) -> int:

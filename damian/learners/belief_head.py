@@ -19,7 +19,7 @@ from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import gather_rows
+from damian.common.tensors import expand_mask, gather_rows, next_true
 from damian.learners.networks import POLICY_GAIN, ModelConfig, with_distribution
 
 FLAGS = 3
@@ -269,6 +269,24 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
 def belief_head(actor: ProbabilisticActor) -> BeliefHead:
     """The predicting part of a policy that ``make_belief_actor`` has made."""
     return next(module for module in actor.modules() if isinstance(module, BeliefHead))
+
+
+def ends_of_actions(ready: Tensor, reset: Tensor, delay: int) -> Tensor:
+    """The last step of the action that is chosen in each of T steps.
+
+    Args:
+        ready: whether the UAV could choose after each step, [T, ...] bool.
+        reset: whether the episode was reset after each step, bool, broadcast to ``ready``.
+        delay: steps until an action is executed, d.
+
+    Returns:
+        index of the step, [T, ...]; T if it comes later, or if a reset came before the action was executed.
+    """
+    ends, n_steps = next_true(ready | reset), len(ready)
+    executed = torch.arange(n_steps, device=ready.device) + delay
+    ends = ends[executed.clamp(max=n_steps - 1)]
+    prevented = next_true(reset.expand_as(ready)) < expand_mask(executed, ready)
+    return ends.where(~prevented & expand_mask(executed < n_steps, ready), n_steps)
 
 
 def prediction_loss(predicted: Tensor, target: Tensor, counts: Tensor) -> Tensor:

@@ -12,16 +12,16 @@ from torchrl.modules import ProbabilisticActor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import next_true
 from damian.keys import next_key
 from damian.learners.base import LEARNERS, LearningSetup
-from damian.learners.belief_head import belief_head, make_belief_actor, prediction_loss
+from damian.learners.belief_head import belief_head, ends_of_actions, make_belief_actor, prediction_loss
 from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import arrived_by_now
 
 _NEEDS = "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
+_CONSTANT = "needs a constant action delay (delay.act): it predicts what each action leads to, and when"
 
 
 @LEARNERS.register("predictive_mappo")
@@ -56,6 +56,7 @@ class PredictiveMappoConfig(MappoConfig):
         super().check(setup)
         name, model = "learner=predictive_mappo", setup.model
         checks.require(setup.backupdate, "learner", "predictive_mappo", _NEEDS)
+        checks.require(setup.action_delay is not None, "learner", "predictive_mappo", _CONSTANT)
         for key, value, good in (
             ("model.rnn", model.rnn, not model.recurrent),
             ("model.skip", model.skip, not model.skip),
@@ -82,10 +83,10 @@ class PredictiveMappoConfig(MappoConfig):
 class PredictiveMappo(Mappo):
     """MAPPO that after each update also learns to predict, from random steps of the replay buffer.
 
-    The target of a decision is the critic's observation when its action has ended (after the step; with real
-    flight times after the landing), as the back-updating storage knows it by now. A decision whose last
-    message has not arrived by now has no weight. What follows from an action does not depend on the policy,
-    so that steps of earlier policies serve too.
+    The target of a decision is the critic's observation when its action has ended (after the step in which it
+    is executed; with real flight times after the landing), as the back-updating storage knows it by now. A
+    decision whose last message has not arrived by now has no weight. What follows from an action does not
+    depend on the policy, so that steps of earlier policies serve too.
     """
 
     config: PredictiveMappoConfig
@@ -137,14 +138,15 @@ class PredictiveMappo(Mappo):
         return cast(BackupdateStorage, self.buffer.storage)
 
     def last_steps(self) -> Tensor:
-        """The last step of the action that each UAV carries out in each stored step.
+        """The last step of the action that each UAV has chosen, or carries on, in each stored step.
 
         Returns:
-            index among the T stored steps in order of time, [T, B, N]; T if the action has not ended yet.
+            index among the T stored steps in order of time, [T, B, N]; T if the action has not ended yet, or
+            was never executed.
         """
         steps, rows = self.storage.steps, self.storage.latest()
         ready, reset = (cast(Tensor, steps[key])[rows] for key in (next_key(keys.READY), keys.RESET_AFTER))
-        return next_true(ready | reset)
+        return ends_of_actions(ready, reset, cast(int, self.setup.action_delay))
 
     def sample(self, last: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
         """Draw K stored steps: what predictions are made from, what came after, and what of it counts.

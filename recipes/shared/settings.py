@@ -218,6 +218,12 @@ class TrainConfig(ScenarioConfig):
         return max(self.longest_delay, late_reward) if self.backupdates else self.longest_delay
 
     @property
+    def action_delay(self) -> int | None:
+        """Delay of every action [steps of the training]; None if it differs between actions."""
+        delay = law_of(self.delay.act, "delay.act").sampler(self.clock.dt).certain
+        return None if delay and self.clock.skip else delay  # a step of the training then has any length
+
+    @property
     def update_steps(self) -> int:
         """Steps of every world before the first update: the system clock's period, or ``learner.steps``."""
         return self.clock.steps("system") if self.clock.system else self.learner.steps
@@ -240,6 +246,7 @@ class TrainConfig(ScenarioConfig):
             else keys.GLOBAL_OBSERVATION,
             compile=self.compile,
             frames=self.frames,
+            action_delay=self.action_delay,
         )
 
     @property

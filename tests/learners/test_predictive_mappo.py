@@ -30,14 +30,14 @@ LATE = {"law": "uniform", "low": 0, "high": 3}
 
 
 def build(
-    kind: str = "discrete", flights: bool = False, **learner
+    kind: str = "discrete", flights: bool = False, act: int = 0, **learner
 ) -> tuple[PredictiveMappo, DelayedEnv, TrainConfig]:
     """A learner of few prediction steps, and an environment whose messages are up to 3 steps late or lost."""
     few: dict[str, Any] = {"prediction_steps": 2, "prediction_batch": 16, "prediction_buffer": 200}
     scenario = square(
         source=walking(),
         actions=ActionConfig(kind=kind),
-        delay=DelayConfig(obs=LATE, loss=0.1, messages=4),
+        delay=DelayConfig(obs=LATE, act=act, loss=0.1, messages=4),
         motion=FLYING if flights else MotionConfig(),
         episode=EpisodeConfig(max_steps=7),
     )
@@ -166,13 +166,15 @@ def test_targets_use_nothing_that_has_not_arrived_by_now():
     assert not before[2].all()
 
 
-def ends_of_actions(storage: BackupdateStorage) -> dict[tuple[int, int, int], int]:
-    """The last step of each action that was completed, for its first step, world and UAV, by loops."""
+def ends_of_completed(storage: BackupdateStorage, act: int) -> dict[tuple[int, int, int], int]:
+    """The last step of each completed action, for the step of its choice, world and UAV, by loops."""
     steps = storage.steps[storage.latest()]
     ready, next_ready, reset = (steps[key] for key in (keys.READY, next_key(keys.READY), keys.RESET_AFTER))
     found, n_steps = {}, len(steps)
     for t, i, j in ready.nonzero().tolist():
-        end = t
+        end = t + act
+        if end >= n_steps or reset[t:end, i].any():
+            continue
         while end < n_steps - 1 and not next_ready[end, i, j] and not reset[end, i]:
             end += 1
         if next_ready[end, i, j]:
@@ -180,18 +182,18 @@ def ends_of_actions(storage: BackupdateStorage) -> dict[tuple[int, int, int], in
     return found
 
 
-@pytest.mark.parametrize("flights", [False, True])
-def test_a_decision_counts_if_its_action_was_completed_and_the_last_message_of_it_has_arrived(flights):
-    learner, env, _ = build(flights=flights, prediction_batch=3000)
+@pytest.mark.parametrize(("flights", "act"), [(False, 0), (True, 0), (False, 2), (True, 2)])
+def test_a_decision_counts_if_its_action_was_completed_and_the_last_message_of_it_has_arrived(flights, act):
+    learner, env, _ = build(flights=flights, act=act, prediction_batch=3000)
     for _ in range(6):
         learner.learn(collected(learner, env))
     storage = learner.storage
-    steps, ends = storage.steps[storage.latest()], ends_of_actions(storage)
+    steps, ends = storage.steps[storage.latest()], ends_of_completed(storage, act)
     delay, seen = steps[next_key(keys.DELAY)], steps[next_key(keys.GLOBAL_OBSERVATION)]
     n_steps = len(steps)
     arrived = {key: end for key, end in ends.items() if 0 <= delay[end, *key[1:]] <= n_steps - 1 - end}
     durations = {end - key[0] for key, end in ends.items()}
-    assert durations == {0} or (flights and max(durations) > 1)
+    assert durations == {act} or (flights and max(durations) > act + 1)
     last = learner.last_steps()
     assert {key: int(last[key]) for key in ends} == ends
     (observation, *_), target, counts = learner.sample(last)

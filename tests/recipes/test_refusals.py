@@ -67,6 +67,10 @@ from damian.recipes.shared.stored_runs import save_config
             ["learner=predictive_mappo", "delay=paper", "aware=backupdate", "model=gru"],
             "model.rnn: gru does not go with learner=predictive_mappo",
         ),
+        (
+            ["learner=predictive_mappo", "delay=paper", "aware=backupdate", "delay.act=${delay.obs}"],
+            "learner: predictive_mappo needs a constant action delay (delay.act)",
+        ),
         (["learner=predictive_mappo", "learner.heads=0"], "learner.heads: 0 is not between 1 and 1024"),
         (["delay.messages=4"], "delay.messages: 4 is not read by learner=mappo; choose learner=predictive"),
         (
