@@ -143,9 +143,9 @@ class BeliefHead(TensorDictModuleBase):
     """Predicts what arrives later, for every discrete action, and encodes what is known for a policy.
 
     The predictions tell, in units of their running standard deviation, what the G numbers of the targets will
-    have been when the action ends (after the next step; with real flight times after the landing), once the
-    messages of that step have arrived. Code 0 asks what will have been whatever the action; its encoding is
-    for the policy.
+    have been when the action ends (after the step that executes it; with real flight times after the
+    landing), once the messages of that step have arrived. Code 0 asks what will have been whatever the
+    action; its encoding is for the policy.
 
     While acting it writes ``("agents", "encoding")`` [*, H] and, with discrete actions,
     ``("agents", "prediction")`` [*, A G]. In TorchRL's recurrent mode, which the losses of a policy switch
