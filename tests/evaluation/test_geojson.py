@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
+import torch
 from geojson_pydantic import FeatureCollection
 from shapely.geometry import shape
 
@@ -28,6 +29,7 @@ def episode():
         delay=DelayConfig(obs=3),
         observation=ObservationConfig(belief=["belief_moments"]),
     )
+    torch.manual_seed(0)  # a fixture of the module is made before the seed of each test is set
     env = make_env(scenario, 1, seed=1, extras=["message", "state", "reward_terms"])
     return record(env.rollout(10, random_policy(env)), env.uav_env, {})[0]
 
