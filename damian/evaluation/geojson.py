@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -98,16 +99,50 @@ def _path(places: Floats) -> shapely.LineString | shapely.Point:
 
 def _on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
     """A geometry of local metres in longitude and latitude, cut at the antimeridian, holes clockwise."""
+    edge = -180.0 if origin[1] < 0 else 180.0  # no other antimeridian is within half a turn of the origin
 
     def degrees(metres: NDArray[np.float64]) -> NDArray[np.float64]:
         latitude, longitude = to_latlon(metres[:, 0], metres[:, 1], origin)
-        return np.column_stack([origin[1] + (longitude - origin[1] + 180) % 360 - 180, latitude])
+        longitude = origin[1] + (longitude - origin[1] + 180) % 360 - 180
+        # What the rounding below would put on the antimeridian lies on it, so that nothing narrower is cut.
+        longitude[np.abs(longitude - edge) < 10.0**-DIGITS] = edge
+        return np.column_stack([longitude, latitude])
 
-    unwrapped = shapely.transform(geometry, degrees)
-    west, _, east, _ = unwrapped.bounds
-    if west < -180 or east > 180:
-        worlds = [(turn, shapely.box(360 * turn - 180, -90, 360 * turn + 180, 90)) for turn in (-1, 0, 1)]
-        parts = [translate(shapely.intersection(unwrapped, world), -360 * turn) for turn, world in worlds]
-        unwrapped = shapely.union_all(parts)
-    rounded = shapely.transform(unwrapped, lambda xy: xy.round(DIGITS))
+    parts = [_turned(part) for part in _cut(shapely.transform(geometry, degrees), edge)]
+    lines = parts[0].geom_type == "LineString"
+    whole = parts[0] if len(parts) == 1 else (shapely.multilinestrings if lines else shapely.union_all)(parts)
+    rounded = shapely.transform(whole, lambda xy: xy.round(DIGITS))
     return json.loads(shapely.to_geojson(shapely.orient_polygons(rounded)))
+
+
+def _turned(part: Any) -> Any:
+    """A geometry on one side of the antimeridian, turned to longitudes in [-180, 180]."""
+    west, _, east, _ = part.bounds
+    return translate(part, -360 * np.round((west + east) / 720))
+
+
+def _cut(geometry: Any, edge: float) -> list[Any]:
+    """Parts of a geometry in degrees, each on one side of the antimeridian of longitude ``edge``."""
+    west, _, east, _ = geometry.bounds
+    if not west < edge < east:
+        return [geometry]
+    if shapely.get_num_geometries(geometry) > 1:
+        return [piece for part in shapely.get_parts(geometry) for piece in _cut(part, edge)]
+    if geometry.geom_type == "LineString":
+        return _cut_path(shapely.get_coordinates(geometry), edge)
+    sides = [shapely.box(low, -90, low + 360, 90) for low in (edge - 360, edge)]
+    return [shapely.intersection(geometry, side) for side in sides]
+
+
+def _cut_path(places: NDArray[np.float64], edge: float) -> list[shapely.LineString]:
+    """A path [T, 2] in degrees, cut where it crosses longitude ``edge``; all of its points stay, in order."""
+    beyond = places[:, 0] - edge
+    last = np.flatnonzero(beyond[:-1] * beyond[1:] < 0)
+    share = beyond[last] / (beyond[last] - beyond[last + 1])
+    crossings = places[last] + share[:, None] * (places[last + 1] - places[last])
+    crossings[:, 0] = edge
+    places = np.insert(places, last + 1, crossings, axis=0)
+    side = np.sign(places[:, 0] - edge)
+    off = np.flatnonzero(side)
+    cuts = off[1:][side[off[1:]] != side[off[:-1]]] - 1
+    return [shapely.LineString(places[a : b + 1]) for a, b in pairwise([0, *cuts, len(places) - 1])]

@@ -123,6 +123,47 @@ def test_what_crosses_the_antimeridian_is_cut_there(episode):
     assert all("times" not in track["properties"] for track in cut)
 
 
+def flown_about_the_antimeridian(episode, longitude: float, metres: list[list[float]]):
+    """The track of UAV 0 along points [T, 2] metres east of the antimeridian and north of an origin there."""
+    origin = (-17.0, longitude)
+    (east,), _north = to_local([-17.0], [180.0], origin)
+    path = np.array(metres) + np.array([east, 0.0])
+    position = episode.position.copy()
+    position[: len(path), 0, :2] = path
+    moved = replace(episode, origin=origin, position=position)
+    track = by_kind(feature_collection(moved, len(path) - 1))["track"][0]
+    return track, path, origin
+
+
+@pytest.mark.parametrize("longitude", [179.999, -179.999])
+@pytest.mark.parametrize("east", [300.0, -300.0, 0.0])
+def test_a_track_on_one_side_of_the_antimeridian_keeps_its_points_and_times(episode, longitude, east):
+    sign = np.sign(east) or -1.0
+    metres = [[east, 0], [east, 0], [east + 80 * sign, 0], [east, 0], [east + 9 * sign, 50], [east, 90]]
+    track, path, origin = flown_about_the_antimeridian(episode, longitude, metres)
+    assert track["geometry"]["type"] == "LineString"
+    np.testing.assert_allclose(local(track, origin), path, atol=0.02)
+    assert track["properties"]["times"] == episode.time[: len(path)].tolist()
+    degrees = shapely.get_coordinates(shape(track["geometry"]))
+    assert (np.abs(degrees[:, 0]) <= 180).all()
+
+
+@pytest.mark.parametrize("longitude", [179.999, -179.999])
+def test_a_track_across_the_antimeridian_is_cut_between_all_of_its_points(episode, longitude):
+    metres = [[-90, 0], [-90, 0], [60, 0], [60, 0], [0, 0], [90, 9], [0, 0], [0, 0], [-90, 0], [-60, 5]]
+    track, path, origin = flown_about_the_antimeridian(episode, longitude, metres)
+    assert track["geometry"]["type"] == "MultiLineString"
+    assert "times" not in track["properties"]
+    parts = [np.array(part) for part in track["geometry"]["coordinates"]]
+    assert [len(part) for part in parts] == [3, 7, 3]
+    for part, following, sign in zip(parts, parts[1:], [1, -1], strict=False):
+        assert (part[-1, 0], following[0, 0]) == (180 * sign, -180 * sign)
+        assert part[-1, 1] == following[0, 1]
+    # The first crossing lies within a step, and the second is a point of the track, which both parts have.
+    points = np.delete(local(track, origin), [2, 3, 10], axis=0)
+    np.testing.assert_allclose(points, path, atol=0.02)
+
+
 def test_an_episode_without_a_place_on_earth_is_refused(episode):
     with pytest.raises(InputError, match="geojson: its region has no latitude and longitude"):
         feature_collection(replace(episode, origin=None), 3)
