@@ -14,7 +14,7 @@ from shapely.affinity import translate
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.evaluation.episode import Episode, Floats
-from damian.world.regions.geodesy import to_latlon
+from damian.world.regions.geodesy import to_latlon, wrap_longitude
 
 DIGITS = 7
 """Decimals of longitudes and latitudes: a centimetre."""
@@ -103,7 +103,7 @@ def _on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
 
     def degrees(metres: NDArray[np.float64]) -> NDArray[np.float64]:
         latitude, longitude = to_latlon(metres[:, 0], metres[:, 1], origin)
-        longitude = origin[1] + (longitude - origin[1] + 180) % 360 - 180
+        longitude = origin[1] + wrap_longitude(longitude - origin[1])
         # What the rounding below would put on the antimeridian lies on it, so that nothing narrower is cut.
         longitude[np.abs(longitude - edge) < 10.0**-DIGITS] = edge
         return np.column_stack([longitude, latitude])
@@ -131,7 +131,9 @@ def _cut(geometry: Any, edge: float) -> list[Any]:
     if geometry.geom_type == "LineString":
         return _cut_path(shapely.get_coordinates(geometry), edge)
     sides = [shapely.box(low, -90, low + 360, 90) for low in (edge - 360, edge)]
-    return [shapely.intersection(geometry, side) for side in sides]
+    pieces = shapely.get_parts(shapely.intersection(geometry, sides))
+    # Where an area only touches the antimeridian, the other side has a line or a point of it.
+    return [*pieces[shapely.get_dimensions(pieces) == 2]]
 
 
 def _cut_path(places: NDArray[np.float64], edge: float) -> list[shapely.LineString]:

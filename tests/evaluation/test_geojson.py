@@ -123,6 +123,28 @@ def test_what_crosses_the_antimeridian_is_cut_there(episode):
     assert all("times" not in track["properties"] for track in cut)
 
 
+@pytest.mark.parametrize("longitude", [179.999, -179.999])
+def test_areas_that_touch_the_antimeridian_stay_areas(episode, longitude):
+    def local_metres(corners: list[list[float]]) -> np.ndarray:
+        return np.column_stack(to_local(*np.array(corners).T[::-1], origin))
+
+    # The region spans the antimeridian in the south, and ends there in the north.
+    origin, above = (0.0, longitude), [[180.0, 0.001], [180.0, 0.002], [179.998, 0.002]]
+    below = [[179.998, -0.002], [180.002, -0.002], [180.002, 0.001]]
+    region = shapely.Polygon(local_metres(below + above))
+    cells = np.stack(np.meshgrid([-45.0, -15.0, 15.0, 45.0], [-30.0, 0.0, 30.0]), -1).reshape(-1, 2)
+    cells += local_metres([[180.0, 0.0]])  # two columns on each side, whose edges touch it
+    belief = np.full((episode.n_steps + 1, len(cells)), 1 / len(cells))
+    moved = replace(episode, origin=origin, region=region, cells=cells, belief=belief)
+    collection = feature_collection(moved, 10)
+    check_rfc_7946(collection)
+    kinds = by_kind(collection)
+    assert [feature["geometry"]["type"] for feature in kinds["belief"]] == ["Polygon"] * len(cells)
+    assert [feature["geometry"]["type"] for feature in kinds["region"]] == ["MultiPolygon"]
+    parts = shapely.get_parts(shape(kinds["region"][0]["geometry"]))
+    assert sorted(part.area for part in parts) == pytest.approx([6e-6, 8e-6], rel=1e-3)
+
+
 def flown_about_the_antimeridian(episode, longitude: float, metres: list[list[float]]):
     """The track of UAV 0 along points [T, 2] metres east of the antimeridian and north of an origin there."""
     origin = (-17.0, longitude)
