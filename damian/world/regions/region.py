@@ -14,6 +14,9 @@ from damian.common.text_files import one_line
 from damian.world.regions.geodesy import Floats, area_centroid, to_local
 from damian.world.regions.polygon import polygon_from_rings
 
+_SLACK = 1e-6
+"""Share of the area of a region that may lie between edges which cross once laid out in metres."""
+
 
 @dataclass(frozen=True)
 class Region:
@@ -122,9 +125,23 @@ def local_region(
     oriented = shapely.get_parts(shapely.orient_polygons(shape))
     origin = area_centroid([shapely.get_coordinates(ring) for ring in shapely.get_rings(oriented)])
     local = shapely.transform(shape, lambda c: np.column_stack(to_local(c[:, 1], c[:, 0], origin)))
-    if not local.is_valid:
+    return Region(_made_valid(local, source), one_line(name), origin, levels)
+
+
+def _made_valid(local: Polygon | MultiPolygon, source: str) -> Polygon | MultiPolygon:
+    """A polygon in metres without the little by which corners of holes cross the edges that they touch.
+
+    On the map an edge stays straight between its ends, while the corner that touches it may move off it.
+
+    Raises:
+        InputError: so much of it crosses that this changes its area by a millionth or more.
+    """
+    if local.is_valid:
+        return local
+    valid = shapely.make_valid(local, method="structure", keep_collapsed=False)
+    if not abs(valid.area - local.area) < _SLACK * local.area:
         raise InputError(f"{source}: edges cross once laid out in metres; take a smaller region")
-    return Region(local, one_line(name), origin, levels)
+    return cast(Polygon | MultiPolygon, valid)
 
 
 def _unwrap_longitude(ring: Floats, lon_deg: float) -> Floats:
