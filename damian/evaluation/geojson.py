@@ -112,6 +112,8 @@ def _on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
     lines = parts[0].geom_type == "LineString"
     whole = parts[0] if len(parts) == 1 else (shapely.multilinestrings if lines else shapely.union_all)(parts)
     rounded = shapely.transform(whole, lambda xy: xy.round(DIGITS))
+    if shapely.get_dimensions(rounded) == 2 and not rounded.is_valid:  # a gap below a centimetre has closed
+        rounded = shapely.make_valid(rounded, method="structure", keep_collapsed=False)
     return json.loads(shapely.to_geojson(shapely.orient_polygons(rounded)))
 
 

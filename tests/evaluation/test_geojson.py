@@ -18,6 +18,7 @@ from damian.evaluation.geojson import feature_collection
 from damian.server.features import ObservationConfig
 from damian.world.regions.config import RegionConfig
 from damian.world.regions.geodesy import to_local
+from damian.world.regions.region import local_region
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +144,17 @@ def test_areas_that_touch_the_antimeridian_stay_areas(episode, longitude):
     assert [feature["geometry"]["type"] for feature in kinds["region"]] == ["MultiPolygon"]
     parts = shapely.get_parts(shape(kinds["region"][0]["geometry"]))
     assert sorted(part.area for part in parts) == pytest.approx([6e-6, 8e-6], rel=1e-3)
+
+
+@pytest.mark.parametrize("latitude", [-30.0, 0.0, 50.0])
+def test_a_region_whose_hole_touches_its_shell_is_valid(episode, latitude):
+    shell = np.array([[9.996, -0.004], [10.004, -0.004], [10.004, 0.004], [9.996, 0.004]])
+    hole = np.array([[9.996, 0.001], [9.998, 0.001], [9.998, -0.001]])
+    read = local_region([[ring + np.array([0, latitude]) for ring in (shell, hole)]], "lake", None, "test")
+    collection = feature_collection(replace(episode, region=read.polygon, origin=read.origin), 10)
+    check_rfc_7946(collection)
+    written = shape(by_kind(collection)["region"][0]["geometry"])
+    assert written.area == pytest.approx(shapely.Polygon(shell, [hole]).area, rel=1e-6)
 
 
 def flown_about_the_antimeridian(episode, longitude: float, metres: list[list[float]]):
