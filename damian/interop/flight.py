@@ -146,6 +146,27 @@ def _instant(outputs: TensorDictBase) -> Instant:
     return Instant(observation, rewards, array(keys.TERMINATED)[:, 0], array(keys.TRUNCATED)[:, 0], infos)
 
 
+def actions_in(space: Space[Any], key: str, given: Any) -> Array:
+    """Actions as an array of the shape and type of a space; they may be of other types of the same kind.
+
+    Args:
+        space: what the actions must lie in.
+        key: of the error.
+        given: an array, or what NumPy makes one of: float64 for a space of float32, or any integers.
+
+    Raises:
+        InputError: they have another shape or kind (fractions where integers are asked for), or lie outside.
+    """
+    try:
+        found = np.asarray(given)
+    except (TypeError, ValueError):  # such as a list of lists of several lengths
+        found = np.empty(0, object)
+    kind = np.dtype(space.dtype)
+    fits = found.shape == space.shape and np.can_cast(found.dtype, kind, "same_kind")
+    checks.require(fits and space.contains(found.astype(kind)), key, given, f"is not in {space}")
+    return found.astype(kind)
+
+
 def one_uav(scenario: ScenarioConfig) -> None:
     """Refuse a scenario of several UAVs.
 

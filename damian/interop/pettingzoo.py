@@ -8,7 +8,7 @@ from gymnasium.spaces import Space
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.envs.scenario import ScenarioConfig
-from damian.interop.flight import METADATA, Array, Flight, row
+from damian.interop.flight import METADATA, Array, Flight, actions_in, row
 
 try:
     from pettingzoo import ParallelEnv
@@ -64,11 +64,11 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
     def step(self, actions: ByAgent) -> tuple[ByAgent, ByAgent, ByAgent, ByAgent, ByAgent]:
         if not self.agents:
             return {}, {}, {}, {}, {}
+        chosen = []
         for agent in self.agents:
             checks.require(agent in actions, "actions", sorted(actions), f"lack one for {agent}")
-            space, action = self.action_spaces[agent], actions[agent]
-            checks.require(space.contains(action), f"action of {agent}", action, f"is not in {space}")
-        instant, _ = self.flight.step(np.stack([np.asarray(actions[agent]) for agent in self.agents])[None])
+            chosen.append(actions_in(self.action_spaces[agent], f"action of {agent}", actions[agent]))
+        instant, _ = self.flight.step(np.stack(chosen)[None])
         n_agents, infos = len(self.agents), self._infos(instant.infos)
         terminated, truncated = bool(instant.terminated[0]), bool(instant.truncated[0])
         results = (

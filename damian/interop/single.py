@@ -5,9 +5,8 @@ from typing import Any, SupportsFloat
 import gymnasium
 import numpy as np
 
-from damian.common import checks
 from damian.envs.scenario import ScenarioConfig
-from damian.interop.flight import METADATA, Array, Flight, one_uav, row
+from damian.interop.flight import METADATA, Array, Flight, actions_in, one_uav, row
 
 
 class UavGymEnv(gymnasium.Env[Array, Any]):
@@ -47,8 +46,7 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         return instant.observation[0, 0], self._info
 
     def step(self, action: Any) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
-        checks.require(self.action_space.contains(action), "action", action, f"is not in {self.action_space}")
-        instant, _ = self.flight.step(np.asarray(action)[None, None])
+        instant, _ = self.flight.step(actions_in(self.action_space, "action", action)[None, None])
         self._info = row(instant.infos, 0, 0)
         ends = bool(instant.terminated[0]), bool(instant.truncated[0])
         return instant.observation[0, 0], float(instant.reward[0, 0]), *ends, self._info

@@ -9,7 +9,7 @@ from gymnasium.vector.utils import batch_space
 
 from damian.common import checks
 from damian.envs.scenario import ScenarioConfig
-from damian.interop.flight import Array, Flight, one_uav
+from damian.interop.flight import Array, Flight, actions_in, one_uav
 
 
 class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
@@ -46,9 +46,8 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
         return instant.observation[:, 0], _infos(instant.infos)
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        given, kind = np.asarray(actions), self.action_space.dtype
-        checks.require(self._contains(given), "actions", given, f"are not in {self.action_space}")
-        last, instant = self.flight.step(given.astype(kind)[:, None], reset=True)
+        chosen = actions_in(self.action_space, "actions", actions)
+        last, instant = self.flight.step(chosen[:, None], reset=True)
         infos, done = _infos(instant.infos), last.terminated | last.truncated
         if done.any():
             final = np.full(self.num_envs, None, object)
@@ -57,12 +56,6 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
             infos |= {"final_obs": final, "_final_obs": done}
             infos |= {"final_info": _infos(last.infos, done), "_final_info": done}
         return instant.observation[:, 0], last.reward[:, 0], last.terminated, last.truncated, infos
-
-    def _contains(self, actions: Array) -> bool:
-        """Are these actions of all worlds, in any type of number that loses nothing?"""
-        space = self.action_space
-        fits = actions.shape == space.shape and np.can_cast(actions.dtype, space.dtype or float, "same_kind")
-        return fits and space.contains(actions.astype(space.dtype))
 
 
 def _infos(infos: dict[str, Array], worlds: Array | None = None) -> dict[str, Any]:

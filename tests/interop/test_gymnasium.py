@@ -205,6 +205,30 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
         UavGymEnv(compose_scenario("agents=1"), render_mode="human")
 
 
+TAKEN = {
+    "continuous": (np.array([0.25, 1.0]), [0.25, 1], np.array([0, 1]), np.array([0.5, 1], np.float16)),
+    "discrete": (3, np.array(3, np.uint8), np.int32(3), np.uint64(3)),
+}
+REFUSED = {
+    "continuous": ([0.5, 1.01], [-0.1, 0.5], [np.nan, 0.5], [0.5], [[0.5], [0.5, 1]], "north", None),
+    "discrete": (3.0, -1, 999, [3], np.uint64(2**64 - 1), 2**70, "3", None),
+}
+
+
+@pytest.mark.parametrize("actions", TAKEN)
+def test_actions_may_be_of_any_type_of_the_same_kind(actions):
+    env = UavGymEnv(compose_scenario("agents=1", f"actions={actions}"))
+    for action in TAKEN[actions]:
+        exact = np.asarray(action).astype(env.action_space.dtype)
+        env.reset(seed=0)
+        expected = env.step(exact)[0]
+        env.reset(seed=0)
+        assert np.array_equal(env.step(action)[0], expected)
+    for action in REFUSED[actions]:
+        with pytest.raises(InputError, match=r"action: .* is not in (Box|Discrete)"):
+            env.step(action)
+
+
 def test_steps_in_which_the_uav_cannot_choose_are_skipped_if_asked():
     def readiness(*overrides: str) -> list[bool]:
         words = ["motion=polynomial", "episode.max_steps=40", *overrides]

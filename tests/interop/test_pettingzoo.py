@@ -91,3 +91,14 @@ def test_what_a_user_can_get_wrong_is_said_in_one_line():
         env.step({"uav_0": 0})
     with pytest.raises(InputError, match="action of uav_1: -1 is not in Discrete"):
         env.step({"uav_0": 0, "uav_1": -1, "uav_2": 0})
+
+
+def test_actions_may_be_of_any_type_of_the_same_kind():
+    env = made("actions=continuous", "agents=2")
+    env.reset(seed=0)
+    expected = env.step({name: np.array([0.25, 1.0], np.float32) for name in env.agents})[0]
+    env.reset(seed=0)
+    found = env.step({"uav_0": np.array([0.25, 1.0]), "uav_1": [0.25, 1]})[0]
+    assert all(np.array_equal(found[name], expected[name]) for name in expected)
+    with pytest.raises(InputError, match=r"action of uav_1: \[0\.5 1\.5\] is not in Box"):
+        env.step({"uav_0": np.array([0.25, 1.0]), "uav_1": np.array([0.5, 1.5])})
