@@ -111,7 +111,8 @@ class ObservationDelay(StatefulTransform):
     def key_usage(self) -> KeyUsage:
         created = [key for key in self.out_keys if key not in self.in_keys]
         created += [key for key in (self.age_key, self.fresh_key, self.delay_key) if key is not None]
-        return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=created)
+        ages = [(key, self.age_key) for key in self.out_keys if self.age_key is not None]
+        return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=created, ages=ages)
 
     @property
     def row_dims(self) -> dict[str, int]:

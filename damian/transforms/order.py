@@ -50,6 +50,10 @@ class KeyUsage(NamedTuple):
     """Whether it may end episodes."""
     derives: Sequence[tuple[NestedKey, NestedKey]] = ()
     """Entries that it computes from others: pairs of the entry read and another one written."""
+    ages: Sequence[tuple[NestedKey, NestedKey]] = ()
+    """Entries whose age it tells: pairs of the entry and the age."""
+    holds: Sequence[tuple[NestedKey, NestedKey | None]] = ()
+    """Entries that it holds: pairs of the entry and of the age that it lets grow meanwhile, if any."""
     skips: bool = False
     """Whether it may keep worlds from stepping."""
     flags: Sequence[NestedKey] = ()
@@ -115,6 +119,11 @@ def _check_pair(first: Transform, a: KeyUsage, second: Transform, b: KeyUsage) -
         if key in b.delays and key in second.out_keys and derived not in b.delays:
             problem = f"{names[0]} computes {derived} from {key} before {names[1]} changes {key}"
             warnings.warn(f"order of transforms: {problem}", stacklevel=2)
+    for (key, age), (held, grown) in itertools.product(a.ages, b.holds):
+        if key == held and age != grown:
+            problem = f"{names[1]} holds {key}, whose age {names[0]} writes under {age}"
+            remedy = f"give {names[1]} age_key={age!r}, so that the age grows with what is held"
+            warnings.warn(f"order of transforms: {problem}: {remedy}", stacklevel=2)
 
 
 def leaf_transforms(transform: Transform | None) -> list[Any]:

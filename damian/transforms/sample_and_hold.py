@@ -19,6 +19,7 @@ from damian.transforms.entries import (
     from_rows,
     require_keys,
     select_entries,
+    sibling_key,
     spec_rows,
 )
 from damian.transforms.order import KeyUsage
@@ -37,6 +38,9 @@ class SampleAndHold(StatefulTransform):
         in_keys_inv: keys of the actions that are held: an action chosen between two ticks is not executed.
         ready_key: key of a flag, [...] bool, that is set to false between two ticks, as an agent cannot
             choose then; None to leave it out.
+        age_key: key of the age of the entries that are held [steps], [..., 1], as ``ObservationDelay`` writes
+            it: between two ticks it grows by one in each step. A bare name means an entry in the same
+            TensorDict as ``in_keys[0]``; None to leave ages as they are.
         dt: length of a step [s], for a period given as a time.
         stagger: every row (world, or agent under a nested key) draws the time from each reset to its second
             tick, from one step to a period, so that the clocks do not all tick in the same step.
@@ -45,7 +49,7 @@ class SampleAndHold(StatefulTransform):
         gradients: let gradients flow through the held entries (``StatefulTransform``).
 
     Raises:
-        InputError: the period is not valid, or no key is given.
+        InputError: the period is not valid, no key is given, or there is an age but no entry is held.
 
     Examples:
         >>> clock = SampleAndHold(4, ["observation"], ["action"])
@@ -59,6 +63,7 @@ class SampleAndHold(StatefulTransform):
         in_keys_inv: NestedKey | Sequence[NestedKey] = (),
         *,
         ready_key: NestedKey | None = None,
+        age_key: NestedKey | None = None,
         dt: float = 1.0,
         stagger: bool = False,
         seed: int | None = None,
@@ -71,9 +76,12 @@ class SampleAndHold(StatefulTransform):
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
         self.ready_key, self.stagger = ready_key, stagger
+        should = "is the age of the entries that are held, but in_keys is empty"
+        checks.require(bool(self.in_keys) or age_key is None, "age_key", age_key, should)
+        self.age_key = sibling_key(self.row_key, age_key)
         self.draws = stagger
         self.action_keys = self.in_keys_inv
-        self.step_keys = [*self.in_keys, *([ready_key] if ready_key else [])]
+        self.step_keys = [*self.in_keys, *(key for key in (ready_key, self.age_key) if key)]
 
     @property
     def row_key(self) -> NestedKey:
@@ -81,11 +89,14 @@ class SampleAndHold(StatefulTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        return KeyUsage(reads=self.step_keys, delays=self.in_keys, replaces=self.in_keys_inv)
+        delayed = [*self.in_keys, *([self.age_key] if self.age_key else [])]
+        held = [(key, self.age_key) for key in self.in_keys if self.period > 1]
+        return KeyUsage(reads=self.step_keys, delays=delayed, replaces=self.in_keys_inv, holds=held)
 
     @property
     def memory_sizes(self) -> dict[str, int]:
-        return {"period": self.period, "in_keys": len(self.in_keys), "in_keys_inv": len(self.in_keys_inv)}
+        n_entries = len(self.in_keys) + (self.age_key is not None)
+        return {"period": self.period, "entries": n_entries, "in_keys_inv": len(self.in_keys_inv)}
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -103,6 +114,8 @@ class SampleAndHold(StatefulTransform):
             for i, key in enumerate(self.in_keys_inv)
         }
         memory = {"elapsed": elapsed, **held, **acted}  # "elapsed": steps since the latest tick
+        if self.age_key:
+            memory["age"] = as_rows(tensordict.get(self.age_key), self.rows)
         if not self.stagger:
             return memory
         streams = self.streams(tensordict.batch_size, device)
@@ -117,7 +130,8 @@ class SampleAndHold(StatefulTransform):
             new = {"phase": phase, "interval": self.period - phase}
             memory = memory | {name: torch.where(mask, value, memory[name]) for name, value in new.items()}
             memory["episode"] = episode
-        return self._hold(memory, entries, self.in_keys, "held", mask)
+        memory, held = self._hold(memory, entries, self.in_keys, "held", mask)
+        return self._with_age(memory, held, entries, mask, 0)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         return self._hold(memory, entries, self.in_keys_inv, "acted", memory["elapsed"] == 0)
@@ -132,10 +146,11 @@ class SampleAndHold(StatefulTransform):
         if self.ready_key:
             ready = entries[self.ready_key]
             held[self.ready_key] = ready & ticks.view_as(ready)
-        return memory, held
+        return self._with_age(memory, held, entries, ticks, 1)
 
     def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
-        return memory | {"elapsed": (memory["elapsed"] + n_steps) % self.period}
+        aged = {"age": memory["age"] + n_steps} if self.age_key else {}
+        return memory | {"elapsed": (memory["elapsed"] + n_steps) % self.period} | aged
 
     def _hold(
         self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, sampled: Tensor
@@ -148,3 +163,21 @@ class SampleAndHold(StatefulTransform):
             memory = memory | {f"{name}_{i}": held}
             outputs[key] = from_rows(held, self.rows).clone()  # the memory keeps the held values
         return memory, outputs
+
+    def _with_age(
+        self, memory: Memory, held: Entries, entries: Entries, sampled: Tensor, n_steps: int
+    ) -> Change:
+        """Add the age of what is held to the outputs, if it has a key.
+
+        Args:
+            memory: memory with what is held now.
+            held: outputs without the age.
+            entries: entries that came in, with the age of those that are not held.
+            sampled: rows that hold what came in, [M] bool; in the others the age grows.
+            n_steps: by how many steps.
+        """
+        if not self.age_key:
+            return memory, held
+        new = as_rows(entries[self.age_key], self.rows)
+        age = torch.where(expand_mask(sampled, new), new, memory["age"] + n_steps)
+        return memory | {"age": age}, held | {self.age_key: from_rows(age, self.rows).clone()}

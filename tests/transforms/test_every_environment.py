@@ -174,7 +174,7 @@ def test_the_outputs_with_all_transforms_together_match_the_specs(kind):
         ObservationDelay(PAPER, [case.observation], loss=0.1, fresh_key="fresh", delay_key="delay"),
         RewardDelay(1, case.reward),
         CumulativeReward(3, 0.9, case.reward),
-        SampleAndHold(2, [case.observation]),
+        SampleAndHold(2, [case.observation], age_key="age"),
         ActionHistory(2, case.action, append_to=case.observation),
     ]
     check_env_specs(TransformedEnv(case.make(), Compose(*chain)), seed=0, break_when_any_done="both")

@@ -60,7 +60,7 @@ def test_a_key_that_the_environment_does_not_have_is_one_line(transform, key, kn
 
 def test_keys_that_earlier_transforms_write_are_known():
     history = ActionHistory(2, append_to="observation", age_key="age")
-    rollout(ActionDelay(1), ObservationDelay(2), RewardDelay(2), SampleAndHold(2), history)
+    rollout(ActionDelay(1), ObservationDelay(2), RewardDelay(2), SampleAndHold(2, age_key="age"), history)
 
 
 @pytest.mark.parametrize(

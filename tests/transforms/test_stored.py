@@ -69,7 +69,7 @@ CHAINS: dict[str, Callable[[Any, Any, Any], Transform]] = {
     "all": lambda o, a, r: Compose(
         ObservationDelay(LATE, [o], order="arrival", seed=1),
         Compose(RewardDelay(LATE, r, seed=2), CumulativeReward(2, 0.9, r)),
-        SampleAndHold(2, [o]),
+        SampleAndHold(2, [o], age_key="age"),
         ActionHistory(2, a, append_to=o, age_key="age"),
         RewardSum([r], ["sum"] if isinstance(r, str) else [("agents", "sum")]),
         InitTracker(),

@@ -200,6 +200,29 @@ def test_a_warning_says_what_follows_from_an_entry_before_it_is_delayed(early, l
     Compose(late(), early())
 
 
+@every_way
+@pytest.mark.parametrize("keys", [{}, {"in_keys": ["observation", "age"]}])
+def test_a_warning_says_that_the_age_of_what_is_held_does_not_grow(way, keys):
+    problem = "SampleAndHold holds observation, whose age ObservationDelay writes under age: give SampleAnd"
+    with pytest.warns(UserWarning, match=problem):
+        way(Drift(), delay(), SampleAndHold(2, **keys)).reset()
+
+
+@every_way
+@pytest.mark.parametrize(
+    ("options", "clock"),
+    [
+        ({}, lambda: SampleAndHold(2, age_key="age")),
+        ({}, lambda: SampleAndHold(2, in_keys=[], in_keys_inv=["action"])),
+        ({}, lambda: SampleAndHold(1)),
+        ({"age_key": None}, lambda: SampleAndHold(2)),
+        ({"out_keys": ["late"]}, lambda: SampleAndHold(2)),
+    ],
+)
+def test_a_clock_that_keeps_no_age_wrong_gives_no_warning(way, options, clock):
+    way(Drift(), delay(**options), clock()).reset()
+
+
 def test_a_transform_that_changes_an_entry_in_place_may_come_before_its_delay():
     env = TransformedEnv(Drift(), Compose(CatFrames(2, -1, ["observation"]), delay(), StepCounter(4)))
     assert env.rollout(3)["observation"].shape == (3, 3, 4)

@@ -107,7 +107,7 @@ def one_of_each() -> list[StatefulTransform]:
         ),
         RewardDelay(PAPER, REWARD),
         CumulativeReward(3, 0.9, REWARD),
-        SampleAndHold(2, [("agents", "seen")], ready_key=("agents", "ready")),
+        SampleAndHold(2, [("agents", "seen")], ready_key=("agents", "ready"), age_key="age"),
         ActionHistory(3, ACTION, append_to=("agents", "seen"), recorded_key="ready"),
     ]
 

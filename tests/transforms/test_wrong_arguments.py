@@ -59,7 +59,8 @@ def test_whole_numbers_of_numpy_are_steps_and_seeds():
     def ages(number: type) -> list[float]:
         delays = ObservationDelay(Uniform(number(1), number(4)), seed=number(3))
         rewards = [RewardDelay(number(2)), CumulativeReward(3)]
-        env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(delays, SampleAndHold(number(2)), *rewards))
+        clock = SampleAndHold(number(2), age_key="age")
+        env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(delays, clock, *rewards))
         return env.rollout(30)["age"].flatten().tolist()
 
     assert ages(np.int64) == ages(np.int32) == ages(int)
