@@ -12,6 +12,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.keys import DONE, STEPPED, last_part
+from damian.transforms.batches import require_one_level
 from damian.transforms.entries import (
     Change,
     Entries,
@@ -222,6 +223,8 @@ class StatefulTransform(MemoryTransform):
         """Allocate the memory, given the outputs of the first reset."""
         self._check_order(self.container)  # others may have come since this one
         require_keys(type(self).__name__, self.required_keys, outputs)
+        if self.one_level:
+            require_one_level(type(self).__name__, [*self.in_keys, *self.in_keys_inv], outputs, self.env)
         rows = self.find_rows(outputs)
         self.require_memory(rows, self.memory_bytes(outputs, rows.numel()))
         self._rows = rows

@@ -21,6 +21,8 @@ class MemoryTransform(Transform):
     """Whether the transform draws random numbers."""
     shared_streams: bool = False
     """Whether all agents of a world draw the same numbers."""
+    one_level: bool = False
+    """Whether its keys must name entries of one batch size, because each row has a part of all of them."""
     memory_setting: tuple[str, Any]
     """Key and value of the setting on which the size of the memory depends, for errors."""
     _rows: torch.Size | None = None

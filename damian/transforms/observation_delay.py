@@ -64,7 +64,8 @@ class ObservationDelay(StatefulTransform):
 
     Raises:
         InputError: the delay or the order is not valid, the law reads what has no key, or ``in_keys`` and
-            ``out_keys`` are none or not as many.
+            ``out_keys`` are none or not as many; at the first reset also: the entries have different batch
+            sizes.
 
     Examples:
         >>> delay = ObservationDelay(Uniform(3, 7), loss=0.1)
@@ -73,6 +74,7 @@ class ObservationDelay(StatefulTransform):
     """
 
     optional_keys = ("age_key", "fresh_key", "delay_key")
+    one_level = True
 
     def __init__(
         self,

@@ -17,7 +17,6 @@ from damian.transforms.entries import (
     Memory,
     as_rows,
     from_rows,
-    require_keys,
     select_entries,
     sibling_key,
     spec_rows,
@@ -35,7 +34,8 @@ class SampleAndHold(StatefulTransform):
     Args:
         period: time between two ticks: steps (``4``), or a time (``"2s"``).
         in_keys: keys of the entries that are sampled and held; their TensorDicts have the same batch size.
-        in_keys_inv: keys of the actions that are held: an action chosen between two ticks is not executed.
+        in_keys_inv: keys of the actions that are held, of the same batch size too: an action chosen between
+            two ticks is not executed.
         ready_key: key of a flag, [...] bool, that is set to false between two ticks, as an agent cannot
             choose then; None to leave it out.
         age_key: key of the age of the entries that are held [steps], [..., 1], as ``ObservationDelay`` writes
@@ -49,12 +49,15 @@ class SampleAndHold(StatefulTransform):
         gradients: let gradients flow through the held entries (``StatefulTransform``).
 
     Raises:
-        InputError: the period is not valid, no key is given, or there is an age but no entry is held.
+        InputError: the period is not valid, no key is given, or there is an age but no entry is held; at the
+            first reset also: the entries and actions have different batch sizes.
 
     Examples:
         >>> clock = SampleAndHold(4, ["observation"], ["action"])
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), clock)  # the agent acts in every fourth step
     """
+
+    one_level = True
 
     def __init__(
         self,
@@ -108,7 +111,6 @@ class SampleAndHold(StatefulTransform):
         elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
         held = {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(first.values())}
         specs = self.env.full_action_spec
-        require_keys(type(self).__name__, self.in_keys_inv, specs)
         acted = {
             f"acted_{i}": expand_to_rows(specs[key].zero(), spec_rows(specs, key), self.rows)
             for i, key in enumerate(self.in_keys_inv)

@@ -2,7 +2,10 @@
 
 import numpy as np
 import pytest
+from plain_env import Plain
+from torchrl.data import Unbounded
 from torchrl.envs import Compose, GymEnv, TransformedEnv
+from transform_cases import ACTION, OBSERVATION
 
 from damian.common.errors import InputError
 from damian.delays.laws import Lag, Uniform
@@ -73,3 +76,40 @@ def test_every_whole_number_is_a_seed():
         env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(Uniform(1, 9), seed=seed))
         drawn.append(env.rollout(20)["age"].flatten().tolist())
     assert drawn[0] != drawn[1] != drawn[2]
+
+
+class TwoLevels(Plain):
+    """Three worlds of two agents, with an entry and an action of each world beside those of the agents."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_spec["state"] = Unbounded((3, 5))
+        self.full_action_spec["order"] = Unbounded((3, 1))
+
+
+LEVELS = {
+    "an agent's and a world's entry": lambda: ObservationDelay(2, [OBSERVATION, "state"]),
+    "a world's and an agent's entry": lambda: ObservationDelay(2, ["state", OBSERVATION]),
+    "entries of a clock": lambda: SampleAndHold(2, [OBSERVATION, "state"]),
+    "a world's entry and an agent's action": lambda: SampleAndHold(2, ["state"], [ACTION]),
+    "an agent's entry and a world's action": lambda: SampleAndHold(2, [OBSERVATION], ["order"]),
+    "actions": lambda: SampleAndHold(2, [], [ACTION, "order"]),
+}
+
+
+@pytest.mark.parametrize("make", LEVELS.values(), ids=LEVELS)
+def test_entries_of_agents_and_of_worlds_in_one_transform_are_refused_in_one_line(make):
+    transform = make()
+    one, other = [*transform.in_keys, *transform.in_keys_inv]
+    sizes = "[3, 2] and [3]" if isinstance(one, tuple) else "[3] and [3, 2]"
+    line = f"{type(transform).__name__}: {one} and {other} have the batch sizes {sizes}: "
+    with pytest.raises(InputError) as error:
+        TransformedEnv(TwoLevels(), transform).reset()
+    assert str(error.value) == line + "use one transform for each level"
+
+
+def test_one_transform_for_each_level_works():
+    delays = ObservationDelay(2, OBSERVATION), ObservationDelay(2, "state")
+    clocks = SampleAndHold(2, [OBSERVATION], [ACTION], age_key="age"), SampleAndHold(2, [], ["order"])
+    steps = TransformedEnv(TwoLevels(), Compose(*delays, *clocks)).rollout(4)
+    assert (steps["agents", "age"].shape, steps["age"].shape) == ((3, 4, 2, 1), (3, 4, 1))
