@@ -68,15 +68,17 @@ def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
 def _shape(config: TrainConfig) -> dict[str, Any]:
     """What the sizes of a policy's networks follow from, by setting."""
     observation, actions, model = config.observation, config.actions, config.model
-    discrete, seen = actions.kind == "discrete", observation.actor
+    discrete, predicts = actions.kind == "discrete", isinstance(config.learner, PredictiveMappoConfig)
+    # A learnt belief has the size of what it predicts, which is what the critic observes.
+    used = observation.critic if predicts else observation.actor
     return {
-        "learner=predictive_mappo": isinstance(config.learner, PredictiveMappoConfig),
+        "learner=predictive_mappo": predicts,
         "observation.ctde": observation.ctde,
         "observation.local_features": [*observation.local_features],
-        "observation.global_features": [] if observation.ctde else [*observation.global_features],
+        "observation.global_features": [*observation.global_features] * (predicts or not observation.ctde),
         "observation.belief": [*observation.belief],
         # After the features, from which it follows: a policy with other features does not lack UAVs.
-        "agents": config.agents if "agent_distances" in seen else "any number of UAVs",
+        "agents": config.agents if "agent_distances" in used else "any number of UAVs",
         "observation.age": observation.age,
         "delay.history": config.delay.history,
         "delay.messages": config.delay.messages,

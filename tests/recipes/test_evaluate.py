@@ -200,6 +200,26 @@ def test_what_a_policy_needs_to_fly_is_named(word, message):
     check_policy_fits(trained, trained)
 
 
+@pytest.mark.parametrize(
+    ("features", "word", "message"),
+    [
+        (
+            "coverage",
+            "observation.global_features=[mean_distance]",
+            r"observation\.global_features: the policy",
+        ),
+        ("agent_distances", "agents=5", "agents: the policy was trained with 3, so it cannot fly with 5"),
+    ],
+)
+def test_what_a_learnt_belief_predicts_is_named_though_the_actor_does_not_observe_it(features, word, message):
+    words = ["observation.ctde=true", f"observation.global_features=[{features}]"]
+    trained, other = (composed_config(*words, *more) for more in ([], [word]))
+    check_policy_fits(other, trained)
+    predicting = composed_config(*words, "learner=predictive_mappo")
+    with pytest.raises(InputError, match=message):
+        check_policy_fits(composed_config(*words, "learner=predictive_mappo", word), predicting)
+
+
 def test_a_policy_with_other_features_does_not_lack_uavs():
     with pytest.raises(InputError, match=r"observation\.global_features: the policy was trained with"):
         check_policy_fits(composed_config("scenario=coverage"), composed_config())
