@@ -6,6 +6,7 @@ from typing import Any
 
 from damian.common.errors import InputError
 from damian.common.text_files import show
+from damian.envs.pipeline import history_since_message
 from damian.envs.scenario import ScenarioConfig
 from damian.learners.predictive_mappo import PredictiveMappoConfig
 
@@ -87,6 +88,16 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
         "number of actions.headings": discrete and len(actions.headings),
         **{f"model.{field.name}": getattr(model, field.name) for field in fields(model)},
     }
+
+
+def note_what_a_history_holds(config: TrainConfig, stored: TrainConfig) -> None:
+    """Say if a policy observes other actions in its history than in its training, which had other delays."""
+    before, now = history_since_message(stored), history_since_message(config)
+    if before == now or not (stored.delay.history and config.delay.history):
+        return
+    newer = "only actions newer than its message that the server holds"
+    held, holds = (newer if since else "all of its latest actions" for since in (before, now))
+    print(f"note: delay.history: in the training a UAV's history held {held}; now it holds {holds}")
 
 
 def changes(config: TrainConfig, stored: TrainConfig) -> str:

@@ -33,7 +33,7 @@ from damian.evaluation.run_record import timed
 
 from .command_line import parsed, prepared, remember_words
 from .composition_errors import COMPOSITION_ERRORS, foreign_cause, one_line
-from .inheritance import changes, check_policy_fits, inherited, own_defaults
+from .inheritance import changes, check_policy_fits, inherited, note_what_a_history_holds, own_defaults
 from .known_settings import CONF, SCHEMAS
 from .leftovers import drop_empty, drop_sweep, drop_unused, remember_folders, sweep_folder
 from .misspelt import no_such_key
@@ -84,6 +84,7 @@ def prepare(composed: DictConfig) -> tuple[TrainConfig, Path]:
         check_policy_fits(config, stored)
         if changed := changes(config, stored):
             print(f"changed since the training: {changed}")
+        note_what_a_history_holds(config, stored)
     return config, folder
 
 

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 import damian
 from damian.common.errors import InputError
 from damian.recipes import evaluate, train
-from damian.recipes.shared.inheritance import check_policy_fits
+from damian.recipes.shared.inheritance import check_policy_fits, note_what_a_history_holds
 from damian.recipes.shared.launch import composed_config, launch
 
 TRAINED = [
@@ -122,7 +122,11 @@ def test_a_policy_keeps_its_action_history_under_another_delay_and_the_changes_a
     capsys.readouterr()
     config = OmegaConf.load(fly("delay=paper", of=first) / "config.yaml")
     assert (config.delay.history, config.delay.obs.law) == (2, "uniform")
-    assert "changed since the training: delay.obs: 1 -> {" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "changed since the training: delay.obs: 1 -> {" in told
+    assert "note:" not in told
+    fly("delay.obs=0", of=first, folder="at once")
+    assert "\nnote: delay.history: in the training a UAV's history held only " in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -218,6 +222,31 @@ def test_what_a_learnt_belief_predicts_is_named_though_the_actor_does_not_observ
     predicting = composed_config(*words, "learner=predictive_mappo")
     with pytest.raises(InputError, match=message):
         check_policy_fits(composed_config(*words, "learner=predictive_mappo", word), predicting)
+
+
+NEWER, ALL = "only actions newer than its message that the server holds", "all of its latest actions"
+
+
+@pytest.mark.parametrize(
+    ("trained", "flown", "line"),
+    [
+        ("delay.obs=1", "delay.obs=0", f"held {NEWER}; now it holds {ALL}"),
+        ("delay.obs=1", "delay.act=1", f"held {NEWER}; now it holds {ALL}"),
+        ("delay.obs=0", "delay.obs=4", f"held {ALL}; now it holds {NEWER}"),
+        ("delay.obs=1", "delay.obs=4", None),
+        ("delay.obs=0", "delay.act=1", None),
+    ],
+)
+def test_what_a_history_holds_now_is_said_if_it_is_something_else(trained, flown, line, capsys):
+    words = ["delay.history=2", trained]
+    note_what_a_history_holds(composed_config(*words, flown), composed_config(*words))
+    note = f"note: delay.history: in the training a UAV's history {line}\n"
+    assert capsys.readouterr().out == (note if line else "")
+
+
+def test_without_a_history_of_actions_nothing_is_said_of_it(capsys):
+    note_what_a_history_holds(composed_config("delay.obs=0"), composed_config("delay.obs=1"))
+    assert capsys.readouterr().out == ""
 
 
 def test_a_policy_with_other_features_does_not_lack_uavs():
