@@ -68,7 +68,7 @@ TASKS = {
 }
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(
     ("task", "fraction"), [*((task, 0.0) for task in TASKS), ("late", 0.7), ("flights", 0.7)]
 )

@@ -264,6 +264,7 @@ def test_a_wrong_question_for_advice_is_refused(client, fleet, desk):
         assert client.get(f"{fleet}/advice{query}").status_code == 422
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("task", ["history", "belief", "clocks", "flights"])
 def test_a_journal_brings_everything_back(task, tmp_path):
     """The service is asked about and takes its steps at other times than when it is restored."""

@@ -143,6 +143,7 @@ class FalsifyMessage(Transform):
         return tensordict_reset
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 @pytest.mark.parametrize("obs", [4, {"law": "geometric", "mean": 3}], ids=["constant", "random"])
 def test_a_message_has_no_effect_before_it_arrives(obs, order):
@@ -184,7 +185,7 @@ def test_an_action_has_no_effect_before_it_is_executed():
 # Batches of worlds.
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(4)
 @every_delay
 @both_motions
 def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
@@ -201,7 +202,7 @@ def test_worlds_stepped_together_equal_worlds_stepped_alone(delays, motion):
         assert all_same([td[w : w + 1] for td in together], outputs, rounding)
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(4)
 @every_delay
 @both_motions
 def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):

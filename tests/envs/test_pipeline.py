@@ -23,6 +23,7 @@ from damian.world.signal_source import SourceConfig
 # The messages that the server holds, and their age of information.
 
 
+@pytest.mark.sample(4)
 @every_delay
 @both_motions
 def test_the_age_of_every_held_message_is_right(delays, motion):

@@ -66,6 +66,7 @@ def check_equal_to_torchrls_way(scenario: ScenarioConfig) -> None:
         assert same(outputs_of(one), outputs_of(third))
 
 
+@pytest.mark.sample(2)
 @both_motions
 @both_kinds
 def test_without_delays(motion, kind):

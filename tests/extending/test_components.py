@@ -206,7 +206,7 @@ def test_a_mistake_in_a_law_that_sees_the_context_is_one_clear_line(run, folder,
     assert not (folder / "run").exists()
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(6)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -29,7 +29,7 @@ def made(*overrides, **options):
     return UavParallelEnv(compose_scenario(*overrides), **options)
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS[::3])  # every value of each
 def test_pettingzoos_checkers_find_nothing(task, actions, motion, delay, capsys):
     overrides = [f"scenario={task}", f"actions={actions}", f"motion={motion}", delay, "episode.max_steps=4"]

@@ -182,6 +182,7 @@ def ends_of_completed(storage: BackupdateStorage, act: int) -> dict[tuple[int, i
     return found
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("flights", "act"), [(False, 0), (True, 0), (False, 2), (True, 2)])
 def test_a_decision_counts_if_its_action_was_completed_and_the_last_message_of_it_has_arrived(flights, act):
     learner, env, _ = build(flights=flights, act=act, prediction_batch=3000)

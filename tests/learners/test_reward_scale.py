@@ -90,6 +90,7 @@ def spread(make: Any, *arguments: Any) -> float:
     return max((other - end).abs().max().item() for other in others) / moved
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("model", "advantage"), [*((model, True) for model in MODELS), ("own value", False)])
 def test_mappo_learns_the_same_from_rewards_of_any_scale_if_values_are_normalised(model, advantage):
     def make(normalize: bool) -> tuple[Mappo, DelayedEnv]:

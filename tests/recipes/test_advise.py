@@ -128,7 +128,7 @@ REFUSALS = [
 ]
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(("words", "message"), REFUSALS, ids=[" ".join(words) for words, _ in REFUSALS])
 def test_what_cannot_be_is_refused_in_one_line(run, capsys, monkeypatch, words, message):
     monkeypatch.setattr("damian.recipes.advise.read_inbox", lambda *_: pytest.fail("it was not refused"))

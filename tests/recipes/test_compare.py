@@ -148,6 +148,7 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
         check_refused(lambda: compare(*words[:1], *stored), problem, capsys)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("n_seeds", [2, 12])
 def test_a_report_counts_every_stored_seed_unless_a_number_of_seeds_is_given(compare, tmp_path, n_seeds):
     words, results = ["report_only=true", "hydra.run.dir=kept"], table(STORED / "delays/results.csv")
@@ -280,6 +281,7 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.sample(6)
 @pytest.mark.parametrize(
     ("text", "message"),
     [

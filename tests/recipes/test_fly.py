@@ -120,6 +120,7 @@ def test_an_episode_has_an_instant_for_the_reset_and_one_for_each_step(flown):
     assert episode.position.shape == (8, 2, 3)
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("motion", [[], FLYING])
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(flown, motion, order):
@@ -176,6 +177,7 @@ def test_if_every_message_is_lost_none_arrives_and_only_sent_messages_count_as_l
     assert "mean age 30.50 s, messages late 0.0%, lost 100.0%" in printed_line(capsys)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
     one, same, other = (
         run(*BADLY, f"seed={seed}", folder=folder) for seed, folder in ((0, "one"), (0, "same"), (1, "other"))

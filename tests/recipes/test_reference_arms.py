@@ -74,6 +74,7 @@ def rollout_of(
 # Held messages.
 
 
+@pytest.mark.sample(2)
 @both_motions
 @pytest.mark.parametrize("law", LAWS)
 def test_held_messages_arrive_as_with_a_constant_delay(law, motion):

@@ -12,7 +12,7 @@ from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.shared.stored_runs import save_config
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(6)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

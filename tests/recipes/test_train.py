@@ -51,7 +51,7 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
     return {f"{key}.{name}": w for key, net in networks.items() for name, w in net.state_dict().items()}
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(6)
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -136,6 +136,7 @@ def test_a_resumed_run_appends_to_its_own_metrics(run, learner):
     assert not (folder.parent / "second").exists()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_continues_with_the_period_of_its_triggered_clock(run):
     quiet = ["source.level_db=106", "learner.steps=4", "clock.trigger=2s", "clock.longest=10s"]
     folder = run(*TINY, *quiet, "frames=80", "delay.obs=2", "backupdate=true", folder="first")
@@ -182,6 +183,7 @@ def test_every_policy_is_evaluated_in_the_same_episodes(run):
     assert others == [one] * 3
 
 
+@pytest.mark.slow
 def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):
     folder = run(*TINY, "learner.steps=16", folder="first")
     with (folder / "metrics.csv").open("a") as file:

@@ -67,6 +67,7 @@ def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys
     assert (folder / "trial_0" / "metrics.csv").stat().st_mtime_ns == written
 
 
+@pytest.mark.slow
 def test_the_best_of_scores_that_count_steps_is_the_least(search, capsys, monkeypatch):
     scores = iter([5.0, 3.0])
     monkeypatch.setattr(tune.Run, "score", lambda *_: next(scores))
@@ -184,6 +185,7 @@ def test_what_a_user_can_get_wrong_is_refused_in_one_line(search, words, message
     check_refused(lambda: search(*words), message, capsys)
 
 
+@pytest.mark.slow
 def test_a_folder_with_another_search_is_refused(search, capsys):
     search("trials=1")
     check_refused(lambda: search("trials=1", "agents=2"), "choose another folder with hydra.run.dir", capsys)

@@ -163,6 +163,7 @@ def test_a_stopped_run_with_workers_goes_on_as_if_it_had_not_been(run, forked):
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_lost_process_is_named_and_the_run_goes_on_from_its_latest_update(run, forked, capsys, monkeypatch):
     add, lost = MetricsLog.add, []
 

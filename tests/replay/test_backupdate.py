@@ -188,6 +188,7 @@ def test_back_updated_steps_know_late_readings(motion):
     check_corrected(in_order(replay, 39)[: 39 - LONGEST], undelayed)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 @pytest.mark.parametrize("ctde", [False, True])
 def test_an_actors_observation_can_be_back_updated_but_its_action_history_stays(motion, ctde):

@@ -116,7 +116,7 @@ ZERO_DELAY_CASES = [
 """Every law on one environment, and two laws on the others."""
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(6)
 @pytest.mark.parametrize(("kind", "zero_delay"), ZERO_DELAY_CASES)
 @pytest.mark.parametrize("transform", TRANSFORMS)
 def test_with_delay_0_nothing_changes(kind, transform, zero_delay, tmp_path):
@@ -125,6 +125,7 @@ def test_with_delay_0_nothing_changes(kind, transform, zero_delay, tmp_path):
     check_unchanged(rollout_of(TransformedEnv(case.make(), delay), case.steps), undelayed_rollout_of(kind))
 
 
+@pytest.mark.sample(3)
 @kinds
 def test_a_clock_of_period_1_a_sum_of_one_reward_and_a_history_change_nothing(kind):
     case = KINDS[kind]

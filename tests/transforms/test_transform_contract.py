@@ -229,6 +229,7 @@ def test_a_clone_shares_no_memory(case):
     assert all_same(onward(env, td.clone()), onward(control, td.clone()))
 
 
+@pytest.mark.sample(3)
 @every_case
 def test_a_clone_of_a_transform_without_memory_works(case):
     original = case.make()
@@ -240,7 +241,7 @@ def test_a_clone_of_a_transform_without_memory_works(case):
 # Checkpoints.
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(8)
 @every_case
 @pytest.mark.parametrize(("n_steps", "used"), [(5, True), (5, False), (0, True)])
 @pytest.mark.parametrize("whole", [True, False], ids=["environment", "transform"])
@@ -299,7 +300,7 @@ CONSTANT = {"chances", "_boundaries", "_delays", "codes", "_law_index", "_loss"}
 # Graphs.
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(8)
 @some(CASES, fast=AGENTS)
 def test_a_step_compiles_into_one_graph_that_does_the_same(case):
     env, twin = case.build(), case.build()
@@ -355,6 +356,7 @@ def nodes(value):
 # Collectors.
 
 
+@pytest.mark.sample(3)
 @every_case
 def test_a_collector_returns_the_same_data_as_a_rollout(case):
     env, twin = case.build(), case.build()

@@ -49,6 +49,7 @@ def only_steps(first: int, last: int, w: int, n: int, total: int) -> Tensor:
     return mask
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 @pytest.mark.parametrize("name", ["constant", "uniform", "geometric", "trace"])
 def test_a_message_has_no_effect_before_it_arrives(name, order, tmp_path):

@@ -43,6 +43,7 @@ from damian.world.state import State
 # Positions on landing points.
 
 
+@pytest.mark.sample(3)
 @both_kinds
 @both_motions
 @pytest.mark.parametrize("n_agents", [2, 5, 8])

@@ -92,6 +92,7 @@ def check_observation(world: twin.World, observation: torch.Tensor):
     assert difference.max() < 1e-4
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("since", "estimate"), [(False, "mean"), (True, "newest")])
 @both_kinds
 @pytest.mark.parametrize("n_agents", [1, 2, 4])
