@@ -197,6 +197,13 @@ def test_a_valid_file_is_read(file, tmp_path, monkeypatch):
     assert refusal(READERS[file], fly) is None
 
 
+def refuse_to_read(file: Path, path: Path, read=Path.read_bytes) -> bytes:
+    """Read a file unless it is this one, which not even a superuser may read."""
+    if path == file:
+        raise PermissionError(13, "Permission denied")
+    return read(path)
+
+
 @pytest.mark.parametrize("file", READERS)
 @pytest.mark.parametrize("kind", ["missing", "folder", "empty", "pipe", "loop", "long name", "not readable"])
 def test_what_is_no_file_is_named(file, kind, tmp_path, monkeypatch):
@@ -214,9 +221,7 @@ def test_what_is_no_file_is_named(file, kind, tmp_path, monkeypatch):
         path.symlink_to(path)
     elif kind == "not readable":
         path.write_text(VALID[file])
-        monkeypatch.setattr(
-            Path, "read_bytes", lambda _: (_ for _ in ()).throw(PermissionError(13, "Permission denied"))
-        )
+        monkeypatch.setattr(Path, "read_bytes", lambda other: refuse_to_read(path, other))
     line = refusal(given_words, fly)
     assert line is not None
 
