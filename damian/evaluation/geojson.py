@@ -104,7 +104,7 @@ def _on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
     def degrees(metres: NDArray[np.float64]) -> NDArray[np.float64]:
         latitude, longitude = to_latlon(metres[:, 0], metres[:, 1], origin)
         longitude = origin[1] + wrap_longitude(longitude - origin[1])
-        # What the rounding below would put on the antimeridian lies on it, so that nothing narrower is cut.
+        # Points that the rounding below moves onto the antimeridian are put there before anything is cut.
         longitude[np.abs(longitude - edge) < 10.0**-DIGITS] = edge
         return np.column_stack([longitude, latitude])
 

@@ -169,7 +169,7 @@ class SampleAndHold(StatefulTransform):
     def _with_age(
         self, memory: Memory, held: Entries, entries: Entries, sampled: Tensor, n_steps: int
     ) -> Change:
-        """Add the age of what is held to the outputs, if it has a key.
+        """Add the age of the entries that are held to the outputs, if it has a key.
 
         Args:
             memory: memory with what is held now.

@@ -70,7 +70,7 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
     """What the sizes of a policy's networks follow from, by setting."""
     observation, actions, model = config.observation, config.actions, config.model
     discrete, predicts = actions.kind == "discrete", isinstance(config.learner, PredictiveMappoConfig)
-    # A learnt belief has the size of what it predicts, which is what the critic observes.
+    # An actor with a learnt belief predicts the critic's observation, so that its layers depend on it too.
     used = observation.critic if predicts else observation.actor
     return {
         "learner=predictive_mappo": predicts,
