@@ -1,4 +1,4 @@
-# make train | test | test-deep | test-slow | test-browser | bench | bench-quick | bench-advise | bench-collectors | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | test-browser | bench | bench-quick | bench-advise | bench-collectors | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -7,13 +7,21 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-deep test-slow test-browser bench bench-quick bench-advise bench-collectors benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow test-browser bench bench-quick bench-advise bench-collectors benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
 
 test: $(VENV)/test
 	$(PY) -m pytest -n 2 $(ARGS)
+
+# Every test must pass alone and in any order: twice in a random order, then each module by itself.
+test-order: $(VENV)/test
+	$(PY) -m pytest -n 2 --random-order $(ARGS)
+	$(PY) -m pytest -n 2 --random-order $(ARGS)
+	mkdir -p build
+	for file in $$(find tests -name 'test_*.py' | sort); do \
+	  $(PY) -m pytest -q $$file > build/alone.log 2>&1 || [ $$? = 5 ] || { cat build/alone.log; exit 1; }; done
 
 # Property tests with thousands of new random examples each.
 test-deep: $(VENV)/test

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported
 
-__version__ = "0.17.0"
+__version__ = "0.17.1"
 
 _MODULES = {
     "damian.delays.config": ["DelayConfig"],
@@ -101,6 +101,10 @@ __all__ = [
     "reward_term",
     "sensor",
 ]
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]
 
 
 def __getattr__(name: str) -> Any:

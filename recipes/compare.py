@@ -37,10 +37,10 @@ from damian.common.errors import InputError
 from damian.envs.pipeline import has_message_delay
 from damian.evaluation.comparison import (
     HELD_OUT,
-    MODE,
     NOT_LATE,
-    SAMPLED,
     SCORES,
+    TRAINED,
+    TRAINED_DETERMINISTIC,
     Comparison,
     Row,
 )
@@ -50,7 +50,7 @@ from damian.evaluation.report import markdown
 from damian.evaluation.statistics import FEWEST
 
 from . import ceiling
-from .evaluate import fly
+from .evaluate import fly, fly_untrained
 from .shared.command_line import command, typed_words, whole_laws
 from .shared.comparison_results import ROWS, Results, results_of, stored_results, write_csv
 from .shared.composition_errors import COMPOSITION_ERRORS, one_line
@@ -66,7 +66,7 @@ from .train import train
 TABLE, MARKDOWN, FIGURE, CURVES = "table.csv", "table.md", "figure.png", "curves.png"
 SEEDS, EPISODES = 10, 100
 """A report with an arm of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
-POLICIES = {"sampled": SAMPLED, "mode": MODE}
+POLICIES = {"sampled": TRAINED, "deterministic": TRAINED_DETERMINISTIC}
 
 
 @dataclass
@@ -94,11 +94,12 @@ class CompareConfig:
     """Names of the arms to run; all of the experiment's if not given."""
     overrides: list[str] = field(default_factory=list)
     """Further overrides of ``damian train`` for every run."""
-    score: str = "true_return"
-    """The measure J that J_norm and recovery are computed from: true_return, true_success_rate or true_steps,
-    of what truly happened; episode_return, success_rate or steps, as the server perceived it."""
+    score: str = "return"
+    """The measure J that J_norm and recovery are computed from: return, success_rate or steps,
+    of what truly happened; perceived_return, perceived_success_rate or steps, as the server perceived it."""
     policy: str = "sampled"
-    """The evaluation that J comes from: actions ``sampled`` from the policy, or its ``mode``."""
+    """The evaluation that J comes from: actions ``sampled`` from the policy, or the most likely ones
+    (``deterministic``)."""
     report_only: bool = False
     """Train and fly nothing; write tables and figures from the finished or the stored results."""
 
@@ -124,7 +125,11 @@ class CompareConfig:
                 checks.one_of(kind, name, getattr(self.experiment, kind))
         for name, arm in self.chosen("arms").items():
             if arm.policy_of is not None:
-                sources = [n for n, a in self.chosen("arms").items() if a.policy_of is None and not a.ceiling]
+                sources = [
+                    n
+                    for n, a in self.chosen("arms").items()
+                    if a.policy_of is None and not (a.ceiling or a.untrained)
+                ]
                 checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, sources)
 
     def chosen(self, kind: str) -> dict[str, Any]:
@@ -170,7 +175,7 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
     ]
     _check_policies(runs)
     succeeds = any(run.config.episode.success_share is not None for run in runs)
-    should = "is in none of the tasks anything that can be reached: choose true_return or episode_return"
+    should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
     checks.require(succeeds or "success" not in config.score, "score", config.score, should)
     return sorted(runs, key=lambda run: (not run.trains, run.config.seed))
 
@@ -201,7 +206,8 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     """
     task, delay, name = folder.parts[-3:]
     arm, arms = config.experiment.arms[name], config.experiment.arms
-    source = arm.policy_of or (name if task != trained_in and not arm.ceiling else None)
+    flies_alone = arm.ceiling or arm.untrained
+    source = arm.policy_of or (name if task != trained_in and not flies_alone else None)
     overrides = whole_laws(["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides])
     try:
         unseeded = _composed(*overrides)
@@ -211,7 +217,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         flies_script = arm.ceiling and unseeded.seeks_source and has_message_delay(unseeded)
         if flies_script:
             ceiling.check(unseeded)
-        elif source is None and not arm.ceiling:
+        elif source is None and not arm.ceiling and not arm.untrained:
             unseeded.check_learning()
     except COMPOSITION_ERRORS as error:
         raise InputError(f"{task}/{delay}/{name}: {one_line(error)}") from error
@@ -224,7 +230,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
             source_delay = delay if arms[source].delayed else NOT_LATE
             policy = folder.parents[2] / trained_in / source_delay / source / seed_folder
             seeded = replace(seeded, checkpoint=str(policy))
-        program = ceiling.fly if arm.ceiling else fly if source else train
+        program = ceiling.fly if arm.ceiling else fly_untrained if arm.untrained else fly if source else train
         yield Run(task, delay, name, seeded, folder / seed_folder, program, trains=program is train)
 
 
@@ -273,8 +279,8 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
         f"`{command(words)}`",
         f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {' or '.join(map(str, episodes))} episodes each",
         "Mean over seeds [95 % interval: stratified bootstrap over seeds, widened for few seeds; none below "
-        f"{FEWEST}]; J: {config.score} of the {config.policy} policy; seen: as the server perceived it, else "
-        "as it truly was; age in steps; back-updated: share of the messages in training; n: seeds",
+        f"{FEWEST}]; J: {config.score} of the {config.policy} policy; perceived: as far as the server knew, "
+        "else as it truly was; age in steps; back-updated: share of the messages in training; n: seeds",
         "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive arm, 1 undelayed, not shown where "
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
         "one of the strongest naive arm, with its score interval; n compared: seeds that all of these have; "

@@ -33,6 +33,12 @@ def fly(config: TrainConfig, folder: Path) -> None:
     report(config, folder, env, actor)
 
 
+def fly_untrained(config: TrainConfig, folder: Path) -> None:
+    """Evaluate the networks before their first update, and fill the run folder."""
+    save_config(config, folder)
+    report(config, folder, make_eval_env(config))
+
+
 def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
     """The evaluation environment, and the actor of ``config.checkpoint``.
 

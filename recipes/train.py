@@ -35,12 +35,12 @@ from damian.common.errors import InputError, RunError, naming_errors
 from damian.common.threads import using_threads
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
-from damian.evaluation.comparison import GREEDY, MODE, RANDOM, SAMPLED
+from damian.evaluation.comparison import RANDOM, SCRIPT, TRAINED, UNTRAINED
 from damian.evaluation.interrupt import Interrupt
 from damian.evaluation.loggers import make_loggers
 from damian.evaluation.metrics import Evaluation, evaluate
 from damian.evaluation.metrics_log import MetricsLog
-from damian.evaluation.run_folder import CHECKPOINT, FIGURE, plot_learning_curve, save_results
+from damian.evaluation.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, plot_learning_curve, save_results
 from damian.evaluation.training_state import TrainingState, load_networks
 from damian.keys import next_key
 from damian.learners.base import Learner, check_learner, check_numbers
@@ -61,8 +61,9 @@ from .shared.stored_runs import run_folder, save_config, stored_config
 from .shared.training_film import film_policy
 from .shared.workers import WorkerLost
 
-MEANING = """sampled: actions are drawn from the policy's distribution; mode: the most likely action is taken.
-Fly the one with the higher return: a policy without memory often needs chance to search."""
+MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
+of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
+likely one is taken. A policy without memory often needs chance to search: fly it as it returns more."""
 """Lines under the table of an evaluation."""
 
 
@@ -309,8 +310,16 @@ def make_eval_env(config: TrainConfig) -> DelayedEnv:
     return make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, ["message"])
 
 
-def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module) -> Evaluation:
-    """Evaluate an actor, write the results into the run folder and print them.
+def report(
+    config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module | None = None
+) -> Evaluation:
+    """Evaluate an actor beside an untrained one, the script and random actions; write and print the results.
+
+    Args:
+        config: settings of the evaluation.
+        folder: the run folder.
+        env: its environment, a world for each episode.
+        actor: the trained actor; None: only the others fly.
 
     Returns:
         The evaluation of the random policy in the same episodes.
@@ -320,16 +329,29 @@ def report(config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.M
         env.set_seed(config.eval_seed)  # the same episodes for every policy
         return evaluate(env, policy, config.horizon, sample)
 
-    random = fly(random_policy(env))
-    rows = {SAMPLED: fly(actor), MODE: fly(actor, False), RANDOM: random}
+    rows = {}
+    for name, policy in {UNTRAINED: untrained_actor(config, env), TRAINED: actor}.items():
+        if policy is not None:
+            rows |= {name: fly(policy), name + DETERMINISTIC: fly(policy, sample=False)}
     try:
-        rows[GREEDY] = fly(greedy_policy(env))
-    except InputError as error:  # the region is too large for the script, but not for what has learnt
-        print(f"no {GREEDY} policy: {error}")
+        rows[SCRIPT] = fly(greedy_policy(env))
+    except InputError as error:  # the region is too large for the script, but not for the networks
+        print(f"no {SCRIPT}: {error}")
+    rows[RANDOM] = fly(random_policy(env))
     can_succeed, late = config.episode.success_share is not None, has_message_delay(config)
     table = save_results(rows, folder, can_succeed, late, MEANING)
-    print(f"\n{table}\n")
-    return random
+    print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
+    return rows[RANDOM]
+
+
+def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
+    """The network of the actor, with its prior, as it is before the first update of a training.
+
+    Its weights are those with which a training of the same seed begins, unless that began with a checkpoint.
+    """
+    with torch.random.fork_rng(devices=[]), own_code(config.learner.name):
+        torch.manual_seed(config.seed)
+        return config.learner.make_actor(env, config.model)
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

@@ -79,12 +79,13 @@ class TuneConfig(TrainConfig):
     """Number of trainings at the same time; each has one thread unless ``threads`` says otherwise."""
     prune: bool = True
     """Whether to stop trainings that are worse than the median."""
-    score: str = "true_return"
-    """The measure of the evaluation that is to be best (least, if it counts steps): true_return,
-    true_success_rate or true_steps, of what truly happened; episode_return, success_rate or steps, as the
+    score: str = "return"
+    """The measure of the evaluation that is to be best (least, if it counts steps): return,
+    success_rate or steps, of what truly happened; perceived_return, perceived_success_rate or steps, as the
     server perceived it."""
     policy: str = "sampled"
-    """The policy that is evaluated: actions ``sampled`` from it, or its ``mode``."""
+    """The policy that is evaluated: actions ``sampled`` from it, or the most likely ones
+    (``deterministic``)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -93,7 +94,7 @@ class TuneConfig(TrainConfig):
         checks.one_of("score", self.score, SCORES)
         checks.one_of("policy", self.policy, POLICIES)
         succeeds = self.episode.success_share is not None or "success" not in self.score
-        should = "is the same for every policy: in this task nothing can be reached; choose true_return"
+        should = "is the same for every policy: in this task nothing can be reached; choose return"
         checks.require(succeeds, "score", self.score, should)
         should = "is not for a search, which trains every policy from the beginning: leave it out"
         checks.require(self.checkpoint is None, "checkpoint", self.checkpoint, should)
@@ -130,11 +131,12 @@ class Search:
         self.study = optuna.create_study(
             study_name="damian",
             storage=self.storage,
-            sampler=optuna.samplers.TPESampler(seed=config.seed),
             pruner=self.pruner,
             direction="maximize" if config.sign > 0 else "minimize",
             load_if_exists=True,
         )
+        # A sampler with the same seed would draw the trials again that the study has already.
+        self.study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(self.study.trials))
         stored, asked = self.study.user_attrs.get(OVERRIDES), [*overrides, f"search={config.search}"]
         should = f"is not {stored}, with which {folder} was begun; choose another folder with hydra.run.dir"
         checks.require(stored in (None, asked), OVERRIDES, asked, should)
@@ -219,7 +221,7 @@ def train_watched(
     watched, sign = Trial(study, trial), 1 if study.direction == optuna.study.StudyDirection.MAXIMIZE else -1
 
     def watch(frames: int, numbers: dict[str, float]) -> None:
-        value = numbers.get("episode_return", math.nan)
+        value = numbers.get("perceived_return", math.nan)
         if not math.isnan(value):
             watched.report(sign * value, frames)  # a return, whatever the score
             if watched.should_prune():

@@ -51,7 +51,7 @@ TRAININGS = [
     ["scenario=tracking", "model=gru", "delay=paper"],
     ["scenario=tracking", "learner=sac", "delay=paper", "aware=backupdate"],
     ["scenario=tracking", "learner=sac", "actions=continuous"],
-    ["scenario=tracking", "learner=bpql", "delay.obs=2", "delay.history=2"],
+    ["scenario=tracking", "learner=bpql", "delay.obs=2", "aware=both"],
     ["scenario=tracking", "learner=predictive_mappo", "delay=paper", "delay.messages=4", "aware=backupdate"],
     ["scenario=paper/usecase2", "delay=paper", "aware=both", "recompute_actor=true"],
 ]
@@ -96,17 +96,17 @@ def training(overrides: list[str]) -> dict[str, list[str]]:
 def record(path: Path, word: str = "") -> None:
     """Write the record of the version that is installed, of all cases whose name has a word."""
     cases = [[*scenario, *delay] for scenario in SCENARIOS for delay in DELAYS] + OTHERS
-    content = {}
+    content = json.loads(path.read_text()) if path.exists() else {}  # what a stopped call has recorded
     for kind, overrides in [*(("rollout", case) for case in cases), *(("training", c) for c in TRAININGS)]:
         name = f"{kind} {' '.join(overrides)}"
-        if word not in name:
+        if word not in name or name in content:
             continue
         print(name, flush=True)
         try:
             content[name] = rollout(overrides) if kind == "rollout" else training(overrides)
         except subprocess.CalledProcessError as error:
             raise SystemExit(f"{name}: {error.stderr.decode()}") from error
-    path.write_text(json.dumps(content, indent=1))
+        path.write_text(json.dumps(content, indent=1))
 
 
 def compare(before: Path, after: Path) -> int:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from damian.evaluation.run_folder import DETERMINISTIC
 from damian.evaluation.statistics import (
     LEAST_GAP,
     Floats,
@@ -18,9 +19,12 @@ from damian.evaluation.statistics import (
     recovery,
 )
 
-SAMPLED, MODE, RANDOM, GREEDY = "trained, sampled", "trained, mode", "random", "greedy"
-SCRIPTED = (RANDOM, GREEDY)
+TRAINED, UNTRAINED, SCRIPT, RANDOM = "trained", "untrained", "script", "random"
+TRAINED_DETERMINISTIC, UNTRAINED_DETERMINISTIC = TRAINED + DETERMINISTIC, UNTRAINED + DETERMINISTIC
+SCRIPTED = (RANDOM, SCRIPT)
 """Policies that fly the same episodes beside each arm, and learn nothing."""
+OF_ARM = (TRAINED, TRAINED_DETERMINISTIC, UNTRAINED, UNTRAINED_DETERMINISTIC)
+"""Policies of an arm: its network after the training and before the first update."""
 ALL_MESSAGES = "all messages"
 CEILING = {"what has arrived": "R0", "its own messages": "R0", ALL_MESSAGES: "R3", "the source's place": "R3"}
 """What is known on time in the rows of an information ceiling (``damian ceiling``), and their regimes."""
@@ -28,15 +32,15 @@ HELD_OUT = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
 """Name that stands for the delay of an undelayed arm."""
-TRUE = ("true_return", "true_success_rate", "true_steps")
+TRUE_SCORES = ("return", "success_rate", "steps")
 """Measures of an ``Evaluation`` from messages without delay."""
-SEEN = ("episode_return", "success_rate", "steps")
+PERCEIVED_SCORES = ("perceived_return", "perceived_success_rate", "perceived_steps")
 """The same measures as the server perceived them."""
-MEASURES = (*TRUE, *SEEN, "age", "late", "lost", "backupdated")
-SCORES = (*TRUE, *SEEN)
+MEASURES = (*TRUE_SCORES, *PERCEIVED_SCORES, "age", "late", "lost", "backupdated")
+SCORES = (*TRUE_SCORES, *PERCEIVED_SCORES)
 """Measures by which arms can be compared."""
-_SHARES = ("true_success_rate", "success_rate", "late", "lost", "backupdated")
-_TIMES = ("true_steps", "steps", "age")
+_SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
+_TIMES = ("steps", "perceived_steps", "age")
 _ANY = (-np.inf, np.inf)
 BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(MEASURES, _ANY),
@@ -46,7 +50,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
 """Smallest and largest possible value of each of ``MEASURES``."""
 COMPARED = ("J_norm", "recovery", "improvement", "of_ceiling")
 """Columns of the estimates of ``Compared``."""
-LESS_IS_BETTER = ("true_steps", "steps")
+LESS_IS_BETTER = ("steps", "perceived_steps")
 """Scores for which lower values are better."""
 
 Row = Mapping[str, Any]
@@ -66,6 +70,8 @@ class Arm:
     """Whether the arm ignores the delay; recovery 0 is the score of the best such arm."""
     policy_of: str | None = None
     """Arm whose policies this one flies, without any training of its own; None: this arm trains."""
+    untrained: bool = False
+    """Whether the networks fly as they are before the first update, with their prior; nothing is trained."""
     ceiling: bool = False
     """Whether the script flies with ever more known on time (``damian ceiling``), and nothing is trained."""
     tasks: list[str] | None = None
@@ -145,10 +151,10 @@ class Comparison:
 
     rows: Sequence[Row]
     arms: Mapping[str, Arm]
-    score: str = "true_return"
+    score: str = "return"
     """Measure that is the J of J_norm and recovery."""
-    policy: str = SAMPLED
-    """Policy with which the arms are compared, ``SAMPLED`` or ``MODE``."""
+    policy: str = TRAINED
+    """Policy with which the arms are compared, ``TRAINED`` or ``TRAINED_DETERMINISTIC``."""
 
     @cached_property
     def lines(self) -> list["Line"]:
@@ -185,7 +191,9 @@ class Comparison:
         return [name for name, arm in self.arms.items() if name in found and not arm.ceiling]
 
     def values(self, task: str, delay: str, arm: str, policy: str, measure: str) -> dict[int, float]:
-        """Values of a measure by seed."""
+        """Values of a measure by seed; an untrained arm has none but those of its untrained network."""
+        if arm in self.arms and self.arms[arm].untrained and policy in OF_ARM[:2]:
+            policy = OF_ARM[OF_ARM.index(policy) + 2]
         wanted = (task, delay, arm, policy)
         keys = ("task", "delay", "arm", "policy")
         return {r["seed"]: r[measure] for r in self.rows if tuple(r[key] for key in keys) == wanted}
@@ -343,10 +351,13 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
             arms = comparison.present(task, delay)
             compared = {} if delay == NOT_LATE else comparison.compared(task, delay)
             for arm in arms:
-                for policy in (SAMPLED, MODE):
-                    line = _line(comparison, task, delay, arm, policy)
-                    found = compared.get(arm) if policy == comparison.policy else None
-                    yield replace(line, compared=found) if found else line
+                for policy in OF_ARM[2:] if comparison.arms[arm].untrained else OF_ARM:
+                    # Policies of other arms and runs of older versions have no untrained network.
+                    if comparison.values(task, delay, arm, policy, comparison.score):
+                        line = _line(comparison, task, delay, arm, policy)
+                        of_arm = policy.removeprefix("un") if comparison.arms[arm].untrained else policy
+                        found = compared.get(arm) if of_arm == comparison.policy else None
+                        yield replace(line, compared=found) if found else line
             for arm in arms[:1]:
                 for policy in SCRIPTED:
                     # Older runs have not flown every scripted policy.

@@ -29,7 +29,11 @@ from damian.evaluation.statistics import Floats, bootstrap
 Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 """Rows of ``metrics.csv`` of each seed, by task, delay and arm."""
 
-LABELS = {"episode_return": "return", "success_rate": "success rate", "steps": "steps per episode"}
+LABELS = {
+    "perceived_return": "return",
+    "perceived_success_rate": "success rate",
+    "perceived_steps": "steps per episode",
+}
 """Axis labels of the measures in training, all as the server perceived them."""
 PROGRESS = {"frames": "environment steps", "episodes": "episodes"}
 """Axis labels of how far a training has come."""
@@ -91,7 +95,7 @@ def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str,
     tasks = [task for task in comparison.tasks() if HELD_OUT not in task]
     delays = {task: comparison.delays(task) or [NOT_LATE] for task in tasks}
     if len(tasks) > 1:
-        return [[(task, delay, "episode_return") for delay in delays[task]] for task in tasks]
+        return [[(task, delay, "perceived_return") for delay in delays[task]] for task in tasks]
     rows = [row for runs in curves.values() for run in runs for row in run]
     measures = [name for name in LABELS if any(not np.isnan(row[name]) for row in rows)]
     return [[(task, delay, name) for name in measures] for task in tasks for delay in delays[task]]

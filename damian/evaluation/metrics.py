@@ -1,7 +1,7 @@
 """Measures of episodes, in training and in evaluations."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from typing import Any, cast
 
 import torch
@@ -20,28 +20,36 @@ from damian.server.server import Server
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Means over episodes: as the server perceived them and (``true_``) from messages without delay."""
+    """Means over episodes: from messages without delay and, ``perceived_``, as the server perceived them."""
 
     episodes: int
     """Number of episodes."""
     success_rate: float
-    """Share of the episodes that ended with success."""
+    """Share of the episodes in which as many UAVs as required spotted the source at the same time."""
     steps: float
     """Length of an episode; where success is possible, an episode without it counts the horizon."""
-    episode_return: float
-    """Sum of the rewards of an episode, as a mean over the UAVs."""
-    true_success_rate: float
-    """Share of the episodes in which as many UAVs as required truly spotted the source at the same time."""
-    true_steps: float
-    """Length of an episode up to its true end, counted as ``steps``."""
-    true_return: float
-    """Sum of the undelayed rewards up to the true end, as a mean over the UAVs."""
+    return_: float
+    """Sum of the undelayed rewards of an episode, as a mean over the UAVs."""
+    perceived_success_rate: float
+    """Share of the episodes that ended with success as far as the server knew."""
+    perceived_steps: float
+    """Length of an episode up to the end that the server perceived, counted as ``steps``."""
+    perceived_return: float
+    """Sum of the rewards as they were paid, as a mean over the UAVs."""
     age: float
     """Age of information: age of the message of a UAV that the server holds [steps]."""
     late: float
     """Share of the messages that arrive late."""
     lost: float
     """Share of the messages that never arrive."""
+
+    def row(self) -> dict[str, float]:
+        """The measures by the names that they have in every file; ``return`` is no name for a field."""
+        return dict(zip(EVALUATED, astuple(self), strict=True))
+
+
+EVALUATED = tuple(field.name.rstrip("_") for field in fields(Evaluation))
+"""Names of the measures of an ``Evaluation`` in files."""
 
 
 @torch.no_grad()
@@ -52,7 +60,7 @@ def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = Tr
         env: environment of B worlds, with ``message`` among its extras.
         policy: chooses the actions.
         horizon: number of steps after which an episode that has not ended is cut.
-        sample: whether to draw actions from the policy's distribution; else its mode is taken.
+        sample: whether to draw actions from the policy's distribution; else the most likely one is taken.
     """
     add_recurrent_state(env, policy)
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
@@ -75,7 +83,7 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
         _ever(truth.status.success, in_true_episode),
     )
     can_succeed = server.episode.success_share is not None
-    steps, true_steps = (
+    perceived_steps, steps = (
         torch.where(succeeded | (not can_succeed), counted.sum(-1), horizon)
         for succeeded, counted in ((success, in_episode), (true_success, in_true_episode))
     )
@@ -84,12 +92,12 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
     late, lost = _message_shares(next_step, in_episode)
     return Evaluation(
         episodes=len(in_episode),
-        success_rate=_mean(success),
+        success_rate=_mean(true_success),
         steps=_mean(steps),
-        episode_return=_mean((next_step[keys.REWARD].squeeze(-1).mean(-1) * in_episode).sum(-1)),
-        true_success_rate=_mean(true_success),
-        true_steps=_mean(true_steps),
-        true_return=_mean((truth.reward.mean(-1) * in_true_episode).sum(-1)),
+        return_=_mean((truth.reward.mean(-1) * in_true_episode).sum(-1)),
+        perceived_success_rate=_mean(success),
+        perceived_steps=_mean(perceived_steps),
+        perceived_return=_mean((next_step[keys.REWARD].squeeze(-1).mean(-1) * in_episode).sum(-1)),
         age=_mean(age[in_episode]),
         late=late,
         lost=lost,
@@ -138,7 +146,7 @@ class EpisodeLog:
             in the paper's Figures 5 and 6.
     """
 
-    NAMES = ("episode_return", "success_rate", "steps")
+    NAMES = ("perceived_return", "perceived_success_rate", "perceived_steps")
 
     def __init__(self, factor: float = 0.991) -> None:
         self.factor, self.finished = factor, 0
@@ -165,7 +173,7 @@ class EpisodeLog:
         self._sums = [float(total) for total in state["sums"]]
 
     def means(self) -> dict[str, float]:
-        """Mean episode return, success rate and steps; nan before the first episode has ended."""
+        """Mean return, success rate and steps, perceived by the server; nan before an episode has ended."""
         if not self.finished:
             return dict.fromkeys(self.NAMES, math.nan)
         return {name: total / self._weight for name, total in zip(self.NAMES, self._sums, strict=True)}

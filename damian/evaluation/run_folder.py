@@ -2,7 +2,6 @@
 
 import io
 import math
-from dataclasses import asdict, fields
 from pathlib import Path
 
 from damian.common.atomic_files import write_atomically
@@ -17,6 +16,8 @@ REPLAY = "replay"
 CONFIG = "config.yaml"
 RESULTS = "result.csv"
 TABLE = "result.md"
+DETERMINISTIC = ", deterministic"
+"""Ending of the name of a policy whose most likely actions are taken, not drawn from its distribution."""
 
 
 def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: Path, title: str) -> None:
@@ -24,9 +25,9 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
     from matplotlib.figure import Figure  # noqa: PLC0415 (slow to import, needed once)
     from matplotlib.ticker import EngFormatter  # noqa: PLC0415
 
-    panels = [("episode_return", "return", random.episode_return)]
-    if any(row["success_rate"] > 0 for row in rows):
-        panels.append(("success_rate", "success rate", random.success_rate))
+    panels = [("perceived_return", "return", random.perceived_return)]
+    if any(row["perceived_success_rate"] > 0 for row in rows):
+        panels.append(("perceived_success_rate", "success rate", random.perceived_success_rate))
     figure = Figure(figsize=(5 * len(panels), 3.4))
     axes = figure.subplots(1, len(panels), squeeze=False)
     for axis, (name, label, level) in zip(axes[0], panels, strict=True):
@@ -46,8 +47,8 @@ def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: 
     write_atomically(path, image.getvalue())
 
 
-SEEN = """seen: as the server perceived it, else as it truly was; age: mean age of what the server holds
-[steps]; late and lost: shares of the messages."""
+LATE = """perceived: as far as the server knew; all else as it truly was; age: mean age of the messages at the
+server [steps]; late and lost: shares of the messages."""
 """Lines under a table of evaluations in which messages are delayed."""
 
 
@@ -61,41 +62,49 @@ def save_results(
         folder: the run folder.
         can_succeed: as for ``results_table``.
         late: as for ``results_table``.
-        note: what stands under the table, before what its columns mean.
+        note: lines under the table, before those that explain its columns.
 
     Returns:
-        the table, with what stands under it.
+        the table, with the lines under it.
     """
-    below = "\n".join(filter(None, [note, SEEN if late else ""]))
+    below = "\n".join(filter(None, [note, LATE if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
-    head = ["policy", *(field.name for field in fields(Evaluation))]
-    results = csv_table([head, *([name, *asdict(row).values()] for name, row in rows.items())])
+    measures = next(iter(rows.values())).row()
+    results = csv_table([["policy", *measures], *([name, *row.row().values()] for name, row in rows.items())])
     write_atomically(folder / RESULTS, results)  # last: with it, a run counts as finished
     return table
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
-    """Evaluations of several policies as a Markdown table.
+    """Evaluations of several policies as a Markdown table, with a line for each policy.
+
+    The same policy with its most likely actions, NAME``, deterministic`` in ``rows``, has two columns of the
+    line of NAME.
 
     Args:
         rows: evaluations by name of the policy.
         can_succeed: whether the task can succeed; if so, success rate and steps are shown.
-        late: whether messages are delayed; if so, what the server has seen stands beside what has truly
-            happened, with the age of information and the shares of late and lost messages.
+        late: whether messages are delayed; if so, the return that the server perceived, the age of
+            information and the shares of late and lost messages are shown too.
     """
-    success = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
-    columns = seen = success | {"return": "episode_return"}
+    columns = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
+    columns |= {"return": "return"}
+    has_both = any(name.endswith(DETERMINISTIC) for name in rows)
+    likely = columns.copy() if has_both else {}
     if late:
-        columns = {title: f"true_{field}" for title, field in success.items()} | {"return": "true_return"}
-        columns |= {f"seen {title}": field for title, field in seen.items()}
-        columns |= {"age": "age", "late": "late", "lost": "lost"}
-    columns |= {"episodes": "episodes"}
-    lines = (
-        [name, *(_number(getattr(row, field)) for field in columns.values())] for name, row in rows.items()
-    )
-    return markdown_table(["policy", *columns], lines)
+        columns |= {"perceived return": "perceived_return", "age": "age", "late": "late", "lost": "lost"}
+    lines = []
+    for name, evaluation in rows.items():
+        if not name.endswith(DETERMINISTIC):
+            row, other = evaluation.row(), rows.get(name + DETERMINISTIC)
+            found = [other.row()[measure] if other else math.nan for measure in likely.values()]
+            lines.append(
+                [name, *(_number(row[measure]) for measure in columns.values()), *map(_number, found)]
+            )
+    head = ["policy", *columns, *(f"{title}, deterministic" for title in likely)]
+    return markdown_table(head, lines)
 
 
 def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:.2f}"
+    return "" if math.isnan(value) else f"{value:.2f}"

@@ -99,7 +99,7 @@ class TrainingState:
         Raises:
             RunError: it cannot be written; the older one is intact.
         """
-        mean = self.episodes.means()["episode_return"]
+        mean = self.episodes.means()["perceived_return"]
         if mean > self.progress.best:
             self.progress.best = mean
             networks = {name: part.state_dict() for name, part in self.components.items()}

@@ -14,7 +14,7 @@ from typing import Any
 from damian.common.atomic_files import write_atomically
 from damian.common.csv_table import csv_table
 from damian.common.errors import InputError
-from damian.evaluation.comparison import MEASURES, MODE, SAMPLED, Arm, Row, regime
+from damian.evaluation.comparison import MEASURES, OF_ARM, Arm, Row, regime
 from damian.evaluation.comparison_figures import LABELS
 from damian.evaluation.metrics_log import METRICS, read_metrics
 from damian.evaluation.run_record import read_record
@@ -73,9 +73,7 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
             "seconds": read_record(run.folder).get("wall_time_s", math.nan),
         }
         for row in run.results():
-            learnt = {
-                "backupdated": _share_backupdated(metrics) if row["policy"] in (SAMPLED, MODE) else math.nan
-            }
+            learnt = {"backupdated": _share_backupdated(metrics) if row["policy"] in OF_ARM[:2] else math.nan}
             without = {} if succeeds else {name: math.nan for name in row if name.endswith("success_rate")}
             rows.append(label | of_run | learnt | row | without)
     return Results(rows, points)
@@ -119,7 +117,7 @@ def _value(name: str, text: str) -> Any:
 
 def _point(row: Mapping[str, float], succeeds: bool) -> dict[str, float]:
     numbers = {name: float(f"{row[name]:.5g}") for name in ("frames", "episodes", *LABELS)}
-    return numbers if succeeds else numbers | {"success_rate": math.nan}
+    return numbers if succeeds else numbers | {"perceived_success_rate": math.nan}
 
 
 def _thinned(rows: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:

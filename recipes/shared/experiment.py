@@ -70,6 +70,9 @@ class Experiment:
         for name, arm in self.arms.items():
             if arm.regime:
                 checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))
+            should = "trains nothing: it has no policy_of and no ceiling, and delayed is not false"
+            alone = arm.delayed and arm.policy_of is None and not arm.ceiling
+            checks.require(alone or not arm.untrained, f"experiment.arms.{name}", "untrained", should)
             if arm.ceiling:
                 should = "flies the script under delay: it has no policy_of, and delayed is not false"
                 good = arm.policy_of is None and arm.delayed

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from multiprocessing.synchronize import Event
@@ -27,7 +27,7 @@ from tqdm import tqdm
 from damian.common.errors import InputError, RunError
 from damian.evaluation.checkpoint import stored_digest
 from damian.evaluation.interrupt import exit_code
-from damian.evaluation.metrics import Evaluation
+from damian.evaluation.metrics import EVALUATED
 from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.evaluation.run_lock import locked
 from damian.evaluation.run_record import POLICY, read_record
@@ -99,8 +99,7 @@ class Run:
                     {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
                     for row in csv.DictReader(lines)
                 ]
-            names = {measure.name for measure in fields(Evaluation)}
-            if missing := [name for name in sorted(names) if not rows or name not in rows[0]]:
+            if missing := [name for name in EVALUATED if not rows or name not in rows[0]]:
                 raise ValueError(f"no {missing[0]}")
             return rows
         except (KeyError, TypeError, ValueError) as error:

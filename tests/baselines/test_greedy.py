@@ -314,7 +314,7 @@ def test_with_any_number_of_uavs_the_policy_is_clearly_better_than_the_random_on
         scores = []
         for policy in (greedy_policy(env), random_policy(env)):
             env.set_seed(5)
-            scores.append(evaluate(env, policy, 50).true_return)
+            scores.append(evaluate(env, policy, 50).return_)
         assert scores[0] > 2 * scores[1]
 
 

@@ -75,8 +75,8 @@ def test_a_scripted_policy_and_an_evaluation_do_the_same_with_sensors(delay):
 def test_an_evaluation_recomputes_rewards_that_depend_on_readings():
     env = make_env(sensing(), 4, seed=3, extras=["message"])
     result = evaluate(env, greedy_policy(env), 12)
-    assert result.true_return == pytest.approx(result.episode_return)
-    assert result.true_return > 0
+    assert result.return_ == pytest.approx(result.perceived_return)
+    assert result.return_ > 0
 
 
 @both_motions

@@ -8,10 +8,10 @@ from matplotlib.text import Annotation, Text
 from damian.evaluation.belief_figure import COLOURS
 from damian.evaluation.comparison import (
     ALL_MESSAGES,
-    GREEDY,
-    MODE,
     RANDOM,
-    SAMPLED,
+    SCRIPT,
+    TRAINED,
+    TRAINED_DETERMINISTIC,
     Arm,
     Comparison,
     regime,
@@ -39,10 +39,17 @@ def test_the_regime_of_an_arm_follows_from_its_delays_unless_it_is_given():
     assert {name: regime(arms, name) for name in arms} == expected
 
 
-def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = SAMPLED) -> dict:
+def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = TRAINED) -> dict:
     """A row of results in which every measure has the same value."""
     labels = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
-    names = ("true_return", "true_success_rate", "true_steps", "episode_return", "success_rate", "steps")
+    names = (
+        "return",
+        "success_rate",
+        "steps",
+        "perceived_return",
+        "perceived_success_rate",
+        "perceived_steps",
+    )
     of_run = {"frames": 400, "seconds": 36.0}
     return labels | of_run | dict.fromkeys((*names, "age", "late", "lost", "backupdated", "episodes"), value)
 
@@ -53,7 +60,7 @@ def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float
         row(task, "none" if arm == "best" else delay, arm, seed, x, policy)
         for arm, values in scores.items()
         for seed, value in enumerate(values)
-        for policy, x in ((SAMPLED, value), (MODE, value), (RANDOM, random))
+        for policy, x in ((TRAINED, value), (TRAINED_DETERMINISTIC, value), (RANDOM, random))
     ]
 
 
@@ -90,7 +97,7 @@ def test_recovery_is_left_out_if_the_delay_costs_nothing():
 
 def test_fewer_steps_give_a_higher_score():
     steps = {arm: [20 - x for x in values] for arm, values in THREE.items()}
-    by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "true_steps").compared("t", "late")
+    by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "steps").compared("t", "late")
     by_return = Comparison(rows_of("t", "late", THREE), ARMS).compared("t", "late")
     for arm, expected in by_return.items():
         np.testing.assert_allclose(by_steps[arm][1:], expected[1:])
@@ -132,16 +139,20 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     lines = Comparison(rows_of("t", "late", THREE), ARMS).lines
     labels = [(line.delay, line.arm, line.policy) for line in lines]
     assert labels == [
-        ("none", "best", SAMPLED),
-        ("none", "best", MODE),
+        ("none", "best", TRAINED),
+        ("none", "best", TRAINED_DETERMINISTIC),
         ("none", RANDOM, RANDOM),
-        *[("late", arm, policy) for arm in ("blind", "flown", "aware") for policy in (SAMPLED, MODE)],
+        *[
+            ("late", arm, policy)
+            for arm in ("blind", "flown", "aware")
+            for policy in (TRAINED, TRAINED_DETERMINISTIC)
+        ],
         ("late", RANDOM, RANDOM),
     ]
     cells = lines[7].cells()
-    assert [cells[name] for name in ("arm", "regime", "policy")] == ["aware", "R0", SAMPLED]
+    assert [cells[name] for name in ("arm", "regime", "policy")] == ["aware", "R0", TRAINED]
     assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
-    value, low, high = (cells[f"true_return{end}"] for end in ("", "_low", "_high"))
+    value, low, high = (cells[f"return{end}"] for end in ("", "_low", "_high"))
     assert value == pytest.approx(22 / 3)
     assert low < value < high
     assert cells["J_norm"] == pytest.approx(22 / 30)
@@ -153,23 +164,23 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
 
 def test_the_table_lists_the_greedy_policy_where_it_was_evaluated():
     rows = rows_of("t", "late", SCORES)
-    greedy = [row("t", delay, arm, 0, 7.0, GREEDY) for delay, arm in (("none", "best"), ("late", "blind"))]
+    greedy = [row("t", delay, arm, 0, 7.0, SCRIPT) for delay, arm in (("none", "best"), ("late", "blind"))]
     table = markdown(Comparison(rows + greedy, ARMS), [])
-    cells = [line.split(" |")[:5] for line in table.splitlines() if "greedy" in line]
-    names = ("greedy (undelayed)", "greedy")
+    cells = [line.split(" |")[:5] for line in table.splitlines() if "script" in line]
+    names = ("script (undelayed)", "script")
     assert cells == [[f"| {name}", " ", " greedy", " 1", " 7.000"] for name in names]
 
 
 def test_the_interval_of_a_share_lies_between_0_and_1_and_that_of_a_length_is_not_negative():
     scores = {arm: [1.0, 0.99, 0.9] for arm in THREE} | {"aware": [0.0, 0.02, 0.01]}
-    comparison = Comparison(rows_of("t", "late", scores), ARMS, "true_success_rate")
+    comparison = Comparison(rows_of("t", "late", scores), ARMS, "success_rate")
     best, aware = (comparison.mean("t", *place) for place in (("none", "best"), ("late", "aware")))
     assert (best.high, aware.low) == (1, 0)
     for line in comparison.lines:
-        for name in ("true_success_rate", "success_rate", "late", "lost", "backupdated"):
+        for name in ("success_rate", "perceived_success_rate", "late", "lost", "backupdated"):
             assert 0 <= line.measures[name].low <= line.measures[name].high <= 1, name
-        assert min(line.measures[name].low for name in ("true_steps", "steps", "age")) >= 0
-    assert comparison.lines[0].measures["true_return"].high > 1
+        assert min(line.measures[name].low for name in ("steps", "perceived_steps", "age")) >= 0
+    assert comparison.lines[0].measures["return"].high > 1
 
 
 def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
@@ -198,19 +209,19 @@ def test_the_share_of_a_script_that_may_win_nothing_has_no_end():
 def test_arms_are_listed_where_no_arm_without_delay_ran(tmp_path):
     scores = {name: values for name, values in SCORES.items() if name in ("blind", "aware")}
     comparison = Comparison(rows_of("t", "late", scores), {name: ARMS[name] for name in scores})
-    assert "| aware | R0 | trained, sampled | 2 | 7.500 |" in markdown(comparison, [])
+    assert "| aware | R0 | trained | 2 | 7.500 |" in markdown(comparison, [])
     assert comparison.compared("t", "late") == {}
-    plot_curves(comparison, {}, {"steps": 1.0}, tmp_path / "curves.png")
+    plot_curves(comparison, {}, {"perceived_steps": 1.0}, tmp_path / "curves.png")
     plot_norms(comparison, tmp_path / "norms.png")
 
 
 def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
-    never = {"success_rate": np.nan, "true_success_rate": np.nan}
+    never = {"perceived_success_rate": np.nan, "success_rate": np.nan}
     rows = rows_of("t", "late", SCORES) + [each | never for each in rows_of("u", "late", SCORES)]
     text = markdown(Comparison(rows, ARMS), ["a note"])
     first, second, overall, compute = text.split("##")[1:]
     assert "Trained for 400 environment steps." in first
-    aware = "| aware | R0 | trained, sampled | 2 | 7.500 |"
+    aware = "| aware | R0 | trained | 2 | 7.500 |"
     assert aware + " 7.500" in first
     assert aware + " - |" in second
     assert "| 2 | 0.750 | 0.583 | 1.000 | - |" in first
@@ -220,14 +231,17 @@ def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
 
 def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finished_episode(tmp_path):
     comparison = Comparison(rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES), ARMS)
-    curve = [{"episodes": n, "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in range(5)]
+    curve = [
+        {"episodes": n, "perceived_return": n / 9, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
+        for n in range(5)
+    ]
     unfinished = [dict.fromkeys(curve[0], np.nan) | {"episodes": 0.0}]
     curves = {("t", "none", "best"): [curve, curve[1:]], ("t", "late", "blind"): [unfinished, unfinished]}
-    plot_curves(comparison, curves, {"steps": 1.0}, tmp_path / "curves.png")
+    plot_curves(comparison, curves, {"perceived_steps": 1.0}, tmp_path / "curves.png")
     plot_norms(comparison, tmp_path / "norms.png")
     plot_delays(comparison, {"learning": ["blind", "aware"], "acting": ["aware"]}, tmp_path / "delays.png")
     one = Comparison(rows_of("t", "late", SCORES), ARMS)
-    plot_curves(one, curves, {"steps": 1.0}, tmp_path / "one.png")
+    plot_curves(one, curves, {"perceived_steps": 1.0}, tmp_path / "one.png")
     names = ("curves.png", "norms.png", "delays.png", "one.png")
     assert all((tmp_path / name).stat().st_size > 10_000 for name in names)
 
@@ -258,7 +272,7 @@ def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other
 
 
 def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch, tmp_path):
-    unknown = [each | {"true_return": np.nan} for each in rows_of("u", "late", SCORES)]
+    unknown = [each | {"return": np.nan} for each in rows_of("u", "late", SCORES)]
     comparison = Comparison(unknown + rows_of("t", "late", SCORES), ARMS)
     path = tmp_path / "figure.png"
     figure = drawn(monkeypatch, lambda: plot_norms(comparison, path))
@@ -276,7 +290,10 @@ def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch
 def test_the_legend_of_learning_curves_names_an_arm_that_ran_under_one_delay_only(monkeypatch, tmp_path):
     rows = rows_of("t", "late", SCORES)
     rows += [each for each in rows_of("t", "later", SCORES) if each["arm"] not in ("best", "flown")]
-    curve = [{"episodes": n, "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in range(5)]
+    curve = [
+        {"episodes": n, "perceived_return": n / 9, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
+        for n in range(5)
+    ]
     two = Comparison(rows + [each | {"task": "u"} for each in rows], ARMS)
     curves = {("t", "none", "best"): [curve]}
     figure = drawn(monkeypatch, lambda: plot_curves(two, curves, {}, tmp_path / "curves.png"))
@@ -287,7 +304,15 @@ def test_the_legend_of_learning_curves_names_an_arm_that_ran_under_one_delay_onl
 @pytest.mark.parametrize(("first", "drawn_over"), [(3, [3.0, 4.0]), (5, [])])
 def test_a_learning_curve_is_drawn_where_all_of_its_runs_have_been(first, drawn_over, monkeypatch, tmp_path):
     runs = [
-        [{"episodes": float(n), "episode_return": n / 9, "success_rate": 0.5, "steps": 9.0} for n in episodes]
+        [
+            {
+                "episodes": float(n),
+                "perceived_return": n / 9,
+                "perceived_success_rate": 0.5,
+                "perceived_steps": 9.0,
+            }
+            for n in episodes
+        ]
         for episodes in (range(5), range(first, 9))
     ]
     comparison = Comparison(rows_of("t", "late", SCORES), ARMS)
@@ -302,7 +327,7 @@ def test_a_learning_curve_is_drawn_where_all_of_its_runs_have_been(first, drawn_
 def test_curves_are_over_steps_if_all_runs_made_as_many_and_else_over_episodes(
     last, label, monkeypatch, tmp_path
 ):
-    measures = {"episode_return": 1.0, "success_rate": 0.5, "steps": 9.0}
+    measures = {"perceived_return": 1.0, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
     fast, slow = (
         [{"frames": end * n / 4, "episodes": many * n, **measures} for n in range(5)]
         for end, many in ((500.0, 90), (last, 9))

@@ -79,25 +79,25 @@ def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
 
 def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[str, Any]:
     """Measures of the first episode of a flight [T], counted step by step."""
-    row = {"episode_return": 0.0, "true_return": 0.0, "success": False, "true_success": False}
-    row |= {"true_steps": HORIZON}
+    row = {"perceived_return": 0.0, "return": 0.0, "success": False, "true_success": False}
+    row |= {"steps": HORIZON}
     truly_over = False
     for t in range(1, HORIZON + 1):
         next_step = world["next"][t - 1]
-        row["episode_return"] += next_step["agents", "reward"].mean().item()
+        row["perceived_return"] += next_step["agents", "reward"].mean().item()
         row["success"] |= next_step["success"].item()
         truth, steps = Messages.unpack(next_step["agents", "message"][None]), torch.tensor([t])
         undelayed = server.reward_and_status(
             server.features(truth, steps), truth, steps, torch.zeros(1, dtype=torch.bool)
         )
         if not truly_over:
-            row["true_return"] += undelayed.reward.mean().item()
+            row["return"] += undelayed.reward.mean().item()
         if truth.spotted.sum() >= needed and not truly_over:
             row["true_success"] = truly_over = True
-            row["true_steps"] = t
+            row["steps"] = t
         if next_step["done"].item():
             break
-    row["steps"] = t if row["success"] else HORIZON
+    row["perceived_steps"] = t if row["success"] else HORIZON
     return row | delays_by_hand(world, t)
 
 
@@ -112,11 +112,11 @@ def by_hand(flight: TensorDictBase, server: Server, needed: int) -> tuple[dict[s
         values = [value for row in rows for value in row[name]]
         return sum(values) / len(values)
 
-    averaged = ("steps", "episode_return", "true_steps", "true_return")
+    averaged = ("perceived_steps", "perceived_return", "steps", "return")
     means = {
         "episodes": len(rows),
-        "success_rate": mean("success"),
-        "true_success_rate": mean("true_success"),
+        "perceived_success_rate": mean("success"),
+        "success_rate": mean("true_success"),
     }
     pooled = {name: mean_over_all(name) for name in ("age", "late", "lost")}
     return means | {name: mean(name) for name in averaged} | pooled, rows
@@ -129,8 +129,8 @@ def test_an_evaluation_equals_counting_step_by_step(motion, delay):
     flight, server = fly(joint_spotting(motion, DELAYS[delay]))
     expected, _ = by_hand(flight, server, needed=2)
     assert asdict(evaluation(flight, server)) == pytest.approx(expected, rel=1e-5)
-    assert 0 < expected["success_rate"] <= 1
-    assert 0 < expected["true_success_rate"] < 1
+    assert 0 < expected["perceived_success_rate"] <= 1
+    assert 0 < expected["success_rate"] < 1
 
 
 @both_motions
@@ -139,14 +139,14 @@ def test_false_late_and_missed_successes_differ_from_true_ones(motion):
     flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.2)), 256)
     expected, rows = by_hand(flight, server, needed=2)
     false = [row for row in rows if row["success"] and not row["true_success"]]
-    late = [row for row in rows if row["success"] and row["true_steps"] < row["steps"]]
+    late = [row for row in rows if row["success"] and row["steps"] < row["perceived_steps"]]
     missed = [row for row in rows if row["true_success"] and not row["success"]]
     assert false
     assert late
     assert missed
-    assert all(row["steps"] < row["true_steps"] == HORIZON for row in false)
+    assert all(row["perceived_steps"] < row["steps"] == HORIZON for row in false)
     row = evaluation(flight, server)
-    assert row.true_success_rate - row.success_rate == pytest.approx((len(missed) - len(false)) / 256)
+    assert row.success_rate - row.perceived_success_rate == pytest.approx((len(missed) - len(false)) / 256)
     assert asdict(row) == pytest.approx(expected, rel=1e-5)
 
 
@@ -157,10 +157,10 @@ def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion)
     for scenario in (joint_spotting(motion, DelayConfig()), stops):
         flight, server = fly(scenario)
         row = evaluation(flight, server)
-        assert (row.true_success_rate, row.true_steps, row.true_return) == (
-            row.success_rate,
-            row.steps,
-            row.episode_return,
+        assert (row.success_rate, row.steps, row.return_) == (
+            row.perceived_success_rate,
+            row.perceived_steps,
+            row.perceived_return,
         )
         assert (row.late, row.lost) == (0.0, 0.0)
         assert (row.age == 0) == (motion == "instant")
@@ -179,14 +179,19 @@ def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_o
     env = make_env(joint_spotting(motion, DelayConfig(), **sections), 24, seed=2, extras=["message"])
     same = env.rollout(HORIZON, again, break_when_any_done=False)
     late, on_time = evaluation(flight, server), evaluation(same, env.server)
-    assert on_time.true_return == on_time.episode_return == pytest.approx(late.true_return, rel=1e-6)
-    assert late.episode_return != pytest.approx(late.true_return, rel=0.01)
+    assert on_time.return_ == on_time.perceived_return == pytest.approx(late.return_, rel=1e-6)
+    assert late.perceived_return != pytest.approx(late.return_, rel=0.01)
 
 
 def test_an_episode_without_an_end_counts_the_horizon():
     endless = joint_spotting("instant", DELAYS["constant"], episode=EpisodeConfig(max_steps=None))
     row = evaluation(*fly(endless))
-    assert (row.steps, row.true_steps, row.success_rate, row.true_success_rate) == (HORIZON, HORIZON, 0, 0)
+    assert (row.perceived_steps, row.steps, row.perceived_success_rate, row.success_rate) == (
+        HORIZON,
+        HORIZON,
+        0,
+        0,
+    )
 
 
 def test_an_evaluation_flies_up_to_the_horizon_and_draws_actions():
@@ -199,7 +204,7 @@ def test_an_evaluation_flies_up_to_the_horizon_and_draws_actions():
     torch.manual_seed(1)
     flight = env().rollout(6, policy, break_when_any_done=False)
     assert row == evaluation(flight, env().server)
-    assert row.steps <= 6
+    assert row.perceived_steps <= 6
 
 
 # Measures in training.
@@ -225,7 +230,13 @@ def ended_episodes(batch: TensorDictBase) -> list[dict[str, float]]:
             sums[1] += 1
             if next_step["done"]:
                 success = float(next_step["success"])
-                ended.append({"episode_return": sums[0], "success_rate": success, "steps": float(sums[1])})
+                ended.append(
+                    {
+                        "perceived_return": sums[0],
+                        "perceived_success_rate": success,
+                        "perceived_steps": float(sums[1]),
+                    }
+                )
                 running[world] = [0.0, 0]
     return ended
 
@@ -241,7 +252,7 @@ def test_the_episode_log_is_an_exponential_mean_over_episodes_in_the_order_of_th
         weights = [factor**k for k in range(len(episodes))]
         weighted = [w * row[name] for w, row in zip(weights, reversed(episodes), strict=True)]
         assert mean == pytest.approx(sum(weighted) / sum(weights), rel=1e-5)
-    assert {row["success_rate"] for row in episodes} == {0.0, 1.0}
+    assert {row["perceived_success_rate"] for row in episodes} == {0.0, 1.0}
 
 
 def test_means_are_nan_before_any_episode_has_ended():
@@ -302,8 +313,8 @@ def test_rows_of_an_older_run_get_the_columns_that_a_newer_version_logs(tmp_path
 
 def test_a_broken_metrics_file_is_refused_with_its_line(tmp_path):
     log = MetricsLog(tmp_path, tensorboard=False, to_csv=True)
-    log.add(10, {"steps": 2.0})
-    assert read_metrics(tmp_path) == [{"frames": 10.0, "steps": 2.0}]
+    log.add(10, {"perceived_steps": 2.0})
+    assert read_metrics(tmp_path) == [{"frames": 10.0, "perceived_steps": 2.0}]
     with (tmp_path / "metrics.csv").open("a") as file:
         file.write("20,many\n")
     with pytest.raises(InputError, match=r"metrics\.csv, line 3: not a row of numbers"):

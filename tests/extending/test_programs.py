@@ -121,7 +121,7 @@ def test_a_scenario_of_ones_own_is_trained_with_a_learner_and_a_logger_of_ones_o
     assert config.learner.name == "learner:ReinforceConfig"
     assert (config.agents, config.delay.obs.law) == (2, "law:Distance")
     *_, progress = (first / "progress.txt").read_text().splitlines()
-    assert progress == f"128 steps: {float(metrics['episode_return']) / 2:.0%}"
+    assert progress == f"128 steps: {float(metrics['perceived_return']) / 2:.0%}"
     assert json.loads((first / "run.json").read_text())["config_dir"] == str(folder / "conf")
     # The learner and the folder of configuration files are found again.
     # The policy keeps its action history, which a file of the scenario has chosen.

@@ -187,7 +187,7 @@ def test_an_evaluation_carries_hidden_states_and_starts_from_zeros():
     env.set_seed(1)
     assert evaluate(env, actor, 9, sample=False) == first
     carried, forgotten = (return_by_hand(delayed_env(), actor, forgets) for forgets in (False, True))
-    assert first.episode_return == pytest.approx(carried, rel=1e-6)
+    assert first.perceived_return == pytest.approx(carried, rel=1e-6)
     assert carried != pytest.approx(forgotten, rel=1e-3)
 
 

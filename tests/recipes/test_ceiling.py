@@ -27,7 +27,7 @@ def returns(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["damian ceiling", *WORDS])
     launch(ceiling.main)
     with (tmp_path / "ceiling/result.csv").open(newline="") as file:
-        return {row["policy"]: float(row["true_return"]) for row in csv.DictReader(file)}
+        return {row["policy"]: float(row["return"]) for row in csv.DictReader(file)}
 
 
 def test_who_knows_more_on_time_wins_more(returns):

@@ -11,7 +11,7 @@ import pytest
 from helpers import check_refused
 from hydra import initialize_config_dir
 
-from damian.evaluation.comparison import CEILING, SAMPLED, Arm
+from damian.evaluation.comparison import CEILING, TRAINED, Arm
 from damian.evaluation.run_lock import locked
 from damian.recipes.compare import CompareConfig, Experiment, main, plan
 from damian.recipes.evaluate import fly
@@ -90,11 +90,11 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     typed = re.search(r"^- `damian compare (.*)`$", text, re.MULTILINE)[1]
     assert shlex.split(typed) == ["--config-dir", "my files", *TWO]
     rows = table(folder / "results.csv")
-    assert len(rows) == 4 * 4
-    unaware = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("unaware", SAMPLED, "paper")]
+    assert len(rows) == 4 * 6
+    unaware = [r for r in rows if (r["arm"], r["policy"], r["delay"]) == ("unaware", TRAINED, "paper")]
     assert [r["seed"] for r in unaware] == ["8", "9"]
-    stored = [table(folder / "usecase2" / name / "result.csv")[0]["true_return"] for name in runs[2:]]
-    assert [float(r["true_return"]) for r in unaware] == [float(number) for number in stored]
+    stored = [table(folder / "usecase2" / name / "result.csv")[2]["return"] for name in runs[2:]]
+    assert [float(r["return"]) for r in unaware] == [float(number) for number in stored]
 
     before = stamps(folder)
     (folder / "usecase2" / runs[3] / "result.csv").unlink()  # as after Ctrl-C during the evaluation
@@ -140,7 +140,7 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     texts = [(place / "table.md").read_text() for place in (folder, kept)]
     assert len({re.sub("`damian compare .*`", "", text) for text in texts}) == 1
     compare(*words[:2], "arms=[undelayed]", *stored)
-    assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "greedy"}
+    assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "script"}
     late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
     check_refused(lambda: compare(*words, *late), problem, capsys)
     for text, problem in ("seed\nx\n", "it does not hold"), ("seed\n8\n", "(no column task)"):
@@ -200,7 +200,7 @@ def test_an_unfinished_policy_is_not_flown(tmp_path, monkeypatch):
     source.mkdir(parents=True)
     (source / "best.pt").write_text("a checkpoint of a run that goes on")
     run = Run("t", "paper", "flown", TrainConfig(checkpoint=str(source)), tmp_path / "flown", fly)
-    assert perform_all([run], 1, (SAMPLED, "true_return")) == [run]
+    assert perform_all([run], 1, (TRAINED, "return")) == [run]
     assert f"{source} has no finished policy to fly" in (run.folder / "log.txt").read_text()
 
 
@@ -252,8 +252,8 @@ def test_ray_tasks_and_slurm_jobs_give_the_same_results_as_this_process(compare,
         (["launcher=cloud"], "launcher: cloud is not one of local, ray, slurm"),
         (["slurm={cluster: local}"], "slurm: {'cluster': 'local'} means nothing without launcher=slurm"),
         (["launcher=slurm", "slurm=cpu"], "slurm: cpu is no mapping such as {slurm_partition: cpu}"),
-        (["score=age"], "score: age is not one of true_return, "),
-        (["policy=best"], "policy: best is not one of sampled, mode"),
+        (["score=age"], "score: age is not one of return, "),
+        (["policy=best"], "policy: best is not one of sampled, deterministic"),
         (["experiment.arms.both.regime=R7"], "experiment.arms.both.regime: R7 is not one of R0, "),
         (
             ["experiment.arms.both.delayed=false"],
@@ -310,7 +310,7 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
         ),
         (
             "tasks: {coverage: [scenario=coverage]}\narms: {undelayed: {delayed: false}}\n",
-            "score: true_success_rate is in none of the tasks anything that can be reached",
+            "score: success_rate is in none of the tasks anything that can be reached",
         ),
         (
             "tasks: {a: [scenario=tracking]}\ndelays: {up: [links=updown, delay.obs=2]}\n"
@@ -322,7 +322,7 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
 def test_a_mistake_in_an_experiment_of_ones_own_is_one_line(compare, capsys, tmp_path, text, message):
     (tmp_path / "own" / "experiment").mkdir(parents=True)
     (tmp_path / "own" / "experiment" / "mine.yaml").write_text(text)
-    score = ["score=true_success_rate"] * message.startswith("score")
+    score = ["score=success_rate"] * message.startswith("score")
     check_refused(lambda: compare("--config-dir=own", "experiment=mine", *score), message, capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
@@ -382,7 +382,7 @@ def test_a_run_with_a_damaged_file_is_refused_and_not_left_out_of_the_report(com
     for file, text, message in (
         ("result.csv", "", "it does not hold the results of a run (no age); delete the folder"),
         ("result.csv", "policy,episodes\nx,3\n", "it does not hold the results of a run (no age)"),
-        ("metrics.csv", "frames,episodes\n8,1\n", "metrics.csv, line 1: no column episode_return"),
+        ("metrics.csv", "frames,episodes\n8,1\n", "metrics.csv, line 1: no column perceived_return"),
     ):
         whole = (run / file).read_text()
         (run / file).write_text(text)

@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 import damian
 from damian.common.errors import InputError
+from damian.evaluation.comparison import OF_ARM
 from damian.recipes import evaluate, train
 from damian.recipes.shared.inheritance import check_policy_fits, note_what_a_history_holds
 from damian.recipes.shared.launch import composed_config, launch
@@ -72,8 +73,8 @@ def test_without_overrides_the_evaluation_after_the_training_is_repeated(fly, tr
     assert {path.name for path in folder.iterdir()} == {"config.yaml", "result.csv", "result.md", "run.json"}
     assert (folder / "result.md").read_text().strip() in capsys.readouterr().out
     again, before = results(folder), results(trained)
-    assert again.keys() == before.keys() == {"trained, sampled", "trained, mode", "random", "greedy"}
-    assert again["trained, mode"] == before["trained, mode"]
+    assert again.keys() == before.keys() == {*OF_ARM, "random", "script"}
+    assert again["trained, deterministic"] == before["trained, deterministic"]
     config, other = (OmegaConf.load(path / "config.yaml") for path in (folder, trained))
     differ = {name for name in other if config[name] != other[name]}
     assert differ == {"checkpoint", "overrides"}
@@ -82,7 +83,7 @@ def test_without_overrides_the_evaluation_after_the_training_is_repeated(fly, tr
 def test_a_policy_trained_with_three_uavs_flies_ten(fly):
     folder = fly("agents=10", "eval_episodes=5")
     assert OmegaConf.load(folder / "config.yaml").agents == 10
-    assert results(folder)["trained, mode"]["episodes"] == 5
+    assert results(folder)["trained, deterministic"]["episodes"] == 5
 
 
 def test_a_policy_of_sac_is_evaluated_like_one_of_mappo(fly, tmp_path, monkeypatch):

@@ -330,7 +330,7 @@ def test_sigterm_stops_a_run_after_its_update(run, capsys, monkeypatch):
 
 def test_no_policy_is_the_best_while_only_short_episodes_can_have_ended(run):
     folder = run(*TINY, "scenario=spotting", "episode.success_share=0.3", "episode.max_steps=100")
-    assert read_metrics(folder)[-1]["success_rate"] == 1  # because failed episodes go on
+    assert read_metrics(folder)[-1]["perceived_success_rate"] == 1  # because failed episodes go on
     assert not (folder / "best.pt").exists()
 
 
@@ -339,7 +339,7 @@ def test_the_best_policy_of_a_run_can_be_flown(run, monkeypatch):
     folder = run(*TINY, "frames=640")
     best = read_checkpoint(folder / "best.pt", "test")
     assert best["training"]["progress"]["best"] == max(
-        row["episode_return"] for row in read_metrics(folder)[2::3]
+        row["perceived_return"] for row in read_metrics(folder)[2::3]
     )
     monkeypatch.setattr("sys.argv", ["evaluate.py", "checkpoint=run/best.pt", "hydra.run.dir=flown"])
     launch(evaluate.main)

@@ -16,7 +16,7 @@ def test_weights_and_biases_keeps_an_offline_run_that_a_resumed_one_continues(ru
     folder = run(*TINY, "logger=wandb", folder="first")
     (kept,) = (folder / "wandb").glob("offline-run-*/*.wandb")
     written = kept.read_bytes()
-    assert all(word in written for word in (b"episode_return", b"delay.obs", b"histogram"))
+    assert all(word in written for word in (b"perceived_return", b"delay.obs", b"histogram"))
     number = (folder / "wandb_id.txt").read_text()
     assert number in kept.name
     run(f"resume={folder}", "frames=384", folder="second")

@@ -44,6 +44,12 @@ def trials_in(folder):
     return optuna.load_study(study_name="damian", storage=storage).get_trials()
 
 
+def test_a_search_that_is_continued_draws_new_trials(search):
+    for trials in (1, 2, 3):
+        folder = search(f"trials={trials}")
+    assert len({trial.params["learner.lr"] for trial in trials_in(folder)}) == 3
+
+
 def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys):
     folder = search("trials=2")
     printed = capsys.readouterr().out
@@ -52,13 +58,13 @@ def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys
     assert found[0]["learner.lr"] != found[1]["learner.lr"]
     for row, trial in zip(found, trials_in(folder), strict=True):
         results = {each["policy"]: each for each in rows(folder / f"trial_{row['trial']}" / "result.csv")}
-        assert trial.value == pytest.approx(float(results["trained, sampled"]["true_return"]))
-        assert float(row["true_return"]) == pytest.approx(trial.value, rel=1e-3)
+        assert trial.value == pytest.approx(float(results["trained"]["return"]))
+        assert float(row["return"]) == pytest.approx(trial.value, rel=1e-3)
         assert float(row["learner.lr"]) == pytest.approx(trial.params["learner.lr"], rel=1e-5)
         text = (folder / f"trial_{row['trial']}" / "config.yaml").read_text()
         assert f"learner.lr={row['learner.lr']}" in text
         assert f"model.hidden={row['model.hidden']}" in text
-    best = max(found, key=lambda row: float(row["true_return"]))
+    best = max(found, key=lambda row: float(row["return"]))
     assert f"learner.lr={best['learner.lr']}" in printed.split("The best:")[1]
     figures = {"history.png", "slices.png", "importances.png"}
     assert figures <= {path.name for path in folder.iterdir()}
@@ -71,9 +77,9 @@ def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys
 def test_the_best_of_scores_that_count_steps_is_the_least(search, capsys, monkeypatch):
     scores = iter([5.0, 3.0])
     monkeypatch.setattr(tune.Run, "score", lambda *_: next(scores))
-    folder = search("trials=2", "score=true_steps", "episode.max_steps=4")
+    folder = search("trials=2", "score=steps", "episode.max_steps=4")
     best = rows(folder / "trials.csv")[1]
-    assert best["true_steps"] == "3"
+    assert best["steps"] == "3"
     assert f"learner.lr={best['learner.lr']}" in capsys.readouterr().out.split("The best:")[1]
 
 
@@ -175,8 +181,11 @@ def test_every_learner_has_a_space(capsys):
         (["resume=x"], "resume: the same command"),
         (["trials=0"], "trials: 0"),
         (["checkpoint=first"], "checkpoint: first is not for a search, which trains every policy from"),
-        (["score=success_rate", "scenario=coverage"], "score: success_rate is the same for every policy"),
-        (["policy=greedy"], "policy: greedy is not one of sampled, mode"),
+        (
+            ["score=perceived_success_rate", "scenario=coverage"],
+            "score: perceived_success_rate is the same for every policy",
+        ),
+        (["policy=greedy"], "policy: greedy is not one of sampled, deterministic"),
         (["+search.learner.lrr.low=1", "+search.learner.lrr.high=2"], "search: "),
         (["-m", "seed=0,1"], "-m: "),
     ],
