@@ -43,7 +43,7 @@ class Experiment:
         for kind in ("tasks", "delays", "arms", "held_out"):
             for name in getattr(self, kind):
                 good = re.fullmatch(r"[\w.-]+", name) and name not in (NOT_LATE, *SCRIPTED)
-                should = "cannot name a folder: use letters, digits, _ . - but not none, random or greedy"
+                should = "cannot name a folder: use letters, digits, _ . - but not none, random or script"
                 checks.require(bool(good), f"experiment.{kind}", name, should)
         for kind in ("tasks", "arms"):
             if not getattr(self, kind):

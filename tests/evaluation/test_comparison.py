@@ -12,6 +12,7 @@ from damian.evaluation.comparison import (
     SCRIPT,
     TRAINED,
     TRAINED_DETERMINISTIC,
+    UNTRAINED,
     Arm,
     Comparison,
     regime,
@@ -162,13 +163,28 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
-def test_the_table_lists_the_greedy_policy_where_it_was_evaluated():
+def test_the_table_lists_the_script_where_it_was_evaluated():
     rows = rows_of("t", "late", SCORES)
-    greedy = [row("t", delay, arm, 0, 7.0, SCRIPT) for delay, arm in (("none", "best"), ("late", "blind"))]
-    table = markdown(Comparison(rows + greedy, ARMS), [])
+    script = [row("t", delay, arm, 0, 7.0, SCRIPT) for delay, arm in (("none", "best"), ("late", "blind"))]
+    table = markdown(Comparison(rows + script, ARMS), [])
     cells = [line.split(" |")[:5] for line in table.splitlines() if "script" in line]
     names = ("script (undelayed)", "script")
-    assert cells == [[f"| {name}", " ", " greedy", " 1", " 7.000"] for name in names]
+    assert cells == [[f"| {name}", " ", " script", " 1", " 7.000"] for name in names]
+
+
+def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its_own():
+    arms = ARMS | {"prior": Arm(untrained=True)}
+    rows = rows_of("t", "late", SCORES)
+    rows += [
+        row("t", "late", arm, seed, 2.0 + seed, UNTRAINED) for arm in ("aware", "prior") for seed in (0, 1)
+    ]
+    lines = [line for line in Comparison(rows, arms).lines if line.policy == UNTRAINED]
+    assert [line.arm for line in lines] == ["aware", "prior"]
+    assert all(line.measures["return"].value == 2.5 for line in lines)
+    aware, prior = (line.compared for line in lines)
+    assert aware.seeds == []  # only the trained policy of an arm is compared with others
+    assert prior.j_norm.value == pytest.approx(2.5 / 10)
+    assert prior.recovery.value == pytest.approx((2.5 - 4) / 6)
 
 
 def test_the_interval_of_a_share_lies_between_0_and_1_and_that_of_a_length_is_not_negative():

@@ -314,8 +314,8 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
         ),
         (
             "tasks: {a: [scenario=tracking]}\ndelays: {up: [links=updown, delay.obs=2]}\n"
-            "arms: {undelayed: {delayed: false}, script: {ceiling: true}}",
-            "a/up/script: links: updown is not supported",
+            "arms: {undelayed: {delayed: false}, known: {ceiling: true}}",
+            "a/up/known: links: updown is not supported",
         ),
     ],
 )
@@ -334,7 +334,7 @@ def test_a_comparison_flies_policies_in_held_out_tasks_and_the_script_that_knows
         """tasks:
   follow: [scenario=delaybench/tracking]
 delays: {late: [delay.obs=2]}
-arms: {best: {delayed: false}, naive: {naive: true}, script: {ceiling: true}}
+arms: {best: {delayed: false}, naive: {naive: true}, known: {ceiling: true}}
 held_out: {two: {overrides: [agents=2], tasks: [follow]}}
 """
     )
@@ -342,7 +342,7 @@ held_out: {two: {overrides: [agents=2], tasks: [follow]}}
     compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
     text = (tmp_path / "runs/script/table.md").read_text()
     for known, information in CEILING.items():
-        assert text.count(f"| script | {information} | {known} | 1 |") == 2
+        assert text.count(f"| known | {information} | {known} | 1 |") == 2
     assert "## follow@two, delay late\n\nPolicies of another task." in text
     results = tmp_path / "runs/script"
     for delay, arm in (("none", "best"), ("late", "naive")):
@@ -367,12 +367,12 @@ def test_runs_go_seed_by_seed_and_an_arm_does_its_tasks_only():
 
 
 def test_the_script_flies_only_where_messages_are_late():
-    arms = {"best": Arm(delayed=False), "script": Arm(ceiling=True)}
+    arms = {"best": Arm(delayed=False), "known": Arm(ceiling=True)}
     delays = {"late": ["delay.obs=2"], "act": ["delay.act=2"]}
     experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms)
     with initialize_config_dir(CONF, version_base=None):
         runs = plan(CompareConfig(experiment, seeds=1), Path("runs"))
-    assert [run.name for run in runs] == ["a/none/best/seed_0", "a/late/script/seed_0"]
+    assert [run.name for run in runs] == ["a/none/best/seed_0", "a/late/known/seed_0"]
 
 
 @pytest.mark.slow
@@ -380,8 +380,8 @@ def test_a_run_with_a_damaged_file_is_refused_and_not_left_out_of_the_report(com
     words = ["experiment=usecase2", "seeds=1", "arms=[undelayed]", listed(*SMALL)]
     run = compare(*words) / "usecase2" / "none" / "undelayed" / "seed_8"
     for file, text, message in (
-        ("result.csv", "", "it does not hold the results of a run (no age); delete the folder"),
-        ("result.csv", "policy,episodes\nx,3\n", "it does not hold the results of a run (no age)"),
+        ("result.csv", "", "it does not hold the results of a run (no episodes); delete the folder"),
+        ("result.csv", "policy,episodes\nx,3\n", "it does not hold the results of a run (no success_rate)"),
         ("metrics.csv", "frames,episodes\n8,1\n", "metrics.csv, line 1: no column perceived_return"),
     ):
         whole = (run / file).read_text()
