@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,6 +94,11 @@ def regime(arms: Mapping[str, Arm], name: str) -> str:
     return "R2" if not arms[arm.policy_of].delayed else regime(arms, arm.policy_of)
 
 
+def track(arms: Mapping[str, Arm], name: str) -> str:
+    """The track of an arm; no recovery mixes arms that learn from late data and arms that had a simulator."""
+    return "late data only" if regime(arms, name) == "R0" else "simulator allowed"
+
+
 class Estimate(NamedTuple):
     """A value and the ends of its 95 % interval, which are nan for fewer than three seeds."""
 
@@ -120,9 +126,9 @@ class Compared(NamedTuple):
     j_norm: Estimate
     """0: the random policy; 1: the undelayed arm."""
     recovery: Estimate = UNKNOWN
-    """0: the strongest naive arm; 1: the undelayed arm."""
+    """0: the strongest naive arm of the same track; 1: the undelayed arm."""
     improvement: Estimate = UNKNOWN
-    """Probability that a run of the arm beats one of the strongest naive arm."""
+    """Probability that a run of the arm beats one of the strongest naive arm of its track."""
     of_ceiling: Estimate = UNKNOWN
     """Score over that of the script which knows all messages on time, if an arm flies it."""
 
@@ -219,8 +225,11 @@ class Comparison:
         """Each delayed arm, over the seeds that it and all arms that it is compared with have finished."""
         scores = self.scores(task, delay)
         delayed = list(scores)[2:]
-        naive = [name for name in delayed if self.arms[name].naive]
-        found = {name: self._compared(scores, naive, name) for name in delayed}
+        found = {}
+        for name in delayed:
+            same_track = [other for other in delayed if track(self.arms, other) == track(self.arms, name)]
+            naive = [other for other in same_track if self.arms[other].naive]
+            found[name] = self._compared(scores, naive, name)
         ceiling = self.values(task, delay, self.ceiling or "", ALL_MESSAGES, self.score)
         return {
             name: result._replace(of_ceiling=_ratio(scores[name], ceiling))
@@ -239,6 +248,20 @@ class Comparison:
         probability = float(_improvement(array))
         improvement = Estimate(probability, *improvement_interval(probability, len(seeds)))
         return Compared(seeds, norm, _recovery(array), improvement)
+
+    def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
+        """Probability that a run of one delayed arm beats one of another, with its score interval, by names.
+
+        Seeds are those that both have finished; there is no entry for arms that share none.
+        """
+        scores = dict(list(self.scores(task, delay).items())[2:])
+        found = {}
+        for one, other in permutations(scores, 2):
+            seeds, array = _paired([scores[other], scores[one]])
+            if seeds:
+                value = float(probability_of_improvement(array[0, 1], array[0, 0]))
+                found[one, other] = Estimate(value, *improvement_interval(value, len(seeds)))
+        return found
 
     def overall(self) -> dict[str, tuple[int, Estimate]]:
         """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.

@@ -12,6 +12,7 @@ from damian.evaluation.comparison import (
     SCRIPT,
     TRAINED,
     TRAINED_DETERMINISTIC,
+    UNKNOWN,
     UNTRAINED,
     Arm,
     Comparison,
@@ -24,13 +25,14 @@ from damian.evaluation.statistics import interquartile_mean
 ARMS = {
     "best": Arm(delayed=False),
     "blind": Arm(naive=True),
-    "flown": Arm(naive=True, policy_of="best"),
+    "flown": Arm(naive=True, policy_of="best", regime="R0"),
     "aware": Arm(),
 }
 
 
 def test_the_regime_of_an_arm_follows_from_its_delays_unless_it_is_given():
     arms = ARMS | {
+        "flown": Arm(naive=True, policy_of="best"),
         "truth": Arm(regime="R1"),
         "of truth": Arm(policy_of="truth"),
         "given": Arm(policy_of="best", regime="R0"),
@@ -170,6 +172,19 @@ def test_the_table_lists_the_script_where_it_was_evaluated():
     cells = [line.split(" |")[:5] for line in table.splitlines() if "script" in line]
     names = ("script (undelayed)", "script")
     assert cells == [[f"| {name}", " ", " script", " 1", " 7.000"] for name in names]
+
+
+def test_a_recovery_is_from_the_naive_arm_of_the_same_track_and_any_two_arms_are_compared():
+    scores = SCORES | {"flown": [9.0, 8.0]}  # naive, but trained undelayed: not the reference of late data
+    arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}
+    comparison = Comparison(rows_of("t", "late", scores), arms)
+    compared = comparison.compared("t", "late")
+    assert compared["aware"].recovery.value == pytest.approx((7.5 - 3) / (10 - 3))
+    assert compared["flown"].recovery is UNKNOWN  # the strongest naive arm of its track
+    pairs = comparison.pairs("t", "late")
+    assert pairs["aware", "flown"].value == (0 + 0 + 0.5 + 1) / 4
+    assert pairs["flown", "aware"].value == (1 + 1 + 0.5 + 0) / 4
+    assert "| aware | 1.000 | 0.375 |" in markdown(comparison, [])
 
 
 def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its_own():
