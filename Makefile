@@ -33,7 +33,7 @@ test-slow: $(VENV)/slow
 # The replay page in Chromium, which Debian and Ubuntu bring as these packages.
 test-browser: $(VENV)/browser
 	command -v chromium && command -v chromedriver || (apt-get update && apt-get install -y chromium chromium-driver)
-	$(PY) -m pytest -m browser tests/evaluation/test_replay_browser.py $(ARGS)
+	$(PY) -m pytest -m browser tests/show/test_replay_browser.py $(ARGS)
 
 bench: $(VENV)/bench
 	$(VENV)/bin/damian bench $(ARGS)
@@ -72,7 +72,7 @@ docs: $(VENV)/docs
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 
 # The libraries of the replay page, in one file that is committed; only a change of their versions or of what is taken needs it.
-PAGE := damian/evaluation/page
+PAGE := damian/show/page
 page-libraries:
 	npm install --prefix $(PAGE)/libraries --no-package-lock --no-audit --no-fund --silent
 	cd $(PAGE)/libraries && node_modules/.bin/esbuild libraries.js --bundle --minify --format=esm \

@@ -39,7 +39,7 @@ from damian.baselines.greedy import greedy_policy
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.text_files import named
-from damian.evaluation.run_lock import is_folder, locked
+from damian.runs.run_lock import is_folder, locked
 
 from .evaluate import stored_actor
 from .shared.command_line import is_secret

@@ -26,12 +26,12 @@ from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.common import checks
 from damian.common.errors import InputError
+from damian.compare.comparison import CEILING
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
-from damian.evaluation.comparison import CEILING
-from damian.evaluation.metrics import Evaluation, evaluate
-from damian.evaluation.run_folder import save_results
+from damian.runs.metrics import Evaluation, evaluate
+from damian.runs.run_folder import save_results
 from damian.server.source_grid import SourceGrid
 
 from .shared.known_settings import CONF

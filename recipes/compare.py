@@ -34,8 +34,7 @@ from omegaconf import MISSING, DictConfig
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
-from damian.envs.pipeline import has_message_delay
-from damian.evaluation.comparison import (
+from damian.compare.comparison import (
     HELD_OUT,
     NOT_LATE,
     SCORES,
@@ -44,10 +43,11 @@ from damian.evaluation.comparison import (
     Comparison,
     Row,
 )
-from damian.evaluation.comparison_figures import plot_curves, plot_delays, plot_norms
-from damian.evaluation.interrupt import exit_code
-from damian.evaluation.report import markdown
-from damian.evaluation.statistics import FEWEST
+from damian.compare.figures import plot_curves, plot_delays, plot_norms
+from damian.compare.report import markdown
+from damian.compare.statistics import FEWEST
+from damian.envs.pipeline import has_message_delay
+from damian.runs.interrupt import exit_code
 
 from . import ceiling
 from .evaluate import fly, fly_untrained

@@ -17,7 +17,7 @@ from torchrl.modules import ProbabilisticActor
 
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
-from damian.evaluation.training_state import load_networks
+from damian.runs.training_state import load_networks
 
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported

@@ -37,12 +37,12 @@ from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
-from damian.evaluation.belief_figure import plot_beliefs
-from damian.evaluation.episode import Episode, record
-from damian.evaluation.film import VIEWS, check_gif, save_film
-from damian.evaluation.geojson import origin_of, save_geojson
-from damian.evaluation.replay_page import save_page
 from damian.learners.recurrent import add_recurrent_state
+from damian.show.belief_figure import plot_beliefs
+from damian.show.episode import Episode, record
+from damian.show.film import VIEWS, check_gif, save_film
+from damian.show.geojson import origin_of, save_geojson
+from damian.show.replay_page import save_page
 
 from .advise import AdviseConfig
 from .evaluate import stored_actor

@@ -24,8 +24,8 @@ from damian import keys
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.envs.pipeline import has_message_delay
-from damian.evaluation.metrics import evaluate
-from damian.evaluation.run_folder import save_results
+from damian.runs.metrics import evaluate
+from damian.runs.run_folder import save_results
 from damian.server.server import Server
 from damian.world.messages import Messages
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from damian.common import checks
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
-from damian.evaluation.episode import Episode
-from damian.evaluation.replay_page import MOST, save_page
+from damian.show.episode import Episode
+from damian.show.replay_page import MOST, save_page
 
 from .shared.command_line import Parser, exits_with_one_line
 

@@ -33,15 +33,9 @@ from damian.baselines.random import random_policy
 from damian.common import checks
 from damian.common.errors import InputError, RunError, naming_errors
 from damian.common.threads import using_threads
+from damian.compare.comparison import RANDOM, SCRIPT, TRAINED, UNTRAINED
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
-from damian.evaluation.comparison import RANDOM, SCRIPT, TRAINED, UNTRAINED
-from damian.evaluation.interrupt import Interrupt
-from damian.evaluation.loggers import make_loggers
-from damian.evaluation.metrics import Evaluation, evaluate
-from damian.evaluation.metrics_log import MetricsLog
-from damian.evaluation.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, plot_learning_curve, save_results
-from damian.evaluation.training_state import TrainingState, load_networks
 from damian.keys import next_key
 from damian.learners.base import Learner, check_learner, check_numbers
 from damian.learners.finite import divergence
@@ -50,6 +44,12 @@ from damian.replay.backupdate import BackupdateStorage
 from damian.replay.corrections import corrections_of
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
+from damian.runs.interrupt import Interrupt
+from damian.runs.loggers import make_loggers
+from damian.runs.metrics import Evaluation, evaluate
+from damian.runs.metrics_log import MetricsLog
+from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, plot_learning_curve, save_results
+from damian.runs.training_state import TrainingState, load_networks
 
 from .shared.collecting import collecting, collector_parts, ticks
 from .shared.inheritance import settings_by_key

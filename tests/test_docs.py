@@ -20,13 +20,13 @@ from damian import Constant
 from damian.delays.delay_line import DelayLine
 from damian.delays.laws import LAWS
 from damian.delays.samplers import Sampler
-from damian.evaluation.episode import COLUMNS
 from damian.recipes.command import PROGRAMS, SETTINGS
 from damian.recipes.shared.known_settings import CONF, known_settings
 from damian.recipes.shared.launch import checked, composed_with
 from damian.recipes.shared.misspelt import check_words
 from damian.replay.hindsight import MessageLog, latest_arrived
 from damian.server.features import GLOBAL, LOCAL
+from damian.show.episode import COLUMNS
 
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "RESULTS.md", "CHANGELOG.md")]

@@ -19,7 +19,7 @@ from damian.advice.tables import Rows
 from damian.common.atomic_files import writing
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import named, show
-from damian.evaluation.run_lock import is_folder, locked
+from damian.runs.run_lock import is_folder, locked
 
 MAX_FLEETS, MAX_UAVS = 1000, 100
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")

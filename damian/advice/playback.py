@@ -26,7 +26,7 @@ from damian.advice.journal import entries, reports_of
 from damian.advice.reports import Report
 from damian.common.errors import InputError
 from damian.common.text_files import named
-from damian.evaluation.episode import Episode, Floats, cells_of, fixed_of
+from damian.show.episode import Episode, Floats, cells_of, fixed_of
 
 MOST_STEPS = 20_000
 """Most steps of an episode that is made from a journal."""

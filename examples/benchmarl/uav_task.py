@@ -13,7 +13,7 @@ from torchrl.envs import CatTensors, EnvBase, FlattenObservation, Transform
 from damian import ScenarioConfig, compose_scenario, keys, make_env
 from damian.common import checks
 from damian.envs.delayed_env import DelayedEnv
-from damian.evaluation.metrics import evaluate
+from damian.runs.metrics import evaluate
 
 STATE = "critic_state"
 """What central critics and the mixer of QMIX read, [B, S]: of all UAVs the observations that the server makes

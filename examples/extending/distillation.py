@@ -23,8 +23,8 @@ from torchrl.envs import EnvBase
 from damian import LearnerConfig, LearningSetup, keys, make_env
 from damian.common import checks
 from damian.envs.pipeline import has_message_delay
-from damian.evaluation.training_state import load_networks
 from damian.recipes.shared.stored_runs import check_run, stored_config
+from damian.runs.training_state import load_networks
 
 OFFSET = 2  # last columns of the privileged observation: the true way to the source, which no teacher sees
 

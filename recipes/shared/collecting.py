@@ -10,10 +10,10 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
 from damian import keys
-from damian.evaluation.training_state import CarriedStep
 from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state
 from damian.learners.schedule import SystemClock
+from damian.runs.training_state import CarriedStep
 from damian.server.server import Server
 
 from .settings import TrainConfig

@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 
 from damian.common.errors import RUN_ERROR, InputError, RunError
 from damian.common.text_files import one_line, show
-from damian.evaluation.run_record import read_record
+from damian.runs.run_record import read_record
 
 from .known_settings import RECIPES
 

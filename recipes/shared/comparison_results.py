@@ -14,10 +14,10 @@ from typing import Any
 from damian.common.atomic_files import write_atomically
 from damian.common.csv_table import csv_table
 from damian.common.errors import InputError
-from damian.evaluation.comparison import MEASURES, OF_ARM, Arm, Row, regime
-from damian.evaluation.comparison_figures import LABELS
-from damian.evaluation.metrics_log import METRICS, read_metrics
-from damian.evaluation.run_record import read_record
+from damian.compare.comparison import MEASURES, OF_ARM, Arm, Row, regime
+from damian.compare.figures import LABELS
+from damian.runs.metrics_log import METRICS, read_metrics
+from damian.runs.run_record import read_record
 
 from .composition_errors import one_line
 from .parallel import Run
@@ -34,7 +34,7 @@ class Results:
     """Results of the finished runs of a comparison."""
 
     rows: Sequence[Row]
-    """Evaluations, see ``damian.evaluation.comparison.Row``."""
+    """Evaluations, see ``damian.compare.comparison.Row``."""
     points: Sequence[Row]
     """Points of the learning curves: task, delay, arm, seed, frames, episodes, and ``LABELS``."""
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.evaluation.comparison import NOT_LATE, SCRIPTED, Arm
-from damian.evaluation.comparison_figures import LABELS
+from damian.compare.comparison import NOT_LATE, SCRIPTED, Arm
+from damian.compare.figures import LABELS
 
 
 @dataclass

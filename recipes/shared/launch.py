@@ -26,10 +26,10 @@ from omegaconf.errors import OmegaConfBaseException
 from damian.common import checks
 from damian.common.atomic_files import remove_unfinished, writing
 from damian.common.errors import RUN_ERROR, InputError, RunError
-from damian.evaluation.interrupt import exit_code
-from damian.evaluation.run_folder import CHECKPOINT, CONFIG
-from damian.evaluation.run_lock import is_folder, locked
-from damian.evaluation.run_record import timed
+from damian.runs.interrupt import exit_code
+from damian.runs.run_folder import CHECKPOINT, CONFIG
+from damian.runs.run_lock import is_folder, locked
+from damian.runs.run_record import timed
 
 from .command_line import parsed, prepared, remember_words
 from .composition_errors import COMPOSITION_ERRORS, foreign_cause, one_line

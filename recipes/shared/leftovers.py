@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from damian.common.errors import InputError
-from damian.evaluation.metrics_log import EVENTS
-from damian.evaluation.run_folder import CHECKPOINT, CONFIG
-from damian.evaluation.run_lock import is_folder, is_locked
-from damian.evaluation.run_record import RECORD
-from damian.evaluation.training_state import stored_progress
+from damian.runs.metrics_log import EVENTS
+from damian.runs.run_folder import CHECKPOINT, CONFIG
+from damian.runs.run_lock import is_folder, is_locked
+from damian.runs.run_record import RECORD
+from damian.runs.training_state import stored_progress
 
 SWEEP = "multirun.yaml"
 """File that Hydra writes into the folder of a sweep."""

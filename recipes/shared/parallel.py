@@ -25,12 +25,12 @@ from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
-from damian.evaluation.checkpoint import stored_digest
-from damian.evaluation.interrupt import exit_code
-from damian.evaluation.metrics import EVALUATED
-from damian.evaluation.run_folder import CHECKPOINT, CONFIG, RESULTS
-from damian.evaluation.run_lock import locked
-from damian.evaluation.run_record import POLICY, read_record
+from damian.runs.checkpoint import stored_digest
+from damian.runs.interrupt import exit_code
+from damian.runs.metrics import EVALUATED
+from damian.runs.run_folder import CHECKPOINT, CONFIG, RESULTS
+from damian.runs.run_lock import locked
+from damian.runs.run_record import POLICY, read_record
 
 from .composition_errors import one_line
 from .launch import Program, perform

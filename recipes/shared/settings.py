@@ -15,13 +15,13 @@ from damian.delays.config import DelayConfig
 from damian.delays.laws import law_of
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
-from damian.evaluation.loggers import check_loggers
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
 from damian.learners.bpql import BpqlConfig  # noqa: F401 (registers the learner, and SacConfig)
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.predictive_mappo import PredictiveMappoConfig
 from damian.learners.schedule import SystemClock
+from damian.runs.loggers import check_loggers
 
 MAX_BATCH = 100_000_000
 """Most environment steps, over all worlds, that are collected before an update; they lie in memory."""

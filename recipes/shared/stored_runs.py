@@ -10,12 +10,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
-from damian.evaluation.checkpoint import stored_digest
-from damian.evaluation.run_folder import CONFIG
-from damian.evaluation.run_lock import is_folder
-from damian.evaluation.run_record import POLICY, new_record, write_record
-from damian.evaluation.training_state import checkpoint_file, stored_progress
 from damian.learners.base import LEARNERS
+from damian.runs.checkpoint import stored_digest
+from damian.runs.run_folder import CONFIG
+from damian.runs.run_lock import is_folder
+from damian.runs.run_record import POLICY, new_record, write_record
+from damian.runs.training_state import checkpoint_file, stored_progress
 
 from .command_line import own_folder, typed_command
 from .composition_errors import one_line

@@ -9,9 +9,9 @@ from torchrl.modules import ProbabilisticActor
 from damian.common.atomic_files import writing
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
-from damian.evaluation.episode import record
-from damian.evaluation.film import save_film
 from damian.learners.recurrent import add_recurrent_state
+from damian.show.episode import record
+from damian.show.film import save_film
 
 from .settings import TrainConfig
 

@@ -25,10 +25,10 @@ from damian.common import counter_rng
 from damian.common.errors import RunError
 from damian.common.threads import using_threads
 from damian.envs.delayed_env import DelayedEnv
-from damian.evaluation.checkpoint import plain
-from damian.evaluation.training_state import CarriedStep, RandomState
 from damian.learners.networks import COMPILE_OPTIONS
 from damian.learners.recurrent import add_recurrent_state
+from damian.runs.checkpoint import plain
+from damian.runs.training_state import CarriedStep, RandomState
 
 from .launch import seed_generators
 from .learning_env import learning_env

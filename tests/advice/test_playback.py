@@ -19,9 +19,9 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
-from damian.evaluation.episode import Episode, record
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
+from damian.show.episode import Episode, record
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig

@@ -21,11 +21,11 @@ from damian.advice.node import Node
 from damian.advice.service import make_app
 from damian.baselines.greedy import greedy_policy
 from damian.envs.pipeline import make_env
-from damian.evaluation.metrics import evaluate
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.recurrent import add_recurrent_state
 from damian.recipes.advise import AdviseConfig, make_desk, serve
+from damian.runs.metrics import evaluate
 from damian.server.rewards import RewardConfig
 
 TOKEN = "a-token-of-the-service"

@@ -17,7 +17,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
-from damian.evaluation.metrics import evaluate
+from damian.runs.metrics import evaluate
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig

@@ -8,11 +8,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.common.errors import InputError
 from damian.envs.uav_env import UavEnv
-from damian.evaluation.checkpoint import restore
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.schedule import LinearSchedule
 from damian.recipes.shared.settings import TrainConfig
+from damian.runs.checkpoint import restore
 
 
 def annealing(frames: int, **settings: float) -> tuple[Mappo, TensorDictBase]:

@@ -14,8 +14,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
-from damian.evaluation.metrics import evaluate
-from damian.evaluation.run_folder import CHECKPOINT
 from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, policy_terms
 from damian.learners.networks import ModelConfig, make_actor
@@ -25,6 +23,8 @@ from damian.recipes import oracle, train
 from damian.recipes.shared.collecting import make_collector
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
+from damian.runs.metrics import evaluate
+from damian.runs.run_folder import CHECKPOINT
 from damian.server.termination import EpisodeConfig
 
 GRU = ModelConfig(hidden=[16, 8], rnn="gru")

@@ -18,7 +18,6 @@ from damian import keys
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
-from damian.evaluation.checkpoint import plain, restore
 from damian.learners.base import Learner
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.networks import ModelConfig
@@ -26,6 +25,7 @@ from damian.learners.recurrent import add_recurrent_state
 from damian.learners.reward_scale import FORGETTING, ReturnScale, value_scale
 from damian.learners.sac import Sac, SacConfig
 from damian.replay.time_storage import TimeStorage
+from damian.runs.checkpoint import plain, restore
 from damian.server.termination import EpisodeConfig
 
 REWARD = keys.next_key(keys.REWARD)

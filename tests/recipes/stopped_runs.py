@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from damian.evaluation.checkpoint import read_checkpoint
-from damian.evaluation.metrics_log import MetricsLog
 from damian.recipes.shared.launch import launch
 from damian.recipes.train import main
+from damian.runs.checkpoint import read_checkpoint
+from damian.runs.metrics_log import MetricsLog
 
 TINY = ["worlds=4", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "checkpoint_every=3"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12", "frames=256", "logger=csv"]

@@ -23,11 +23,11 @@ from damian.advice.desk import Desk
 from damian.advice.inbox import read_inbox
 from damian.advice.same_service import FREE
 from damian.common.errors import RUN_ERROR
-from damian.evaluation.run_lock import is_locked, locked
 from damian.recipes.advise import AdviseConfig, main, make_desk
 from damian.recipes.shared.launch import launch
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import main as train
+from damian.runs.run_lock import is_locked, locked
 from damian.world.regions.config import RegionConfig
 
 HEAD = "ID,source time,lat,lon,source spotted,track,takeoff-landing time,battery,AoI,FLA"

@@ -11,14 +11,14 @@ import pytest
 from helpers import check_refused
 from hydra import initialize_config_dir
 
-from damian.evaluation.comparison import CEILING, TRAINED, Arm
-from damian.evaluation.run_lock import locked
+from damian.compare.comparison import CEILING, TRAINED, Arm
 from damian.recipes.compare import CompareConfig, Experiment, main, plan
 from damian.recipes.evaluate import fly
 from damian.recipes.shared.known_settings import CONF
 from damian.recipes.shared.launch import launch
 from damian.recipes.shared.parallel import Run, perform_all
 from damian.recipes.shared.settings import TrainConfig
+from damian.runs.run_lock import locked
 
 STORED = Path(__file__).parents[2] / "docs" / "results"
 SMALL = [

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 import damian
 from damian.common.errors import InputError
-from damian.evaluation.comparison import OF_ARM
+from damian.compare.comparison import OF_ARM
 from damian.recipes import evaluate, train
 from damian.recipes.shared.inheritance import check_policy_fits, note_what_a_history_holds
 from damian.recipes.shared.launch import composed_config, launch

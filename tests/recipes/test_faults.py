@@ -13,14 +13,14 @@ from stopped_runs import TINY, ended, files, forked, killed_after
 from torch import nn
 
 from damian.common.errors import InputError, RunError
-from damian.evaluation.checkpoint import read_checkpoint
-from damian.evaluation.interrupt import Interrupt
-from damian.evaluation.metrics_log import EventFile, MetricsLog, read_metrics
-from damian.evaluation.run_lock import is_locked, locked
 from damian.learners.finite import divergence
 from damian.learners.mappo import Mappo
 from damian.recipes import evaluate, train
 from damian.recipes.shared.launch import launch
+from damian.runs.checkpoint import read_checkpoint
+from damian.runs.interrupt import Interrupt
+from damian.runs.metrics_log import EventFile, MetricsLog, read_metrics
+from damian.runs.run_lock import is_locked, locked
 
 
 @pytest.fixture(scope="module")

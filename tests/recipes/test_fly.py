@@ -14,10 +14,10 @@ from matplotlib.image import imread
 from PIL import Image
 from shapely.geometry import shape
 
-from damian.evaluation.episode import Episode
 from damian.recipes.fly import kept, main
 from damian.recipes.shared.launch import launch
 from damian.recipes.train import main as train
+from damian.show.episode import Episode
 
 SHORT = ["policy=random", "formats=[]", "actions.distances=[0,30,60]", "episode.max_steps=60"]
 UNDELAYED = ["delay.obs=0", "delay.loss=0"]

@@ -10,9 +10,9 @@ from helpers import check_refused
 from PIL import Image
 
 from damian.advice.journal import Journal, head
-from damian.evaluation.episode import Episode
 from damian.recipes.fly import main
 from damian.recipes.shared.launch import launch
+from damian.show.episode import Episode
 
 WORDS = ["region=llanbedr", "delay=paper", "port=0", "policy=greedy", "agents=5", "token=x"]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from damian.evaluation.run_lock import is_locked
+from damian.runs.run_lock import is_locked
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ import pytest
 from episodes import flight
 from helpers import check_refused
 
-from damian.evaluation.replay_page import MOST, page
 from damian.recipes.replay import main
+from damian.show.replay_page import MOST, page
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from stopped_runs import SAC, TINY, check_equal, ended, files, forked, killed_after
 
-from damian.evaluation import replay_memory
+from damian.runs import replay_memory
 
 WHOLE = [
     "delay=paper",

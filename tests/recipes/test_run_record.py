@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from damian.evaluation.run_record import RECORD, new_record, read_record, timed, write_record
 from damian.recipes.shared.command_line import command, prepared
+from damian.runs.run_record import RECORD, new_record, read_record, timed, write_record
 
 
 def record(command: str, config_dir: str | None = None) -> dict:

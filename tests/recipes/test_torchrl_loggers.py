@@ -3,7 +3,7 @@
 import pytest
 from extensions import TINY
 
-from damian.evaluation.metrics_log import read_metrics
+from damian.runs.metrics_log import read_metrics
 
 pytestmark = pytest.mark.slow
 mlflow = pytest.importorskip("mlflow")

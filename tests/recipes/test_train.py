@@ -18,12 +18,12 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch import Tensor
 
 from damian.envs.pipeline import make_env
-from damian.evaluation.training_state import load_networks
 from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.recipes import train as train_recipe
 from damian.recipes.shared.launch import composed_config, seed_generators
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.shared.stored_runs import stored_config
+from damian.runs.training_state import load_networks
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
@@ -364,6 +364,6 @@ def test_where_nothing_is_won_by_the_source_a_belief_is_left_out(spotted, succes
 @pytest.mark.slow
 def test_a_notebook_that_imports_damian_keeps_its_own_figures():
     code = "import matplotlib; matplotlib.use('svg'); import damian; damian.compose_scenario()\n"
-    code += "import damian.evaluation.film, damian.recipes.train; print(matplotlib.get_backend())"
+    code += "import damian.show.film, damian.recipes.train; print(matplotlib.get_backend())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "svg"

@@ -21,7 +21,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
 from damian.common.errors import InputError
-from damian.evaluation.metrics_log import MetricsLog
 from damian.recipes.shared.collecting import collecting
 from damian.recipes.shared.launch import composed_config
 from damian.recipes.shared.learning_env import learning_env
@@ -29,6 +28,7 @@ from damian.recipes.shared.ray_workers import check_installed
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.shared.workers import worker_env, worker_seed
 from damian.recipes.train import make_learner, replay_buffer
+from damian.runs.metrics_log import MetricsLog
 
 TWO = ["collector=process", "workers=2"]
 LATE = ["delay=paper", "aware=both", "delay.rew=2"]

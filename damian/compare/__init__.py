@@ -1,0 +1,1 @@
+"""Comparison of methods over tasks, delays and seeds: statistics, tables and figures."""

@@ -1,0 +1,399 @@
+"""Comparison of arms over tasks, delays and seeds: means, J_norm and recovery, with 95 % intervals."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import permutations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from damian.compare.statistics import (
+    LEAST_GAP,
+    Floats,
+    bootstrap,
+    improvement_interval,
+    interquartile_mean,
+    normalised,
+    probability_of_improvement,
+    recovery,
+)
+from damian.runs.run_folder import DETERMINISTIC
+
+TRAINED, UNTRAINED, SCRIPT, RANDOM = "trained", "untrained", "script", "random"
+TRAINED_DETERMINISTIC, UNTRAINED_DETERMINISTIC = TRAINED + DETERMINISTIC, UNTRAINED + DETERMINISTIC
+SCRIPTED = (RANDOM, SCRIPT)
+"""Policies that fly the same episodes beside each arm, and learn nothing."""
+OF_ARM = (TRAINED, TRAINED_DETERMINISTIC, UNTRAINED, UNTRAINED_DETERMINISTIC)
+"""Policies of an arm: its network after the training and before the first update."""
+ALL_MESSAGES = "all messages"
+CEILING = {"what has arrived": "R0", "its own messages": "R0", ALL_MESSAGES: "R3", "the source's place": "R3"}
+"""What is known on time in the rows of an information ceiling (``damian ceiling``), and their regimes."""
+HELD_OUT = "@"
+"""Stands between a task and a change of it under which the task's policies fly untrained."""
+NOT_LATE = "none"
+"""Name that stands for the delay of an undelayed arm."""
+TRUE_SCORES = ("return", "success_rate", "steps")
+"""Measures of an ``Evaluation`` from messages without delay."""
+PERCEIVED_SCORES = ("perceived_return", "perceived_success_rate", "perceived_steps")
+"""The same measures as the server perceived them."""
+MEASURES = (*TRUE_SCORES, *PERCEIVED_SCORES, "age", "late", "lost", "backupdated")
+SCORES = (*TRUE_SCORES, *PERCEIVED_SCORES)
+"""Measures by which arms can be compared."""
+_SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
+_TIMES = ("steps", "perceived_steps", "age")
+_ANY = (-np.inf, np.inf)
+BOUNDS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(MEASURES, _ANY),
+    **dict.fromkeys(_SHARES, (0.0, 1.0)),
+    **dict.fromkeys(_TIMES, (0.0, np.inf)),
+}
+"""Smallest and largest possible value of each of ``MEASURES``."""
+COMPARED = ("J_norm", "recovery", "improvement", "of_ceiling")
+"""Columns of the estimates of ``Compared``."""
+LESS_IS_BETTER = ("steps", "perceived_steps")
+"""Scores for which lower values are better."""
+
+Row = Mapping[str, Any]
+"""Evaluation of one policy: task, delay, arm, regime, seed, policy, a number for each measure, and of its run
+the ``frames`` (environment steps in training) and ``seconds``. Unknown or meaningless numbers are nan."""
+
+
+@dataclass
+class Arm:
+    """One way to train policies for a task, or to fly those of another arm."""
+
+    overrides: list[str] = field(default_factory=list)
+    """Overrides of the settings of ``damian train``."""
+    delayed: bool = True
+    """Whether the arm has delays. Exactly one arm has none: the reference, run once for each task."""
+    naive: bool = False
+    """Whether the arm ignores the delay; recovery 0 is the score of the best such arm."""
+    policy_of: str | None = None
+    """Arm whose policies this one flies, without any training of its own; None: this arm trains."""
+    untrained: bool = False
+    """Whether the networks fly as they are before the first update, with their prior; nothing is trained."""
+    ceiling: bool = False
+    """Whether the script flies with ever more known on time (``damian ceiling``), and nothing is trained."""
+    tasks: list[str] | None = None
+    """Tasks of the experiment that the arm does; all of them if not given."""
+    regime: str = ""
+    """Information that the arm uses: R0: messages that have arrived; R1: the truth, for the critic; R2: no
+    delay in training; R3: no delay at all. If it is not given, ``delayed`` and ``policy_of`` decide."""
+
+
+def regime(arms: Mapping[str, Arm], name: str) -> str:
+    """The regime of an arm: its own, or R3 without delay, R2 with a policy trained without, or else R0."""
+    arm = arms[name]
+    if arm.regime:
+        return arm.regime
+    if not arm.delayed:
+        return "R3"
+    if arm.policy_of is None:
+        return "R0"
+    return "R2" if not arms[arm.policy_of].delayed else regime(arms, arm.policy_of)
+
+
+def track(arms: Mapping[str, Arm], name: str) -> str:
+    """The track of an arm; no recovery mixes arms that learn from late data and arms that had a simulator."""
+    return "late data only" if regime(arms, name) == "R0" else "simulator allowed"
+
+
+class Estimate(NamedTuple):
+    """A value and the ends of its 95 % interval, which are nan for fewer than three seeds."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        if np.isnan(self.value):
+            return "-"
+        if np.isnan(self.low):
+            return _short(self.value)
+        return f"{_short(self.value)} [{_short(self.low)}, {_short(self.high)}]"
+
+
+UNKNOWN = Estimate(np.nan, np.nan, np.nan)
+"""Stands for an estimate that cannot be made, or has no meaning."""
+
+
+class Compared(NamedTuple):
+    """An arm compared with the undelayed one, the random policy and the naive arms, under the same delay."""
+
+    seeds: list[int]
+    """Seeds that all of these have finished."""
+    j_norm: Estimate
+    """0: the random policy; 1: the undelayed arm."""
+    recovery: Estimate = UNKNOWN
+    """0: the strongest naive arm of the same track; 1: the undelayed arm."""
+    improvement: Estimate = UNKNOWN
+    """Probability that a run of the arm beats one of the strongest naive arm of its track."""
+    of_ceiling: Estimate = UNKNOWN
+    """Score over that of the script which knows all messages on time, if an arm flies it."""
+
+
+NOT_COMPARED = Compared([], UNKNOWN)
+"""Stands for an arm without a seed that all others have finished too, and for what is not compared."""
+
+
+def _short(number: float) -> str:
+    return f"{number:.3f}" if abs(number) < 10 else f"{number:.1f}"
+
+
+def _estimates(statistic: Any, scores: Floats, bounds: tuple[float, float] = _ANY) -> list[Estimate]:
+    """Estimates, K in number, of a statistic that maps ``scores`` [strata, ..., seeds] to [K].
+
+    ``bounds`` are its smallest and its largest possible value.
+    """
+    low, high = bootstrap(statistic, scores, bounds=bounds)
+    ends = (np.ravel(statistic(scores)), np.ravel(low), np.ravel(high))
+    return [Estimate(*map(float, numbers)) for numbers in zip(*ends, strict=True)]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The rows of all runs, and the statistics that follow from them."""
+
+    rows: Sequence[Row]
+    arms: Mapping[str, Arm]
+    score: str = "return"
+    """Measure that is the J of J_norm and recovery."""
+    policy: str = TRAINED
+    """Policy with which the arms are compared, ``TRAINED`` or ``TRAINED_DETERMINISTIC``."""
+
+    @cached_property
+    def lines(self) -> list["Line"]:
+        """Lines of the table; cached, because the bootstrap takes time."""
+        return list(_lines(self))
+
+    @property
+    def undelayed(self) -> str:
+        """Name of the arm without delay; empty if there is none, and then nothing is compared with it."""
+        return next((name for name, arm in self.arms.items() if not arm.delayed), "")
+
+    def tasks(self) -> list[str]:
+        """Tasks with a finished run."""
+        return list(dict.fromkeys(row["task"] for row in self.rows))
+
+    def delays(self, task: str) -> list[str]:
+        """Delays of a task with a finished run, without ``NOT_LATE``."""
+        found = (row["delay"] for row in self.rows if row["task"] == task)
+        return [name for name in dict.fromkeys(found) if name != NOT_LATE]
+
+    def runs(self) -> list[Row]:
+        """The first row of each run."""
+        keys = ("task", "delay", "arm", "seed")
+        return list({tuple(row[key] for key in keys): row for row in reversed(self.rows)}.values())[::-1]
+
+    @property
+    def ceiling(self) -> str | None:
+        """Name of the arm that flies the script with ever more known on time, if there is one."""
+        return next((name for name, arm in self.arms.items() if arm.ceiling), None)
+
+    def present(self, task: str, delay: str) -> list[str]:
+        """Arms with a policy of their own that have a finished run of a task under a delay."""
+        found = {row["arm"] for row in self.rows if (row["task"], row["delay"]) == (task, delay)}
+        return [name for name, arm in self.arms.items() if name in found and not arm.ceiling]
+
+    def values(self, task: str, delay: str, arm: str, policy: str, measure: str) -> dict[int, float]:
+        """Values of a measure by seed; an untrained arm has none but those of its untrained network."""
+        if arm in self.arms and self.arms[arm].untrained and policy in OF_ARM[:2]:
+            policy = OF_ARM[OF_ARM.index(policy) + 2]
+        wanted = (task, delay, arm, policy)
+        keys = ("task", "delay", "arm", "policy")
+        return {r["seed"]: r[measure] for r in self.rows if tuple(r[key] for key in keys) == wanted}
+
+    def mean(self, task: str, delay: str, arm: str) -> Estimate:
+        """Mean score of an arm over its seeds."""
+        scores = list(self.values(task, delay, arm, self.policy, self.score).values())
+        return _mean(scores, self.score) if scores else UNKNOWN
+
+    def scores(self, task: str, delay: str) -> dict[str, dict[int, float]]:
+        """Scores by arm and seed, with the sign that makes higher ones better.
+
+        First come the undelayed arm and the random policy, both without delay.
+        """
+        sign = -1 if self.score in LESS_IS_BETTER else 1
+        sources = {self.undelayed: (NOT_LATE, self.undelayed, self.policy)}
+        sources[RANDOM] = (NOT_LATE, self.undelayed, RANDOM)
+        sources |= {arm: (delay, arm, self.policy) for arm in self.present(task, delay)}
+        found = {name: self.values(task, *source, self.score) for name, source in sources.items()}
+        return {name: {seed: sign * x for seed, x in runs.items()} for name, runs in found.items()}
+
+    def compared(self, task: str, delay: str) -> dict[str, Compared]:
+        """Each delayed arm, over the seeds that it and all arms that it is compared with have finished."""
+        scores = self.scores(task, delay)
+        delayed = list(scores)[2:]
+        found = {}
+        for name in delayed:
+            same_track = [other for other in delayed if track(self.arms, other) == track(self.arms, name)]
+            naive = [other for other in same_track if self.arms[other].naive]
+            found[name] = self._compared(scores, naive, name)
+        ceiling = self.values(task, delay, self.ceiling or "", ALL_MESSAGES, self.score)
+        return {
+            name: result._replace(of_ceiling=_ratio(scores[name], ceiling))
+            for name, result in found.items()
+            if result.seeds
+        }
+
+    def _compared(self, scores: Mapping[str, Mapping[int, float]], naive: list[str], arm: str) -> Compared:
+        names = [*list(scores)[:2], *(name for name in naive if name != arm), arm]
+        seeds, array = _paired([scores[name] for name in names])
+        if not seeds:
+            return NOT_COMPARED
+        (norm,) = _estimates(_norms, array)
+        if arm in naive or not naive:
+            return Compared(seeds, norm)
+        probability = float(_improvement(array))
+        improvement = Estimate(probability, *improvement_interval(probability, len(seeds)))
+        return Compared(seeds, norm, _recovery(array), improvement)
+
+    def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
+        """Probability that a run of one delayed arm beats one of another, with its score interval, by names.
+
+        Seeds are those that both have finished; there is no entry for arms that share none.
+        """
+        scores = dict(list(self.scores(task, delay).items())[2:])
+        found = {}
+        for one, other in permutations(scores, 2):
+            seeds, array = _paired([scores[other], scores[one]])
+            if seeds:
+                value = float(probability_of_improvement(array[0, 1], array[0, 0]))
+                found[one, other] = Estimate(value, *improvement_interval(value, len(seeds)))
+        return found
+
+    def overall(self) -> dict[str, tuple[int, Estimate]]:
+        """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.
+
+        Held-out tasks do not count. Of the others, only the arms and delays that every one has do, and of
+        each arm the seeds that it and the undelayed arm have everywhere. The result is empty if there are
+        fewer than two combinations of task and delay. Seeds are resampled within each task, because its
+        delays share the undelayed arm.
+        """
+        by_task = {task: self.delays(task) for task in self.tasks() if HELD_OUT not in task}
+        delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
+        cells = [[self.scores(task, delay) for delay in delays] for task in by_task]
+        flat = [cell for row in cells for cell in row]
+        if len(flat) < 2:
+            return {}
+        found = {}
+        for name in list(flat[0])[2:]:
+            if all(name in cell for cell in flat):
+                names = [*list(flat[0])[:2], name]
+                seeds, array = _paired([cell[name] for cell in flat for name in names])
+                if seeds:
+                    by_cell = array.reshape(len(cells), len(delays), len(names), len(seeds))
+                    found[name] = (len(seeds), *_estimates(_interquartile_norms, by_cell))
+        return found
+
+
+def _mean(values: Sequence[float], measure: str) -> Estimate:
+    """Mean of the values of a measure by seed."""
+    return _estimates(lambda drawn: drawn.mean(-1), np.array([values]), BOUNDS[measure])[0]
+
+
+def _paired(runs: Sequence[Mapping[int, float]]) -> tuple[list[int], Floats]:
+    """Seeds that all runs have, and their scores, [1, runs, seeds]."""
+    seeds = sorted(set.intersection(*map(set, runs)))
+    return seeds, np.array([[[scores[seed] for seed in seeds] for scores in runs]])
+
+
+def _ratio(scores: Mapping[int, float], others: Mapping[int, float]) -> Estimate:
+    """Mean score over the mean of others, over the seeds of both; unknown unless both are positive."""
+    seeds, array = _paired([others, dict.fromkeys(others, 0.0), scores])
+    if not seeds or array.mean(-1)[0, -1] <= 0:
+        return UNKNOWN
+    return _estimates(_norms, array)[0]
+
+
+def _norms(scores: Floats) -> Floats:
+    """J_norm of the last arm's mean score, [*, 1, arms, seeds] to [*]; first come undelayed and random."""
+    means = scores.mean(-1)[..., 0, :]
+    return normalised(means[..., -1], means[..., 0], means[..., 1])
+
+
+def _improvement(scores: Floats) -> Floats:
+    """Probability that the last arm beats the strongest naive one, [*, 1, arms, seeds] to [*].
+
+    First come undelayed and random, then the naive arms.
+    """
+    naive = scores[..., 0, 2:-1, :]
+    strongest = np.expand_dims(naive.mean(-1).argmax(-1), (-1, -2))
+    other = np.take_along_axis(naive, strongest, -2)[..., 0, :]
+    return probability_of_improvement(scores[..., 0, -1, :], other)
+
+
+def _interquartile_norms(scores: Floats) -> Floats:
+    """Interquartile means of J_norm, [*, tasks, delays, arms, seeds] to [*, arms - 2]."""
+    means = scores.mean(-1, keepdims=True)
+    norms = normalised(scores[..., 2:, :], means[..., :1, :], means[..., 1:2, :])
+    by_arm = np.moveaxis(norms, -2, -4)
+    return interquartile_mean(by_arm.reshape(*by_arm.shape[:-3], -1))
+
+
+def _recovery(scores: Floats) -> Estimate:
+    """Recovery of the last arm, [1, arms, seeds]; first come undelayed and random, then the naive arms."""
+
+    def statistic(scores: Floats, least: float = 0.0) -> Floats:
+        means = scores.mean(-1)[..., 0, :]
+        return recovery(means[..., -1], means[..., 2:-1].max(-1), means[..., 0], means[..., 1], least)
+
+    return UNKNOWN if np.isnan(statistic(scores, LEAST_GAP)) else _estimates(statistic, scores)[0]
+
+
+@dataclass(frozen=True)
+class Line:
+    """Line of the table: one policy of one arm, over its seeds."""
+
+    task: str
+    delay: str
+    arm: str
+    regime: str
+    policy: str
+    seeds: list[int]
+    measures: dict[str, Estimate]
+    compared: Compared = NOT_COMPARED
+
+    def cells(self) -> dict[str, Any]:
+        """Columns of ``table.csv`` by name; unknown numbers are empty."""
+        compared = dict(zip(COMPARED, self.compared[1:], strict=True))
+        cells: dict[str, Any] = {k: getattr(self, k) for k in ("task", "delay", "arm", "regime", "policy")}
+        cells |= {"seeds": len(self.seeds), "compared_seeds": len(self.compared.seeds)}
+        for name, number in {**self.measures, **compared}.items():
+            parts = [float("nan")] * 3 if np.isnan(number.value) else number
+            for suffix, value in zip(("", "_low", "_high"), parts, strict=True):
+                cells[name + suffix] = "" if np.isnan(value) else value
+        return cells
+
+
+def _lines(comparison: Comparison) -> Iterator[Line]:
+    """Lines of every arm and policy, task by task and delay by delay; the undelayed arm comes first."""
+    for task in comparison.tasks():
+        for delay in (NOT_LATE, *comparison.delays(task)):
+            arms = comparison.present(task, delay)
+            compared = {} if delay == NOT_LATE else comparison.compared(task, delay)
+            for arm in arms:
+                for policy in OF_ARM[2:] if comparison.arms[arm].untrained else OF_ARM:
+                    # Policies of other arms and runs of older versions have no untrained network.
+                    if comparison.values(task, delay, arm, policy, comparison.score):
+                        line = _line(comparison, task, delay, arm, policy)
+                        of_arm = policy.removeprefix("un") if comparison.arms[arm].untrained else policy
+                        found = compared.get(arm) if of_arm == comparison.policy else None
+                        yield replace(line, compared=found) if found else line
+            for arm in arms[:1]:
+                for policy in SCRIPTED:
+                    # Older runs have not flown every scripted policy.
+                    if comparison.values(task, delay, arm, policy, comparison.score):
+                        yield replace(_line(comparison, task, delay, arm, policy), arm=policy, regime="")
+            for known, information in CEILING.items():
+                if comparison.values(task, delay, comparison.ceiling or "", known, comparison.score):
+                    line = _line(comparison, task, delay, str(comparison.ceiling), known)
+                    yield replace(line, regime=information)
+
+
+def _line(comparison: Comparison, task: str, delay: str, arm: str, policy: str) -> Line:
+    found = {name: comparison.values(task, delay, arm, policy, name) for name in MEASURES}
+    means = {name: _mean(list(runs.values()), name) for name, runs in found.items()}
+    information = regime(comparison.arms, arm)
+    return Line(task, delay, arm, information, policy, sorted(found["age"]), means)

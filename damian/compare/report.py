@@ -1,0 +1,82 @@
+"""Report of a comparison as Markdown: the tables of all arms, and the time that the runs took."""
+
+from collections.abc import Sequence
+
+from damian.common.markdown import markdown_table
+from damian.compare.comparison import HELD_OUT, MEASURES, NOT_LATE, SCRIPTED, Comparison, Line
+
+HEADS = (
+    "return",
+    "success",
+    "steps",
+    "perceived return",
+    "perceived success",
+    "perceived steps",
+    "age",
+    "late",
+    "lost",
+    "back-updated",
+)
+"""Headings of ``MEASURES`` in the Markdown table."""
+
+
+def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
+    """Return the whole comparison as Markdown, with ``notes`` as lines at the top."""
+    all_lines, parts = comparison.lines, ["\n".join(f"- {note}" for note in notes)]
+    for task in comparison.tasks():
+        for delay in comparison.delays(task) or [NOT_LATE]:
+            lines = [line for line in all_lines if line.task == task and line.delay in (NOT_LATE, delay)]
+            parts += [f"## {task}, delay {delay}", _length(comparison, task), _table(lines)]
+            if delay != NOT_LATE:
+                parts += _pairs(comparison, task, delay)
+    overall = [(arm, seeds, str(norm)) for arm, (seeds, norm) in comparison.overall().items()]
+    if overall:
+        table = markdown_table(("arm", "n", "interquartile mean of J_norm"), overall)
+        parts += ["## All tasks and delays", table]
+    return "\n\n".join([*parts, "## Compute", _compute(comparison)]) + "\n"
+
+
+def _length(comparison: Comparison, task: str) -> str:
+    """How long the policies of a task were trained."""
+    if HELD_OUT in task:
+        return "Policies of another task."
+    trained = sorted(
+        {int(run["frames"]) for run in comparison.runs() if run["task"] == task and run["frames"]}
+    )
+    least_to_most = " to ".join(f"{frames:,}" for frames in dict.fromkeys([*trained[:1], *trained[-1:]]))
+    return f"Trained for {least_to_most or 'no'} environment steps."
+
+
+def _table(lines: Sequence[Line]) -> str:
+    left, right = (
+        ("arm", "regime", "policy"),
+        ("n", *HEADS, "n compared", "J_norm", "recovery", "P > naive", "of ceiling"),
+    )
+    rows = []
+    for line in lines:
+        name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
+        seeds, *compared = line.compared
+        numbers = [str(len(line.seeds)), *(str(line.measures[key]) for key in MEASURES)]
+        rows.append([name, line.regime, line.policy, *numbers, str(len(seeds) or "-"), *map(str, compared)])
+    return markdown_table([*left, *right], rows, left=len(left))
+
+
+def _pairs(comparison: Comparison, task: str, delay: str) -> list[str]:
+    """Table of the probabilities that a run of one arm beats a run of another."""
+    pairs = comparison.pairs(task, delay)
+    arms = list(dict.fromkeys(one for one, _ in pairs))
+    rows = [[one, *(str(pairs.get((one, other), "")) for other in arms)] for one in arms]
+    title = "Probability that a run of the row's arm beats one of the column's [95 % score interval]:"
+    return [title, markdown_table(("arm", *arms), rows)] if arms else []
+
+
+def _compute(comparison: Comparison) -> str:
+    """Number and time of the runs of each arm."""
+    runs = comparison.runs()
+    by_arm = {arm: [run["seconds"] for run in runs if run["arm"] == arm] for arm in comparison.arms}
+    rows = [
+        (arm, len(times), f"{sum(times) / len(times):.0f}", f"{sum(times) / 3600:.2f}")
+        for arm, times in (by_arm | {"all": [run["seconds"] for run in runs]}).items()
+        if times
+    ]
+    return markdown_table(("arm", "runs", "seconds a run", "hours of all runs"), rows)

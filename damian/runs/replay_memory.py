@@ -1,0 +1,117 @@
+"""Replay memory in checkpoints: steps that stay as they are go into files of their own, each written once."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
+
+from damian.common.atomic_files import remove_unfinished, writing
+from damian.replay.time_storage import TimeStorage
+from damian.runs.checkpoint import read_checkpoint, to_tensordict, write_checkpoint
+
+SEGMENT_BYTES = 2**21
+"""A segment has at least so many bytes; fewer are stored in the checkpoint itself."""
+SEGMENTS = 32
+"""A full replay memory has about so many segments at most."""
+
+
+class ReplayMemory:
+    """The steps of a replay buffer, as a component of a checkpoint.
+
+    Row k is step k of all worlds, counted from the begin of the training. Segment s has the rows from s R up
+    to (s + 1) R, and is written when all of them are stored and late messages can change none of them any
+    more. The rows after the last segment are part of the state. A checkpoint thus costs as much as the new
+    rows, however large the memory is.
+
+    Args:
+        buffer: on a ``TimeStorage``, with a round-robin writer (TorchRL's default).
+        folder: of the segments.
+    """
+
+    def __init__(self, buffer: ReplayBuffer, folder: Path) -> None:
+        self._buffer, self._folder = buffer, folder
+        self._digests: dict[int, str] = {}
+        """SHA-256 of each segment."""
+
+    @property
+    def _storage(self) -> TimeStorage:
+        return cast(TimeStorage, self._buffer.storage)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Write the segments that are complete by now, and return what else there is to store.
+
+        Raises:
+            RunError: a segment cannot be written.
+        """
+        storage, written = self._storage, cast(RoundRobinWriter, self._buffer.writer)._write_count
+        if not written:
+            return {"written": 0}
+        oldest, per_segment = written - cast(int, storage._len_along_dim0), self._rows_per_segment()
+        # Late messages correct rows after these (``BackupdateStorage``).
+        final = written - cast(int, getattr(storage, "longest", -1)) - 1
+        first, end = oldest // per_segment, max(final // per_segment, 0)
+        self._digests = {s: digest for s, digest in self._digests.items() if s >= first}
+        for segment in range(first, end):
+            if segment not in self._digests:
+                begin = max(oldest, segment * per_segment)
+                self._digests[segment] = self._write(segment, begin, (segment + 1) * per_segment)
+        return {
+            "written": written,
+            "oldest": oldest,
+            "segments": dict(self._digests),
+            "rows": self._rows(max(oldest, end * per_segment), written),
+            "writer": self._buffer.writer.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Fill the empty buffer with the rows of a state and of its segments.
+
+        Raises:
+            InputError: a segment is missing or damaged.
+        """
+        if not state["written"]:
+            return
+        files = {s: (self._path(s), digest) for s, digest in state["segments"].items()}
+        parts = [read_checkpoint(path, "resume", digest)["rows"] for path, digest in files.values()]
+        rows = torch.cat([to_tensordict(part) for part in (*parts, state["rows"])])  # type: ignore[arg-type]
+        rows = cast(TensorDictBase, rows)[state["oldest"] - state["written"] :]
+        storage = self._storage
+        if storage.device != "auto":
+            rows = rows.to(storage.device)
+        most_rows = storage._max_size_along_dim0(batched_data=rows)
+        index = torch.arange(state["oldest"], state["written"]) % most_rows
+        # Not ``storage.set``: a BackupdateStorage has corrected these rows already.
+        LazyTensorStorage.set(storage, index, rows)  # type: ignore[arg-type]
+        self._buffer.writer.load_state_dict(state["writer"])
+        self._digests = dict(state["segments"])
+
+    def remove_old(self) -> None:
+        """Delete the segments that the latest state does not need."""
+        if not self._folder.is_dir():
+            return
+        remove_unfinished(self._folder)
+        needed = {self._path(segment) for segment in self._digests}
+        for path in sorted({*self._folder.glob("*.pt")} - needed):
+            with writing(path):
+                path.unlink()
+
+    def _rows_per_segment(self) -> int:
+        storage, steps = self._storage, self._storage.steps
+        per_row = sum(steps.get(key)[0].nbytes for key in steps.keys(True, True))
+        most_rows = cast(int, storage._max_size_along_dim0())
+        return max(-(-most_rows // SEGMENTS), -(-SEGMENT_BYTES // per_row))
+
+    def _rows(self, begin: int, end: int) -> TensorDictBase:
+        index = torch.arange(begin, end) % cast(int, self._storage._max_size_along_dim0())
+        return cast(TensorDictBase, self._storage.steps[index])
+
+    def _write(self, segment: int, begin: int, end: int) -> str:
+        with writing(self._folder):
+            self._folder.mkdir(exist_ok=True)
+        return write_checkpoint(self._path(segment), {"rows": self._rows(begin, end)})
+
+    def _path(self, segment: int) -> Path:
+        return self._folder / f"{segment:06}.pt"

@@ -1,0 +1,110 @@
+"""Files of a run folder: their names, the learning curve, and the table of results."""
+
+import io
+import math
+from pathlib import Path
+
+from damian.common.atomic_files import write_atomically
+from damian.common.csv_table import csv_table
+from damian.common.markdown import markdown_table
+from damian.runs.metrics import Evaluation
+
+FIGURE = "learning_curve.png"
+CHECKPOINT = "checkpoint.pt"
+BEST = "best.pt"
+REPLAY = "replay"
+CONFIG = "config.yaml"
+RESULTS = "result.csv"
+TABLE = "result.md"
+DETERMINISTIC = ", deterministic"
+"""Ending of the name of a policy whose most likely actions are taken, not drawn from its distribution."""
+
+
+def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: Path, title: str) -> None:
+    """Draw return and success rate over environment steps, with the random policy as a dashed line."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 (slow to import, needed once)
+    from matplotlib.ticker import EngFormatter  # noqa: PLC0415
+
+    panels = [("perceived_return", "return", random.perceived_return)]
+    if any(row["perceived_success_rate"] > 0 for row in rows):
+        panels.append(("perceived_success_rate", "success rate", random.perceived_success_rate))
+    figure = Figure(figsize=(5 * len(panels), 3.4))
+    axes = figure.subplots(1, len(panels), squeeze=False)
+    for axis, (name, label, level) in zip(axes[0], panels, strict=True):
+        points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
+        mark = "o" if len(points) == 1 else ""  # a line of one point would be invisible
+        axis.plot(*zip(*points, strict=True), color="tab:blue", marker=mark, label="while training")
+        axis.axhline(level, color="tab:gray", linestyle="--", label="random policy")
+        axis.set_xlabel("environment steps, all worlds")
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    axes[0][0].legend(loc="best", fontsize="small")
+    figure.suptitle(title, fontsize="medium")
+    figure.tight_layout()
+    image = io.BytesIO()
+    figure.savefig(image, dpi=120)
+    write_atomically(path, image.getvalue())
+
+
+LATE = """perceived: as far as the server knew; all else as it truly was; age: mean age of the messages at the
+server [steps]; late and lost: shares of the messages."""
+"""Lines under a table of evaluations in which messages are delayed."""
+
+
+def save_results(
+    rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool, note: str = ""
+) -> str:
+    """Write evaluations by policy to ``result.csv`` and, as a Markdown table, to ``result.md``.
+
+    Args:
+        rows: evaluations by name of the policy.
+        folder: the run folder.
+        can_succeed: as for ``results_table``.
+        late: as for ``results_table``.
+        note: lines under the table, before those that explain its columns.
+
+    Returns:
+        the table, with the lines under it.
+    """
+    below = "\n".join(filter(None, [note, LATE if late else ""]))
+    table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
+    write_atomically(folder / TABLE, table + "\n")
+    measures = next(iter(rows.values())).row()
+    results = csv_table([["policy", *measures], *([name, *row.row().values()] for name, row in rows.items())])
+    write_atomically(folder / RESULTS, results)  # last: with it, a run counts as finished
+    return table
+
+
+def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
+    """Evaluations of several policies as a Markdown table, with a line for each policy.
+
+    The same policy with its most likely actions, NAME``, deterministic`` in ``rows``, has two columns of the
+    line of NAME.
+
+    Args:
+        rows: evaluations by name of the policy.
+        can_succeed: whether the task can succeed; if so, success rate and steps are shown.
+        late: whether messages are delayed; if so, the return that the server perceived, the age of
+            information and the shares of late and lost messages are shown too.
+    """
+    columns = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
+    columns |= {"return": "return"}
+    has_both = any(name.endswith(DETERMINISTIC) for name in rows)
+    likely = columns.copy() if has_both else {}
+    if late:
+        columns |= {"perceived return": "perceived_return", "age": "age", "late": "late", "lost": "lost"}
+    lines = []
+    for name, evaluation in rows.items():
+        if not name.endswith(DETERMINISTIC):
+            row, other = evaluation.row(), rows.get(name + DETERMINISTIC)
+            found = [other.row()[measure] if other else math.nan for measure in likely.values()]
+            lines.append(
+                [name, *(_number(row[measure]) for measure in columns.values()), *map(_number, found)]
+            )
+    head = ["policy", *columns, *(f"{title}, deterministic" for title in likely)]
+    return markdown_table(head, lines)
+
+
+def _number(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.2f}"

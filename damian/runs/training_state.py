@@ -1,0 +1,211 @@
+"""What a training needs to continue exactly where it was: learner, environment, progress, random numbers."""
+
+import math
+import os
+import random
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torchrl.collectors import Collector
+from torchrl.data import ReplayBuffer
+
+from damian.common.errors import InputError
+from damian.learners.schedule import SystemClock
+from damian.runs.checkpoint import read_checkpoint, restore, to_tensordict, write_checkpoint
+from damian.runs.metrics import EpisodeLog
+from damian.runs.replay_memory import ReplayMemory
+from damian.runs.run_folder import BEST, CHECKPOINT, REPLAY
+
+OLD_CHECKPOINT = "checkpoint"
+"""Folder in which damian 0.4 and older stored checkpoints."""
+
+
+@dataclass
+class Progress:
+    """How far the training of a run has come."""
+
+    frames: int = 0
+    """Environment steps, over all worlds."""
+    updates: int = 0
+    """Batches that the learner has learnt from."""
+    best: float = -math.inf
+    """Best mean episode return at a checkpoint so far."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.frames, self.updates, self.best = int(state["frames"]), int(state["updates"]), state["best"]
+
+
+class TrainingState:
+    """All that changes during a training, stored in a run folder.
+
+    A training that loads the state continues as if it had never stopped, bit for bit on a CPU.
+
+    Args:
+        folder: the run folder.
+        components: of the learner, by name.
+        collector: what changes while worlds step, by name; it has reset the environment.
+        clock: the system clock.
+        buffer: replay buffer on a ``TimeStorage``, if there is one.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        components: Mapping[str, Any],
+        collector: Mapping[str, Any],
+        clock: SystemClock,
+        buffer: ReplayBuffer | None = None,
+    ) -> None:
+        self.folder, self.components = folder, components
+        self.progress, self.episodes = Progress(), EpisodeLog()
+        self.saved = 0
+        """The update after which the checkpoint of the run was written."""
+        self._replay = ReplayMemory(buffer, folder / REPLAY) if buffer is not None else None
+        replay = {} if self._replay is None else {"replay": self._replay}
+        self._parts = {
+            "progress": self.progress,
+            "episodes": self.episodes,
+            "clock": clock,
+            **collector,
+            **replay,
+            "random": RandomState(),  # last, because loading the others may draw numbers
+        }
+
+    def save(self) -> None:
+        """Replace the checkpoint of the run.
+
+        Raises:
+            RunError: it cannot be written; the older one is intact.
+        """
+        networks, parts = (
+            {name: part.state_dict() for name, part in group.items()}
+            for group in (self.components, self._parts)
+        )
+        write_checkpoint(self.folder / CHECKPOINT, {"components": networks, "training": parts})
+        self.saved = self.progress.updates
+        if self._replay is not None:
+            self._replay.remove_old()
+
+    def save_best(self) -> None:
+        """Store the learner if the mean episode return is the best so far; ``save`` must follow.
+
+        Raises:
+            RunError: it cannot be written; the older one is intact.
+        """
+        mean = self.episodes.means()["perceived_return"]
+        if mean > self.progress.best:
+            self.progress.best = mean
+            networks = {name: part.state_dict() for name, part in self.components.items()}
+            progress = {"progress": self.progress.state_dict()}
+            write_checkpoint(self.folder / BEST, {"components": networks, "training": progress})
+
+    def load(self) -> None:
+        """Continue from the checkpoint of the run, and remove what a killed run has left beside it.
+
+        Raises:
+            InputError: it is missing, damaged, or does not fit.
+        """
+        path = checkpoint_file(self.folder, "resume")
+        content = _content(path, "resume")
+        restore(self.components, content["components"], path, "resume")
+        restore(self._parts, content["training"], path, "resume")
+        self.saved = self.progress.updates
+        if self._replay is not None:
+            self._replay.remove_old()
+
+
+def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> None:
+    """Restore some components of a learner in place, such as its actor.
+
+    Args:
+        written: a run folder, or a checkpoint file in it.
+        key: the setting that names it, for errors.
+        components: by name.
+
+    Raises:
+        InputError: the checkpoint is missing or damaged, or has other sizes.
+    """
+    path = checkpoint_file(written, key)
+    restore(components, _content(path, key)["components"], path, key)
+
+
+def stored_progress(folder: Path) -> dict[str, Any]:
+    """How far the stored training of a run folder has come, as its checkpoint says.
+
+    Raises:
+        InputError: the checkpoint is missing or damaged.
+    """
+    path = checkpoint_file(folder, "resume")
+    training, names = _content(path, "resume")["training"], ("progress", "episodes")
+    if missing := [name for name in names if name not in training]:
+        raise InputError(f"resume: {path}: it has no {missing[0]}, so it is not the checkpoint of a training")
+    return {name: training[name] for name in names}
+
+
+def checkpoint_file(written: Path, key: str) -> Path:
+    """The file that a run folder, or a file in one, stands for.
+
+    Raises:
+        InputError: there is none.
+    """
+    if os.path.isfile(written):
+        return written
+    path = written / CHECKPOINT
+    if path.exists():
+        return path
+    if (written / OLD_CHECKPOINT).is_dir():
+        problem = "damian 0.4 or an older one wrote its checkpoint, which this one cannot read: train again"
+        raise InputError(f"{key}: {written}: {problem}, or use that version")
+    raise InputError(f"{key}: {path}: there is no such file, so there is nothing to load")
+
+
+def _content(path: Path, key: str) -> dict[str, Any]:
+    content = read_checkpoint(path, key)
+    if not all(isinstance(content.get(part), dict) for part in ("components", "training")):
+        raise InputError(f"{key}: {path}: it is not the checkpoint of a training; give the folder of a run")
+    return content
+
+
+class CarriedStep:
+    """The TensorDict with which a collector takes its next step: observations, hidden states, counters."""
+
+    def __init__(self, collector: Collector) -> None:
+        self._collector = collector
+
+    def state_dict(self) -> dict[str, Any]:
+        collector = self._collector
+        return {"step": collector._carrier, "trajectories": collector._traj_pool.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        collector = self._collector
+        step = to_tensordict(state["step"]).to(collector.env.device)
+        collector._carrier = step.clear_device_() if collector._carrier.device is None else step
+        collector._traj_pool.load_state_dict(state["trajectories"])
+
+
+class RandomState:
+    """The states of the global random generators of torch, NumPy and Python."""
+
+    def state_dict(self) -> dict[str, Any]:
+        name, numbers, *rest = np.random.get_state()  # noqa: NPY002 (components of one's own may use it)
+        return {
+            "torch": torch.get_rng_state(),
+            "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+            "numpy": [name, np.asarray(numbers).tolist(), *rest],
+            "python": random.getstate(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        torch.set_rng_state(state["torch"])
+        if len(state["cuda"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(state["cuda"])
+        name, numbers, *rest = state["numpy"]
+        np.random.set_state((name, np.array(numbers, dtype=np.uint32), *rest))  # noqa: NPY002
+        random.setstate(state["python"])

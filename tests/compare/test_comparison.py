@@ -1,0 +1,377 @@
+"""Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables and figures of them."""
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation, Text
+
+from damian.compare.comparison import (
+    ALL_MESSAGES,
+    RANDOM,
+    SCRIPT,
+    TRAINED,
+    TRAINED_DETERMINISTIC,
+    UNKNOWN,
+    UNTRAINED,
+    Arm,
+    Comparison,
+    regime,
+)
+from damian.compare.figures import plot_curves, plot_delays, plot_norms
+from damian.compare.report import markdown
+from damian.compare.statistics import interquartile_mean
+from damian.show.belief_figure import COLOURS
+
+ARMS = {
+    "best": Arm(delayed=False),
+    "blind": Arm(naive=True),
+    "flown": Arm(naive=True, policy_of="best", regime="R0"),
+    "aware": Arm(),
+}
+
+
+def test_the_regime_of_an_arm_follows_from_its_delays_unless_it_is_given():
+    arms = ARMS | {
+        "flown": Arm(naive=True, policy_of="best"),
+        "truth": Arm(regime="R1"),
+        "of truth": Arm(policy_of="truth"),
+        "given": Arm(policy_of="best", regime="R0"),
+    }
+    expected = {"best": "R3", "blind": "R0", "flown": "R2", "aware": "R0"}
+    expected |= {"truth": "R1", "of truth": "R1", "given": "R0"}
+    assert {name: regime(arms, name) for name in arms} == expected
+
+
+def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = TRAINED) -> dict:
+    """A row of results in which every measure has the same value."""
+    labels = {"task": task, "delay": delay, "arm": arm, "regime": "R0", "seed": seed, "policy": policy}
+    names = (
+        "return",
+        "success_rate",
+        "steps",
+        "perceived_return",
+        "perceived_success_rate",
+        "perceived_steps",
+    )
+    of_run = {"frames": 400, "seconds": 36.0}
+    return labels | of_run | dict.fromkeys((*names, "age", "late", "lost", "backupdated", "episodes"), value)
+
+
+def rows_of(task: str, delay: str, scores: dict[str, list[float]], random: float = 0.0) -> list[dict]:
+    """Rows of every arm, seed and policy, from the values of the arms by seed."""
+    return [
+        row(task, "none" if arm == "best" else delay, arm, seed, x, policy)
+        for arm, values in scores.items()
+        for seed, value in enumerate(values)
+        for policy, x in ((TRAINED, value), (TRAINED_DETERMINISTIC, value), (RANDOM, random))
+    ]
+
+
+THREE = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3], "flown": [5.0, 3, 4], "aware": [6.0, 9, 7]}
+SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware": [6.0, 9.0]}
+
+
+def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
+    compared = Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
+    seeds, norm, recovery, improvement, _ = compared["aware"]
+    assert seeds == [0, 1]
+    assert norm.value == 7.5 / 10
+    assert recovery.value == (7.5 - 4) / (10 - 4)
+    assert improvement.value == 1
+    assert np.isnan([norm.low, recovery.low, recovery.high]).all()  # two seeds give no interval
+    assert compared["blind"].j_norm.value == 3 / 10
+    for naive in ("blind", "flown"):
+        assert np.isnan([compared[naive].recovery.value, compared[naive].improvement.value]).all()
+
+
+def test_the_probability_of_improvement_is_over_the_naive_arm_with_the_higher_mean():
+    scores = {"best": [9.0, 9, 9], "blind": [6.0, 0, 0], "flown": [5.0, 4, 3], "aware": [4.0, 6, 7]}
+    improvement = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"].improvement
+    assert improvement.value == (1.5 + 3 + 3) / 9  # against 5, 4, 3
+    assert 0 <= improvement.low < improvement.value < improvement.high <= 1
+
+
+def test_recovery_is_left_out_if_the_delay_costs_nothing():
+    scores = SCORES | {"blind": [9.0, 9.5]}
+    _, norm, recovery, *_ = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
+    assert norm.value == 0.75
+    assert str(recovery) == "-"
+
+
+def test_fewer_steps_give_a_higher_score():
+    steps = {arm: [20 - x for x in values] for arm, values in THREE.items()}
+    by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "steps").compared("t", "late")
+    by_return = Comparison(rows_of("t", "late", THREE), ARMS).compared("t", "late")
+    for arm, expected in by_return.items():
+        np.testing.assert_allclose(by_steps[arm][1:], expected[1:])
+
+
+def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
+    rows = rows_of("t", "late", THREE)
+    alone = Comparison(rows, ARMS).compared("t", "late")
+    unfinished = [row for row in rows if (row["arm"], row["seed"]) != ("aware", 2)]
+    compared = Comparison(unfinished, ARMS).compared("t", "late")
+    assert compared["aware"].seeds == [0, 1]
+    assert repr(compared["blind"]) == repr(alone["blind"])  # an unfinished arm changes no other one
+    unfinished = [row for row in rows if (row["arm"], row["seed"]) != ("blind", 0)]
+    compared = Comparison(unfinished, ARMS).compared("t", "late")
+    assert [compared[arm].seeds for arm in ("blind", "flown", "aware")] == [[1, 2]] * 3
+
+
+def test_tasks_and_delays_are_summed_up_by_the_interquartile_mean_of_all_runs():
+    rows, norms = [], []
+    for task, best in (("t", [9.0, 11.0, 10.0]), ("u", [3.0, 5.0, 7.0])):
+        for delay, aware in (("late", [6.0, 1.0, 2.0]), ("later", [2.0, 0.0, 1.0])):
+            rows += rows_of(task, delay, {"blind": [0.0] * 3, "aware": aware})
+            norms += [x / np.mean(best) for x in aware]
+        rows += rows_of(task, "none", {"best": best})
+    overall = Comparison(rows, ARMS).overall()
+    n_seeds, norm = overall["aware"]
+    assert n_seeds == 3
+    assert norm.value == pytest.approx(interquartile_mean(np.array(norms)), abs=1e-12)
+    assert norm.low < norm.value < norm.high
+    assert overall["blind"][1].value == 0
+    assert Comparison([r for r in rows if (r["task"], r["delay"]) != ("u", "later")], ARMS).overall()
+    held_out = rows_of("t@other", "late", {"best": [1.0] * 3, "aware": [9.0] * 3})
+    assert repr(Comparison(rows + held_out, ARMS).overall()) == repr(overall)
+    one = Comparison(rows_of("t", "late", SCORES), ARMS)
+    assert one.overall() == {}
+
+
+def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
+    lines = Comparison(rows_of("t", "late", THREE), ARMS).lines
+    labels = [(line.delay, line.arm, line.policy) for line in lines]
+    assert labels == [
+        ("none", "best", TRAINED),
+        ("none", "best", TRAINED_DETERMINISTIC),
+        ("none", RANDOM, RANDOM),
+        *[
+            ("late", arm, policy)
+            for arm in ("blind", "flown", "aware")
+            for policy in (TRAINED, TRAINED_DETERMINISTIC)
+        ],
+        ("late", RANDOM, RANDOM),
+    ]
+    cells = lines[7].cells()
+    assert [cells[name] for name in ("arm", "regime", "policy")] == ["aware", "R0", TRAINED]
+    assert (cells["seeds"], cells["compared_seeds"]) == (3, 3)
+    value, low, high = (cells[f"return{end}"] for end in ("", "_low", "_high"))
+    assert value == pytest.approx(22 / 3)
+    assert low < value < high
+    assert cells["J_norm"] == pytest.approx(22 / 30)
+    assert cells["recovery"] == pytest.approx((22 / 3 - 4) / 6)
+    assert cells["improvement"] == cells["improvement_high"] == 1
+    assert cells["improvement_low"] == pytest.approx(0.5, abs=0.01)
+    assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
+
+
+def test_the_table_lists_the_script_where_it_was_evaluated():
+    rows = rows_of("t", "late", SCORES)
+    script = [row("t", delay, arm, 0, 7.0, SCRIPT) for delay, arm in (("none", "best"), ("late", "blind"))]
+    table = markdown(Comparison(rows + script, ARMS), [])
+    cells = [line.split(" |")[:5] for line in table.splitlines() if "script" in line]
+    names = ("script (undelayed)", "script")
+    assert cells == [[f"| {name}", " ", " script", " 1", " 7.000"] for name in names]
+
+
+def test_a_recovery_is_from_the_naive_arm_of_the_same_track_and_any_two_arms_are_compared():
+    scores = SCORES | {"flown": [9.0, 8.0]}  # naive, but trained undelayed: not the reference of late data
+    arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}
+    comparison = Comparison(rows_of("t", "late", scores), arms)
+    compared = comparison.compared("t", "late")
+    assert compared["aware"].recovery.value == pytest.approx((7.5 - 3) / (10 - 3))
+    assert compared["flown"].recovery is UNKNOWN  # the strongest naive arm of its track
+    pairs = comparison.pairs("t", "late")
+    assert pairs["aware", "flown"].value == (0 + 0 + 0.5 + 1) / 4
+    assert pairs["flown", "aware"].value == (1 + 1 + 0.5 + 0) / 4
+    assert "| aware | 1.000 | 0.375 |" in markdown(comparison, [])
+
+
+def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its_own():
+    arms = ARMS | {"prior": Arm(untrained=True)}
+    rows = rows_of("t", "late", SCORES)
+    rows += [
+        row("t", "late", arm, seed, 2.0 + seed, UNTRAINED) for arm in ("aware", "prior") for seed in (0, 1)
+    ]
+    lines = [line for line in Comparison(rows, arms).lines if line.policy == UNTRAINED]
+    assert [line.arm for line in lines] == ["aware", "prior"]
+    assert all(line.measures["return"].value == 2.5 for line in lines)
+    aware, prior = (line.compared for line in lines)
+    assert aware.seeds == []  # only the trained policy of an arm is compared with others
+    assert prior.j_norm.value == pytest.approx(2.5 / 10)
+    assert prior.recovery.value == pytest.approx((2.5 - 4) / 6)
+
+
+def test_the_interval_of_a_share_lies_between_0_and_1_and_that_of_a_length_is_not_negative():
+    scores = {arm: [1.0, 0.99, 0.9] for arm in THREE} | {"aware": [0.0, 0.02, 0.01]}
+    comparison = Comparison(rows_of("t", "late", scores), ARMS, "success_rate")
+    best, aware = (comparison.mean("t", *place) for place in (("none", "best"), ("late", "aware")))
+    assert (best.high, aware.low) == (1, 0)
+    for line in comparison.lines:
+        for name in ("success_rate", "perceived_success_rate", "late", "lost", "backupdated"):
+            assert 0 <= line.measures[name].low <= line.measures[name].high <= 1, name
+        assert min(line.measures[name].low for name in ("steps", "perceived_steps", "age")) >= 0
+    assert comparison.lines[0].measures["return"].high > 1
+
+
+def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
+    arms = ARMS | {"script": Arm(ceiling=True)}
+    rows = rows_of("t", "late", THREE)
+    for known, value in (("its own messages", 8.0), (ALL_MESSAGES, 10.0)):
+        rows += [row("t", "late", "script", seed, value, known) for seed in range(3)]
+    comparison = Comparison(rows, arms)
+    compared = comparison.compared("t", "late")
+    assert set(compared) == {"blind", "flown", "aware"}
+    assert compared["aware"].of_ceiling.value == pytest.approx((22 / 3) / 10)
+    script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
+    assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
+    assert comparison.compared("t", "late")["aware"].recovery.value == pytest.approx((22 / 3 - 4) / 6)
+
+
+def test_the_share_of_a_script_that_may_win_nothing_has_no_end():
+    arms = ARMS | {"script": Arm(ceiling=True)}
+    rows = rows_of("t", "late", THREE)
+    rows += [row("t", "late", "script", seed, x, ALL_MESSAGES) for seed, x in enumerate((-4.0, 10.0, 12.0))]
+    share = Comparison(rows, arms).compared("t", "late")["aware"].of_ceiling
+    assert share.value == pytest.approx((22 / 3) / 6)
+    assert np.isinf(share[1:]).all()  # one of 27 draws has the first seed only
+
+
+def test_arms_are_listed_where_no_arm_without_delay_ran(tmp_path):
+    scores = {name: values for name, values in SCORES.items() if name in ("blind", "aware")}
+    comparison = Comparison(rows_of("t", "late", scores), {name: ARMS[name] for name in scores})
+    assert "| aware | R0 | trained | 2 | 7.500 |" in markdown(comparison, [])
+    assert comparison.compared("t", "late") == {}
+    plot_curves(comparison, {}, {"perceived_steps": 1.0}, tmp_path / "curves.png")
+    plot_norms(comparison, tmp_path / "norms.png")
+
+
+def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
+    never = {"perceived_success_rate": np.nan, "success_rate": np.nan}
+    rows = rows_of("t", "late", SCORES) + [each | never for each in rows_of("u", "late", SCORES)]
+    text = markdown(Comparison(rows, ARMS), ["a note"])
+    first, second, overall, compute = text.split("##")[1:]
+    assert "Trained for 400 environment steps." in first
+    aware = "| aware | R0 | trained | 2 | 7.500 |"
+    assert aware + " 7.500" in first
+    assert aware + " - |" in second
+    assert "| 2 | 0.750 | 0.583 | 1.000 | - |" in first
+    assert "| aware | 2 | 0.750 |" in overall
+    assert "| aware | 4 | 36 | 0.04 |" in compute
+
+
+def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finished_episode(tmp_path):
+    comparison = Comparison(rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES), ARMS)
+    curve = [
+        {"episodes": n, "perceived_return": n / 9, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
+        for n in range(5)
+    ]
+    unfinished = [dict.fromkeys(curve[0], np.nan) | {"episodes": 0.0}]
+    curves = {("t", "none", "best"): [curve, curve[1:]], ("t", "late", "blind"): [unfinished, unfinished]}
+    plot_curves(comparison, curves, {"perceived_steps": 1.0}, tmp_path / "curves.png")
+    plot_norms(comparison, tmp_path / "norms.png")
+    plot_delays(comparison, {"learning": ["blind", "aware"], "acting": ["aware"]}, tmp_path / "delays.png")
+    one = Comparison(rows_of("t", "late", SCORES), ARMS)
+    plot_curves(one, curves, {"perceived_steps": 1.0}, tmp_path / "one.png")
+    names = ("curves.png", "norms.png", "delays.png", "one.png")
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in names)
+
+
+def drawn(monkeypatch, draw) -> Figure:
+    """The figure that a function draws instead of saving it."""
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kwargs: figures.append(figure))
+    draw()
+    return figures[-1]
+
+
+def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other_one(monkeypatch, tmp_path):
+    names = [f"arm {i}" for i in range(2 * len(COLOURS) - 2)]
+    arms = {"best": Arm(delayed=False), "blind": Arm(naive=True)} | {name: Arm() for name in names}
+    arms |= {"unfinished": Arm(), "script": Arm(ceiling=True)}
+    scores = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3]} | {name: [6.0, 9, 7] for name in names}
+    comparison = Comparison(rows_of("t", "late", scores), arms)
+    panels = {"all": [*names, "unfinished", "left out"], "none": ["left out"]}
+    path = tmp_path / "figure.png"
+    norms = drawn(monkeypatch, lambda: plot_norms(comparison, path))
+    delays = drawn(monkeypatch, lambda: plot_delays(comparison, panels, path))
+    assert len(delays.axes) == 2
+    for axis, expected in ((norms.axes[0], ["blind", *names]), (delays.axes[0], names)):
+        assert axis.get_legend_handles_labels()[1] == expected
+        lines = [bars[0] for bars in axis.containers]
+        assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(expected)
+
+
+def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch, tmp_path):
+    unknown = [each | {"return": np.nan} for each in rows_of("u", "late", SCORES)]
+    comparison = Comparison(unknown + rows_of("t", "late", SCORES), ARMS)
+    path = tmp_path / "figure.png"
+    figure = drawn(monkeypatch, lambda: plot_norms(comparison, path))
+    assert [axis.get_title() for axis in figure.axes] == ["t"]
+    figure = drawn(monkeypatch, lambda: plot_delays(comparison, {"none": ["left out"]}, path))
+    assert [axis.get_title() for axis in figure.axes] == ["t"]
+    figure = drawn(monkeypatch, lambda: plot_norms(Comparison(unknown, ARMS), path))
+    assert not figure.axes
+    assert "no J_norm is known" in figure.texts[0].get_text()
+    path.write_text("of an earlier report")
+    plot_curves(Comparison(unknown, ARMS), {}, {}, path)
+    assert not path.exists()
+
+
+def test_the_legend_of_learning_curves_names_an_arm_that_ran_under_one_delay_only(monkeypatch, tmp_path):
+    rows = rows_of("t", "late", SCORES)
+    rows += [each for each in rows_of("t", "later", SCORES) if each["arm"] not in ("best", "flown")]
+    curve = [
+        {"episodes": n, "perceived_return": n / 9, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
+        for n in range(5)
+    ]
+    two = Comparison(rows + [each | {"task": "u"} for each in rows], ARMS)
+    curves = {("t", "none", "best"): [curve]}
+    figure = drawn(monkeypatch, lambda: plot_curves(two, curves, {}, tmp_path / "curves.png"))
+    texts = [text.get_text() for text in figure.axes[1].findobj(Text)]
+    assert {"best", "blind", "flown", "aware", RANDOM} <= {*texts}
+
+
+@pytest.mark.parametrize(("first", "drawn_over"), [(3, [3.0, 4.0]), (5, [])])
+def test_a_learning_curve_is_drawn_where_all_of_its_runs_have_been(first, drawn_over, monkeypatch, tmp_path):
+    runs = [
+        [
+            {
+                "episodes": float(n),
+                "perceived_return": n / 9,
+                "perceived_success_rate": 0.5,
+                "perceived_steps": 9.0,
+            }
+            for n in episodes
+        ]
+        for episodes in (range(5), range(first, 9))
+    ]
+    comparison = Comparison(rows_of("t", "late", SCORES), ARMS)
+    path = tmp_path / "curves.png"
+    figure = drawn(monkeypatch, lambda: plot_curves(comparison, {("t", "none", "best"): runs}, {}, path))
+    line = next(line for line in figure.axes[0].lines if line.get_label() == "best")
+    place = np.asarray(line.get_xdata())
+    assert [*place[~np.isnan(place)][[0, -1]]] == drawn_over if drawn_over else np.isnan(place).all()
+
+
+@pytest.mark.parametrize(("last", "label"), [(500.0, "environment steps"), (400.0, "episodes")])
+def test_curves_are_over_steps_if_all_runs_made_as_many_and_else_over_episodes(
+    last, label, monkeypatch, tmp_path
+):
+    measures = {"perceived_return": 1.0, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
+    fast, slow = (
+        [{"frames": end * n / 4, "episodes": many * n, **measures} for n in range(5)]
+        for end, many in ((500.0, 90), (last, 9))
+    )
+    one, curves = Comparison(rows_of("t", "late", SCORES), ARMS), {("t", "none", "best"): [fast, slow]}
+    figure = drawn(monkeypatch, lambda: plot_curves(one, curves, {}, tmp_path / "curves.png"))
+    assert {axis.get_xlabel() for axis in figure.axes} == {label}
+    assert max(figure.axes[0].lines[0].get_xdata()) == (500 if label != "episodes" else 36)
+
+
+def test_an_infinite_end_of_an_interval_is_drawn_to_the_edge_of_the_panel(monkeypatch, tmp_path):
+    scores = {"best": [9.0, -1.0, 10.0], "blind": [1.0, 5.0, 3.0], "aware": [6.0, 9.0, 7.0]}
+    comparison = Comparison(rows_of("t", "late", scores), ARMS)
+    assert np.isinf(comparison.compared("t", "late")["aware"].j_norm[1:]).all()
+    axis = drawn(monkeypatch, lambda: plot_norms(comparison, tmp_path / "figure.png")).axes[0]
+    assert sorted(line.xy[1] for line in axis.findobj(Annotation)) == [0, 0, 1, 1]

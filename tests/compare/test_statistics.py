@@ -1,0 +1,219 @@
+"""The statistics of comparisons, against closed forms and slow, obvious implementations."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from damian.common.errors import InputError
+from damian.compare.statistics import (
+    bootstrap,
+    improvement_interval,
+    interquartile_mean,
+    interval,
+    normalised,
+    probability_of_improvement,
+    recovery,
+    resampled,
+    student_quantile,
+)
+
+
+def means(scores):
+    return scores.mean(-1)
+
+
+def test_the_normalised_score_is_0_for_random_and_1_for_undelayed():
+    scores = np.array([2.0, 10.0, 4.0, 12.0, 0.0])
+    np.testing.assert_array_equal(normalised(scores, 10.0, 2.0), [0, 1, 0.25, 1.25, -0.25])
+
+
+def test_the_normalised_score_is_nan_where_undelayed_does_not_beat_random():
+    scores = normalised(np.array([1.0, 1.0, 1.0]), np.array([2.0, 3.0, 4.0]), np.array([3.0, 3.0, 3.0]))
+    assert np.isnan(scores).tolist() == [True, True, False]
+
+
+def test_recovery_is_0_for_naive_and_1_for_undelayed():
+    aware = np.array([4.0, 10.0, 7.0, 1.0, 13.0])
+    np.testing.assert_array_equal(recovery(aware, 4.0, 10.0, 0.0), [0, 1, 0.5, -0.5, 1.5])
+
+
+@pytest.mark.parametrize(
+    ("naive", "defined"), [(8.0, True), (9.0, True), (9.01, False), (10.0, False), (11.0, False)]
+)
+def test_recovery_is_nan_if_the_delay_costs_less_than_a_tenth(naive, defined):
+    assert np.isnan(recovery(9.5, naive, 10.0, 0.0)) == (not defined)
+
+
+@pytest.mark.parametrize("n_values", range(1, 14))
+def test_the_interquartile_mean_equals_that_of_each_value_repeated_four_times(n_values):
+    values = np.random.default_rng(n_values).normal(size=n_values)
+    repeated = sorted(np.repeat(values, 4).tolist())
+    middle = repeated[n_values : 3 * n_values]
+    assert interquartile_mean(values) == pytest.approx(sum(middle) / len(middle), abs=1e-12)
+
+
+def test_the_interquartile_mean_ignores_the_outermost_quarters():
+    values = np.arange(8.0)
+    with_outliers = values.copy()
+    with_outliers[[0, 1, 6, 7]] = [-1e9, -5, 70, 1e9]
+    assert interquartile_mean(values) == interquartile_mean(np.flip(with_outliers)) == 3.5
+
+
+def test_the_interquartile_mean_takes_any_leading_dimensions():
+    values = np.random.default_rng(0).normal(size=(2, 3, 7))
+    averages = interquartile_mean(values)
+    for index in np.ndindex(2, 3):
+        assert averages[index] == pytest.approx(interquartile_mean(values[index]), abs=1e-15)
+
+
+def test_all_arms_of_a_stratum_share_their_resamples_and_strata_do_not():
+    seeds = np.arange(5.0)
+    scores = np.stack([[seeds, seeds + 10], [seeds + 100, seeds + 110]])  # [strata, arms, seeds]
+    drawn = resampled(scores, draws=50)
+    assert drawn.shape == (50, 2, 2, 5)
+    np.testing.assert_array_equal(drawn[:, :, 1], drawn[:, :, 0] + 10)
+    assert (drawn[:, 1] - 100 != drawn[:, 0]).any()
+    assert set(drawn[:, 0, 0].ravel()) == set(seeds)
+    assert set(drawn[:, 1, 1].ravel()) == set(seeds + 110)
+
+
+def test_a_resample_is_a_uniform_draw_with_replacement():
+    scores = np.arange(3.0)[None]
+    drawn = resampled(scores, draws=30_000)[:, 0]
+    distinct, counts = np.unique(drawn, axis=0, return_counts=True)
+    assert len(distinct) == 27  # every ordered draw of three seeds
+    assert abs(counts / 30_000 - 1 / 27).max() < 5 * math.sqrt(1 / 27 / 30_000)
+
+
+def exact_interval(values: list[float], weights: list[float]) -> tuple[float, float]:
+    """The 95 % percentile interval of a discrete distribution with these values and weights."""
+    total, low, high = 0.0, math.nan, math.nan
+    for value, weight in sorted(zip(values, weights, strict=True)):
+        total += weight
+        low = value if math.isnan(low) and total >= 0.025 else low
+        high = value if math.isnan(high) and total >= 0.975 else high
+    return low, high
+
+
+def test_the_interval_of_a_mean_equals_that_over_all_possible_draws():
+    scores = np.array([0.0, 1.0, 7.0, 20.0])
+    every = [float(np.mean(draw)) for draw in itertools.product(scores, repeat=4)]
+    low, high = interval(means(resampled(scores[None], draws=20_000)))
+    assert (low[0], high[0]) == exact_interval(every, [4**-4] * len(every))
+
+
+def test_the_interval_of_a_recovery_equals_that_over_all_possible_draws():
+    aware, naive, undelayed = np.array([[3.0, 4.0, 8.0], [1.0, 0.0, 2.0], [9.0, 7.0, 10.0]])
+    ratios = []
+    for draw in itertools.product(range(3), repeat=3):
+        a, n, u = (float(np.mean(arm[list(draw)])) for arm in (aware, naive, undelayed))
+        ratios.append((a - n) / (u - n))
+
+    def ratio(scores):
+        a, n, u = np.moveaxis(scores.mean(-1), -1, 0)
+        return recovery(a, n, u, 0.0)
+
+    low, high = interval(ratio(resampled(np.stack([aware, naive, undelayed])[None], draws=20_000)))
+    np.testing.assert_allclose((low[0], high[0]), exact_interval(ratios, [3**-3] * 27), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("strata", "n_seeds"), [(1, 3), (1, 5), (1, 10), (3, 5)])
+def test_95_percent_intervals_contain_the_truth_in_95_percent_of_all_experiments(strata, n_seeds):
+    experiments = np.random.default_rng(1).normal(7.0, 2.0, size=(strata, 4000, n_seeds))
+    low, high = bootstrap(lambda scores: scores.mean((-1, -3)), experiments, draws=500)
+    covered = ((low < 7) & (high > 7)).mean()
+    assert 0.94 < covered < 0.97, covered
+
+
+def test_an_interval_ends_at_the_bounds_of_its_statistic():
+    shares = np.array([[[1.0, 0.99, 0.9], [0.0, 0.02, 0.01], [0.4, 0.5, 0.6]]])
+    wide, within = bootstrap(means, shares), bootstrap(means, shares, bounds=(0.0, 1.0))
+    assert wide[1][0, 0] > 1
+    assert wide[0][0, 1] < 0
+    np.testing.assert_array_equal(within, np.clip(wide, 0, 1))
+    np.testing.assert_array_equal(np.stack(within)[:, 0, 2], np.stack(wide)[:, 0, 2])
+
+
+def test_fewer_than_three_seeds_give_no_interval():
+    low, high = bootstrap(means, np.array([[[1.0, 2.0], [3.0, 9.0]]]))
+    assert np.isnan([low, high]).all()
+
+
+@pytest.mark.parametrize(
+    ("probability", "degrees", "quantile"),
+    [(0.975, 1, 12.7062), (0.975, 2, 4.3027), (0.95, 9, 1.8331), (0.975, 9, 2.2622), (0.975, 100_000, 1.96)],
+)
+def test_quantiles_of_students_distribution_are_those_of_printed_tables(probability, degrees, quantile):
+    assert student_quantile(probability, degrees) == pytest.approx(quantile, rel=1e-4)
+
+
+def test_the_probability_of_improvement_is_the_share_of_pairs_of_runs():
+    ours, theirs = np.array([[3.0, 5.0, 5.0], [1.0, 2.0, 3.0]]), np.array([[5.0, 4.0, 1.0], [9.0, 9.0, 9.0]])
+    expected = [
+        sum(1.0 if a > b else 0.5 if a == b else 0.0 for a in mine for b in other) / 9
+        for mine, other in zip(ours, theirs, strict=True)
+    ]
+    np.testing.assert_allclose(probability_of_improvement(ours, theirs), expected)
+
+
+@pytest.mark.parametrize("n_seeds", [3, 5, 10])
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 3.0])
+def test_the_interval_of_an_improvement_contains_the_truth_in_95_percent_of_all_experiments(n_seeds, shift):
+    ours, theirs = np.random.default_rng(1).normal(size=(2, 2000, n_seeds))
+    found = probability_of_improvement(ours + shift, theirs)
+    truth = (1 + math.erf(shift / 2)) / 2  # of two normal scores whose means differ by ``shift``
+    ends = {each: improvement_interval(each, n_seeds) for each in np.unique(found)}
+    covered = np.mean([ends[each][0] < truth < ends[each][1] for each in found])
+    assert 0.93 < covered < 0.98, covered
+
+
+def test_the_interval_of_an_improvement_has_a_width_even_if_every_run_beats_every_other_one():
+    # Its end t solves (1 - t)^2 = z^2 t (1 - t) (1 + 9 ((1 - t) / (2 - t) + t / (1 + t))) / 100.
+    low, high = improvement_interval(1.0, 10)
+    other_low, other_high = improvement_interval(0.0, 10)
+    assert (low, high) == pytest.approx((0.8002, 1.0), abs=1e-4)
+    assert (other_low, other_high) == pytest.approx((1 - high, 1 - low), abs=1e-12)
+    assert np.isnan(improvement_interval(1.0, 2)).all()
+
+
+RLIABLE = [
+    (4, 0.5208333333333334, -0.02959999643662835),
+    (8, 0.515625, -0.0058190621298199),
+    (12, 0.44675925925925924, -0.051904822102819555),
+]
+"""Runs of each of three tasks, and what rliable 1.2.0 returns for their probability of improvement and their
+interquartile mean (which it rounds where the number of all runs is not a multiple of four)."""
+
+
+@pytest.mark.parametrize(("n_seeds", "improvement", "middle"), RLIABLE)
+def test_statistics_are_those_of_rliable(n_seeds, improvement, middle):
+    ours, theirs = np.random.default_rng(n_seeds).normal(size=(2, n_seeds, 3))
+    assert probability_of_improvement(ours.T, theirs.T).mean() == pytest.approx(improvement, abs=1e-12)
+    assert interquartile_mean(ours.reshape(-1)) == pytest.approx(middle, abs=1e-12)
+
+
+def test_equal_scores_of_all_seeds_give_an_interval_of_no_width():
+    low, high = bootstrap(means, np.full((1, 2, 5), 3.5))
+    np.testing.assert_array_equal(low, [[3.5, 3.5]])
+    np.testing.assert_array_equal(high, [[3.5, 3.5]])
+
+
+@pytest.mark.parametrize(("n_nans", "ends"), [(0, (2, 97)), (1, (1, 98)), (10, (-np.inf, np.inf))])
+def test_a_nan_counts_at_both_ends_of_an_interval(n_nans, ends):
+    values = np.arange(100.0)
+    values[40 : 40 + n_nans] = np.nan
+    assert interval(values) == ends
+
+
+def test_the_same_seed_gives_the_same_interval():
+    scores = np.random.default_rng(0).normal(size=(2, 4, 6))
+    one, same, other = (bootstrap(means, scores, draws=100, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert (np.array(one) != np.array(other)).any()
+
+
+def test_zero_draws_are_refused():
+    with pytest.raises(InputError, match="draws: 0 is not at least 1"):
+        bootstrap(means, np.zeros((1, 3)), draws=0)

@@ -1,0 +1,321 @@
+"""Measures of episodes in evaluations and in training, and the files that hold them."""
+
+import csv
+import math
+from dataclasses import asdict
+from typing import Any
+
+import pytest
+import torch
+from helpers import MOTIONS, both_motions, everything, square, walking
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torchrl.envs import RewardSum, StepCounter
+
+from damian import keys
+from damian.baselines.random import random_policy
+from damian.common.errors import InputError
+from damian.delays.config import DelayConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.runs.metrics import EpisodeLog, Evaluation, evaluate, evaluation
+from damian.runs.metrics_log import MetricsLog, read_metrics
+from damian.runs.run_folder import results_table, save_results
+from damian.server.features import ObservationConfig
+from damian.server.rewards import RewardConfig
+from damian.server.server import Server
+from damian.server.termination import EpisodeConfig
+from damian.world.messages import Messages
+from damian.world.signal_source import SourceConfig
+
+HORIZON = 24
+BURSTS = {"law": "burst", "enter": 0.3, "leave": 0.3, "good": 0, "bad": 5, "bad_loss": 0.2}
+DELAYS = {
+    "none": DelayConfig(),
+    "constant": DelayConfig(obs=3),
+    "bursts and losses": DelayConfig(obs=BURSTS, loss=0.1),
+    "losses only": DelayConfig(loss=0.3),
+    "rewards and actions too": DelayConfig(obs=2, act=1, rew=2),
+}
+
+
+def joint_spotting(motion: str, delay: DelayConfig, **changed: Any) -> ScenarioConfig:
+    """Two of three UAVs must spot the source at the same time; it is near many of the landing points."""
+    sections = {
+        "motion": MOTIONS[motion],
+        # UAVs in flight hear nothing, so that a louder source is needed for as many successes.
+        "source": SourceConfig(level_db=135.0 if motion == "instant" else 140.0, position=[100.0, 100.0]),
+        "delay": delay,
+        "reward": RewardConfig(
+            spotted=0.3, source_distance=0.2, bonus=2.0, bonus_over_steps=True, penalty=0.5
+        ),
+        "episode": EpisodeConfig(max_steps=20, success_share=0.6),
+    }
+    return square(**(sections | changed))
+
+
+def fly(scenario: ScenarioConfig, n_worlds: int = 24) -> tuple[TensorDictBase, Server]:
+    """A flight of the random policy, [B, HORIZON], and the server."""
+    torch.manual_seed(1)
+    env = make_env(scenario, n_worlds, seed=2, extras=["message"])
+    return env.rollout(HORIZON, random_policy(env), break_when_any_done=False), env.server
+
+
+def delays_by_hand(world: TensorDictBase, steps: int) -> dict[str, list[float]]:
+    """Ages of the messages held [steps], and whether each message sent is late or lost, in an episode."""
+    agents, delays = world["next", "agents"], {"age": [], "late": [], "lost": []}
+    for i in range(agents["message_sent"].shape[-1]):
+        arrivals = {0: 0}  # step of arrival by step of generation; the first message arrives at once
+        for t in range(1, steps + 1):
+            if agents["message_sent"][t - 1, i]:
+                delay = int(agents["delay"][t - 1, i]) if "delay" in agents else 0
+                delays["late"].append(delay > 0)
+                delays["lost"].append(delay == -1)
+                arrivals |= {t: t + delay} if delay >= 0 else {}
+            delays["age"].append(t - max(sent for sent, arrival in arrivals.items() if arrival <= t))
+    return delays
+
+
+def episode_by_hand(world: TensorDictBase, server: Server, needed: int) -> dict[str, Any]:
+    """Measures of the first episode of a flight [T], counted step by step."""
+    row = {"perceived_return": 0.0, "return": 0.0, "success": False, "true_success": False}
+    row |= {"steps": HORIZON}
+    truly_over = False
+    for t in range(1, HORIZON + 1):
+        next_step = world["next"][t - 1]
+        row["perceived_return"] += next_step["agents", "reward"].mean().item()
+        row["success"] |= next_step["success"].item()
+        truth, steps = Messages.unpack(next_step["agents", "message"][None]), torch.tensor([t])
+        undelayed = server.reward_and_status(
+            server.features(truth, steps), truth, steps, torch.zeros(1, dtype=torch.bool)
+        )
+        if not truly_over:
+            row["return"] += undelayed.reward.mean().item()
+        if truth.spotted.sum() >= needed and not truly_over:
+            row["true_success"] = truly_over = True
+            row["steps"] = t
+        if next_step["done"].item():
+            break
+    row["perceived_steps"] = t if row["success"] else HORIZON
+    return row | delays_by_hand(world, t)
+
+
+def by_hand(flight: TensorDictBase, server: Server, needed: int) -> tuple[dict[str, float], list[dict]]:
+    """The measures of an ``Evaluation`` by name, and those of each episode."""
+    rows = [episode_by_hand(world, server, needed) for world in flight]
+
+    def mean(name: str) -> float:
+        return sum(row[name] for row in rows) / len(rows)
+
+    def mean_over_all(name: str) -> float:
+        values = [value for row in rows for value in row[name]]
+        return sum(values) / len(values)
+
+    averaged = ("perceived_steps", "perceived_return", "steps", "return")
+    means = {
+        "episodes": len(rows),
+        "perceived_success_rate": mean("success"),
+        "success_rate": mean("true_success"),
+    }
+    pooled = {name: mean_over_all(name) for name in ("age", "late", "lost")}
+    return means | {name: mean(name) for name in averaged} | pooled, rows
+
+
+@pytest.mark.sample(2)
+@both_motions
+@pytest.mark.parametrize("delay", DELAYS)
+def test_an_evaluation_equals_counting_step_by_step(motion, delay):
+    flight, server = fly(joint_spotting(motion, DELAYS[delay]))
+    expected, _ = by_hand(flight, server, needed=2)
+    assert evaluation(flight, server).row() == pytest.approx(expected, rel=1e-5)
+    assert 0 < expected["perceived_success_rate"] <= 1
+    assert 0 < expected["success_rate"] < 1
+
+
+@both_motions
+@pytest.mark.slow
+def test_false_late_and_missed_successes_differ_from_true_ones(motion):
+    flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.2)), 256)
+    expected, rows = by_hand(flight, server, needed=2)
+    false = [row for row in rows if row["success"] and not row["true_success"]]
+    late = [row for row in rows if row["success"] and row["steps"] < row["perceived_steps"]]
+    missed = [row for row in rows if row["true_success"] and not row["success"]]
+    assert false
+    assert late
+    assert missed
+    assert all(row["perceived_steps"] < row["steps"] == HORIZON for row in false)
+    row = evaluation(flight, server)
+    assert row.success_rate - row.perceived_success_rate == pytest.approx((len(missed) - len(false)) / 256)
+    assert asdict(row) == pytest.approx(expected, rel=1e-5)
+
+
+@both_motions
+def test_without_delay_perceived_and_true_measures_are_equal_bit_for_bit(motion):
+    ends = EpisodeConfig(max_steps=9, success_share=0.3, discharged_share=0.6, end_with_source=True)
+    stops = everything(motion, episode=ends, source=walking(emission="per_step", after_walk="stop"))
+    for scenario in (joint_spotting(motion, DelayConfig()), stops):
+        flight, server = fly(scenario)
+        row = evaluation(flight, server)
+        assert (row.success_rate, row.steps, row.return_) == (
+            row.perceived_success_rate,
+            row.perceived_steps,
+            row.perceived_return,
+        )
+        assert (row.late, row.lost) == (0.0, 0.0)
+        assert (row.age == 0) == (motion == "instant")
+
+
+@both_motions
+def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_on_time(motion):
+    sections = {
+        "observation": ObservationConfig(belief=["belief_moments"]),
+        "reward": RewardConfig(spotted=0.3, custom=[{"term": "extensions:certainty", "weight": 1.0}]),
+        "episode": EpisodeConfig(max_steps=20),
+    }
+    flight, server = fly(joint_spotting(motion, DelayConfig(obs=BURSTS, loss=0.1), **sections))
+    actions = iter(flight[keys.ACTION].unbind(1))
+    again = TensorDictModule(lambda _: next(actions), [keys.READY], [keys.ACTION])
+    env = make_env(joint_spotting(motion, DelayConfig(), **sections), 24, seed=2, extras=["message"])
+    same = env.rollout(HORIZON, again, break_when_any_done=False)
+    late, on_time = evaluation(flight, server), evaluation(same, env.server)
+    assert on_time.return_ == on_time.perceived_return == pytest.approx(late.return_, rel=1e-6)
+    assert late.perceived_return != pytest.approx(late.return_, rel=0.01)
+
+
+def test_an_episode_without_an_end_counts_the_horizon():
+    endless = joint_spotting("instant", DELAYS["constant"], episode=EpisodeConfig(max_steps=None))
+    row = evaluation(*fly(endless))
+    assert (row.perceived_steps, row.steps, row.perceived_success_rate, row.success_rate) == (
+        HORIZON,
+        HORIZON,
+        0,
+        0,
+    )
+
+
+def test_an_evaluation_flies_up_to_the_horizon_and_draws_actions():
+    def env() -> DelayedEnv:
+        return make_env(joint_spotting("instant", DELAYS["constant"]), 8, seed=2, extras=["message"])
+
+    policy = random_policy(env())
+    torch.manual_seed(1)
+    row = evaluate(env(), policy, 6)
+    torch.manual_seed(1)
+    flight = env().rollout(6, policy, break_when_any_done=False)
+    assert row == evaluation(flight, env().server)
+    assert row.perceived_steps <= 6
+
+
+# Measures in training.
+
+
+def training_batch() -> TensorDictBase:
+    env = make_env(
+        joint_spotting("instant", DelayConfig(), episode=EpisodeConfig(max_steps=7, success_share=0.6)), 16
+    )
+    env.append_transform(RewardSum([("agents", "reward")], [("agents", "episode_reward")]))
+    env.append_transform(StepCounter())
+    torch.manual_seed(4)
+    return env.rollout(40, random_policy(env), break_when_any_done=False)
+
+
+def ended_episodes(batch: TensorDictBase) -> list[dict[str, float]]:
+    """Return, success and steps of each ended episode, in the order in which they end."""
+    running, ended = [[0.0, 0] for _ in range(len(batch))], []  # return and steps of each world's episode
+    for t in range(batch.shape[1]):
+        for world, sums in enumerate(running):
+            next_step = batch["next"][world, t]
+            sums[0] += next_step["agents", "reward"].mean().item()
+            sums[1] += 1
+            if next_step["done"]:
+                success = float(next_step["success"])
+                ended.append(
+                    {
+                        "perceived_return": sums[0],
+                        "perceived_success_rate": success,
+                        "perceived_steps": float(sums[1]),
+                    }
+                )
+                running[world] = [0.0, 0]
+    return ended
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.9, 0.991])
+def test_the_episode_log_is_an_exponential_mean_over_episodes_in_the_order_of_their_ends(factor):
+    batch, log = training_batch(), EpisodeLog(factor)
+    for part in batch.split([13, 1, 26], 1):
+        log.add(part)
+    episodes = ended_episodes(batch)
+    assert log.finished == len(episodes) > 50
+    for name, mean in log.means().items():
+        weights = [factor**k for k in range(len(episodes))]
+        weighted = [w * row[name] for w, row in zip(weights, reversed(episodes), strict=True)]
+        assert mean == pytest.approx(sum(weighted) / sum(weights), rel=1e-5)
+    assert {row["perceived_success_rate"] for row in episodes} == {0.0, 1.0}
+
+
+def test_means_are_nan_before_any_episode_has_ended():
+    log = EpisodeLog()
+    log.add(training_batch()[:, :0])
+    assert log.finished == 0
+    assert all(math.isnan(mean) for mean in log.means().values())
+
+
+def test_a_restored_episode_log_continues_as_the_original():
+    batch = training_batch()
+    log, restored = EpisodeLog(0.9), EpisodeLog(0.9)
+    log.add(batch[:, :20])
+    restored.load_state_dict(log.state_dict())
+    assert restored.means() == log.means()
+    for either in (log, restored):
+        either.add(batch[:, 20:])
+    assert restored.means() == log.means()
+    assert restored.finished == log.finished
+
+
+# Tables and files.
+
+ROW = Evaluation(4, 0.25, 50.0, 1.5, 0.75, 30.0, 2.5, 0.125, 0.5, 0.1)
+
+
+def test_a_table_shows_success_only_if_possible_and_what_the_server_saw_only_with_delays():
+    plain = results_table({"random": ROW}, can_succeed=False).splitlines()
+    assert plain[0] == "| policy | return | episodes |"
+    assert plain[2] == "| random | 1.50 | 4 |"
+    success = results_table({"random": ROW}, can_succeed=True).splitlines()
+    assert success[0] == "| policy | success rate | steps | return | episodes |"
+    assert success[2] == "| random | 0.25 | 50.00 | 1.50 | 4 |"
+    late = results_table({"random": ROW}, can_succeed=True, late=True).splitlines()
+    assert late[2] == "| random | 0.75 | 30.00 | 2.50 | 0.25 | 50.00 | 1.50 | 0.12 | 0.50 | 0.10 | 4 |"
+    assert late[0].startswith("| policy | success rate | steps | return | seen success rate | seen steps |")
+
+
+def test_results_are_written_with_every_measure(tmp_path):
+    table = save_results({"one": ROW, "other": ROW}, tmp_path, can_succeed=False, late=False)
+    assert (tmp_path / "result.md").read_text() == table + "\n"
+    with (tmp_path / "result.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row.pop("policy") for row in rows] == ["one", "other"]
+    assert [{name: float(x) for name, x in row.items()} for row in rows] == [asdict(ROW)] * 2
+    assert {path.name for path in tmp_path.iterdir()} == {"result.csv", "result.md"}
+
+
+def test_rows_of_an_older_run_get_the_columns_that_a_newer_version_logs(tmp_path):
+    MetricsLog(tmp_path, tensorboard=False, to_csv=True).add(10, {"loss": 2.0, "old": 3.0})
+    log = MetricsLog(tmp_path, tensorboard=False, to_csv=True, frames=10)
+    log.add(20, {"new": 4.0, "loss": 5.0})
+    log.add(30, {"loss": 6.0})
+    lines = ["frames,loss,old,new", "10.0,2.0,3.0,nan", "20.0,5.0,nan,4.0", "30.0,6.0,nan,nan"]
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == lines
+    assert repr(log.rows) == repr(read_metrics(tmp_path))
+
+
+def test_a_broken_metrics_file_is_refused_with_its_line(tmp_path):
+    log = MetricsLog(tmp_path, tensorboard=False, to_csv=True)
+    log.add(10, {"perceived_steps": 2.0})
+    assert read_metrics(tmp_path) == [{"frames": 10.0, "perceived_steps": 2.0}]
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("20,many\n")
+    with pytest.raises(InputError, match=r"metrics\.csv, line 3: not a row of numbers"):
+        read_metrics(tmp_path)

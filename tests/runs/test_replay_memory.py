@@ -1,0 +1,109 @@
+"""Replay memory in checkpoints: what is loaded equals what was there, whenever it was stored."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import ReplayBuffer
+
+from damian.common.errors import InputError
+from damian.replay.time_storage import TimeStorage
+from damian.runs import replay_memory
+from damian.runs.checkpoint import plain
+from damian.runs.replay_memory import ReplayMemory
+
+WORLDS, ROWS, LONGEST = 2, 20, 3
+
+
+@pytest.fixture(autouse=True)
+def small_segments(monkeypatch):
+    monkeypatch.setattr(replay_memory, "SEGMENT_BYTES", 1)
+    monkeypatch.setattr(replay_memory, "SEGMENTS", 5)  # of 4 rows each
+
+
+def make_buffer() -> ReplayBuffer:
+    storage = TimeStorage(WORLDS * ROWS)
+    storage.longest = LONGEST  # as a BackupdateStorage: later messages correct so many rows
+    return ReplayBuffer(storage=storage)
+
+
+def batch(begin: int, n_rows: int) -> TensorDict:
+    time = torch.arange(begin, begin + n_rows).expand(WORLDS, -1)
+    agents = TensorDict({"x": torch.stack([time, time], -1)}, [WORLDS, n_rows, 2])
+    return TensorDict({"time": time.clone(), "agents": agents}, [WORLDS, n_rows])
+
+
+def correct_latest(buffer: ReplayBuffer, n_rows: int) -> None:
+    """Change the latest rows, as late messages do."""
+    buffer.storage.steps["time"][buffer.storage.latest(n_rows)] += 1000
+
+
+@pytest.mark.parametrize("sizes", [[1, 2, 3], [5] * 9, [19, 1, 20, 7], [3, 20, 20, 20, 2], [4] * 12])
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_a_loaded_memory_equals_the_stored_one(tmp_path, sizes, every):
+    buffer, n_rows = make_buffer(), 0
+    memory, files = ReplayMemory(buffer, tmp_path / "replay"), {}
+    for i, size in enumerate(sizes):
+        if n_rows:
+            correct_latest(buffer, min(LONGEST, n_rows))
+        buffer.extend(batch(n_rows, size))
+        n_rows += size
+        if i % every == 0 or i == len(sizes) - 1:
+            state = plain(memory.state_dict())
+            memory.remove_old()
+            found = {path: path.read_bytes() for path in (tmp_path / "replay").glob("*")}
+            assert all(files.get(path, data) == data for path, data in found.items())  # each is written once
+            assert len(found) <= 7
+            files |= found
+            other = make_buffer()
+            loaded = ReplayMemory(other, tmp_path / "replay")
+            loaded.load_state_dict(state)
+            same(buffer, other)
+            more = batch(n_rows, 2)
+            one, two = (each.storage.steps[each.storage.latest()].clone() for each in (buffer, other))
+            assert (one == two).all()
+            other.extend(more)
+            assert other.storage.steps["time"][other.storage.latest(2)].equal(more["time"].T)
+
+
+def same(one: ReplayBuffer, other: ReplayBuffer) -> None:
+    """Check that two buffers hold the same rows at the same places, and write at the same place next."""
+    n_rows = one.storage._len_along_dim0
+    assert other.storage._len_along_dim0 == n_rows
+    assert (one.storage.steps[:n_rows] == other.storage.steps[:n_rows]).all()
+    assert one.storage.latest().equal(other.storage.latest())
+    assert one.writer.state_dict() == other.writer.state_dict()
+    assert other.storage.steps["agents"].batch_size == (ROWS, WORLDS, 2)
+
+
+def test_an_empty_memory_is_stored_and_loaded(tmp_path):
+    state = ReplayMemory(make_buffer(), tmp_path / "replay").state_dict()
+    buffer = make_buffer()
+    ReplayMemory(buffer, tmp_path / "replay").load_state_dict(state)
+    assert len(buffer) == 0
+    assert [*tmp_path.iterdir()] == []
+
+
+def damaged(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-1])
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        (Path.unlink, "it cannot be read: No such file"),
+        (damaged, "instead of"),
+        (
+            lambda file: file.write_bytes(file.with_name("000001.pt").read_bytes()),
+            "belongs to another checkpoint",
+        ),
+    ],
+)
+def test_a_missing_or_damaged_segment_is_refused_in_one_line(tmp_path, damage, problem):
+    buffer = make_buffer()
+    buffer.extend(batch(0, 20))
+    state = plain(ReplayMemory(buffer, tmp_path / "replay").state_dict())
+    damage(tmp_path / "replay" / "000002.pt")
+    with pytest.raises(InputError, match=rf"^resume: .*replay/000002\.pt: .*{problem}"):
+        ReplayMemory(make_buffer(), tmp_path / "replay").load_state_dict(state)

@@ -1,0 +1,156 @@
+"""Episodes as data: recorded from a rollout, written to files and read again."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from episodes import flight
+
+from damian import keys
+from damian.baselines.random import random_policy
+from damian.common.errors import InputError
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import DelayConfig, ScenarioConfig
+from damian.server.features import ObservationConfig
+from damian.server.termination import EpisodeConfig
+from damian.show.episode import COLUMNS, Episode, record
+from damian.world.signal_source import SourceConfig
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """A rollout [4, 40] in which every world ends, and the episodes that ended first."""
+    source = SourceConfig(motion="dynamic", emission="per_step", emission_probability=0.5)
+    scenario = ScenarioConfig(
+        source=source,
+        delay=DelayConfig(obs={"law": "uniform", "low": 0, "high": 4}, loss=0.2),
+        observation=ObservationConfig(belief=["belief_moments"]),
+        episode=EpisodeConfig(max_steps=25),
+    )
+    env = make_env(scenario, 4, seed=5, extras=["message", "state", "reward_terms"])
+    rollout = env.rollout(40, random_policy(env), break_when_any_done=False)
+    return rollout, record(rollout, env.uav_env, {"policy": "random"})
+
+
+def test_an_episode_ends_where_the_world_first_ends(flown):
+    rollout, episodes = flown
+    done = rollout["next", "done"].squeeze(-1)
+    lengths = [next((t + 1 for t in range(40) if done[world, t]), 40) for world in range(4)]
+    assert [episode.n_steps for episode in episodes] == lengths
+    assert max(lengths) < 40
+    successes = [bool(rollout["next", "success"][world, n - 1]) for world, n in enumerate(lengths)]
+    assert [episode.success for episode in episodes] == successes
+    assert [episode.about["world"] for episode in episodes] == [0, 1, 2, 3]
+
+
+def test_rewards_and_beliefs_are_those_of_the_rollout_after_each_step(flown):
+    rollout, episodes = flown
+    for world, episode in enumerate(episodes):
+        after = rollout["next"][world, : episode.n_steps]
+        reward = np.concatenate([np.zeros((1, 3)), after[keys.REWARD].squeeze(-1).numpy()])
+        assert np.array_equal(episode.reward, reward)
+        np.testing.assert_allclose(sum(episode.reward_terms.values()), reward, atol=1e-5)
+        assert np.array_equal(episode.belief[1:], after[keys.BELIEF].numpy())
+        assert episode.belief.shape[1] == len(episode.cells)
+        assert episode.perceived_return == pytest.approx(reward.mean(-1).sum())
+
+
+def test_a_uav_spots_only_a_source_that_emits_and_is_near(flown):
+    seen = 0
+    for episode in flown[1]:
+        distance = np.linalg.norm(episode.true - episode.source[:, None], axis=-1)
+        expected = (distance <= episode.radius) & episode.emits[:, None]
+        clear = np.abs(distance - episode.radius) > 1e-3
+        assert (episode.spotted == expected)[clear].all()
+        seen += int(episode.spotted.sum())
+    assert seen > 0
+
+
+def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(flown, tmp_path):
+    for episode in flown[1]:
+        episode.save(tmp_path / "episode.json")
+        again = Episode.load(tmp_path / "episode.json")
+        for name in COLUMNS:
+            one, other = getattr(episode, name), getattr(again, name)
+            pairs = one.items() if isinstance(one, dict) else [(None, one)]
+            for key, values in pairs:
+                found = other if key is None else other[key]
+                np.testing.assert_allclose(found, values, rtol=5.1e-5, atol=1e-30)
+                assert found.dtype == bool if values.dtype == bool else found.shape == values.shape
+        assert again.region.equals_exact(episode.region, 1e-9)
+        assert (again.about, again.success, again.origin) == (episode.about, episode.success, episode.origin)
+    stored = json.loads((tmp_path / "episode.json").read_text())
+    assert (stored["schema"], stored["version"]) == ("damian-episode", 2)
+    assert set(stored["meaning"]) == set(COLUMNS) <= set(stored)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("{}", "'schema'"),
+        ('{"schema": "damian-episode", "version": 3}', "it is damian-episode of version 3"),
+        ("no json", "Expecting value"),
+        ("[1]", "list indices"),
+    ],
+)
+def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, text, problem):
+    path = tmp_path / "episode.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1 or 2: ") as refused:
+        Episode.load(path)
+    assert problem in str(refused.value)
+    with pytest.raises(InputError, match="no episode"):
+        Episode.load(tmp_path / "missing.json")
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"age": [[0.0, 0.0]]}, "age has not the shape [T + 1, N]: (1, 2)"),
+        ({"age": [["old", "x"]] * 4}, "ufunc"),
+        ({"battery": [[1.0], [1.0, 2.0]] * 2}, "inhomogeneous"),
+        ({"cells": [[0.0, 0.0]], "belief": [[0.5, 0.5]] * 4}, "belief has not the shape [T + 1, K]: (4, 2)"),
+        ({"belief": [[1.0]] * 4}, "cells has not the shape [K, 2]: None"),
+        ({"reward_terms": {"near": [[1.0, 2.0]]}}, "reward_terms has not the shape"),
+        ({"track": None}, "track is missing"),
+        ({"time": None}, "time is missing"),
+        ({"position": {}}, "position is not a list"),
+        ({"spotted": {"a": [[True]]}}, "spotted is not a list"),
+        ({"reward_terms": [[1.0, 2.0]] * 4}, "reward_terms is not lists by name"),
+        ({"source": [[0.0, 1e300]] * 4}, "source holds something else than numbers up to 1e+09"),
+        ({"source": [[0.0, float("nan")]] * 4}, "source holds something else than numbers"),
+        ({"time": [0.0, 1.0, 1.0, 2.0]}, "time does not increase"),
+        ({"time": []}, "has not the shape"),
+        ({"delay": [[0.5, 0.5]] * 4}, "delay is not in whole steps"),
+        ({"region": {"type": "Point", "coordinates": [0, 0]}}, "region is no polygon with an area"),
+        ({"region": {"type": "Polygon"}}, "ParseException"),
+        ({"landing_points": [[1.0, 2.0, 3.0]]}, "landing_points or region"),
+        ({"origin": [1.0]}, "origin is not latitude and longitude"),
+        ({"radius": -1.0}, "radius no length"),
+        ({"about": []}, "about is not what damian fly writes"),
+    ],
+)
+def test_a_file_whose_columns_do_not_fit_is_refused_in_one_line(tmp_path, changes, problem):
+    path = tmp_path / "episode.json"
+    path.write_text(json.dumps({**flight().document(), **changes}))
+    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1 or 2: ") as refused:
+        Episode.load(path)
+    assert problem in str(refused.value)
+    assert str(refused.value).isprintable()
+
+
+def test_an_episode_without_optional_columns_survives_its_file(flown, tmp_path):
+    episode = replace(flown[1][0], cells=None, belief=None, reward_terms={}, origin=(53.0, -4.0))
+    episode.save(tmp_path / "episode.json")
+    again = Episode.load(tmp_path / "episode.json")
+    assert again.cells is None
+    assert again.belief is None
+    assert again.reward_terms == {}
+    assert again.origin == (53.0, -4.0)
+
+
+def test_the_times_of_a_long_episode_differ(tmp_path):
+    long = flight(1, time=np.array([12000.0, 12000.8]))
+    long.save(tmp_path / "episode.json")
+    assert Episode.load(tmp_path / "episode.json").time.tolist() == [12000.0, 12000.8]

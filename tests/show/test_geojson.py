@@ -1,0 +1,203 @@
+"""Episodes on real regions as GeoJSON: valid by RFC 7946, and where they should be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from geojson_pydantic import FeatureCollection
+from shapely.geometry import shape
+
+from damian.baselines.random import random_policy
+from damian.common.errors import InputError
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import DelayConfig, ScenarioConfig
+from damian.server.features import ObservationConfig
+from damian.show.episode import record
+from damian.show.geojson import feature_collection
+from damian.world.regions.config import RegionConfig
+from damian.world.regions.geodesy import to_local
+from damian.world.regions.region import local_region
+
+
+@pytest.fixture(scope="module")
+def episode():
+    """Ten steps of two UAVs over Llanbedr, with delays and a belief."""
+    scenario = ScenarioConfig(
+        agents=2,
+        region=RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest"),
+        delay=DelayConfig(obs=3),
+        observation=ObservationConfig(belief=["belief_moments"]),
+    )
+    torch.manual_seed(0)  # a fixture of the module is made before the seed of each test is set
+    env = make_env(scenario, 1, seed=1, extras=["message", "state", "reward_terms"])
+    return record(env.rollout(10, random_policy(env)), env.uav_env, {})[0]
+
+
+def by_kind(collection: dict) -> dict[str, list[dict]]:
+    """Features by their kind."""
+    found: dict[str, list[dict]] = {}
+    for feature in collection["features"]:
+        found.setdefault(feature["properties"]["kind"], []).append(feature)
+    return found
+
+
+def local(feature: dict, origin: tuple[float, float]) -> np.ndarray:
+    """Corners of a feature's geometry in local metres, [C, 2]."""
+    degrees = shapely.get_coordinates(shape(feature["geometry"]))
+    return np.column_stack(to_local(degrees[:, 1], degrees[:, 0], origin))
+
+
+def check_rfc_7946(collection: dict) -> None:
+    """Valid by a library, on the Earth, with shells counter-clockwise and holes clockwise."""
+    FeatureCollection.model_validate(collection)
+    for feature in collection["features"]:
+        geometry = shape(feature["geometry"])
+        assert geometry.is_valid
+        west, south, east, north = geometry.bounds
+        assert -180 <= west <= east <= 180
+        assert -90 <= south <= north <= 90
+        for part in shapely.get_parts(geometry):
+            if part.geom_type == "Polygon":
+                assert part.exterior.is_ccw
+                assert not any(ring.is_ccw for ring in part.interiors)
+
+
+def test_an_episode_is_valid_and_lies_where_it_was_flown(episode):
+    collection = feature_collection(episode, 7)
+    check_rfc_7946(collection)
+    kinds = by_kind(collection)
+    assert {name: len(found) for name, found in kinds.items() if name != "belief"} == {
+        "region": 1,
+        "landing points": 1,
+        **dict.fromkeys(("track", "footprint", "coverage", "believed position"), 2),
+        "source track": 1,
+    }
+    for uav in range(2):
+        track, now, held = (kinds[kind][uav] for kind in ("track", "footprint", "believed position"))
+        flown = episode.true[:8, uav]
+        moved = (flown != flown[0]).any()
+        np.testing.assert_allclose(local(track, episode.origin), flown if moved else flown[:1], atol=0.02)
+        assert track["properties"].get("times") == (episode.time[:8].tolist() if moved else None)
+        distance = np.linalg.norm(local(now, episode.origin) - episode.true[7, uav], axis=-1)
+        np.testing.assert_allclose(distance, episode.radius, atol=0.02)
+        np.testing.assert_allclose(local(held, episode.origin)[0], episode.true[4, uav], atol=0.02)
+        assert held["properties"]["age_s"] == 3.0
+    assert kinds["source track"][0]["geometry"]["type"] == "Point"  # it does not move
+    source = local(kinds["source track"][0], episode.origin)
+    np.testing.assert_allclose(source, episode.source[:1], atol=0.02)
+
+
+def test_coverage_is_what_footprints_have_covered_of_the_region(episode):
+    def in_metres(degrees: np.ndarray) -> np.ndarray:
+        return np.column_stack(to_local(degrees[:, 1], degrees[:, 0], episode.origin))
+
+    for uav, feature in enumerate(by_kind(feature_collection(episode, 10))["coverage"]):
+        covered = shapely.transform(shape(feature["geometry"]), in_metres)
+        points = np.random.default_rng(uav).uniform(*np.reshape(episode.region.bounds, (2, 2)), (4000, 2))
+        distance = np.linalg.norm(points[:, None] - episode.true[:, uav], axis=-1).min(-1)
+        expected = (distance <= episode.radius) & shapely.contains_xy(episode.region, *points.T)
+        clear = np.abs(distance - episode.radius) > 0.01 * episode.radius
+        assert (shapely.contains_xy(covered, *points.T) == expected)[clear].mean() > 0.999
+
+
+def test_beliefs_are_cells_with_their_probability(episode):
+    cells = by_kind(feature_collection(episode, 10))["belief"]
+    likely = episode.likely_cells(10)
+    assert len(cells) == len(likely) > 3
+    shares = [cell["properties"]["probability"] for cell in cells]
+    np.testing.assert_allclose(shares, episode.belief[10, likely], atol=1e-5)
+
+
+def test_what_crosses_the_antimeridian_is_cut_there(episode):
+    moved = replace(episode, origin=(-17.0, 179.9999))
+    collection = feature_collection(moved, 10)
+    check_rfc_7946(collection)
+    kinds = by_kind(collection)
+    region = shape(kinds["region"][0]["geometry"])
+    assert region.geom_type == "MultiPolygon"
+    assert [round(bound, 3) for bound in region.bounds[::2]] == [-180.0, 180.0]
+    one_place = by_kind(feature_collection(replace(episode, origin=(-17.0, 20.0)), 10))["region"][0]
+    assert region.area == pytest.approx(shape(one_place["geometry"]).area, rel=1e-4)
+    cut = [track for track in kinds["track"] if track["geometry"]["type"] == "MultiLineString"]
+    assert all("times" not in track["properties"] for track in cut)
+
+
+@pytest.mark.parametrize("longitude", [179.999, -179.999])
+def test_areas_that_touch_the_antimeridian_stay_areas(episode, longitude):
+    def local_metres(corners: list[list[float]]) -> np.ndarray:
+        return np.column_stack(to_local(*np.array(corners).T[::-1], origin))
+
+    # The region spans the antimeridian in the south, and ends there in the north.
+    origin, above = (0.0, longitude), [[180.0, 0.001], [180.0, 0.002], [179.998, 0.002]]
+    below = [[179.998, -0.002], [180.002, -0.002], [180.002, 0.001]]
+    region = shapely.Polygon(local_metres(below + above))
+    cells = np.stack(np.meshgrid([-45.0, -15.0, 15.0, 45.0], [-30.0, 0.0, 30.0]), -1).reshape(-1, 2)
+    cells += local_metres([[180.0, 0.0]])  # two columns on each side, whose edges touch it
+    belief = np.full((episode.n_steps + 1, len(cells)), 1 / len(cells))
+    moved = replace(episode, origin=origin, region=region, cells=cells, belief=belief)
+    collection = feature_collection(moved, 10)
+    check_rfc_7946(collection)
+    kinds = by_kind(collection)
+    assert [feature["geometry"]["type"] for feature in kinds["belief"]] == ["Polygon"] * len(cells)
+    assert [feature["geometry"]["type"] for feature in kinds["region"]] == ["MultiPolygon"]
+    parts = shapely.get_parts(shape(kinds["region"][0]["geometry"]))
+    assert sorted(part.area for part in parts) == pytest.approx([6e-6, 8e-6], rel=1e-3)
+
+
+@pytest.mark.parametrize("latitude", [-30.0, 0.0, 50.0])
+def test_a_region_whose_hole_touches_its_shell_is_valid(episode, latitude):
+    shell = np.array([[9.996, -0.004], [10.004, -0.004], [10.004, 0.004], [9.996, 0.004]])
+    hole = np.array([[9.996, 0.001], [9.998, 0.001], [9.998, -0.001]])
+    read = local_region([[ring + np.array([0, latitude]) for ring in (shell, hole)]], "lake", None, "test")
+    collection = feature_collection(replace(episode, region=read.polygon, origin=read.origin), 10)
+    check_rfc_7946(collection)
+    written = shape(by_kind(collection)["region"][0]["geometry"])
+    assert written.area == pytest.approx(shapely.Polygon(shell, [hole]).area, rel=1e-6)
+
+
+def flown_about_the_antimeridian(episode, longitude: float, metres: list[list[float]]):
+    """The track of UAV 0 along points [T, 2] metres east of the antimeridian and north of an origin there."""
+    origin = (-17.0, longitude)
+    (east,), _north = to_local([-17.0], [180.0], origin)
+    path = np.array(metres) + np.array([east, 0.0])
+    position = episode.position.copy()
+    position[: len(path), 0, :2] = path
+    moved = replace(episode, origin=origin, position=position)
+    track = by_kind(feature_collection(moved, len(path) - 1))["track"][0]
+    return track, path, origin
+
+
+@pytest.mark.parametrize("longitude", [179.999, -179.999])
+@pytest.mark.parametrize("east", [300.0, -300.0, 0.0])
+def test_a_track_on_one_side_of_the_antimeridian_keeps_its_points_and_times(episode, longitude, east):
+    sign = np.sign(east) or -1.0
+    metres = [[east, 0], [east, 0], [east + 80 * sign, 0], [east, 0], [east + 9 * sign, 50], [east, 90]]
+    track, path, origin = flown_about_the_antimeridian(episode, longitude, metres)
+    assert track["geometry"]["type"] == "LineString"
+    np.testing.assert_allclose(local(track, origin), path, atol=0.02)
+    assert track["properties"]["times"] == episode.time[: len(path)].tolist()
+    degrees = shapely.get_coordinates(shape(track["geometry"]))
+    assert (np.abs(degrees[:, 0]) <= 180).all()
+
+
+@pytest.mark.parametrize("longitude", [179.999, -179.999])
+def test_a_track_across_the_antimeridian_is_cut_between_all_of_its_points(episode, longitude):
+    metres = [[-90, 0], [-90, 0], [60, 0], [60, 0], [0, 0], [90, 9], [0, 0], [0, 0], [-90, 0], [-60, 5]]
+    track, path, origin = flown_about_the_antimeridian(episode, longitude, metres)
+    assert track["geometry"]["type"] == "MultiLineString"
+    assert "times" not in track["properties"]
+    parts = [np.array(part) for part in track["geometry"]["coordinates"]]
+    assert [len(part) for part in parts] == [3, 7, 3]
+    for part, following, sign in zip(parts, parts[1:], [1, -1], strict=False):
+        assert (part[-1, 0], following[0, 0]) == (180 * sign, -180 * sign)
+        assert part[-1, 1] == following[0, 1]
+    # The first crossing lies within a step, and the second is a point of the track, which both parts have.
+    points = np.delete(local(track, origin), [2, 3, 10], axis=0)
+    np.testing.assert_allclose(points, path, atol=0.02)
+
+
+def test_an_episode_without_a_place_on_earth_is_refused(episode):
+    with pytest.raises(InputError, match="geojson: its region has no latitude and longitude"):
+        feature_collection(replace(episode, origin=None), 3)

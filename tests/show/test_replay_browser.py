@@ -1,0 +1,353 @@
+"""The replay page in a real browser: it shows the numbers of the episode, and every part of it draws.
+
+Run by `make test-browser`. Selenium is imported where it is used, so that the other tests do not need it.
+"""
+
+import io
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib import import_module
+from shutil import which
+
+import numpy as np
+import pytest
+import shapely
+from episodes import SQUARE, flight
+from PIL import Image
+
+from damian.show.belief_figure import COLOURS
+from damian.show.replay_page import save_page
+from damian.world.regions.geodesy import to_latlon
+
+pytestmark = pytest.mark.browser
+FLAGS = ["--headless=new", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
+FLAGS += ["--enable-unsafe-swiftshader", "--hide-scrollbars"]
+LAST, LATE = 20, 4
+ORIGIN = (52.8, -4.1)
+
+
+def late_flight(late: int = LATE, **changes):
+    """Two UAVs that fly through the region and up, whose messages are late, and some of which are lost."""
+    rng, t = np.random.default_rng(3), LAST + 1
+    position = np.cumsum(rng.normal(0, 25, (t, 2, 3)), 0).clip(-180, 180).round(1)
+    position[..., 2] = np.abs(position[..., 2])
+    steps = np.arange(t)
+    held = np.maximum(steps - late, 0)
+    sent = np.ones((t, 2), bool)
+    sent[0] = False
+    delay = np.full((t, 2), late)
+    delay[::5, 1] = -1
+    reward = rng.uniform(0, 1, (t, 2))
+    reward[0] = 0
+    east, north = np.meshgrid(np.arange(-175.0, 200, 50), np.arange(-175.0, 200, 50))
+    columns = {
+        "position": position,
+        "battery": 100 - 4.0 * np.tile(steps[:, None], 2),
+        "believed": position[held, :, :2],
+        "age": 2.0 * np.tile((steps - held)[:, None], 2),
+        "emits": steps % 3 == 0,
+        "spotted": rng.uniform(size=(t, 2)) > 0.5,
+        "reward": reward,
+        "reward_terms": {"near": 0.75 * reward, "far": 0.25 * reward},
+        "cells": np.stack([east.ravel(), north.ravel()], -1),
+        "belief": rng.dirichlet(np.full(64, 0.2), t),
+        "about": {"overrides": [f"delay.obs={late}"], "seed": 3},
+        "instant": False,
+    }
+    return flight(LAST, **{**columns, "sent": sent, "delay": delay, **changes})
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium without a screen, whose WebGL is computed by the processor."""
+    webdriver = import_module("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    for flag in FLAGS:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(which("chromedriver")))
+    yield driver
+    driver.quit()
+
+
+class Page:
+    """A page that is open, and what one can do with it."""
+
+    def __init__(self, driver):
+        self.driver = driver
+
+    def run(self, code, *values):
+        return self.driver.execute_script(code, *values)
+
+    def all(self, selector):
+        return self.driver.find_elements("css selector", selector)
+
+    def one(self, selector):
+        return self.driver.find_element("css selector", selector)
+
+    def wait(self, condition, seconds=20):
+        waits = import_module("selenium.webdriver.support.wait")
+        waits.WebDriverWait(self.driver, seconds, 0.02).until(lambda _: condition())
+
+    def settle(self):
+        """Wait until what has changed is on the screen."""
+        code = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()))"
+        self.driver.execute_async_script(code)
+
+    def press(self, *keys):
+        names = import_module("selenium.webdriver").Keys
+        for key in keys:
+            self.one("body").send_keys(getattr(names, key, key))
+        self.settle()
+
+    def actions(self):
+        """What a mouse does."""
+        return import_module("selenium.webdriver").ActionChains(self.driver)
+
+    def time(self):
+        return float(self.run("return document.querySelector('#transport input').value"))
+
+    def shown(self, name, card=0):
+        return self.all(".card")[card].find_element("css selector", f"[data-shown={name}]").text
+
+    def table(self, card=0):
+        """The numbers of the UAVs at this instant, by column."""
+        rows = self.all(".card")[card].find_elements("css selector", ".numbers tbody tr")
+        names = ("east", "north", "up", "age", "battery")
+        find = [[row.find_element("css selector", f"[data-shown={n}]") for n in names] for row in rows]
+        cells = np.array([[float(cell.text.replace("\u2212", "-")) for cell in row] for row in find])
+        return dict(zip(names, cells.T, strict=True))
+
+    def map(self, card=0):
+        return self.run("return document.querySelectorAll('canvas.map')[arguments[0]].toDataURL()", card)
+
+    def picture(self, selector):
+        """An element as pixels [height, width, 3]."""
+        return np.asarray(Image.open(io.BytesIO(self.one(selector).screenshot_as_png)).convert("RGB"))
+
+
+@pytest.fixture
+def opened(browser, tmp_path):
+    """Open a page of episodes, and see that the browser has nothing to complain of."""
+
+    @contextmanager
+    def open_page(*episodes, width=1280, height=900, dark=False):
+        save_page(episodes, tmp_path / "page.html")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+        browser.get((tmp_path / "page.html").as_uri())
+        page = Page(browser)
+        page.wait(lambda: page.run("return document.documentElement.dataset.ready"))
+        page.settle()
+        yield page
+        problems = [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"]
+        assert problems == []
+
+    return open_page
+
+
+def check_numbers(page, episode, step, card=0):
+    """The page shows the numbers of an instant of an episode."""
+    table = page.table(card)
+    for axis, name in enumerate(("east", "north", "up")):
+        np.testing.assert_allclose(table[name], episode.position[step, :, axis], atol=0.001)
+    np.testing.assert_allclose(table["age"], episode.age[step], atol=0.001)
+    np.testing.assert_allclose(table["battery"], episode.battery[step], atol=0.001)
+    won = float(page.shown("return", card).split()[1])
+    assert won == pytest.approx(episode.reward[: step + 1].mean(-1).sum(), abs=0.0051)
+    assert page.shown("time", card) == f"{episode.time[step]:g} s"
+    assert page.shown("spots", card).startswith(f"{episode.spotted[step].sum()} of 2")
+
+
+def test_it_shows_the_numbers_of_every_instant_and_loads_nothing(opened):
+    episode = late_flight()
+    with opened(episode) as page:
+        for step in range(LAST + 1):
+            check_numbers(page, episode, step)
+            page.press("ARROW_RIGHT")
+        legend = [each.text for each in page.all("[data-chart=reward] .u-value")][1:]
+        expected = [f"{episode.reward_terms[name][LAST].mean():.3f}" for name in ("near", "far")]
+        assert legend == expected
+        assert page.run("return performance.getEntriesByType('resource').length") == 0
+
+
+def test_it_plays_pauses_and_ends_with_the_last_instant(opened):
+    episode = late_flight()
+    with opened(episode) as page:
+        before = page.map()
+        page.press(" ")
+        page.wait(lambda: page.time() > 3)
+        page.press(" ")
+        paused = page.time()
+        page.settle()
+        assert page.time() == paused
+        assert page.map() != before
+        page.press(*["ARROW_UP"] * 5, " ")
+        page.wait(lambda: page.time() == episode.time[-1])
+        check_numbers(page, episode, LAST)
+        assert page.shown("ended") == "ended"
+        assert page.one("#transport .play").get_attribute("aria-label").startswith("play")
+        page.press(" ")
+        page.wait(lambda: page.time() < episode.time[-1])
+
+
+def test_the_slider_the_keys_and_a_click_in_a_chart_go_to_an_instant(opened):
+    episode = late_flight()
+    with opened(episode) as page:
+        slide = "const s = document.querySelector('#transport input'); s.value = arguments[0];"
+        slide += "s.dispatchEvent(new Event('input'))"
+        for time, step in ((episode.time[-1], LAST), (13.2, 7)):
+            page.run(slide, float(time))
+            page.settle()
+            check_numbers(page, episode, step)
+        for key, step in (("END", LAST), ("ARROW_LEFT", LAST - 1), ("HOME", 0)):
+            page.press(key)
+            check_numbers(page, episode, step)
+        for selector in ("[data-chart=age] .u-over", "canvas.lanes"):
+            page.press("HOME")
+            page.actions().move_to_element(page.one(selector)).click().perform()
+            page.settle()
+            step = round(page.time() / 2)
+            assert 8 <= step <= 12
+            check_numbers(page, episode, step)
+
+
+@pytest.mark.parametrize("layer", ["truth", "believed", "messages", "covered", "belief"])
+def test_each_layer_can_be_seen_and_taken_away(opened, layer):
+    with opened(late_flight()) as page:
+        page.press(*["ARROW_RIGHT"] * 11)
+        button = page.one(f"[data-layer={layer}]")
+        pictures, states = [], []
+        for _ in range(3):
+            pictures.append(page.map())
+            states.append(button.get_attribute("aria-pressed"))
+            button.click()
+            page.settle()
+        assert pictures[0] == pictures[2] != pictures[1]
+        assert states[0] == states[2] != states[1]
+
+
+def test_without_a_belief_its_layer_is_not_offered(opened):
+    with opened(late_flight(cells=None, belief=None)) as page:
+        assert not page.one("[data-layer=belief]").is_enabled()
+        assert page.one("[data-layer=covered]").get_attribute("aria-pressed") == "true"
+
+
+def coloured(picture, uav, tolerance=40):
+    """Rows and columns of the pixels that have about the colour of a UAV."""
+    colour = np.array([int(COLOURS[uav][i : i + 2], 16) for i in (1, 3, 5)])
+    return np.nonzero(np.abs(picture.astype(int) - colour).max(-1) < tolerance)
+
+
+def test_real_uavs_have_their_ids_and_an_unknown_source_is_not_drawn(opened):
+    about = {"uavs": ["north-1", "a rather long identifier of a UAV"], "fleet": "north"}
+    known = late_flight()
+    with opened(known) as page:
+        with_source = page.map()
+    with opened(replace(known, about=about, source=None, emits=None)) as page:
+        assert page.map() != with_source
+        heads = [head.text for head in page.all(".numbers tbody th")]
+        assert heads == about["uavs"]
+        page.press("END")
+        check_numbers(page, known, LAST)
+        page.press("v")
+        page.press("HOME")
+        check_numbers(page, known, 0)
+
+
+def test_the_space_shows_uavs_above_the_ground_and_turns(opened):
+    place = np.tile([[-80.0, 0.0, 0.0], [80.0, 0.0, 0.0]], (LAST + 1, 1, 1))
+    place[LAST, 0, 2] = 60.0
+    calm = {"position": place, "believed": place[..., :2], "age": np.zeros((LAST + 1, 2))}
+    with opened(late_flight(0, **calm, spotted=np.zeros((LAST + 1, 2), bool))) as page:
+        page.one("[data-view='3d']").click()
+        page.press("2", "3", "5")
+        low = page.picture(".view")
+        assert len(np.unique(low.reshape(-1, 3), axis=0)) > 50
+        assert len(coloured(low, 0)[0]) > 30
+        assert len(coloured(low, 1)[0]) > 30
+        page.press("END")
+        high = page.picture(".view")
+        assert coloured(high, 0)[0].min() < coloured(low, 0)[0].min() - 30
+        assert abs(coloured(high, 1)[0].min() - coloured(low, 1)[0].min()) < 3
+        drag = page.actions().move_to_element(page.one(".view"))
+        drag.click_and_hold().move_by_offset(120, 0).release().perform()
+        page.settle()
+        assert (page.picture(".view") != high).any(-1).mean() > 0.05
+
+
+def test_several_episodes_share_the_time_and_one_that_has_ended_waits(opened):
+    short = flight(5, about={"overrides": ["delay.obs=0"], "seed": 3}, reward=np.ones((6, 2)))
+    with opened(short, late_flight()) as page:
+        assert [each.text for each in page.all(".card h2")] == ["delay.obs=0", "delay.obs=4"]
+        left, right = (card.rect for card in page.all(".card"))
+        assert left["y"] == right["y"]
+        assert left["x"] + left["width"] <= right["x"]
+        page.press("END")
+        assert (page.shown("time", 0), page.shown("time", 1)) == ("10 s", "40 s")
+        assert page.shown("return", 0) == "return 6.00"
+        check_numbers(page, late_flight(), LAST, card=1)
+
+
+def test_the_pointer_tells_latitude_and_longitude_of_a_real_region(opened):
+    region = shapely.transform(SQUARE, lambda xy: xy + np.array([3000.0, -1500.0]))
+    with opened(flight(region=region, origin=ORIGIN)) as page:
+        page.actions().move_to_element(page.one(".view")).perform()
+        page.settle()
+        north, west = page.one(".hint").text.replace("°", "").split(", ")
+        assert (north[-1], west[-1]) == ("N", "W")
+        latitude, longitude = to_latlon(3000.0, -1500.0, ORIGIN)
+        assert float(north[:-1]) == pytest.approx(float(latitude), abs=3e-5)
+        assert -float(west[:-1]) == pytest.approx(float(longitude), abs=3e-5)
+
+
+def test_one_can_come_nearer_to_the_map_and_see_all_of_it_again(opened):
+    def places():
+        found = []
+        for shift in (0, 120):
+            page.actions().move_to_element_with_offset(page.one(".view"), shift, 0).perform()
+            page.settle()
+            east, north = page.one(".hint").text.replace("\u2212", "-").split(", ")
+            found.append([float(east.split()[1]), float(north.split()[1])])
+        return np.array(found)
+
+    with opened(late_flight()) as page:
+        before, picture = places(), page.map()
+        page.press("+")
+        nearer = places()
+        np.testing.assert_allclose(nearer[0], before[0], atol=2)
+        np.testing.assert_allclose(2 * (nearer[1] - nearer[0]), before[1] - before[0], atol=3)
+        page.actions().move_to_element(page.one(".view")).click_and_hold().move_by_offset(60, 0).perform()
+        page.actions().release().perform()
+        page.settle()
+        moved = places()
+        np.testing.assert_allclose(2 * (nearer[0] - moved[0]), nearer[1] - nearer[0], atol=3)
+        assert page.map() != picture
+        page.actions().double_click(page.one(".view")).perform()
+        page.settle()
+        assert page.map() == picture
+
+
+def test_on_a_telephone_nothing_is_wider_than_the_screen(opened):
+    with opened(late_flight(2), late_flight(), width=390, height=844) as page:
+        for view in ("2d", "3d"):
+            page.one(f"[data-view='{view}']").click()
+            page.settle()
+            assert page.run("return document.documentElement.scrollWidth") <= 390
+        tops = [card.rect["y"] for card in page.all(".card")]
+        assert tops[1] > tops[0] + 300
+        sizes = [each.rect for each in page.all("button, select") if each.is_displayed()]
+        assert min(size["height"] for size in sizes) >= 40
+
+
+def test_dark_screens_get_a_dark_page(opened):
+    pictures = []
+    for dark in (False, True):
+        with opened(late_flight(), dark=dark) as page:
+            pictures.append(page.picture("body")[:600])
+            background = page.run("return getComputedStyle(document.body).backgroundColor")
+            assert (int(background.split("(")[1].split(",")[0]) < 60) == dark
+    assert pictures[0].mean() > 200
+    assert pictures[1].mean() < 80

@@ -1,0 +1,146 @@
+"""Replay pages as files: what they hold, and that they need nothing else."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import pytest
+from episodes import flight
+
+from damian.common.errors import InputError, RunError
+from damian.show import replay_page
+from damian.show.belief_figure import COLOURS
+from damian.show.replay_page import MOST, page, save_page, titles
+
+EVIL = "scenario=</script><script>alert('&\"\ud800')</script><!--"
+
+
+class Parts(HTMLParser):
+    """The texts of a page's elements, as a browser separates them."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found, self.comments, self.tags = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self.found.append((tag, dict(attrs), ""))
+
+    def handle_data(self, data):
+        tag, attrs, text = self.found.pop() if self.found else ("", {}, "")
+        self.found.append((tag, attrs, text + data))
+
+    def handle_comment(self, data):
+        self.comments.append(data)
+
+    def text(self, tag, **attrs):
+        """The text of the only element of a kind with these attributes."""
+        (text,) = [t for name, own, t in self.found if name == tag and attrs.items() <= own.items()]
+        return text
+
+
+def flown_with(*overrides):
+    """Episodes that differ in their overrides."""
+    about = {"policy": "greedy", "checkpoint": None, "seed": 2, "world": 0}
+    return [flight(about={**about, "overrides": list(words)}) for words in overrides]
+
+
+def test_a_page_holds_the_episodes_as_their_files_do(tmp_path):
+    shown = flown_with(["delay=none", "agents=2"], ["delay=burst", "agents=2"])
+    save_page(shown, tmp_path / "page.html")
+    replay = json.loads(Parts((tmp_path / "page.html").read_text()).text("script", id="replay"))
+    assert replay["colours"] == list(COLOURS)
+    for episode, held in zip(shown, replay["episodes"], strict=True):
+        episode.save(tmp_path / "episode.json")
+        assert {**json.loads((tmp_path / "episode.json").read_text()), "title": held["title"]} == held
+
+
+def test_a_page_is_small_and_loads_nothing():
+    rng = np.random.default_rng(0)
+    steps, cells = 150, 256
+    belief = rng.dirichlet(np.ones(cells), steps + 1)
+    ordinary = flight(steps, cells=rng.uniform(-200, 200, (cells, 2)), belief=belief)
+    text = page([ordinary])
+    assert len(text.encode()) < 2_000_000
+    parts = Parts(text)
+    assert not [attrs for _, attrs in parts.tags if {"src", "href", "srcset", "action"} & {*attrs}]
+    (policy,) = [attrs["content"] for _, attrs in parts.tags if "http-equiv" in attrs]
+    assert policy.startswith("default-src 'none';")
+    assert "http" not in policy
+    assert not re.search(r"@import|url\(", parts.text("style"))
+
+
+def test_the_modules_are_the_files_and_name_only_each_other():
+    modules = json.loads(Parts(page([flight()])).text("script", type="importmap"))["imports"]
+    sources = {name: unquote(url.partition(",")[2]) for name, url in modules.items()}
+    assert {"libraries", "page/main", "page/map", "page/space"} <= {*sources}
+    own = {name: source for name, source in sources.items() if name != "libraries"}
+    for name, source in own.items():
+        assert {*re.findall(r'from "([^"]+)"', source)} <= {*modules}, name
+        assert not re.search(r"https?://(?!www\.w3\.org/)", source), name
+        assert len(source.splitlines()) <= 250, name
+        assert source.startswith("/**"), name
+    assert {*re.findall(r"https?://[^\"'`\s\\]+", sources["libraries"])} == {"http://www.w3.org/1999/xhtml"}
+
+
+def test_the_bundle_has_just_what_the_page_uses_of_the_libraries():
+    folder = Path(replay_page.__file__).parent / "page"
+    entry = (folder / "libraries" / "libraries.js").read_text()
+    exported = {*re.findall(r"(\w+)(?:,\n| \})", entry)}
+    used = {"uPlot"} if 'import { uPlot } from "libraries"' in (folder / "charts.js").read_text() else set()
+    for name in ("space.js", "space_uav.js"):
+        used |= {*re.findall(r"\bthree\.(\w+)", (folder / name).read_text())} - {"js"}
+    assert exported == used
+    bundle = (folder / "libraries.min.js").read_text()
+    (names,) = re.findall(r"export\{([^}]*)\};?\s*$", bundle)
+    assert {each.rpartition(" as ")[2] for each in names.split(",")} == used
+
+
+def test_the_licences_of_the_libraries_are_in_the_page():
+    (comment,) = Parts(page([flight()])).comments
+    assert "three.js authors" in comment
+    assert "Leon Sorokin" in comment
+    assert comment.count("Permission is hereby granted, free of charge") == 2
+
+
+def test_names_of_any_text_stay_text():
+    text = page(flown_with([EVIL], ["agents=2"]))
+    parts = Parts(text.encode().decode())
+    assert [tag for tag, _ in parts.tags].count("script") == 3
+    assert len(parts.comments) == 1
+    held = json.loads(parts.text("script", id="replay"))
+    assert held["episodes"][0]["title"] == EVIL
+    assert "alert" in parts.text("title")
+
+
+@pytest.mark.parametrize(
+    ("words", "shared", "names"),
+    [
+        ([["a=1", "delay=none"], ["a=1", "delay=burst"]], "a=1", ["delay=none", "delay=burst"]),
+        ([["a=1"], ["a=1", "+delay.obs=8"]], "a=1", ["without delay.obs=8", "delay.obs=8"]),
+        ([["a=1"], ["a=1"]], "a=1", ["episode 1", "episode 2"]),
+        ([["formats=[html]", "hydra.run.dir=x", "keep=all"], ["b=2"]], "", ["without b=2", "b=2"]),
+    ],
+)
+def test_episodes_are_named_by_the_settings_that_tell_them_apart(words, shared, names):
+    everywhere, own = titles(flown_with(*words))
+    assert everywhere.removesuffix("policy=greedy seed=2 world=0").strip() == shared
+    assert own == names
+
+
+def test_one_episode_is_named_by_all_its_settings():
+    assert titles(flown_with(["a=1"])) == ("", ["a=1 policy=greedy seed=2 world=0"])
+    assert titles([flight()]) == ("", ["episode"])
+
+
+def test_too_many_episodes_and_places_that_cannot_be_written_are_refused(tmp_path):
+    with pytest.raises(InputError, match=f"episodes: {MOST + 1} is not between 1 and {MOST}"):
+        page([flight()] * (MOST + 1))
+    with pytest.raises(InputError, match="episodes: 0 is not"):
+        page([])
+    with pytest.raises(RunError, match="it cannot be written"):
+        save_page([flight()], tmp_path / "missing" / "page.html")
