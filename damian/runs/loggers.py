@@ -1,15 +1,19 @@
-"""Loggers of one's own, which get every number that a training logs."""
+"""Loggers, which get every number that a training logs: the user's own ones, and two of TorchRL's."""
 
+import secrets
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 from damian.common import checks
-from damian.common.errors import naming_errors
+from damian.common.atomic_files import write_atomically
+from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry, check_parameters
 
 BINS = 64
 """Bins of a histogram."""
+WANDB_ID = "wandb_id.txt"
+"""File in a run folder with the id of its W&B run, which a resumed run continues."""
 
 
 class Logger(Protocol):
@@ -37,7 +41,7 @@ def _not_a_logger(found: Any) -> str | None:
 
 
 LOGGERS = Registry[Callable[..., Logger]]("logger", _not_a_logger)
-"""Loggers of one's own as ``package.module:Name``: functions or classes that get the run folder."""
+"""Loggers of the user's own as ``package.module:Name``: functions or classes that get the run folder."""
 
 
 def make_loggers(written: Sequence[Any], folder: Path) -> list[Logger]:
@@ -68,3 +72,80 @@ def _read(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
     path, make, parameters = LOGGERS.read(entry, key, "logger")
     check_parameters(make, parameters, path, key)
     return path, make, parameters
+
+
+class TorchrlLogger:
+    """Passes what a training logs on to a logger of TorchRL's.
+
+    Args:
+        logger: one of ``torchrl.record.loggers``.
+        finish: ends the run of its library.
+        histograms: whether that library takes histograms.
+    """
+
+    def __init__(self, logger: Any, finish: Callable[[], Any], histograms: bool) -> None:
+        self.logger, self.close, self._histograms = logger, finish, histograms
+
+    def log_scalar(self, name: str, value: float, step: int) -> None:
+        self.logger.log_scalar(name, value, step=step)
+
+    def log_hparams(self, settings: Mapping[str, Any]) -> None:
+        self.logger.log_hparams(dict(settings))
+
+    def log_histogram(self, name: str, values: Sequence[float], step: int) -> None:
+        if self._histograms:
+            self.logger.log_histogram(name, values, step=step, bins=BINS)
+
+
+def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> TorchrlLogger:
+    """A run of Weights & Biases, named as the run folder; a resumed training continues it.
+
+    Args:
+        folder: the run folder, which gets ``wandb/``.
+        project: the run's project.
+        offline: keep everything in the folder, for ``wandb sync``; so does the variable WANDB_MODE=offline.
+
+    Raises:
+        InputError: wandb is not installed.
+    """
+    from torchrl.record.loggers import WandbLogger  # noqa: PLC0415 (takes seconds to import)
+
+    library, stored = _installed("wandb"), folder / WANDB_ID
+    if not stored.exists():
+        write_atomically(stored, secrets.token_hex(8))
+    number = stored.read_text().strip()
+    logger = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
+    return TorchrlLogger(logger, library.finish, histograms=True)
+
+
+def mlflow(
+    folder: Path, *, tracking_uri: str = "sqlite:///mlflow.db", experiment: str = "damian"
+) -> TorchrlLogger:
+    """A run of MLflow, named as the run folder; MLflow takes no histograms.
+
+    Args:
+        folder: the run folder.
+        tracking_uri: MLflow's store or server.
+        experiment: the run's experiment.
+
+    Raises:
+        InputError: mlflow is not installed.
+    """
+    from torchrl.record.loggers import MLFlowLogger  # noqa: PLC0415 (takes seconds to import)
+
+    library = _installed("mlflow")
+    logger = MLFlowLogger(experiment, tracking_uri)
+    library.set_tag("mlflow.runName", folder.name)
+    return TorchrlLogger(logger, library.end_run, histograms=False)
+
+
+def _installed(package: str) -> Any:
+    """A package that not everyone needs.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return __import__(package)
+    except ImportError:
+        raise InputError(f"logger: {package} is not installed; pip install {package}") from None

@@ -1,12 +1,11 @@
 """Replay memory in checkpoints: steps that stay as they are go into files of their own, each written once."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from damian.common.atomic_files import remove_unfinished, writing
 from damian.replay.time_storage import TimeStorage
@@ -21,8 +20,8 @@ SEGMENTS = 32
 class ReplayMemory:
     """The steps of a replay buffer, as a component of a checkpoint.
 
-    Row k is step k of all worlds, counted from the begin of the training. Segment s has the rows from s R up
-    to (s + 1) R, and is written when all of them are stored and late messages can change none of them any
+    Row k is step k of all worlds, counted from the beginning of the training. Segment s has the rows from s R
+    up to (s + 1) R, and is written when all of them are stored and late messages can change none of them any
     more. The rows after the last segment are part of the state. A checkpoint thus costs as much as the new
     rows, however large the memory is.
 
@@ -33,8 +32,8 @@ class ReplayMemory:
 
     def __init__(self, buffer: ReplayBuffer, folder: Path) -> None:
         self._buffer, self._folder = buffer, folder
-        self._digests: dict[int, str] = {}
-        """SHA-256 of each segment."""
+        self._segments: list[int] = []
+        """Numbers of the segments that the latest state needs."""
 
     @property
     def _storage(self) -> TimeStorage:
@@ -46,27 +45,26 @@ class ReplayMemory:
         Raises:
             RunError: a segment cannot be written.
         """
-        storage, written = self._storage, cast(RoundRobinWriter, self._buffer.writer)._write_count
+        storage, written = self._storage, cast(int, self._buffer.write_count)
         if not written:
             return {"written": 0}
-        oldest, per_segment = written - cast(int, storage._len_along_dim0), self._rows_per_segment()
+        oldest, per_segment = written - len(storage.latest()), self._rows_per_segment()
         # Late messages correct rows after these (``BackupdateStorage``).
         final = written - cast(int, getattr(storage, "longest", -1)) - 1
-        first, end = oldest // per_segment, max(final // per_segment, 0)
-        self._digests = {s: digest for s, digest in self._digests.items() if s >= first}
-        for segment in range(first, end):
-            if segment not in self._digests:
-                begin = max(oldest, segment * per_segment)
-                self._digests[segment] = self._write(segment, begin, (segment + 1) * per_segment)
+        segments = range(oldest // per_segment, max(final // per_segment, oldest // per_segment))
+        for segment in segments:
+            if segment not in self._segments:
+                self._write(segment, max(oldest, segment * per_segment), segment * per_segment + per_segment)
+        self._segments = list(segments)
         return {
             "written": written,
             "oldest": oldest,
-            "segments": dict(self._digests),
-            "rows": self._rows(max(oldest, end * per_segment), written),
+            "segments": self._segments,
+            "rows": self._rows(max(oldest, segments.stop * per_segment), written),
             "writer": self._buffer.writer.state_dict(),
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Fill the empty buffer with the rows of a state and of its segments.
 
         Raises:
@@ -74,44 +72,42 @@ class ReplayMemory:
         """
         if not state["written"]:
             return
-        files = {s: (self._path(s), digest) for s, digest in state["segments"].items()}
-        parts = [read_checkpoint(path, "resume", digest)["rows"] for path, digest in files.values()]
+        parts = [read_checkpoint(self._path(segment), "resume")["rows"] for segment in state["segments"]]
         rows = torch.cat([to_tensordict(part) for part in (*parts, state["rows"])])  # type: ignore[arg-type]
         rows = cast(TensorDictBase, rows)[state["oldest"] - state["written"] :]
         storage = self._storage
         if storage.device != "auto":
             rows = rows.to(storage.device)
-        most_rows = storage._max_size_along_dim0(batched_data=rows)
+        most_rows = -(-storage.max_size // rows.shape[1])
         index = torch.arange(state["oldest"], state["written"]) % most_rows
         # Not ``storage.set``: a BackupdateStorage has corrected these rows already.
         LazyTensorStorage.set(storage, index, rows)  # type: ignore[arg-type]
         self._buffer.writer.load_state_dict(state["writer"])
-        self._digests = dict(state["segments"])
+        self._segments = list(state["segments"])
 
     def remove_old(self) -> None:
         """Delete the segments that the latest state does not need."""
         if not self._folder.is_dir():
             return
         remove_unfinished(self._folder)
-        needed = {self._path(segment) for segment in self._digests}
+        needed = {self._path(segment) for segment in self._segments}
         for path in sorted({*self._folder.glob("*.pt")} - needed):
             with writing(path):
                 path.unlink()
 
     def _rows_per_segment(self) -> int:
-        storage, steps = self._storage, self._storage.steps
+        steps = self._storage.steps
         per_row = sum(steps.get(key)[0].nbytes for key in steps.keys(True, True))
-        most_rows = cast(int, storage._max_size_along_dim0())
-        return max(-(-most_rows // SEGMENTS), -(-SEGMENT_BYTES // per_row))
+        return max(-(-len(steps) // SEGMENTS), -(-SEGMENT_BYTES // per_row))
 
     def _rows(self, begin: int, end: int) -> TensorDictBase:
-        index = torch.arange(begin, end) % cast(int, self._storage._max_size_along_dim0())
-        return cast(TensorDictBase, self._storage.steps[index])
+        steps = self._storage.steps
+        return cast(TensorDictBase, steps[torch.arange(begin, end) % len(steps)])
 
-    def _write(self, segment: int, begin: int, end: int) -> str:
+    def _write(self, segment: int, begin: int, end: int) -> None:
         with writing(self._folder):
             self._folder.mkdir(exist_ok=True)
-        return write_checkpoint(self._path(segment), {"rows": self._rows(begin, end)})
+        write_checkpoint(self._path(segment), {"rows": self._rows(begin, end)})
 
     def _path(self, segment: int) -> Path:
         return self._folder / f"{segment:06}.pt"

@@ -1,13 +1,13 @@
 """Files of a run folder: their names, the learning curve, and the table of results."""
 
+import csv
 import io
 import math
 from pathlib import Path
 
 from damian.common.atomic_files import write_atomically
-from damian.common.csv_table import csv_table
 from damian.common.markdown import markdown_table
-from damian.runs.metrics import Evaluation
+from damian.runs.metrics import EVALUATED, Evaluation
 
 FIGURE = "learning_curve.png"
 CHECKPOINT = "checkpoint.pt"
@@ -70,9 +70,11 @@ def save_results(
     below = "\n".join(filter(None, [note, LATE if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
-    measures = next(iter(rows.values())).row()
-    results = csv_table([["policy", *measures], *([name, *row.row().values()] for name, row in rows.items())])
-    write_atomically(folder / RESULTS, results)  # last: with it, a run counts as finished
+    results = io.StringIO(newline="")
+    writer = csv.DictWriter(results, ["policy", *EVALUATED])
+    writer.writeheader()
+    writer.writerows({"policy": name, **evaluation.row()} for name, evaluation in rows.items())
+    write_atomically(folder / RESULTS, results.getvalue())  # last: with it, a run counts as finished
     return table
 
 

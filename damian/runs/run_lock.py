@@ -5,20 +5,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-try:
-    import fcntl
-except ImportError:  # Windows has no such locks
-    fcntl = None
+from filelock import FileLock, Timeout
 
 from damian.common.atomic_files import writing
 from damian.common.errors import InputError
 
+LOCK = ".lock"
+"""The file that is locked; it stays in the folder, since deleting it would let two runs in."""
+
 
 @contextmanager
 def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
-    """Lock a folder for what is done inside.
-
-    The lock is on the open folder itself: it leaves no file, and ends with the process, however that ends.
+    """Lock a folder for what is done inside; the lock ends with the process, however that ends.
 
     Args:
         folder: the run folder; without one there is nothing to lock.
@@ -26,25 +24,28 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
 
     Raises:
         InputError: another process has locked it.
+        RunError: nothing can be written there.
     """
-    if fcntl is None or not is_folder(folder):
+    if not is_folder(folder):
         yield
         return
-    with writing(folder):
-        descriptor = os.open(folder, os.O_RDONLY)
+    lock = FileLock(folder / LOCK, blocking=False, thread_local=False)
     try:
-        # The folder of a run that was refused may just have been removed by that run.
-        if not _lock(descriptor) or not os.fstat(descriptor).st_nlink:
-            raise InputError(
-                f"{key}: {folder} is in use by another run: wait for its end, or choose another folder"
-            )
+        with writing(folder):
+            lock.acquire()
+    except Timeout:
+        problem = "is in use by another run: wait for its end, or choose another folder"
+        raise InputError(f"{key}: {folder} {problem}") from None
+    try:
         yield
     finally:
-        os.close(descriptor)
+        lock.release()
 
 
 def is_locked(folder: Path) -> bool:
     """Has another process, or another run of this one, locked the folder?"""
+    if not (folder / LOCK).exists():
+        return False
     try:
         with locked(folder):
             return False
@@ -54,19 +55,9 @@ def is_locked(folder: Path) -> bool:
 
 def is_folder(path: Path) -> bool:
     """Is the path a folder? False for what can be no path at all, such as one of 5000 characters."""
-    try:
-        return path.is_dir()
-    except OSError:
-        return False
+    return os.path.isdir(path)
 
 
-def _lock(descriptor: int) -> bool:
-    """Lock an open folder; False if another process has. Some file systems cannot lock: there it is true."""
-    assert fcntl is not None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
-    return True
+def is_empty(folder: Path) -> bool:
+    """Is there no folder, or one with nothing in it but the file of its lock?"""
+    return not is_folder(folder) or all(path.name == LOCK for path in folder.iterdir())

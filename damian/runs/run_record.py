@@ -14,6 +14,7 @@ from typing import Any
 
 import damian
 from damian.common.atomic_files import write_atomically
+from damian.common.errors import InputError
 
 RECORD = "run.json"
 OF_FIRST_PART = ("command", "started")
@@ -56,13 +57,11 @@ def commit() -> str | None:
     folder = Path(damian.__file__).parents[1]
     if not (folder / ".git").exists():
         return None
-    git = ["git", "-C", str(folder)]
+    git = ["git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+changes"]
     try:
-        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        status = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=True)
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-    return head.stdout.strip() + ("+changes" if status.stdout.strip() else "")
 
 
 def processor() -> str:
@@ -83,10 +82,8 @@ def write_record(folder: Path, record: dict[str, Any]) -> None:
     if first:
         part = {name: record[name] for name in OF_FIRST_PART}
         record |= {name: first[name] for name in (*OF_FIRST_PART, "config_dir", POLICY) if first.get(name)}
-        parts = first.get("resumed")
-        record["resumed"] = [*(parts if isinstance(parts, list) else []), part]
-    record["wall_time_s"] = _wall_time(first)
-    _write(folder, record)
+        record["resumed"] = [*first.get("resumed", []), part]
+    _write(folder, {**record, "wall_time_s": first.get("wall_time_s", 0.0)})
 
 
 @contextmanager
@@ -97,23 +94,37 @@ def timed(folder: Path) -> Iterator[None]:
         yield
     finally:
         if record := read_record(folder):
-            record["wall_time_s"] = round(_wall_time(record) + time.monotonic() - begin, 1)
-            _write(folder, record)
+            seconds = record["wall_time_s"] + time.monotonic() - begin
+            _write(folder, {**record, "wall_time_s": round(seconds, 1)})
 
 
 def read_record(folder: Path) -> dict[str, Any]:
     """The record of a run; empty if there is none that can be read."""
     try:
         record = json.loads((folder / RECORD).read_text())
-    except (OSError, ValueError, RecursionError):
+    except (OSError, ValueError):
         return {}
-    return record if isinstance(record, dict) else {}
+    return record if isinstance(record, dict) and "damian" in record else {}
 
 
-def _wall_time(record: dict[str, Any]) -> float:
-    """The wall time in a record [s]; 0 if it has none, as that of a damaged file."""
-    seconds = record.get("wall_time_s")
-    return seconds if isinstance(seconds, float | int) else 0.0
+def check_version(folder: Path, key: str) -> None:
+    """Check that this minor version of damian has written a run folder, as its record says.
+
+    Files change between minor versions, and no version reads those of another one.
+
+    Args:
+        folder: the run folder.
+        key: the setting that names it, for errors.
+
+    Raises:
+        InputError: another minor version has written it.
+    """
+    writer = str(read_record(folder).get("damian", damian.__version__))
+    if writer.split(".")[:2] != damian.__version__.split(".")[:2]:
+        here = f"this is damian {damian.__version__}"
+        raise InputError(
+            f"{key}: {folder}: damian {writer} wrote it, and {here}: train again, or use {writer}"
+        )
 
 
 def _write(folder: Path, record: dict[str, Any]) -> None:

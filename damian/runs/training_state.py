@@ -20,9 +20,6 @@ from damian.runs.metrics import EpisodeLog
 from damian.runs.replay_memory import ReplayMemory
 from damian.runs.run_folder import BEST, CHECKPOINT, REPLAY
 
-OLD_CHECKPOINT = "checkpoint"
-"""Folder in which damian 0.4 and older stored checkpoints."""
-
 
 @dataclass
 class Progress:
@@ -84,10 +81,8 @@ class TrainingState:
         Raises:
             RunError: it cannot be written; the older one is intact.
         """
-        networks, parts = (
-            {name: part.state_dict() for name, part in group.items()}
-            for group in (self.components, self._parts)
-        )
+        # The states of the parts first: that of the replay memory writes files, which the checkpoint names.
+        parts, networks = _states(self._parts), _states(self.components)
         write_checkpoint(self.folder / CHECKPOINT, {"components": networks, "training": parts})
         self.saved = self.progress.updates
         if self._replay is not None:
@@ -102,9 +97,10 @@ class TrainingState:
         mean = self.episodes.means()["perceived_return"]
         if mean > self.progress.best:
             self.progress.best = mean
-            networks = {name: part.state_dict() for name, part in self.components.items()}
-            progress = {"progress": self.progress.state_dict()}
-            write_checkpoint(self.folder / BEST, {"components": networks, "training": progress})
+            training = _states({"progress": self.progress})
+            write_checkpoint(
+                self.folder / BEST, {"components": _states(self.components), "training": training}
+            )
 
     def load(self) -> None:
         """Continue from the checkpoint of the run, and remove what a killed run has left beside it.
@@ -143,10 +139,10 @@ def stored_progress(folder: Path) -> dict[str, Any]:
         InputError: the checkpoint is missing or damaged.
     """
     path = checkpoint_file(folder, "resume")
-    training, names = _content(path, "resume")["training"], ("progress", "episodes")
-    if missing := [name for name in names if name not in training]:
-        raise InputError(f"resume: {path}: it has no {missing[0]}, so it is not the checkpoint of a training")
-    return {name: training[name] for name in names}
+    training = _content(path, "resume")["training"]
+    if "episodes" not in training:  # as in the file of the best policy
+        raise InputError(f"resume: {path}: a training cannot continue from it: give the folder of the run")
+    return {name: training[name] for name in ("progress", "episodes")}
 
 
 def checkpoint_file(written: Path, key: str) -> Path:
@@ -155,15 +151,14 @@ def checkpoint_file(written: Path, key: str) -> Path:
     Raises:
         InputError: there is none.
     """
-    if os.path.isfile(written):
-        return written
-    path = written / CHECKPOINT
-    if path.exists():
-        return path
-    if (written / OLD_CHECKPOINT).is_dir():
-        problem = "damian 0.4 or an older one wrote its checkpoint, which this one cannot read: train again"
-        raise InputError(f"{key}: {written}: {problem}, or use that version")
-    raise InputError(f"{key}: {path}: there is no such file, so there is nothing to load")
+    path = written if os.path.isfile(written) else written / CHECKPOINT
+    if not path.exists():
+        raise InputError(f"{key}: {path}: there is no such file, so there is nothing to load")
+    return path
+
+
+def _states(parts: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: part.state_dict() for name, part in parts.items()}
 
 
 def _content(path: Path, key: str) -> dict[str, Any]:
@@ -174,7 +169,10 @@ def _content(path: Path, key: str) -> dict[str, Any]:
 
 
 class CarriedStep:
-    """The TensorDict with which a collector takes its next step: observations, hidden states, counters."""
+    """The TensorDict with which a collector takes its next step: observations, hidden states, counters.
+
+    TorchRL keeps it in private attributes, and has no public way to restore it.
+    """
 
     def __init__(self, collector: Collector) -> None:
         self._collector = collector
@@ -194,7 +192,7 @@ class RandomState:
     """The states of the global random generators of torch, NumPy and Python."""
 
     def state_dict(self) -> dict[str, Any]:
-        name, numbers, *rest = np.random.get_state()  # noqa: NPY002 (components of one's own may use it)
+        name, numbers, *rest = np.random.get_state()  # noqa: NPY002 (components of the user's own may use it)
         return {
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],

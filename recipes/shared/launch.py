@@ -28,7 +28,7 @@ from damian.common.atomic_files import remove_unfinished, writing
 from damian.common.errors import RUN_ERROR, InputError, RunError
 from damian.runs.interrupt import exit_code
 from damian.runs.run_folder import CHECKPOINT, CONFIG
-from damian.runs.run_lock import is_folder, locked
+from damian.runs.run_lock import is_empty, locked
 from damian.runs.run_record import timed
 
 from .command_line import parsed, prepared, remember_words
@@ -133,7 +133,7 @@ def perform(config: TrainConfig, folder: Path, program: Program) -> None:
     """
     torch.set_num_threads(1)
     seed_generators(config.seed)
-    was_empty = not is_folder(folder) or not any(folder.iterdir())
+    was_empty = is_empty(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     remove_unfinished(folder)

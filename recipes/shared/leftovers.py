@@ -8,7 +8,7 @@ from pathlib import Path
 from damian.common.errors import InputError
 from damian.runs.metrics_log import EVENTS
 from damian.runs.run_folder import CHECKPOINT, CONFIG
-from damian.runs.run_lock import is_folder, is_locked
+from damian.runs.run_lock import LOCK, is_empty, is_folder, is_locked
 from damian.runs.run_record import RECORD
 from damian.runs.training_state import stored_progress
 
@@ -29,7 +29,7 @@ def remember_folders(words: Sequence[str]) -> None:
 
 def drop_unused(folder: Path) -> None:
     """Remove a run folder with nothing in it but what is written before the first update."""
-    files = [*folder.iterdir()] if is_folder(folder) else []
+    files = [path for path in folder.iterdir() if path.name != LOCK] if is_folder(folder) else []
     written_first = all(path.name in (CONFIG, RECORD, CHECKPOINT) or _is_events(path) for path in files)
     if written_first and not _has_learnt(folder):
         for path in files:
@@ -39,8 +39,9 @@ def drop_unused(folder: Path) -> None:
 
 def drop_empty(folder: Path) -> None:
     """Remove an empty run folder that no other run uses, and the folders that Hydra made around it."""
-    if not is_folder(folder) or any(folder.iterdir()) or is_locked(folder):
+    if not is_folder(folder) or not is_empty(folder) or is_locked(folder):
         return
+    (folder / LOCK).unlink(missing_ok=True)
     folder.rmdir()
     parent = folder.parent
     drop_sweep(parent)

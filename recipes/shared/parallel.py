@@ -25,7 +25,7 @@ from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
-from damian.runs.checkpoint import stored_digest
+from damian.runs.checkpoint import digest
 from damian.runs.interrupt import exit_code
 from damian.runs.metrics import EVALUATED
 from damian.runs.run_folder import CHECKPOINT, CONFIG, RESULTS
@@ -75,7 +75,7 @@ class Run:
         if not results.exists() or self.policy is None:
             return results.exists()
         source = self.policy / RESULTS
-        flown, stored = read_record(self.folder).get(POLICY), stored_digest(self.policy / CHECKPOINT)
+        flown, stored = read_record(self.folder).get(POLICY), digest(self.policy / CHECKPOINT)
         if source.exists() and flown and stored:
             return flown == stored
         # An older damian did not record it. The times of copied files need not tell which was written first.

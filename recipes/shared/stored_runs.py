@@ -11,10 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.learners.base import LEARNERS
-from damian.runs.checkpoint import stored_digest
+from damian.runs.checkpoint import digest
 from damian.runs.run_folder import CONFIG
 from damian.runs.run_lock import is_folder
-from damian.runs.run_record import POLICY, new_record, write_record
+from damian.runs.run_record import POLICY, check_version, new_record, write_record
 from damian.runs.training_state import checkpoint_file, stored_progress
 
 from .command_line import own_folder, typed_command
@@ -28,14 +28,14 @@ _ALWAYS_STORED = ("agents", "learner", "region", "seed", "worlds")
 
 
 def save_config(config: TrainConfig, folder: Path) -> None:
-    """Write the resolved configuration into the run folder, and the record of versions and machine."""
-    write_atomically(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(config)))
+    """Write the record of versions and machine into the run folder, then the resolved configuration."""
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
     record = new_record(typed_command(), device, config.learning_threads, own_folder())
     if config.checkpoint and not config.resume:  # a resumed run no longer needs that policy
-        record[POLICY] = stored_digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
+        record[POLICY] = digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
     write_record(folder, record)
+    write_atomically(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(config)))
 
 
 def stored_run(written: Path) -> TrainConfig:
@@ -81,13 +81,12 @@ def stored_config(folder: Path, key: str) -> DictConfig:
         key: the setting that names the folder, for the error message.
 
     Raises:
-        InputError: it cannot be read, or damian 0.1 has written it.
+        InputError: it cannot be read, or another minor version of damian has written it.
     """
+    check_version(folder, key)
     file = folder / CONFIG
     try:
         saved = cast(DictConfig, OmegaConf.load(file))
-        if "algo" in saved:
-            raise InputError("damian 0.1 wrote it, and settings have other names since: train again")
         if "policy" in saved:
             flown = f"the one of {saved.checkpoint}" if saved.checkpoint else "a script"
             raise InputError(f"it holds no policy: {flown} was flown there")

@@ -271,7 +271,7 @@ def test_without_a_policy_nothing_is_evaluated(fly, capsys, tmp_path, policy, me
 def test_a_damaged_checkpoint_is_refused(fly, trained, capsys, tmp_path):
     damaged = shutil.copytree(trained, tmp_path / "damaged")
     (damaged / "checkpoint.pt").write_text("{")
-    check_refused(lambda: fly(of=damaged), "checkpoint.pt: it is no checkpoint of damian", capsys)
+    check_refused(lambda: fly(of=damaged), "checkpoint.pt: it is damaged", capsys)
     (damaged / "checkpoint.pt").unlink()
     check_refused(lambda: fly(of=damaged), "checkpoint.pt: there is no such file", capsys)
     (damaged / "config.yaml").unlink()

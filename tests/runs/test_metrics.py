@@ -1,17 +1,20 @@
 """Measures of episodes in evaluations and in training, and the files that hold them."""
 
 import csv
+import json
 import math
-from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers import MOTIONS, both_motions, everything, square, walking
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.envs import RewardSum, StepCounter
 
+import damian
 from damian import keys
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
@@ -22,6 +25,7 @@ from damian.envs.scenario import ScenarioConfig
 from damian.runs.metrics import EpisodeLog, Evaluation, evaluate, evaluation
 from damian.runs.metrics_log import MetricsLog, read_metrics
 from damian.runs.run_folder import results_table, save_results
+from damian.runs.run_record import check_version
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.server import Server
@@ -147,7 +151,7 @@ def test_false_late_and_missed_successes_differ_from_true_ones(motion):
     assert all(row["perceived_steps"] < row["steps"] == HORIZON for row in false)
     row = evaluation(flight, server)
     assert row.success_rate - row.perceived_success_rate == pytest.approx((len(missed) - len(false)) / 256)
-    assert asdict(row) == pytest.approx(expected, rel=1e-5)
+    assert row.row() == pytest.approx(expected, rel=1e-5)
 
 
 @both_motions
@@ -279,16 +283,16 @@ def test_a_restored_episode_log_continues_as_the_original():
 ROW = Evaluation(4, 0.25, 50.0, 1.5, 0.75, 30.0, 2.5, 0.125, 0.5, 0.1)
 
 
-def test_a_table_shows_success_only_if_possible_and_what_the_server_saw_only_with_delays():
-    plain = results_table({"random": ROW}, can_succeed=False).splitlines()
-    assert plain[0] == "| policy | return | episodes |"
-    assert plain[2] == "| random | 1.50 | 4 |"
-    success = results_table({"random": ROW}, can_succeed=True).splitlines()
-    assert success[0] == "| policy | success rate | steps | return | episodes |"
-    assert success[2] == "| random | 0.25 | 50.00 | 1.50 | 4 |"
-    late = results_table({"random": ROW}, can_succeed=True, late=True).splitlines()
-    assert late[2] == "| random | 0.75 | 30.00 | 2.50 | 0.25 | 50.00 | 1.50 | 0.12 | 0.50 | 0.10 | 4 |"
-    assert late[0].startswith("| policy | success rate | steps | return | seen success rate | seen steps |")
+def test_a_table_shows_success_only_if_possible_and_what_the_server_perceived_only_with_delays():
+    def shown(**settings: bool) -> dict[str, str]:
+        head, _, line = results_table({"random": ROW}, **settings).splitlines()
+        return dict(zip(head.strip("| ").split(" | "), line.strip("| ").split(" | "), strict=True))
+
+    plain = {"policy": "random", "return": "1.50"}
+    assert shown(can_succeed=False) == plain
+    assert shown(can_succeed=True) == plain | {"success rate": "0.25", "steps": "50.00"}
+    late = {"perceived return": "2.50", "age": "0.12", "late": "0.50", "lost": "0.10"}
+    assert shown(can_succeed=False, late=True) == plain | late
 
 
 def test_results_are_written_with_every_measure(tmp_path):
@@ -297,25 +301,51 @@ def test_results_are_written_with_every_measure(tmp_path):
     with (tmp_path / "result.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row.pop("policy") for row in rows] == ["one", "other"]
-    assert [{name: float(x) for name, x in row.items()} for row in rows] == [asdict(ROW)] * 2
-    assert {path.name for path in tmp_path.iterdir()} == {"result.csv", "result.md"}
+    assert [{name: float(x) for name, x in row.items()} for row in rows] == [ROW.row()] * 2
 
 
-def test_rows_of_an_older_run_get_the_columns_that_a_newer_version_logs(tmp_path):
-    MetricsLog(tmp_path, tensorboard=False, to_csv=True).add(10, {"loss": 2.0, "old": 3.0})
+def test_a_resumed_log_drops_later_rows_and_takes_new_numbers(tmp_path):
+    log = MetricsLog(tmp_path, tensorboard=False, to_csv=True)
+    log.add(10, {"loss": 2.0, "old": 3.0})
+    log.add(15, {"loss": 9.0, "old": 9.0})
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("20.0,1")  # a killed process has not written the whole line
     log = MetricsLog(tmp_path, tensorboard=False, to_csv=True, frames=10)
     log.add(20, {"new": 4.0, "loss": 5.0})
     log.add(30, {"loss": 6.0})
     lines = ["frames,loss,old,new", "10.0,2.0,3.0,nan", "20.0,5.0,nan,4.0", "30.0,6.0,nan,nan"]
     assert (tmp_path / "metrics.csv").read_text().splitlines() == lines
-    assert repr(log.rows) == repr(read_metrics(tmp_path))
 
 
-def test_a_broken_metrics_file_is_refused_with_its_line(tmp_path):
-    log = MetricsLog(tmp_path, tensorboard=False, to_csv=True)
-    log.add(10, {"perceived_steps": 2.0})
-    assert read_metrics(tmp_path) == [{"frames": 10.0, "perceived_steps": 2.0}]
-    with (tmp_path / "metrics.csv").open("a") as file:
-        file.write("20,many\n")
-    with pytest.raises(InputError, match=r"metrics\.csv, line 3: not a row of numbers"):
+@pytest.mark.parametrize("text", ["a\n1\n", "frames,a\n1,many\n", "frames,a\n1\n", "frames,a\n\x001,2\n"])
+def test_a_broken_metrics_file_is_refused_in_one_line(tmp_path, text):
+    (tmp_path / "metrics.csv").write_text(text)
+    with pytest.raises(InputError, match=r"metrics\.csv: it (is no table of numbers|has no column frames)"):
         read_metrics(tmp_path)
+
+
+def test_tensorboard_shows_numbers_settings_distributions_and_films_up_to_where_a_run_resumed(tmp_path):
+    film = tmp_path / "film.gif"
+    film.write_bytes(b"GIF89a")
+    for resumed, frames in ((0, [10, 20]), (10, [20, 30])):
+        settings = {"agents": 3, "delay.obs": [1]}
+        log = MetricsLog(tmp_path, tensorboard=True, to_csv=False, frames=resumed, settings=settings)
+        for each in frames:
+            log.add(each, {"loss": float(each + resumed)})
+        log.add_histogram(frames[-1], "age", np.arange(6.0))
+        log.add_film(frames[-1], film)
+        log.close()
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [(each.step, each.value) for each in events.Scalars("loss")] == [(10, 10), (20, 30), (30, 40)]
+    assert [each.histogram_value.num for each in events.Histograms("age")] == [6]
+    assert events.Images("evaluation")[-1].encoded_image_string == b"GIF89a"
+    assert "_hparams_/session_start_info" in events.summary_metadata
+
+
+def test_a_run_folder_of_another_minor_version_is_refused_by_its_record(tmp_path):
+    for record in ({}, {"damian": damian.__version__}):
+        (tmp_path / "run.json").write_text(json.dumps(record))
+        check_version(tmp_path, "resume")
+    (tmp_path / "run.json").write_text('{"damian": "0.4.9"}')
+    with pytest.raises(InputError, match=r"^resume: .*: damian 0\.4\.9 wrote it"):
+        check_version(tmp_path, "resume")

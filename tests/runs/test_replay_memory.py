@@ -85,25 +85,11 @@ def test_an_empty_memory_is_stored_and_loaded(tmp_path):
     assert [*tmp_path.iterdir()] == []
 
 
-def damaged(file: Path) -> None:
-    file.write_bytes(file.read_bytes()[:-1])
-
-
-@pytest.mark.parametrize(
-    ("damage", "problem"),
-    [
-        (Path.unlink, "it cannot be read: No such file"),
-        (damaged, "instead of"),
-        (
-            lambda file: file.write_bytes(file.with_name("000001.pt").read_bytes()),
-            "belongs to another checkpoint",
-        ),
-    ],
-)
-def test_a_missing_or_damaged_segment_is_refused_in_one_line(tmp_path, damage, problem):
+@pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_bytes(file.read_bytes()[:-1])])
+def test_a_missing_or_damaged_segment_is_refused_in_one_line(tmp_path, damage):
     buffer = make_buffer()
     buffer.extend(batch(0, 20))
     state = plain(ReplayMemory(buffer, tmp_path / "replay").state_dict())
     damage(tmp_path / "replay" / "000002.pt")
-    with pytest.raises(InputError, match=rf"^resume: .*replay/000002\.pt: .*{problem}"):
+    with pytest.raises(InputError, match=r"^resume: .*replay/000002\.pt: it "):
         ReplayMemory(make_buffer(), tmp_path / "replay").load_state_dict(state)
