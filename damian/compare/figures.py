@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from damian.common.plotting import COLOURS, STYLE
 from damian.compare.comparison import (
     ALL_MESSAGES,
     BOUNDS,
@@ -24,7 +25,6 @@ from damian.compare.comparison import (
     Estimate,
 )
 from damian.compare.statistics import Floats, bootstrap
-from damian.show.belief_figure import COLOURS, STYLE
 
 Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 """Rows of ``metrics.csv`` of each seed, by task, delay and arm."""

@@ -16,7 +16,7 @@ from damian.common import checks
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
-from damian.show.pixels import LiveFilm
+from damian.show.film import LiveFilm
 
 RENDER_MODES = ("rgb_array",)
 METADATA: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 4}

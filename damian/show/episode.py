@@ -6,6 +6,7 @@ Films, figures and replay pages are made from it. As a file it is JSON that says
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -20,14 +21,11 @@ from torch import Tensor
 import damian
 from damian import keys
 from damian.common.atomic_files import write_atomically
-from damian.common.checks import HUGE
 from damian.common.errors import InputError
 from damian.common.text_files import one_line, read_text
 from damian.envs.uav_env import UavEnv
 
 SCHEMA, VERSION = "damian-episode", 2
-READABLE = (1, 2)
-"""Versions that can be read; in version 1 the source is always known."""
 DIGITS = 5
 """Significant digits of the numbers in a file."""
 TIME_DIGITS = 9
@@ -64,7 +62,7 @@ class Episode:
     """Whether the episode ended with success."""
     time: Annotated[Floats, "time of each instant [s], [T + 1]"]
     position: Annotated[Floats, "true positions: east, north, up [m], [T + 1, N, 3]"]
-    target: Annotated[Floats, "landing points that the UAVs are bound for: east, north [m], [T + 1, N, 2]"]
+    target: Annotated[Floats, "landing points to which the UAVs fly: east, north [m], [T + 1, N, 2]"]
     track: Annotated[Floats, "headings, clockwise from north [rad], [T + 1, N]"]
     battery: Annotated[Floats, "battery levels [%], [T + 1, N]"]
     spotted: Annotated[Flags, "whether the UAV spots the source, [T + 1, N]"]
@@ -131,11 +129,15 @@ class Episode:
         arrived[0] = True
         return arrived
 
-    @property
-    def cell_edge(self) -> float:
-        """Edge of the belief's square cells [m]."""
-        gaps = np.diff(np.unique(np.asarray(self.cells)[:, 0].round(3)))
-        return float(gaps.min()) if len(gaps) else 1.0
+    @cached_property
+    def squares(self) -> NDArray[np.object_]:
+        """What of each of the belief's square cells lies in the region, [K] polygons or several of them."""
+        if self.cells is None:
+            return np.zeros(0, object)
+        gaps = np.diff(np.unique(self.cells[:, 0].round(3)))
+        half = float(gaps.min()) / 2 if len(gaps) else 0.5
+        boxes = shapely.box(*(self.cells - half).T, *(self.cells + half).T)
+        return np.asarray(shapely.intersection(boxes, self.region))
 
     def likely_cells(self, step: int) -> Integers:
         """Numbers of the cells in which the source may well be at an instant, [C]; none without a belief."""
@@ -171,34 +173,40 @@ class Episode:
         """Read an episode from its file.
 
         Raises:
-            InputError: the file does not hold an episode of a version that can be read, or its columns do not
-                fit together.
+            InputError: the file does not hold an episode of this version, or its columns do not fit together.
         """
         try:
             found = json.loads(read_text(path))
-            if found["schema"] != SCHEMA or found["version"] not in READABLE:
-                raise ValueError(f"it is {found['schema']} of version {found['version']}")
+            if (found.get("schema"), found.get("version")) != (SCHEMA, VERSION):
+                raise ValueError(f"it is {found.get('schema')} of version {found.get('version')}")
+            columns = {name: _column(name, found[name]) for name in COLUMNS}
             fixed = {f.name: found[f.name] for f in fields(cls) if f.name not in COLUMNS}
             fixed["region"] = shapely.from_geojson(json.dumps(found["region"]))
             fixed["origin"] = found["origin"] and tuple(found["origin"])
             fixed["landing_points"] = np.asarray(found["landing_points"], float)
-            columns = {name: _array(found[name]) for name in COLUMNS}
-            _check_fixed(fixed)
-            _check_columns(columns)
-            flags = [name for name in ("spotted", "emits", "sent") if columns[name] is not None]
-            columns |= {name: columns[name].astype(bool) for name in flags}
-            return cls(**fixed, **columns)
-        except (OSError, LookupError, TypeError, ValueError, RecursionError, ShapelyError) as error:
-            raise InputError(
-                f"{path}: it is no episode of version 1 or {VERSION}: {one_line(str(error))}"
-            ) from error
+            return cls(**fixed, **columns).checked()
+        except (AttributeError, LookupError, TypeError, ValueError, RecursionError, ShapelyError) as error:
+            problem = f"no {error}" if isinstance(error, KeyError) else one_line(str(error))
+            raise InputError(f"{path}: it is no episode of version {VERSION}: {problem}") from error
+
+    def checked(self) -> "Episode":
+        """The episode itself.
+
+        Raises:
+            ValueError: a column has not as many instants as there are times, or time does not increase.
+        """
+        for name in COLUMNS:
+            values = getattr(self, name)
+            for each in values.values() if isinstance(values, Mapping) else [values]:
+                if each is not None and name != "cells" and len(each) != len(self.time):
+                    raise ValueError(f"{name} has {len(each)} instants, and time has {len(self.time)}")
+        if (np.diff(self.time) <= 0).any():
+            raise ValueError("time does not increase")
+        return self
 
 
 COLUMNS = {f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")}  # type: ignore[union-attr]
 """What each column means, by its name."""
-
-OPTIONAL = (("cells", "belief"), ("source", "emits"))
-"""Columns that are null together: without a belief, and where nobody knows the source."""
 
 OUTPUTS = (
     keys.STATE,
@@ -310,63 +318,12 @@ def _listed(values: Any, digits: int = DIGITS) -> Any:
     return np.where(values == 0, 0.0, np.round(values * scale) / scale).tolist()
 
 
-def _array(values: Any) -> Any:
+_KINDS = {"delay": int, "spotted": bool, "sent": bool, "emits": bool}
+"""Types of the columns that are not of floats."""
+
+
+def _column(name: str, values: Any) -> Any:
     """An array from nested lists, or arrays by name."""
-    if isinstance(values, dict):
-        return {name: _array(each) for name, each in values.items()}
-    return None if values is None else np.asarray(values)
-
-
-def _check_columns(columns: Mapping[str, Any]) -> None:
-    """Check that columns have the shapes that their meanings say, and hold numbers.
-
-    Raises:
-        ValueError: one does not, or time does not increase.
-    """
-    for name, values in columns.items():
-        optional = values is None and any(name in pair for pair in OPTIONAL)
-        if not optional and isinstance(values, Mapping) != (name == "reward_terms"):
-            raise ValueError(f"{name} is not {'lists by name' if name == 'reward_terms' else 'a list'}")
-        if not optional and not isinstance(values, np.ndarray | Mapping):
-            raise ValueError(f"{name} is missing")
-    (instants,), (_, agents, _) = columns["time"].shape, columns["position"].shape
-    sizes = {"T + 1": instants, "N": agents, "K": 0 if columns["cells"] is None else len(columns["cells"])}
-    for name, meaning in COLUMNS.items():
-        letters = meaning[meaning.rindex("[") + 1 : -1]
-        shape = tuple(sizes[each] if each in sizes else int(each) for each in letters.split(", "))
-        values = columns[name]
-        if values is None and any(name in pair and columns[pair[0]] is columns[pair[1]] for pair in OPTIONAL):
-            continue
-        for each in values.values() if isinstance(values, Mapping) else [values]:
-            if each is None or each.shape != shape or 0 in shape:
-                raise ValueError(
-                    f"{name} has not the shape [{letters}]: {each if each is None else each.shape}"
-                )
-            if not (np.abs(each) <= HUGE).all():
-                raise ValueError(f"{name} holds something else than numbers up to {HUGE:g}")
-    if (np.diff(columns["time"]) <= 0).any() or columns["delay"].dtype.kind != "i":
-        raise ValueError("time does not increase, or delay is not in whole steps")
-
-
-def _check_fixed(fixed: Mapping[str, Any]) -> None:
-    """Check what an episode has beside its columns.
-
-    Raises:
-        ValueError: the region has no area, or something is not of the kind that it should be.
-    """
-    points, place = fixed["landing_points"], fixed["origin"] or (0.0, 0.0)
-    if (
-        not isinstance(fixed["region"], shapely.Polygon | shapely.MultiPolygon)
-        or not fixed["region"].area > 0
-    ):
-        raise ValueError("region is no polygon with an area")
-    corners = shapely.get_coordinates(fixed["region"])
-    if points.shape != (len(points), 2) or not all(
-        (np.abs(each) <= HUGE).all() for each in (points, corners)
-    ):
-        raise ValueError("landing_points or region are not of places east and north [m]")
-    numbers = np.array([*place, fixed["radius"]], float)
-    if len(place) != 2 or not (np.abs(numbers) <= HUGE).all() or fixed["radius"] < 0:
-        raise ValueError("origin is not latitude and longitude [deg], or radius no length [m]")
-    if not isinstance(fixed["about"], dict) or not isinstance(fixed["about"].get("overrides") or [], list):
-        raise ValueError("about is not what damian fly writes")
+    if name == "reward_terms":
+        return {term: np.asarray(each, float) for term, each in values.items()}
+    return None if values is None else np.asarray(values, _KINDS.get(name, float))

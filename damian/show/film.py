@@ -1,23 +1,27 @@
 """Films of an episode: what is true, what the server believes, and the messages between them."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import matplotlib
 import numpy as np
+import torch
 from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 from PIL import Image
+from tensordict import TensorDictBase
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Transform
 
 from damian.common import checks
-from damian.show.belief_figure import COLOURS
-from damian.show.episode import Episode
-from damian.show.film_views import DART, HEAT, INK, MapView, SpaceView
+from damian.common.plotting import STYLE
+from damian.envs.uav_env import UavEnv
+from damian.show.episode import Episode, at_instant, episode_of
+from damian.show.frame import frame_of
+from damian.show.views import INK, MapView, SpaceView, draw_messages, legend_marks
 
 VIEWS = ("2d", "3d")
 DPI = 100
@@ -29,7 +33,7 @@ LONGEST_GIF = 1000
 """Most steps of a GIF, all of whose pictures (half a megabyte each) are in memory until it is written."""
 LAST_STEPS = 6
 """Steps for whose time a film shows the last instant."""
-_STYLE: dict[Any, Any] = {"font.size": 8.5, "axes.spines.top": False, "axes.spines.right": False}
+_STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5}
 
 
 def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
@@ -82,7 +86,7 @@ class Film:
     def __init__(self, episode: Episode, view: str = "2d") -> None:
         checks.one_of("view", view, VIEWS)
         self.episode = episode
-        self.colours = [COLOURS[uav % len(COLOURS)] for uav in range(episode.n_agents)]
+        self.colours = [uav.colour for uav in frame_of(episode, 0).uavs]
         with matplotlib.rc_context(_STYLE):
             self.figure = Figure(figsize=SIZE, dpi=DPI)
             FigureCanvasAgg(self.figure)
@@ -95,25 +99,26 @@ class Film:
             self.map = self.figure.add_subplot(grid[:3, 0], projection="3d" if view == "3d" else None)
             self.charts = [self.figure.add_subplot(grid[row, 1]) for row in (1, 2)]
             self.lanes = self.figure.add_subplot(grid[3, :])
-            self.view = (SpaceView if view == "3d" else MapView)(self.map, episode, self.colours)
-            self._draw_legend()
+            self.view = (SpaceView if view == "3d" else MapView)(self.map, episode)
+            place = {"loc": "upper left", "bbox_to_anchor": (0.745, 0.95), "frameon": False}
+            self.figure.legend(handles=legend_marks(episode), **place)
             self._draw_charts()
-            self._draw_messages()
+            draw_messages(self.lanes, episode, self.colours)
         self._moving: list[Any] = []
 
     def draw(self, step: int) -> list[Any]:
         """Draw the instant after so many steps; returns the artists that were drawn."""
         for artist in self._moving:
             artist.remove()
-        now, spotted = float(self.episode.time[step]), int(self.episode.spotted[step].sum())
+        frame = frame_of(self.episode, step)
         with matplotlib.rc_context(_STYLE):
-            self._moving = [*self.view.draw(step), *self._now(now)]
+            self._moving = [*self.view.draw(frame), *self._now(frame.time)]
         won = f"return {self.episode.reward[: step + 1].mean(-1).sum():.2f}"
-        spots = f"{spotted} of {self.episode.n_agents} UAVs spot the source"
-        self.figure.suptitle(f"{now:g} s   ·   {won}   ·   {spots}", x=0.085, ha="left", fontsize=10)
+        spots = f"{sum(uav.spots for uav in frame.uavs)} of {len(frame.uavs)} UAVs spot the source"
+        self.figure.suptitle(f"{frame.time:g} s   ·   {won}   ·   {spots}", x=0.085, ha="left", fontsize=10)
         return self._moving
 
-    def frame(self, step: int) -> np.ndarray:
+    def frame(self, step: int) -> NDArray[np.uint8]:
         """The picture of an instant, [height, width, 3] uint8."""
         self.draw(step)
         canvas: Any = self.figure.canvas
@@ -123,21 +128,6 @@ class Film:
     def image(self, step: int) -> Image.Image:
         """The picture of an instant in 256 colours, which is a third of its size."""
         return Image.fromarray(self.frame(step)).quantize(dither=Image.Dither.NONE)
-
-    def _draw_legend(self) -> None:
-        marks: list[Any] = [
-            _mark("UAV, true", marker=DART, markersize=9),
-            _mark("UAV, as the server\nbelieves, with age", marker="o", markerfacecolor="none", markersize=9),
-        ]
-        if self.episode.source is not None:
-            white = {"markerfacecolor": "white"}
-            marks += [
-                _mark(f"source, {does}", marker="*", color=INK, markersize=11, **style)
-                for does, style in (("emits", {}), ("silent", white))
-            ]
-        if self.episode.belief is not None:
-            marks.append(Rectangle((0, 0), 1, 1, facecolor=HEAT(1.0), label="belief about\nthe source"))
-        self.figure.legend(handles=marks, loc="upper left", bbox_to_anchor=(0.745, 0.95), frameon=False)
 
     def _draw_charts(self) -> None:
         """Draw over time the return so far and the age of what the server knows, or the batteries if used."""
@@ -164,34 +154,76 @@ class Film:
             drawn.append(axis.axvline(time, color=INK, linewidth=0.9, zorder=9))
         return drawn
 
-    def _draw_messages(self) -> None:
-        """Draw a row for each UAV with its messages, from left to right over the time of sending."""
-        axis, episode = self.lanes, self.episode
-        dt = float(episode.time[1] - episode.time[0]) if episode.n_steps else 1.0
-        for uav, colour in enumerate(self.colours):
-            sent = np.flatnonzero(episode.sent[:, uav])
-            begin, delay = episode.time[sent], episode.delay[sent, uav]
-            late, lost = delay > 0, delay < 0
-            ends = np.stack([begin, begin + np.maximum(delay, 0) * dt], -1)[late]
-            lines = [[(a, uav), (b, uav)] for a, b in ends]
-            axis.add_collection(LineCollection(lines, colors=colour, linewidths=2.2, alpha=0.55))
-            axis.plot(
-                begin[~lost & ~late], np.full((~lost & ~late).sum(), uav), ".", color=colour, markersize=3
-            )
-            axis.plot(ends[:, 1], np.full(len(ends), uav), ">", color=colour, markersize=3.5)
-            axis.plot(begin[lost], np.full(lost.sum(), uav), "x", color=INK, markersize=4.5)
-        axis.set_yticks(range(episode.n_agents), [_short(name) for name in episode.names])
-        axis.set(ylim=(episode.n_agents - 0.4, -0.6), xlim=(0, max(float(episode.time[-1]), dt)))
-        axis.set_xlabel("messages over time [s]: dots arrive at once, bars are late, crosses are lost")
-        axis.spines["left"].set_visible(False)
-        axis.tick_params(left=False)
+
+class LiveFilm:
+    """Draws an episode while it is flown; drawing takes about 0.3 s an instant.
+
+    Args:
+        env: the environment without delays, of one world, with the extras ``message``, ``state`` and
+            ``reward_terms``.
+        view: ``2d`` or ``3d``.
+    """
+
+    def __init__(self, env: UavEnv, view: str = "2d") -> None:
+        should = "is not 1: a film shows one world"
+        checks.require(env.batch_size[0] == 1, "film: number of worlds", env.batch_size[0], should)
+        checks.one_of("film: view", view, VIEWS)
+        for extra in ("message", "state"):
+            checks.require(extra in env.extras, "film: extras", sorted(env.extras), f"lack {extra}")
+        self.env, self.view = env, view
+        self._instants: list[TensorDictBase] = []
+
+    def begin(self, outputs: TensorDictBase) -> None:
+        """Begin an episode, with the outputs of a reset, [1]."""
+        self._instants = [at_instant(outputs).detach().cpu()]
+
+    def add(self, outputs: TensorDictBase) -> None:
+        """Add the outputs of a step, [1]."""
+        self._instants.append(at_instant(outputs).detach().cpu())
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The latest instant, as a film of the episode so far shows it, [height, width, 3]."""
+        stacked = cast(TensorDictBase, torch.stack([each[0] for each in self._instants]))  # type: ignore[arg-type]
+        episode = episode_of(stacked, self.env, {})
+        return Film(episode, self.view).frame(episode.n_steps)
 
 
-def _short(name: str) -> str:
-    """A name that fits beside its row."""
-    return name if len(name) <= 8 else f"{name[:7]}\N{HORIZONTAL ELLIPSIS}"
+class FilmPixels(Transform):
+    """Writes the picture of each instant, as a film of the episode so far shows it.
 
+    It writes ``pixels`` [1, height, width, 3] uint8. Drawing takes about 0.3 s a step, so that it suits
+    evaluations, not training.
 
-def _mark(label: str, color: str = "0.3", **style: Any) -> Line2D:
-    """An entry of the legend."""
-    return Line2D([], [], label=label, color=color, linestyle="", **style)
+    Args:
+        env: the environment without delays, of one world, with the extras ``message``, ``state`` and
+            ``reward_terms``.
+        view: ``2d`` or ``3d``.
+
+    Examples:
+        >>> env = make_env(scenario, 1, extras=["message", "state", "reward_terms"])
+        >>> env.append_transform(FilmPixels(env.uav_env))
+        >>> env.append_transform(VideoRecorder(logger, tag="flight"))
+        >>> env.rollout(50, policy)
+        >>> env.transform.dump()
+    """
+
+    def __init__(self, env: UavEnv, view: str = "2d") -> None:
+        super().__init__(in_keys=[], out_keys=["pixels"])
+        self.film = LiveFilm(env, view)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.film.add(next_tensordict)
+        return self._draw(next_tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        self.film.begin(tensordict_reset)
+        return self._draw(tensordict_reset)
+
+    def _draw(self, outputs: TensorDictBase) -> TensorDictBase:
+        return outputs.set("pixels", torch.as_tensor(self.film.picture(), device=outputs.device).unsqueeze(0))
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        width, height = (round(DPI * size) for size in SIZE)
+        shape, device = torch.Size([1, height, width, 3]), observation_spec.device
+        observation_spec["pixels"] = Unbounded(shape, dtype=torch.uint8, device=device)
+        return observation_spec

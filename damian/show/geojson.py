@@ -14,6 +14,7 @@ from shapely.affinity import translate
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.show.episode import Episode, Floats
+from damian.show.frame import frame_of
 from damian.world.regions.geodesy import to_latlon, wrap_longitude
 
 DIGITS = 7
@@ -72,24 +73,20 @@ def _features(episode: Episode, step: int) -> Iterator[tuple[Any, dict[str, Any]
     """Geometries in local metres, each with its properties."""
     yield episode.region, {"kind": "region"}
     yield shapely.MultiPoint(episode.landing_points), {"kind": "landing points"}
-    times = episode.time[: step + 1].tolist()
-    for uav in range(episode.n_agents):
-        path, label = episode.true[: step + 1, uav], {"uav": uav, "name": episode.names[uav]}
+    times, frame = episode.time[: step + 1].tolist(), frame_of(episode, step, trail=None)
+    for number, uav in enumerate(frame.uavs):
+        path, label = uav.path[:, :2], {"uav": number, "name": uav.name}
         places: Any = shapely.points(path)
         footprints: Any = shapely.buffer(places, episode.radius, quad_segs=_CORNERS)
         covered = shapely.intersection(shapely.union_all(footprints), episode.region)
         yield _path(path), {"kind": "track", **label, "times": times}
-        yield footprints[-1], {"kind": "footprint", **label, "spotted": bool(episode.spotted[step, uav])}
+        yield footprints[-1], {"kind": "footprint", **label, "spotted": uav.spots}
         yield covered, {"kind": "coverage", **label}
-        age = float(episode.age[step, uav])
-        yield shapely.Point(episode.believed[step, uav]), {"kind": "believed position", **label, "age_s": age}
+        yield shapely.Point(uav.believed), {"kind": "believed position", **label, "age_s": uav.age}
     if episode.source is not None:
         yield _path(episode.source[: step + 1]), {"kind": "source track", "times": times}
-    half = episode.cell_edge / 2 if episode.cells is not None else 0.0
-    for cell in episode.likely_cells(step):
-        (x, y), share = np.asarray(episode.cells)[cell], float(np.asarray(episode.belief)[step, cell])
-        square = shapely.intersection(shapely.box(x - half, y - half, x + half, y + half), episode.region)
-        yield square, {"kind": "belief", "probability": round(share, 5)}
+    for area, probability in frame.cells:
+        yield area, {"kind": "belief", "probability": round(probability, 5)}
 
 
 def _path(places: Floats) -> shapely.LineString | shapely.Point:

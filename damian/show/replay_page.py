@@ -16,7 +16,7 @@ from urllib.parse import quote
 
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
-from damian.show.belief_figure import COLOURS
+from damian.common.plotting import COLOURS
 from damian.show.episode import LIKELY, Episode
 
 MOST = 12

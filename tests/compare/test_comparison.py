@@ -5,6 +5,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation, Text
 
+from damian.common.plotting import COLOURS
 from damian.compare.comparison import (
     ALL_MESSAGES,
     RANDOM,
@@ -20,7 +21,6 @@ from damian.compare.comparison import (
 from damian.compare.figures import plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import interquartile_mean
-from damian.show.belief_figure import COLOURS
 
 ARMS = {
     "best": Arm(delayed=False),

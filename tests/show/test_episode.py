@@ -86,58 +86,31 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
 
 
 @pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("{}", "'schema'"),
-        ('{"schema": "damian-episode", "version": 3}', "it is damian-episode of version 3"),
-        ("no json", "Expecting value"),
-        ("[1]", "list indices"),
-    ],
-)
-def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, text, problem):
-    path = tmp_path / "episode.json"
-    path.write_text(text)
-    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1 or 2: ") as refused:
-        Episode.load(path)
-    assert problem in str(refused.value)
-    with pytest.raises(InputError, match="no episode"):
-        Episode.load(tmp_path / "missing.json")
-
-
-@pytest.mark.parametrize(
     ("changes", "problem"),
     [
-        ({"age": [[0.0, 0.0]]}, "age has not the shape [T + 1, N]: (1, 2)"),
-        ({"age": [["old", "x"]] * 4}, "ufunc"),
+        ({"version": 3}, "it is damian-episode of version 3"),
+        ({"age": [[0.0, 0.0]]}, "age has 1 instants, and time has 4"),
         ({"battery": [[1.0], [1.0, 2.0]] * 2}, "inhomogeneous"),
-        ({"cells": [[0.0, 0.0]], "belief": [[0.5, 0.5]] * 4}, "belief has not the shape [T + 1, K]: (4, 2)"),
-        ({"belief": [[1.0]] * 4}, "cells has not the shape [K, 2]: None"),
-        ({"reward_terms": {"near": [[1.0, 2.0]]}}, "reward_terms has not the shape"),
-        ({"track": None}, "track is missing"),
-        ({"time": None}, "time is missing"),
-        ({"position": {}}, "position is not a list"),
-        ({"spotted": {"a": [[True]]}}, "spotted is not a list"),
-        ({"reward_terms": [[1.0, 2.0]] * 4}, "reward_terms is not lists by name"),
-        ({"source": [[0.0, 1e300]] * 4}, "source holds something else than numbers up to 1e+09"),
-        ({"source": [[0.0, float("nan")]] * 4}, "source holds something else than numbers"),
+        ({"reward_terms": {"near": {}}}, "float"),
         ({"time": [0.0, 1.0, 1.0, 2.0]}, "time does not increase"),
-        ({"time": []}, "has not the shape"),
-        ({"delay": [[0.5, 0.5]] * 4}, "delay is not in whole steps"),
-        ({"region": {"type": "Point", "coordinates": [0, 0]}}, "region is no polygon with an area"),
         ({"region": {"type": "Polygon"}}, "ParseException"),
-        ({"landing_points": [[1.0, 2.0, 3.0]]}, "landing_points or region"),
-        ({"origin": [1.0]}, "origin is not latitude and longitude"),
-        ({"radius": -1.0}, "radius no length"),
-        ({"about": []}, "about is not what damian fly writes"),
     ],
 )
-def test_a_file_whose_columns_do_not_fit_is_refused_in_one_line(tmp_path, changes, problem):
+def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, changes, problem):
     path = tmp_path / "episode.json"
     path.write_text(json.dumps({**flight().document(), **changes}))
-    with pytest.raises(InputError, match=r"episode\.json: it is no episode of version 1 or 2: ") as refused:
+    with pytest.raises(InputError, match=rf"episode\.json: it is no episode of version 2: .*{problem}.*$"):
         Episode.load(path)
-    assert problem in str(refused.value)
-    assert str(refused.value).isprintable()
+
+
+@pytest.mark.parametrize("text", ["no json", "[1]", "{}", '{"schema": "damian-episode", "version": 2}'])
+def test_another_file_is_refused_in_one_line(tmp_path, text):
+    path = tmp_path / "episode.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"episode\.json: it is no episode"):
+        Episode.load(path)
+    with pytest.raises(InputError, match="no episode"):
+        Episode.load(tmp_path / "missing.json")
 
 
 def test_an_episode_without_optional_columns_survives_its_file(flown, tmp_path):

@@ -2,14 +2,21 @@
 
 import numpy as np
 import pytest
+import torch
 from episodes import flight
 from matplotlib.colors import to_rgb
 from PIL import Image
+from torchrl.envs.utils import check_env_specs
+from torchrl.record import VideoRecorder
 
+from damian.baselines.random import random_policy
 from damian.common.errors import InputError
+from damian.common.plotting import COLOURS
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import DelayConfig, ScenarioConfig
 from damian.show import film as films
-from damian.show.belief_figure import COLOURS
-from damian.show.film import Film, save_film
+from damian.show.episode import record
+from damian.show.film import Film, FilmPixels, save_film
 
 
 def colour_at(film: Film, step: int, east: float, north: float) -> np.ndarray:
@@ -117,3 +124,47 @@ def test_a_gif_of_too_many_steps_and_an_unknown_view_are_refused(tmp_path, monke
     assert not any(tmp_path.iterdir())
     with pytest.raises(InputError, match="view: 3D is not one of 2d, 3d"):
         Film(flight(1), "3D")
+
+
+# While an environment runs, through TorchRL's own recorder.
+
+EXTRAS = ["message", "state", "reward_terms"]
+
+
+class Kept:
+    """A logger that keeps the videos."""
+
+    def __init__(self) -> None:
+        self.videos: dict[str, torch.Tensor] = {}
+
+    def log_video(self, name: str, video: torch.Tensor, **_: object) -> None:
+        self.videos[name] = video
+
+
+def test_torchrls_recorder_films_what_a_film_of_the_episode_shows():
+    scenario = ScenarioConfig(delay=DelayConfig(obs=2))
+    env, logger = make_env(scenario, 1, seed=0, extras=EXTRAS), Kept()
+    env.append_transform(FilmPixels(env.uav_env))
+    env.append_transform(VideoRecorder(logger, tag="flight", skip=1, make_grid=False))
+    rollout = env.rollout(3, random_policy(env))
+    env.transform.dump()
+    video = logger.videos["flight"]
+    assert video.shape[-4:] == (4, 3, 700, 720)
+    film = Film(record(rollout, env.uav_env, {})[0])
+    last = np.moveaxis(video.reshape(-1, 3, 700, 720)[-1].numpy(), 0, -1)
+    assert np.array_equal(last, film.frame(3))
+    again = env.rollout(2, random_policy(env))
+    film = Film(record(again, env.uav_env, {})[0])
+    assert np.array_equal(again["next", "pixels"][0, -1].numpy(), film.frame(2))
+
+
+def test_the_pixels_are_in_the_specs():
+    env = make_env(ScenarioConfig(), 1, seed=0, extras=EXTRAS)
+    env.append_transform(FilmPixels(env.uav_env, view="3d"))
+    check_env_specs(env)
+
+
+def test_several_worlds_cannot_be_filmed():
+    env = make_env(ScenarioConfig(), 2, extras=EXTRAS)
+    with pytest.raises(InputError, match="number of worlds: 2 is not 1"):
+        FilmPixels(env.uav_env)

@@ -15,7 +15,7 @@ import shapely
 from episodes import SQUARE, flight
 from PIL import Image
 
-from damian.show.belief_figure import COLOURS
+from damian.common.plotting import COLOURS
 from damian.show.replay_page import save_page
 from damian.world.regions.geodesy import to_latlon
 

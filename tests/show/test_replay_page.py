@@ -11,8 +11,8 @@ import pytest
 from episodes import flight
 
 from damian.common.errors import InputError, RunError
+from damian.common.plotting import COLOURS
 from damian.show import replay_page
-from damian.show.belief_figure import COLOURS
 from damian.show.replay_page import MOST, page, save_page, titles
 
 EVIL = "scenario=</script><script>alert('&\"\ud800')</script><!--"

@@ -1,0 +1,85 @@
+"""One instant of an episode, as every picture of it shows it: on the map, in space, and as GeoJSON."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from shapely.geometry.base import BaseGeometry
+
+from damian.common.plotting import COLOURS
+from damian.show.episode import Episode, Floats
+
+TRAIL = 8
+"""Number of steps whose path is drawn behind a UAV."""
+
+
+@dataclass(frozen=True)
+class Uav:
+    """A UAV at an instant."""
+
+    name: str
+    colour: str
+    path: Floats
+    """Its latest places, the present one last: east, north, up [m], [P, 3]."""
+    heading: float
+    """Clockwise from north [rad]."""
+    spots: bool
+    """Whether it spots the source."""
+    believed: Floats
+    """Where the server believes it to be: east, north [m], [2]."""
+    age: float
+    """Age of the message from which the server knows that [s]."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is true at an instant, and what the server believes."""
+
+    time: float
+    """Time since the reset [s]."""
+    uavs: list[Uav]
+    source: Floats | None
+    """Place of the source: east, north [m], [2]; None if nobody knows it."""
+    emits: bool
+    """Whether the source emits."""
+    cells: list[tuple[BaseGeometry, float]]
+    """Where the source may well be: areas in the region, with their probabilities."""
+
+
+def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
+    """An episode at an instant.
+
+    Args:
+        episode: the episode.
+        step: number of steps before the instant.
+        trail: number of steps that the paths reach back; None: to the beginning.
+    """
+    begin = 0 if trail is None else max(step - trail, 0)
+    uavs = [
+        Uav(
+            name=episode.names[uav],
+            colour=COLOURS[uav % len(COLOURS)],
+            path=episode.position[begin : step + 1, uav],
+            heading=float(episode.track[step, uav]),
+            spots=bool(episode.spotted[step, uav]),
+            believed=episode.believed[step, uav],
+            age=float(episode.age[step, uav]),
+        )
+        for uav in range(episode.n_agents)
+    ]
+    return Frame(
+        time=float(episode.time[step]),
+        uavs=uavs,
+        source=None if episode.source is None else episode.source[step],
+        emits=episode.emits is not None and bool(episode.emits[step]),
+        cells=[
+            (episode.squares[k], float(np.asarray(episode.belief)[step, k]))
+            for k in episode.likely_cells(step)
+        ],
+    )
+
+
+def limits(episode: Episode) -> tuple[Floats, Floats]:
+    """Lower left and upper right corner of what a view shows, east and north [m]."""
+    west, south, east, north = episode.region.bounds
+    margin = max(0.06 * max(east - west, north - south), 0.5 * episode.radius)
+    return np.array([west, south]) - margin, np.array([east, north]) + margin
