@@ -35,7 +35,7 @@ from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.compare.comparison import (
-    HELD_OUT,
+    HELD_OUT_MARK,
     NOT_LATE,
     SCORES,
     TRAINED,
@@ -139,7 +139,7 @@ class CompareConfig:
 
     def includes(self, row: Row) -> bool:
         """Is a row of results of a task, a delay, an arm and a seed that are asked for?"""
-        task, delays = row["task"].partition(HELD_OUT)[0], [NOT_LATE, *self.chosen("delays")]
+        task, delays = row["task"].partition(HELD_OUT_MARK)[0], [NOT_LATE, *self.chosen("delays")]
         chosen = task in self.chosen("tasks") and row["arm"] in self.chosen("arms")
         seeds = range(self.experiment.first_seed, sys.maxsize) if self.seeds is None else self.every_seed
         return chosen and row["delay"] in delays and row["seed"] in seeds
@@ -164,7 +164,7 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
     places = {task: (task, overrides) for task, overrides in tasks.items()}
     for name, held_out in config.experiment.held_out.items():
         for task in tasks if held_out.tasks is None else [t for t in tasks if t in held_out.tasks]:
-            places[f"{task}{HELD_OUT}{name}"] = (task, [*tasks[task], *held_out.overrides])
+            places[f"{task}{HELD_OUT_MARK}{name}"] = (task, [*tasks[task], *held_out.overrides])
     runs = [
         run
         for place, (task, task_overrides) in places.items()

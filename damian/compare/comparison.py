@@ -29,30 +29,56 @@ OF_ARM = (TRAINED, TRAINED_DETERMINISTIC, UNTRAINED, UNTRAINED_DETERMINISTIC)
 ALL_MESSAGES = "all messages"
 CEILING = {"what has arrived": "R0", "its own messages": "R0", ALL_MESSAGES: "R3", "the source's place": "R3"}
 """What is known on time in the rows of an information ceiling (``damian ceiling``), and their regimes."""
-HELD_OUT = "@"
+HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
 """Name that stands for the delay of an undelayed arm."""
-TRUE_SCORES = ("return", "success_rate", "steps")
-"""Measures of an ``Evaluation`` from messages without delay."""
-PERCEIVED_SCORES = ("perceived_return", "perceived_success_rate", "perceived_steps")
-"""The same measures as the server perceived them."""
-MEASURES = (*TRUE_SCORES, *PERCEIVED_SCORES, "age", "late", "lost", "backupdated")
-SCORES = (*TRUE_SCORES, *PERCEIVED_SCORES)
-"""Measures by which arms can be compared."""
-_SHARES = ("success_rate", "perceived_success_rate", "late", "lost", "backupdated")
-_TIMES = ("steps", "perceived_steps", "age")
-_ANY = (-np.inf, np.inf)
-BOUNDS: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(MEASURES, _ANY),
-    **dict.fromkeys(_SHARES, (0.0, 1.0)),
-    **dict.fromkeys(_TIMES, (0.0, np.inf)),
-}
-"""Smallest and largest possible value of each of ``MEASURES``."""
-COMPARED = ("J_norm", "recovery", "improvement", "of_ceiling")
-"""Columns of the estimates of ``Compared``."""
-LESS_IS_BETTER = ("steps", "perceived_steps")
-"""Scores for which lower values are better."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers in the tables of a comparison."""
+
+    name: str
+    """Its name in files; that of the measure."""
+    head: str
+    """Its heading in Markdown."""
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    """Smallest and largest possible value."""
+    is_score: bool = False
+    """Whether arms can be compared by it."""
+    less_is_better: bool = False
+
+
+_SHARE, _TIME = (0.0, 1.0), (0.0, np.inf)
+MEASURED = (
+    Column("return", "return", is_score=True),
+    Column("success_rate", "success", _SHARE, is_score=True),
+    Column("steps", "steps", _TIME, is_score=True, less_is_better=True),
+    Column("perceived_return", "perceived return", is_score=True),
+    Column("perceived_success_rate", "perceived success", _SHARE, is_score=True),
+    Column("perceived_steps", "perceived steps", _TIME, is_score=True, less_is_better=True),
+    Column("age", "age", _TIME),
+    Column("late", "late", _SHARE),
+    Column("lost", "lost", _SHARE),
+    Column("backupdated", "back-updated", _SHARE),
+)
+"""Means over seeds. The first ones are of an ``Evaluation``: from messages without delay and, ``perceived_``,
+as the server perceived them."""
+COMPARED = (
+    Column("J_norm", "J_norm"),
+    Column("recovery", "recovery"),
+    Column("improvement", "P > naive"),
+    Column("of_ceiling", "of ceiling"),
+)
+"""What ``Comparison.compared`` finds of an arm: J_norm is 0 for the random policy, 1 for the undelayed arm;
+recovery is 0 for the strongest naive arm of the same track and 1 for the undelayed one; improvement: the
+probability that a run beats one of that naive arm; of_ceiling: the score over that of the script which knows
+all messages on time, if an arm flies it."""
+MEASURES = tuple(column.name for column in MEASURED)
+SCORES = tuple(column.name for column in MEASURED if column.is_score)
+LESS_IS_BETTER = tuple(column.name for column in MEASURED if column.less_is_better)
+BOUNDS = {column.name: column.bounds for column in MEASURED}
 
 Row = Mapping[str, Any]
 """Evaluation of one policy: task, delay, arm, regime, seed, policy, a number for each measure, and of its run
@@ -118,30 +144,26 @@ UNKNOWN = Estimate(np.nan, np.nan, np.nan)
 """Stands for an estimate that cannot be made, or has no meaning."""
 
 
-class Compared(NamedTuple):
+@dataclass(frozen=True)
+class Compared:
     """An arm compared with the undelayed one, the random policy and the naive arms, under the same delay."""
 
-    seeds: list[int]
-    """Seeds that all of these have finished."""
-    j_norm: Estimate
-    """0: the random policy; 1: the undelayed arm."""
-    recovery: Estimate = UNKNOWN
-    """0: the strongest naive arm of the same track; 1: the undelayed arm."""
-    improvement: Estimate = UNKNOWN
-    """Probability that a run of the arm beats one of the strongest naive arm of its track."""
-    of_ceiling: Estimate = UNKNOWN
-    """Score over that of the script which knows all messages on time, if an arm flies it."""
+    seeds: list[int] = field(default_factory=list)
+    """Seeds that all of these have finished; empty if there is none, and nothing is compared."""
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    """By names of ``COMPARED``; what cannot be estimated is missing."""
 
-
-NOT_COMPARED = Compared([], UNKNOWN)
-"""Stands for an arm without a seed that all others have finished too, and for what is not compared."""
+    def __getitem__(self, name: str) -> Estimate:
+        return self.estimates.get(name, UNKNOWN)
 
 
 def _short(number: float) -> str:
     return f"{number:.3f}" if abs(number) < 10 else f"{number:.1f}"
 
 
-def _estimates(statistic: Any, scores: Floats, bounds: tuple[float, float] = _ANY) -> list[Estimate]:
+def _estimates(
+    statistic: Any, scores: Floats, bounds: tuple[float, float] = (-np.inf, np.inf)
+) -> list[Estimate]:
     """Estimates, K in number, of a statistic that maps ``scores`` [strata, ..., seeds] to [K].
 
     ``bounds`` are its smallest and its largest possible value.
@@ -200,9 +222,15 @@ class Comparison:
         """Values of a measure by seed; an untrained arm has none but those of its untrained network."""
         if arm in self.arms and self.arms[arm].untrained and policy in OF_ARM[:2]:
             policy = OF_ARM[OF_ARM.index(policy) + 2]
-        wanted = (task, delay, arm, policy)
-        keys = ("task", "delay", "arm", "policy")
-        return {r["seed"]: r[measure] for r in self.rows if tuple(r[key] for key in keys) == wanted}
+        return {row["seed"]: row[measure] for row in self._rows_of.get((task, delay, arm, policy), ())}
+
+    @cached_property
+    def _rows_of(self) -> dict[tuple[str, ...], list[Row]]:
+        """Rows by task, delay, arm and policy."""
+        found: dict[tuple[str, ...], list[Row]] = {}
+        for row in self.rows:
+            found.setdefault((row["task"], row["delay"], row["arm"], row["policy"]), []).append(row)
+        return found
 
     def mean(self, task: str, delay: str, arm: str) -> Estimate:
         """Mean score of an arm over its seeds."""
@@ -224,30 +252,25 @@ class Comparison:
     def compared(self, task: str, delay: str) -> dict[str, Compared]:
         """Each delayed arm, over the seeds that it and all arms that it is compared with have finished."""
         scores = self.scores(task, delay)
-        delayed = list(scores)[2:]
-        found = {}
-        for name in delayed:
-            same_track = [other for other in delayed if track(self.arms, other) == track(self.arms, name)]
-            naive = [other for other in same_track if self.arms[other].naive]
-            found[name] = self._compared(scores, naive, name)
         ceiling = self.values(task, delay, self.ceiling or "", ALL_MESSAGES, self.score)
-        return {
-            name: result._replace(of_ceiling=_ratio(scores[name], ceiling))
-            for name, result in found.items()
-            if result.seeds
-        }
+        found = {name: self._compared(scores, ceiling, name) for name in list(scores)[2:]}
+        return {name: result for name, result in found.items() if result.seeds}
 
-    def _compared(self, scores: Mapping[str, Mapping[int, float]], naive: list[str], arm: str) -> Compared:
+    def _compared(
+        self, scores: Mapping[str, Mapping[int, float]], ceiling: Mapping[int, float], arm: str
+    ) -> Compared:
+        others = [name for name in list(scores)[2:] if track(self.arms, name) == track(self.arms, arm)]
+        naive = [name for name in others if self.arms[name].naive]
         names = [*list(scores)[:2], *(name for name in naive if name != arm), arm]
         seeds, array = _paired([scores[name] for name in names])
         if not seeds:
-            return NOT_COMPARED
-        (norm,) = _estimates(_norms, array)
-        if arm in naive or not naive:
-            return Compared(seeds, norm)
-        probability = float(_improvement(array))
-        improvement = Estimate(probability, *improvement_interval(probability, len(seeds)))
-        return Compared(seeds, norm, _recovery(array), improvement)
+            return Compared()
+        found = {"J_norm": _estimates(_norms, array)[0]}
+        if naive and arm not in naive:
+            probability = float(_improvement(array))
+            found["improvement"] = Estimate(probability, *improvement_interval(probability, len(seeds)))
+            found["recovery"] = _recovery(array)
+        return Compared(seeds, {**found, "of_ceiling": _ratio(scores[arm], ceiling)})
 
     def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
         """Probability that a run of one delayed arm beats one of another, with its score interval, by names.
@@ -271,7 +294,7 @@ class Comparison:
         fewer than two combinations of task and delay. Seeds are resampled within each task, because its
         delays share the undelayed arm.
         """
-        by_task = {task: self.delays(task) for task in self.tasks() if HELD_OUT not in task}
+        by_task = {task: self.delays(task) for task in self.tasks() if HELD_OUT_MARK not in task}
         delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
         cells = [[self.scores(task, delay) for delay in delays] for task in by_task]
         flat = [cell for row in cells for cell in row]
@@ -353,15 +376,18 @@ class Line:
     policy: str
     seeds: list[int]
     measures: dict[str, Estimate]
-    compared: Compared = NOT_COMPARED
+    compared: Compared = field(default_factory=Compared)
+
+    def estimates(self) -> dict[str, Estimate]:
+        """All numbers by the names of their columns, ``MEASURED`` and then ``COMPARED``."""
+        return {**self.measures, **{column.name: self.compared[column.name] for column in COMPARED}}
 
     def cells(self) -> dict[str, Any]:
         """Columns of ``table.csv`` by name; unknown numbers are empty."""
-        compared = dict(zip(COMPARED, self.compared[1:], strict=True))
         cells: dict[str, Any] = {k: getattr(self, k) for k in ("task", "delay", "arm", "regime", "policy")}
         cells |= {"seeds": len(self.seeds), "compared_seeds": len(self.compared.seeds)}
-        for name, number in {**self.measures, **compared}.items():
-            parts = [float("nan")] * 3 if np.isnan(number.value) else number
+        for name, estimate in self.estimates().items():
+            parts = UNKNOWN if np.isnan(estimate.value) else estimate
             for suffix, value in zip(("", "_low", "_high"), parts, strict=True):
                 cells[name + suffix] = "" if np.isnan(value) else value
         return cells
@@ -375,7 +401,7 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
             compared = {} if delay == NOT_LATE else comparison.compared(task, delay)
             for arm in arms:
                 for policy in OF_ARM[2:] if comparison.arms[arm].untrained else OF_ARM:
-                    # Policies of other arms and runs of older versions have no untrained network.
+                    # An arm that flies the policies of another one has no untrained network.
                     if comparison.values(task, delay, arm, policy, comparison.score):
                         line = _line(comparison, task, delay, arm, policy)
                         of_arm = policy.removeprefix("un") if comparison.arms[arm].untrained else policy
@@ -383,7 +409,7 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
                         yield replace(line, compared=found) if found else line
             for arm in arms[:1]:
                 for policy in SCRIPTED:
-                    # Older runs have not flown every scripted policy.
+                    # The script does not fly in every region.
                     if comparison.values(task, delay, arm, policy, comparison.score):
                         yield replace(_line(comparison, task, delay, arm, policy), arm=policy, regime="")
             for known, information in CEILING.items():

@@ -1,4 +1,7 @@
-"""Figures of a comparison: learning curves, J_norm of each arm, and scores over delays."""
+"""Figures of a comparison: learning curves, J_norm of each arm, and scores over delays.
+
+An arm has the same colour in all figures of one comparison.
+"""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,8 +20,7 @@ from damian.common.plotting import COLOURS, STYLE
 from damian.compare.comparison import (
     ALL_MESSAGES,
     BOUNDS,
-    HELD_OUT,
-    NOT_COMPARED,
+    HELD_OUT_MARK,
     NOT_LATE,
     RANDOM,
     Comparison,
@@ -37,11 +39,15 @@ LABELS = {
 """Axis labels of the measures in training, all as the server perceived them."""
 PROGRESS = {"frames": "environment steps", "episodes": "episodes"}
 """Axis labels of how far a training has come."""
+ARM_COLOURS = (*COLOURS, "#332288", "#882255", "#117733", "#999933", "#44AA99", "#AA4499")
+"""Colours of arms: after the usual ones, six of Paul Tol's muted ones."""
+_LINES, _DOTTED, _MARKERS = ("-", "-."), (":", (0, (1, 4))), "os^D"
+"""Of arms that train, of those that train nothing, and of points; later ones where colours repeat."""
 _POINTS = 200
 """Number of points of a learning curve."""
 _NORMS_IN_A_ROW = 4
-_LINES, _DOTTED, _MARKERS = ("-", "-."), (":", (0, (1, 4))), "os"
-"""Of arms that train, of those that train nothing, and of points; the second ones where colours repeat."""
+_LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
+"""Style of lines at a reference."""
 _NO_NORMS = "no J_norm is known:\nthe undelayed arm has no run, or none better than the random policy"
 
 
@@ -71,8 +77,7 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
             for axis, (task, delay, name) in zip(row, contents, strict=False):
                 _curve_panel(axis, comparison, curves, (task, delay, name), progress)
                 if name in best:
-                    style = {"color": "0.2", "linestyle": "--", "linewidth": 0.8}
-                    axis.axhline(best[name], label="best possible", **style)
+                    axis.axhline(best[name], label="best possible", **{**_LEVEL, "color": "0.2"})
                 title, label = f"{task}, delay {delay}", f"{LABELS[name]}, perceived"
                 axis.set(xlabel=PROGRESS[progress], ylabel=label, title=title)
                 axis.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -80,70 +85,6 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
                 axis.set_axis_off()
             _legend(row[len(contents) - 1], row)
         figure.savefig(path, dpi=150)
-
-
-def _legend(place: Axes, panels: Iterable[Axes]) -> None:
-    """Name what any of the panels shows, to the right of one of them."""
-    drawn: dict[str, Any] = {}
-    for axis in panels:
-        drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    place.legend([*drawn.values()], [*drawn], loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-
-
-def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str, str]]]:
-    """Task, delay and measure of each panel, by rows."""
-    tasks = [task for task in comparison.tasks() if HELD_OUT not in task]
-    delays = {task: comparison.delays(task) or [NOT_LATE] for task in tasks}
-    if len(tasks) > 1:
-        return [[(task, delay, "perceived_return") for delay in delays[task]] for task in tasks]
-    rows = [row for runs in curves.values() for run in runs for row in run]
-    measures = [name for name in LABELS if any(not np.isnan(row[name]) for row in rows)]
-    return [[(task, delay, name) for name in measures] for task in tasks for delay in delays[task]]
-
-
-def _progress(curves: Curves) -> str:
-    """What learning curves are drawn over, a key of ``PROGRESS``: steps, if all runs have made as many."""
-    ends = {run[-1].get("frames") for runs in curves.values() for run in runs}
-    return "frames" if len(ends) == 1 and None not in ends else "episodes"
-
-
-def _curve_panel(
-    axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str], progress: str
-) -> None:
-    """Draw all arms of a task under a delay, by one measure, which ``content`` names, over ``progress``."""
-    task, delay, measure = content
-    for index, (name, arm) in enumerate(comparison.arms.items()):
-        run, colour = (task, delay if arm.delayed else NOT_LATE, name), _colour(index)
-        if run in curves:
-            place, mean, low, high = _band(curves[run], measure, progress)
-            axis.plot(place, mean, color=colour, ls=_again(_LINES, index), linewidth=1.2, label=name)
-            axis.fill_between(place, low, high, color=colour, alpha=0.2, linewidth=0)
-        elif values := comparison.values(*run, comparison.policy, measure):
-            level = fmean(values.values())
-            axis.axhline(level, color=colour, linestyle=_again(_DOTTED, index), label=name)
-    random = comparison.values(task, NOT_LATE, comparison.undelayed, RANDOM, measure)
-    if random:
-        axis.axhline(fmean(random.values()), color="0.5", linestyle="--", linewidth=0.8, label=RANDOM)
-
-
-def _band(
-    runs: Sequence[Sequence[Mapping[str, float]]], name: str, progress: str
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Steps or episodes (``progress``) that all seeds reached, mean over seeds, ends of its 95 % interval.
-
-    Each is [_POINTS], NaN if there is none that all have reached; ``name`` is the measure.
-    """
-    points = [np.array([(r[progress], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
-    points = [run for run in points if len(run)]
-    first = max((run[0, 0] for run in points), default=np.inf)
-    last = min((run[-1, 0] for run in points), default=-np.inf)
-    if first > last:
-        unknown = np.full(_POINTS, np.nan)
-        return unknown, unknown, unknown, unknown
-    place = np.linspace(first, last, _POINTS)
-    values = np.stack([np.interp(place, *run.T) for run in points], -1)
-    low, high = bootstrap(lambda scores: scores.mean(-1), values[None], draws=500, bounds=BOUNDS[name])
-    return place, values.mean(-1), low[0], high[0]
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
@@ -159,45 +100,28 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
         return
     width = min(len(norms), _NORMS_IN_A_ROW)
     height = math.ceil(len(norms) / width)
+    arms = [name for name, arm in comparison.arms.items() if arm.delayed and not arm.ceiling]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.0 * width + 1.2, 3.0 * height), layout="constrained")
         axes = figure.subplots(height, width, squeeze=False, sharey=True)
         for axis, task in zip_longest(axes.flat, norms):
             if task is None:
                 axis.set_axis_off()
-            else:
-                _norm_panel(axis, comparison, task, norms[task])
+                continue
+            for arm in [arm for arm in arms if arm in norms[task]]:
+                place = 0.7 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
+                known = [(x + place, norm) for x, norm in norms[task][arm].items()]
+                _error_bars(axis, known, label=arm, **look(comparison, arm) | {"linestyle": ""})
+            delays = comparison.delays(task)
+            axis.set_xticks(range(len(delays)), delays)
+            title = task.replace(HELD_OUT_MARK, ", held-out ")
+            axis.set(title=title, xlabel="delay", xlim=(-0.5, max(len(delays), 1) - 0.5))
+            for level in (0, 1):
+                axis.axhline(level, **_LEVEL)
         for axis in axes[:, 0]:
             axis.set_ylabel("J_norm (dashed: undelayed 1, random 0)")
         _legend(axes[0, -1], axes.flat)
         figure.savefig(path, dpi=150)
-
-
-def _known_norms(comparison: Comparison, task: str) -> dict[str, dict[int, Estimate]]:
-    """J_norm by arm and number of the delay, where it is known."""
-    found: dict[str, dict[int, Estimate]] = {}
-    for x, delay in enumerate(comparison.delays(task)):
-        for arm, compared in comparison.compared(task, delay).items():
-            if not np.isnan(compared.j_norm.value):
-                found.setdefault(arm, {})[x] = compared.j_norm
-    return found
-
-
-def _norm_panel(
-    axis: Axes, comparison: Comparison, task: str, norms: Mapping[str, Mapping[int, Estimate]]
-) -> None:
-    delays = comparison.delays(task)
-    arms = [name for name, arm in comparison.arms.items() if arm.delayed and not arm.ceiling]
-    for index, arm in enumerate(comparison.arms):
-        if arm in norms:
-            place = 0.7 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
-            known = [(x + place, norm) for x, norm in norms[arm].items()]
-            _error_bars(axis, known, index, fmt=_again(_MARKERS, index), label=arm)
-    for level in (0, 1):
-        axis.axhline(level, color="0.5", linestyle="--", linewidth=0.8)
-    axis.set_xticks(range(len(delays)), delays)
-    title = task.replace(HELD_OUT, ", held-out ")
-    axis.set(title=title, xlabel="delay", xlim=(-0.5, max(len(delays), 1) - 0.5))
 
 
 def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], path: Path) -> None:
@@ -233,46 +157,130 @@ def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], pat
         figure.savefig(path, dpi=150)
 
 
+def look(comparison: Comparison, arm: str) -> dict[str, Any]:
+    """Colour, line and marker of an arm, by its place among all arms of the comparison."""
+    again, index = divmod(list(comparison.arms).index(arm), len(ARM_COLOURS))
+    of_arm = comparison.arms[arm]
+    trains = of_arm.policy_of is None and not (of_arm.untrained or of_arm.ceiling)
+    lines = _LINES if trains else _DOTTED
+    return {
+        "color": ARM_COLOURS[index],
+        "linestyle": lines[again % len(lines)],
+        "marker": _MARKERS[again % len(_MARKERS)],
+    }
+
+
+def _legend(place: Axes, panels: Iterable[Axes]) -> None:
+    """Name what any of the panels shows, to the right of one of them."""
+    drawn: dict[str, Any] = {}
+    for axis in panels:
+        drawn |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    place.legend([*drawn.values()], [*drawn], loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+
+
+def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str, str]]]:
+    """Task, delay and measure of each panel, by rows."""
+    tasks = [task for task in comparison.tasks() if HELD_OUT_MARK not in task]
+    delays = {task: comparison.delays(task) or [NOT_LATE] for task in tasks}
+    if len(tasks) > 1:
+        return [[(task, delay, "perceived_return") for delay in delays[task]] for task in tasks]
+    rows = [row for runs in curves.values() for run in runs for row in run]
+    measures = [name for name in LABELS if any(not np.isnan(row[name]) for row in rows)]
+    return [[(task, delay, name) for name in measures] for task in tasks for delay in delays[task]]
+
+
+def _progress(curves: Curves) -> str:
+    """What learning curves are drawn over, a key of ``PROGRESS``: steps, if all runs have made as many."""
+    ends = {run[-1].get("frames") for runs in curves.values() for run in runs}
+    return "frames" if len(ends) == 1 and None not in ends else "episodes"
+
+
+def _curve_panel(
+    axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str], progress: str
+) -> None:
+    """Draw all arms of a task under a delay, by one measure, which ``content`` names, over ``progress``."""
+    task, delay, measure = content
+    for name, arm in comparison.arms.items():
+        run = (task, delay if arm.delayed else NOT_LATE, name)
+        style = look(comparison, name) | {"marker": "", "label": name}
+        if run in curves:
+            place, mean, low, high = _band(curves[run], measure, progress)
+            axis.plot(place, mean, linewidth=1.2, **style)
+            axis.fill_between(place, low, high, color=style["color"], alpha=0.2, linewidth=0)
+        elif values := comparison.values(*run, comparison.policy, measure):
+            axis.axhline(fmean(values.values()), **style)
+    if random := comparison.values(task, NOT_LATE, comparison.undelayed, RANDOM, measure):
+        axis.axhline(fmean(random.values()), label=RANDOM, **_LEVEL)
+
+
+def _band(
+    runs: Sequence[Sequence[Mapping[str, float]]], name: str, progress: str
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Steps or episodes (``progress``) that all seeds reached, mean over seeds, ends of its 95 % interval.
+
+    Each is [_POINTS], NaN if there is none that all have reached; ``name`` is the measure.
+    """
+    points = [np.array([(r[progress], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
+    points = [run for run in points if len(run)]
+    first = max((run[0, 0] for run in points), default=np.inf)
+    last = min((run[-1, 0] for run in points), default=-np.inf)
+    if first > last:
+        unknown = np.full(_POINTS, np.nan)
+        return unknown, unknown, unknown, unknown
+    place = np.linspace(first, last, _POINTS)
+    values = np.stack([np.interp(place, *run.T) for run in points], -1)
+    low, high = bootstrap(lambda scores: scores.mean(-1), values[None], draws=500, bounds=BOUNDS[name])
+    return place, values.mean(-1), low[0], high[0]
+
+
+def _known_norms(comparison: Comparison, task: str) -> dict[str, dict[int, Estimate]]:
+    """J_norm by arm and number of the delay, where it is known."""
+    found: dict[str, dict[int, Estimate]] = {}
+    for x, delay in enumerate(comparison.delays(task)):
+        for arm, compared in comparison.compared(task, delay).items():
+            if not np.isnan(compared["J_norm"].value):
+                found.setdefault(arm, {})[x] = compared["J_norm"]
+    return found
+
+
 def _delay_column(column: Sequence[Axes], comparison: Comparison, task: str, arms: Sequence[str]) -> None:
     """Draw the scores of arms over the delays of a task; below, their recovery or share of the ceiling."""
-    scores, below = column
+    above, below = column
     delays = comparison.delays(task)
     has_naive = any(comparison.arms[arm].naive for arm in arms)
-    for index, arm in enumerate(arms):
-        _estimates_over(scores, [comparison.mean(task, delay, arm) for delay in delays], index, arm)
+    won = "recovery" if has_naive else "of_ceiling"
+    compared = [comparison.compared(task, delay) for delay in delays]
+    for arm in arms:
+        scores = [comparison.mean(task, delay, arm) for delay in delays]
+        shown = [(above, list(enumerate(scores)))]
         if not comparison.arms[arm].naive:
-            found = [comparison.compared(task, delay).get(arm, NOT_COMPARED) for delay in delays]
-            won = [each.recovery if has_naive else each.of_ceiling for each in found]
-            _estimates_over(below, won, index, arm)
-    _references(scores, comparison, task)
+            shown += [(below, [(x, found[arm][won]) for x, found in enumerate(compared) if arm in found])]
+        for axis, estimates in shown:
+            known = [(x, estimate) for x, estimate in estimates if not np.isnan(estimate.value)]
+            if known:
+                _error_bars(axis, known, label=arm, **look(comparison, arm))
+    _references(above, comparison, task)
     for level in (0, 1):
-        below.axhline(level, color="0.5", linestyle="--", linewidth=0.8)
-    scores.legend(frameon=False)
+        below.axhline(level, **_LEVEL)
+    above.legend(frameon=False)
     below.set_xticks(range(len(delays)), delays)
     below.set_ylabel("recovery (0: naive, 1: undelayed)" if has_naive else "share of the script's return")
-    lowest = below if below.containers else scores
-    if lowest is scores:  # no recovery or share is known
+    lowest = below if below.containers else above
+    if lowest is above:  # no recovery or share is known
         below.set_visible(False)
-        scores.tick_params(labelbottom=True)
+        above.tick_params(labelbottom=True)
     lowest.set_xlabel("delay of the observations [steps]")
 
 
-def _estimates_over(axis: Axes, estimates: Sequence[Estimate], index: int, label: str) -> None:
-    """Draw estimates of an arm, one for each delay, as a line with bars; unknown ones are left out."""
-    known = [(x, estimate) for x, estimate in enumerate(estimates) if not np.isnan(estimate.value)]
-    if known:
-        _error_bars(axis, known, index, marker=_again(_MARKERS, index), ls=_again(_LINES, index), label=label)
-
-
-def _error_bars(axis: Axes, known: Sequence[tuple[float, Estimate]], index: int, **style: Any) -> None:
-    """Draw known estimates at their places, in the colour of the arm with a number.
+def _error_bars(axis: Axes, known: Sequence[tuple[float, Estimate]], **style: Any) -> None:
+    """Draw known estimates at their places.
 
     A bar whose end is infinite goes to the edge of the panel: matplotlib would leave it out.
     """
     bars = np.array([(each.value - each.low, each.high - each.value) for _, each in known]).T
     places, values = [x for x, _ in known], [each.value for _, each in known]
-    drawn = axis.errorbar(places, values, yerr=bars, color=_colour(index), markersize=4, **style)
-    line = {"arrowstyle": "-", "color": _colour(index), "shrinkA": 0, "shrinkB": 0}
+    drawn = axis.errorbar(places, values, yerr=bars, markersize=4, **style)
+    line = {"arrowstyle": "-", "color": style["color"], "shrinkA": 0, "shrinkB": 0}
     line["linewidth"] = drawn[2][0].get_linewidth()[0]
     for place, value, *ends in zip(places, values, *bars, strict=True):
         for edge, length in enumerate(ends):
@@ -291,15 +299,5 @@ def _references(axis: Axes, comparison: Comparison, task: str) -> None:
     for label, style, values in lines:
         if values:
             level = fmean(values.values())
-            axis.axhline(level, color="0.5", linestyle=style, linewidth=0.8)
+            axis.axhline(level, **_LEVEL | {"linestyle": style})
             axis.annotate(label, (0.01, level), xycoords=("axes fraction", "data"), fontsize=6, va="bottom")
-
-
-def _colour(index: int) -> str:
-    """Colour of the arm with a number."""
-    return COLOURS[index % len(COLOURS)]
-
-
-def _again(looks: Sequence[Any], index: int) -> Any:
-    """Which of several looks the arm with a number has, so that two of one colour differ."""
-    return looks[index // len(COLOURS) % len(looks)]

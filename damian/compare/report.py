@@ -3,21 +3,15 @@
 from collections.abc import Sequence
 
 from damian.common.markdown import markdown_table
-from damian.compare.comparison import HELD_OUT, MEASURES, NOT_LATE, SCRIPTED, Comparison, Line
-
-HEADS = (
-    "return",
-    "success",
-    "steps",
-    "perceived return",
-    "perceived success",
-    "perceived steps",
-    "age",
-    "late",
-    "lost",
-    "back-updated",
+from damian.compare.comparison import (
+    COMPARED,
+    HELD_OUT_MARK,
+    MEASURED,
+    NOT_LATE,
+    SCRIPTED,
+    Comparison,
+    Line,
 )
-"""Headings of ``MEASURES`` in the Markdown table."""
 
 
 def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
@@ -38,7 +32,7 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
 
 def _length(comparison: Comparison, task: str) -> str:
     """How long the policies of a task were trained."""
-    if HELD_OUT in task:
+    if HELD_OUT_MARK in task:
         return "Policies of another task."
     trained = sorted(
         {int(run["frames"]) for run in comparison.runs() if run["task"] == task and run["frames"]}
@@ -48,17 +42,16 @@ def _length(comparison: Comparison, task: str) -> str:
 
 
 def _table(lines: Sequence[Line]) -> str:
-    left, right = (
-        ("arm", "regime", "policy"),
-        ("n", *HEADS, "n compared", "J_norm", "recovery", "P > naive", "of ceiling"),
-    )
+    left, heads = ["arm", "regime", "policy"], [column.head for column in MEASURED]
     rows = []
     for line in lines:
         name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
-        seeds, *compared = line.compared
-        numbers = [str(len(line.seeds)), *(str(line.measures[key]) for key in MEASURES)]
-        rows.append([name, line.regime, line.policy, *numbers, str(len(seeds) or "-"), *map(str, compared)])
-    return markdown_table([*left, *right], rows, left=len(left))
+        measured = [str(line.measures[column.name]) for column in MEASURED]
+        compared = [str(line.compared[column.name]) for column in COMPARED]
+        n_compared = str(len(line.compared.seeds) or "-")
+        rows.append([name, line.regime, line.policy, str(len(line.seeds)), *measured, n_compared, *compared])
+    heads = [*left, "n", *heads, "n compared", *(column.head for column in COMPARED)]
+    return markdown_table(heads, rows, left=len(left))
 
 
 def _pairs(comparison: Comparison, task: str, delay: str) -> list[str]:

@@ -5,7 +5,6 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation, Text
 
-from damian.common.plotting import COLOURS
 from damian.compare.comparison import (
     ALL_MESSAGES,
     RANDOM,
@@ -18,7 +17,7 @@ from damian.compare.comparison import (
     Comparison,
     regime,
 )
-from damian.compare.figures import plot_curves, plot_delays, plot_norms
+from damian.compare.figures import ARM_COLOURS, plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import interquartile_mean
 
@@ -73,29 +72,29 @@ SCORES = {"best": [9.0, 11.0], "blind": [1.0, 5.0], "flown": [5.0, 3.0], "aware"
 
 def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
     compared = Comparison(rows_of("t", "late", SCORES), ARMS).compared("t", "late")
-    seeds, norm, recovery, improvement, _ = compared["aware"]
-    assert seeds == [0, 1]
-    assert norm.value == 7.5 / 10
-    assert recovery.value == (7.5 - 4) / (10 - 4)
-    assert improvement.value == 1
-    assert np.isnan([norm.low, recovery.low, recovery.high]).all()  # two seeds give no interval
-    assert compared["blind"].j_norm.value == 3 / 10
+    aware = compared["aware"]
+    assert aware.seeds == [0, 1]
+    assert aware["J_norm"].value == 7.5 / 10
+    assert aware["recovery"].value == (7.5 - 4) / (10 - 4)
+    assert aware["improvement"].value == 1
+    assert np.isnan([aware["J_norm"].low, *aware["recovery"][1:]]).all()  # two seeds give no interval
+    assert compared["blind"]["J_norm"].value == 3 / 10
     for naive in ("blind", "flown"):
-        assert np.isnan([compared[naive].recovery.value, compared[naive].improvement.value]).all()
+        assert compared[naive]["recovery"] is compared[naive]["improvement"] is UNKNOWN
 
 
 def test_the_probability_of_improvement_is_over_the_naive_arm_with_the_higher_mean():
     scores = {"best": [9.0, 9, 9], "blind": [6.0, 0, 0], "flown": [5.0, 4, 3], "aware": [4.0, 6, 7]}
-    improvement = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"].improvement
+    improvement = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]["improvement"]
     assert improvement.value == (1.5 + 3 + 3) / 9  # against 5, 4, 3
     assert 0 <= improvement.low < improvement.value < improvement.high <= 1
 
 
 def test_recovery_is_left_out_if_the_delay_costs_nothing():
     scores = SCORES | {"blind": [9.0, 9.5]}
-    _, norm, recovery, *_ = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
-    assert norm.value == 0.75
-    assert str(recovery) == "-"
+    aware = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]
+    assert aware["J_norm"].value == 0.75
+    assert str(aware["recovery"]) == "-"
 
 
 def test_fewer_steps_give_a_higher_score():
@@ -103,7 +102,8 @@ def test_fewer_steps_give_a_higher_score():
     by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "steps").compared("t", "late")
     by_return = Comparison(rows_of("t", "late", THREE), ARMS).compared("t", "late")
     for arm, expected in by_return.items():
-        np.testing.assert_allclose(by_steps[arm][1:], expected[1:])
+        for name, estimate in expected.estimates.items():
+            np.testing.assert_allclose(by_steps[arm][name], estimate)
 
 
 def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
@@ -179,8 +179,8 @@ def test_a_recovery_is_from_the_naive_arm_of_the_same_track_and_any_two_arms_are
     arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}
     comparison = Comparison(rows_of("t", "late", scores), arms)
     compared = comparison.compared("t", "late")
-    assert compared["aware"].recovery.value == pytest.approx((7.5 - 3) / (10 - 3))
-    assert compared["flown"].recovery is UNKNOWN  # the strongest naive arm of its track
+    assert compared["aware"]["recovery"].value == pytest.approx((7.5 - 3) / (10 - 3))
+    assert compared["flown"]["recovery"] is UNKNOWN  # the strongest naive arm of its track
     pairs = comparison.pairs("t", "late")
     assert pairs["aware", "flown"].value == (0 + 0 + 0.5 + 1) / 4
     assert pairs["flown", "aware"].value == (1 + 1 + 0.5 + 0) / 4
@@ -198,8 +198,8 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its
     assert all(line.measures["return"].value == 2.5 for line in lines)
     aware, prior = (line.compared for line in lines)
     assert aware.seeds == []  # only the trained policy of an arm is compared with others
-    assert prior.j_norm.value == pytest.approx(2.5 / 10)
-    assert prior.recovery.value == pytest.approx((2.5 - 4) / 6)
+    assert prior["J_norm"].value == pytest.approx(2.5 / 10)
+    assert prior["recovery"].value == pytest.approx((2.5 - 4) / 6)
 
 
 def test_the_interval_of_a_share_lies_between_0_and_1_and_that_of_a_length_is_not_negative():
@@ -222,17 +222,17 @@ def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     comparison = Comparison(rows, arms)
     compared = comparison.compared("t", "late")
     assert set(compared) == {"blind", "flown", "aware"}
-    assert compared["aware"].of_ceiling.value == pytest.approx((22 / 3) / 10)
+    assert compared["aware"]["of_ceiling"].value == pytest.approx((22 / 3) / 10)
     script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
     assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
-    assert comparison.compared("t", "late")["aware"].recovery.value == pytest.approx((22 / 3 - 4) / 6)
+    assert comparison.compared("t", "late")["aware"]["recovery"].value == pytest.approx((22 / 3 - 4) / 6)
 
 
 def test_the_share_of_a_script_that_may_win_nothing_has_no_end():
     arms = ARMS | {"script": Arm(ceiling=True)}
     rows = rows_of("t", "late", THREE)
     rows += [row("t", "late", "script", seed, x, ALL_MESSAGES) for seed, x in enumerate((-4.0, 10.0, 12.0))]
-    share = Comparison(rows, arms).compared("t", "late")["aware"].of_ceiling
+    share = Comparison(rows, arms).compared("t", "late")["aware"]["of_ceiling"]
     assert share.value == pytest.approx((22 / 3) / 6)
     assert np.isinf(share[1:]).all()  # one of 27 draws has the first seed only
 
@@ -286,7 +286,7 @@ def drawn(monkeypatch, draw) -> Figure:
 
 
 def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other_one(monkeypatch, tmp_path):
-    names = [f"arm {i}" for i in range(2 * len(COLOURS) - 2)]
+    names = [f"arm {i}" for i in range(2 * len(ARM_COLOURS) - 2)]
     arms = {"best": Arm(delayed=False), "blind": Arm(naive=True)} | {name: Arm() for name in names}
     arms |= {"unfinished": Arm(), "script": Arm(ceiling=True)}
     scores = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3]} | {name: [6.0, 9, 7] for name in names}
@@ -300,6 +300,29 @@ def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other
         assert axis.get_legend_handles_labels()[1] == expected
         lines = [bars[0] for bars in axis.containers]
         assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(expected)
+
+
+def test_an_arm_has_the_same_colour_in_all_figures(monkeypatch, tmp_path):
+    comparison = Comparison(rows_of("t", "late", THREE), ARMS)
+    points = [{"episodes": n, "perceived_return": n / 9} for n in range(5)]
+    curve = [{"perceived_success_rate": 0.5, "perceived_steps": 9.0, **point} for point in points]
+    curves = {("t", "late", "blind"): [curve], ("t", "late", "aware"): [curve]}
+    path, found = tmp_path / "figure.png", {}
+    for draw in (
+        lambda: plot_curves(comparison, curves, {}, path),
+        lambda: plot_norms(comparison, path),
+        lambda: plot_delays(comparison, {"one": ["aware", "blind"], "other": ["blind"]}, path),
+    ):
+        for axis in drawn(monkeypatch, draw).axes:
+            shown = [line for line in axis.lines if line.get_label() in ARMS]
+            shown += [bars[0] for bars in axis.containers]
+            labels = [line.get_label() for line in axis.lines if line.get_label() in ARMS]
+            labels += [bars.get_label() for bars in axis.containers]
+            for label, line in zip(labels, shown, strict=True):
+                found.setdefault(label, set()).add(line.get_color())
+    assert {"blind", "aware", "flown"} <= set(found)
+    assert all(len(colours) == 1 for colours in found.values())
+    assert len(set.union(*found.values())) == len(found)
 
 
 def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch, tmp_path):
@@ -372,6 +395,6 @@ def test_curves_are_over_steps_if_all_runs_made_as_many_and_else_over_episodes(
 def test_an_infinite_end_of_an_interval_is_drawn_to_the_edge_of_the_panel(monkeypatch, tmp_path):
     scores = {"best": [9.0, -1.0, 10.0], "blind": [1.0, 5.0, 3.0], "aware": [6.0, 9.0, 7.0]}
     comparison = Comparison(rows_of("t", "late", scores), ARMS)
-    assert np.isinf(comparison.compared("t", "late")["aware"].j_norm[1:]).all()
+    assert np.isinf(comparison.compared("t", "late")["aware"]["J_norm"][1:]).all()
     axis = drawn(monkeypatch, lambda: plot_norms(comparison, tmp_path / "figure.png")).axes[0]
     assert sorted(line.xy[1] for line in axis.findobj(Annotation)) == [0, 0, 1, 1]
