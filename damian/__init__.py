@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from damian.recipes.shared.environments import compose_scenario  # type: ignore[import-not-found]
     from damian.replay.backupdate import BackupdateStorage
     from damian.server.features import feature
-    from damian.server.reward_terms import reward_term
+    from damian.server.rewards import reward_term
     from damian.transforms import (
         ActionDelay,
         ActionHistory,
@@ -50,7 +50,7 @@ _MODULES = {
     "damian.recipes.shared.environments": ["compose_scenario"],
     "damian.replay.backupdate": ["BackupdateStorage"],
     "damian.server.features": ["feature"],
-    "damian.server.reward_terms": ["reward_term"],
+    "damian.server.rewards": ["reward_term"],
     "damian.transforms": [
         "ActionDelay",
         "ActionHistory",

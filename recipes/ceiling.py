@@ -32,7 +32,7 @@ from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import save_results
-from damian.server.source_grid import SourceGrid
+from damian.server.belief import SourceGrid
 
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from damian.server.source_grid import SourceGrid
+from damian.server.belief import SourceGrid
 
 Steps = Sequence[tuple[list[int], list[int]]]
 """For each step the rows of ``SourceGrid.log_reports`` that UAVs send, and the delays of these messages."""

@@ -9,7 +9,7 @@ from damian import feature, reward_term, sensor
 from damian.common import counter_rng
 from damian.envs.uav_env import UavEnv
 from damian.server.features import FeatureCache
-from damian.server.reward_terms import Counters
+from damian.server.rewards import Counters
 from damian.world.simulation import Simulation
 from damian.world.state import State
 

@@ -17,8 +17,8 @@ from hydra import initialize_config_dir
 import damian
 import damian.transforms
 from damian import Constant
-from damian.delays.delay_line import DelayLine
 from damian.delays.laws import LAWS
+from damian.delays.line import DelayLine
 from damian.delays.samplers import Sampler
 from damian.recipes.command import PROGRAMS, SETTINGS
 from damian.recipes.shared.known_settings import CONF, known_settings

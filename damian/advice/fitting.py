@@ -15,8 +15,7 @@ from damian.advice.reports import Report, read_rows
 from damian.advice.tables import read_file
 from damian.common.errors import InputError
 from damian.common.text_files import named
-from damian.delays.laws import LOST
-from damian.delays.times import LONGEST
+from damian.delays.laws import LONGEST, LOST
 
 REGULAR = 0.2
 """Share of a period by which the time between two reports may differ from whole periods."""

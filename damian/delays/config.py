@@ -5,10 +5,18 @@ from typing import Any
 
 from damian import keys
 from damian.common import checks
-from damian.common.text_files import show
-from damian.delays.delay_line import ORDERS
-from damian.delays.laws import LONGEST, LOSES, Held, Law, law_of, sampler_of
-from damian.delays.link_sampler import check_losses, is_matrix
+from damian.delays.laws import (
+    LONGEST,
+    LOSES,
+    Held,
+    Law,
+    check_losses,
+    is_matrix,
+    law_of,
+    same_size,
+    sampler_of,
+)
+from damian.delays.line import ORDERS
 from damian.delays.samplers import Sampler
 
 CONTEXT_KEYS = {"position": keys.POSITION}
@@ -22,7 +30,7 @@ class DelayConfig:
     obs: Any = 0
     """Delay of each UAV's messages to the server node (paper, section 3.4): steps such as 3, a time such as
     3s, or a law such as {law: uniform, low: 3s, high: 7s}; there are constant, uniform, geometric, burst,
-    trace, lag and distance (docs/concepts.md has their parameters), and one's own (docs/extending.md)."""
+    trace, lag and distance (docs/concepts.md has their parameters), and your own (docs/extending.md)."""
     act: Any = 0
     """Delay of each action (section 3.3), written as ``obs``; a UAV holds until the first one arrives."""
     rew: Any = 0
@@ -56,15 +64,37 @@ class DelayConfig:
         checks.above("delay.reward_discount", self.reward_discount, 0.0)
         checks.in_range("delay.reward_discount", self.reward_discount, 0.0, 1.0)
 
-    @property
-    def uplink(self) -> Law:
-        """Law of the messages to the server node, with ``hold`` applied."""
-        law = law_of(self.obs, "delay.obs")
-        return Held(law) if self.hold == "max" else law
+        # Each law is parsed once here, and its sampler built once for each ``dt``, since many places ask.
+        self._laws = {name: law_of(getattr(self, name), f"delay.{name}") for name in ("obs", "act", "rew")}
+        if self.hold == "max":
+            self._laws["obs"] = Held(self._laws["obs"])
+        self._samplers: dict[tuple[str, float], Sampler] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The settings alone, because a worker process finds classes outside the package by their paths."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.__post_init__()
+
+    def law(self, name: str) -> Law:
+        """The law of ``act``, of ``rew``, or of ``obs`` with ``hold`` applied."""
+        return self._laws[name]
+
+    def sampler(self, name: str, dt: float) -> Sampler:
+        """The sampler of this law for steps of ``dt`` seconds, without the losses of ``loss``.
+
+        Raises:
+            InputError: a parameter of the law is invalid.
+        """
+        if (name, dt) not in self._samplers:
+            self._samplers[name, dt] = sampler_of(self._laws[name], dt, key=f"delay.{name}")
+        return self._samplers[name, dt]
 
     def reads(self, dt: float) -> set[str]:
         """Names of the entries that the laws read in the contexts of messages."""
-        return {name for sampler in self._samplers(dt).values() for name in sampler.reads}
+        return {read for name in self._laws for read in self.sampler(name, dt).reads}
 
     def check(self, dt: float) -> None:
         """Check that every law is valid for steps of ``dt`` seconds.
@@ -72,23 +102,16 @@ class DelayConfig:
         Raises:
             InputError: a law is invalid or reads what there is not, or the reward delay loses rewards.
         """
-        samplers = self._samplers(dt)
-        for name, sampler in samplers.items():
-            for read in sampler.reads:
+        for name in self._laws:
+            for read in self.sampler(name, dt).reads:
                 should = f"reads {read}, but a law can read only {', '.join(CONTEXT_KEYS)}"
-                checks.require(read in CONTEXT_KEYS, f"delay.{name}", show(getattr(self, name)), should)
-        checks.require(not samplers["rew"].loses, "delay.rew", show(self.rew), LOSES)
+                checks.require(read in CONTEXT_KEYS, f"delay.{name}", getattr(self, name), should)
+        checks.require(not self.sampler("rew", dt).loses, "delay.rew", self.rew, LOSES)
 
     def settings_longer_than(self, n_steps: int, dt: float) -> list[str]:
         """Names of the settings whose delay is always at least ``n_steps``: in so many, nothing arrives."""
-        samplers = self._samplers(dt).items()
-        return [f"delay.{name}" for name, each in samplers if each.certain and each.certain >= n_steps]
-
-    def _samplers(self, dt: float) -> dict[str, Sampler]:
-        """The samplers of the laws, by the name of the setting."""
-        names = ("obs", "act", "rew")
-        laws = {name: law_of(getattr(self, name), f"delay.{name}") for name in names}
-        return {name: sampler_of(law, dt, key=f"delay.{name}") for name, law in laws.items()}
+        shortest = {name: self.sampler(name, dt).constant_delay or 0 for name in self._laws}
+        return [f"delay.{name}" for name, delay in shortest.items() if delay >= n_steps]
 
 
 @dataclass
@@ -119,52 +142,37 @@ class LinkConfig:
             value = getattr(self, field.name)
             idle = meant is not None and field.name not in meant and value != field.default
             problem = f"means nothing with links={self.kind}"
-            checks.require(not idle, f"links.{field.name}", show(value), problem)
-        if self.kind == "updown" or not is_matrix(self.loss):
+            checks.require(not idle, f"links.{field.name}", value, problem)
+        if self.kind == "updown":
             checks.in_range("links.loss", self.loss, 0.0, 1.0)
+        check_losses("links.loss", self.loss)
         if self.range is not None:
             checks.above("links.range", self.range, 0.0, "m")
         if self.limit is not None:
             checks.whole("links.limit", self.limit, 1, 1000, "UAVs")
-        checks.require(self.range is None or self.hears is None, "links.range", self.range, _EITHER)
+        should = "does not go with links.hears: leave out one of them"
+        checks.require(self.range is None or self.hears is None, "links.range", self.range, should)
 
     def check(self, n_agents: int) -> None:
         """Check what is given for each pair of UAVs.
 
         Raises:
-            InputError: there is not one entry for each receiver and sender, a loss is no probability, or
-                ``hears`` is not of bools.
+            InputError: there is not one entry for each receiver and sender, or ``hears`` is not of bools.
         """
-        for name in ("delay", "loss", "hears"):
-            matrix = getattr(self, name)
-            if not is_matrix(matrix):
-                checks.require(name != "hears" or matrix is None, "links.hears", show(matrix), _NO_BOOLS)
-                continue
-            good = len(matrix) == n_agents and all(is_matrix(row) and len(row) == n_agents for row in matrix)
-            should = f"is not {n_agents} lists (receivers) of {n_agents} entries (senders)"
-            checks.require(good, f"links.{name}", "it", should)
-            if name == "loss":
-                check_losses("links.loss", matrix)
-            bools = name != "hears" or all(isinstance(hears, bool) for row in matrix for hears in row)
-            checks.require(bools, "links.hears", show(matrix), _NO_BOOLS)
-
-    def laws(self) -> dict[str, Law]:
-        """All laws of the links, by name, such as ``links.delay`` or ``links.delay[0][1]``.
-
-        Raises:
-            InputError: one is not valid.
-        """
-        if not is_matrix(self.delay):
-            return {"links.delay": law_of(self.delay, "links.delay")}
-        rows = [enumerate(row) for row in self.delay]
-        named = {f"links.delay[{i}][{j}]": law for i, row in enumerate(rows) for j, law in row}
-        return {name: law_of(law, name) for name, law in named.items()}
+        n = same_size({f"links.{name}": getattr(self, name) for name in ("delay", "loss", "hears")})
+        checks.require(
+            n in (None, n_agents), "links", f"{n} x {n}", f"is not {n_agents} x {n_agents}, for the UAVs"
+        )
+        hears = [] if self.hears is None else self.hears
+        good = is_matrix(hears) and all(isinstance(each, bool) for row in hears for each in row)
+        should = "is not a list of true and false for each receiver"
+        checks.require(good, "links.hears", self.hears, should)
 
     def reads(self, dt: float) -> set[str]:
         """Names of the entries that the links read: what their laws do, and positions for a range."""
-        read = {name for key, law in self.laws().items() for name in sampler_of(law, dt, key=key).reads}
+        written = {"links.delay": self.delay}
+        if is_matrix(self.delay):
+            rows = [enumerate(row) for row in self.delay]
+            written = {f"links.delay[{i}][{j}]": law for i, row in enumerate(rows) for j, law in row}
+        read = {name for key, law in written.items() for name in sampler_of(law, dt, key=key).reads}
         return read | ({"position"} if self.range is not None else set())
-
-
-_NO_BOOLS = "is not a list of true and false for each receiver"
-_EITHER = "does not go with links.hears: leave out one of them"

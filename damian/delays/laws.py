@@ -1,4 +1,4 @@
-"""Delay laws: probability distributions of message delays, in steps (``3``) or time (``"3s"``, ``"0.5m"``).
+"""Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"0.5m"``).
 
 ``Law.sampler`` turns a law into a table from which delays are drawn, with one hash and one search per
 message, or into a function of the message's context (``ContextSampler``). The transforms that delay
@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,22 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry
-from damian.common.text_files import named, parse_table, read_text, show
-from damian.delays.lag_sampler import LagSampler
-from damian.delays.samplers import ContextSampler, HeldSampler, MessageContext, Recorded, Sampler
-from damian.delays.times import LONGEST, Delay, check_dt, in_steps, seconds  # noqa: F401 (others import all of them here)
+from damian.common.text_files import named, parse_table, read_text
+from damian.delays.samplers import (
+    ContextSampler,
+    HeldSampler,
+    LagSampler,
+    LinkSampler,
+    MessageContext,
+    Recorded,
+    Sampler,
+)
+
+Delay = int | str
+"""Whole steps (``3``), or a time with its unit (``"3s"``)."""
+
+LONGEST = 10_000
+"""Longest delay allowed [steps], because every message in transit takes memory."""
 
 LOSES = "loses messages, but no reward may be lost"
 
@@ -56,19 +69,45 @@ def law_name(law: Law) -> str:
     return f"{type(law).__module__}:{type(law).__qualname__}"
 
 
-def sampler_of(law: Law, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-    """Build the sampler of a law, which may be one's own; the arguments are those of ``Law.sampler``.
+def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+    """Build the sampler of a law, or of what ``law_of`` takes; the arguments are those of ``Law.sampler``.
 
     Raises:
-        InputError: a parameter is invalid, or a law of one's own raises an error or returns no ``Sampler``.
+        InputError: a parameter is invalid, or a law of the user's own raises an error or returns no
+            ``Sampler``.
     """
-    check_dt(dt)
-    name = f"law {law_name(law)}"
-    with naming_errors(f"{key}: {name}"):
+    checks.above("dt", dt, 0.0, "s")
+    law = law_of(written, key)
+    with naming_errors(f"{key}: law {law_name(law)}"):
         sampler = law.sampler(dt, loss, key)
-    problem = f"returns a {type(sampler).__name__} from sampler(dt, loss, key), not a Sampler"
-    checks.require(isinstance(sampler, Sampler), key, name, problem)
+    should = f"of sampler(dt, loss, key) of the law {law_name(law)} is no Sampler"
+    checks.require(isinstance(sampler, Sampler), key, f"the {type(sampler).__name__}", should)
     return sampler
+
+
+def in_steps(key: str, delay: Delay, dt: float) -> int:
+    """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up.
+
+    Raises:
+        InputError: the delay is neither steps nor a time, or longer than ``LONGEST``.
+    """
+    if isinstance(delay, str):
+        steps = math.ceil(_seconds(key, delay) / dt - 1e-9)
+    else:
+        is_steps = isinstance(delay, Integral) and not isinstance(delay, bool) and delay >= 0
+        checks.require(is_steps, key, delay, _NO_DELAY)
+        steps = int(delay)
+    checks.require(steps <= LONGEST, key, delay, f"is more than {LONGEST} steps")
+    return steps
+
+
+def _seconds(key: str, delay: str) -> float:
+    """Convert a time with its unit to seconds; it may be zero (``0s``)."""
+    checks.require(delay[-1:] in ("s", "m", "h"), key, delay, _NO_DELAY)
+    return checks.seconds(key, delay, zero=True)
+
+
+_NO_DELAY = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
 
 
 def _is_no_law(found: Any) -> str | None:
@@ -77,18 +116,23 @@ def _is_no_law(found: Any) -> str | None:
 
 
 LAWS = Registry[type[Law]]("law", _is_no_law)
-"""Laws by name; ``law_of`` also takes one's own as ``package.module:Class``."""
+"""Laws by name; ``law_of`` also takes the path of a class outside the package, ``package.module:Class``."""
 
 
 @LAWS.register("constant")
 @dataclass(frozen=True)
 class Constant(Law):
-    """Every message has the same delay."""
+    """Every message has the same delay.
+
+    A worked timeline of ``Constant(3)``: a message sent at t = 0 arrives at t = 3, one sent at t = 1 at
+    t = 4.
+    """
 
     delay: Delay = 0
+    """Delay: steps, or a time."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return Sampler([_certain(in_steps(key, self.delay, dt))], loss=loss)
+        return Sampler([_only(in_steps(key, self.delay, dt))], loss=loss)
 
 
 @LAWS.register("uniform")
@@ -98,25 +142,30 @@ class Uniform(Law):
 
     Delays in steps are equally likely whole numbers, both ends included. Delays in time are continuous and
     rounded up to whole steps, so that 3 to 7 s are 4, 5, 6 or 7 steps of 1 s.
+
+    A worked timeline of ``Uniform(1, 3)``: a message sent at t = 0 arrives at t = 1, 2 or 3. If it draws 3
+    and the next message draws 1, that one arrives at t = 2 and overtakes it.
     """
 
     low: Delay = 0
+    """Shortest delay: steps, or a time."""
     high: Delay = 0
+    """Longest delay, written as ``low`` is."""
     probability: float = 1.0
+    """Probability that a message is late at all."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.in_range(f"{key}.probability", self.probability, 0.0, 1.0)
         low, high = in_steps(f"{key}.low", self.low, dt), in_steps(f"{key}.high", self.high, dt)
         in_time = isinstance(self.low, str), isinstance(self.high, str)
-        first, last = low, high
         if all(in_time):
-            first, last = seconds(f"{key}.low", self.low), seconds(f"{key}.high", self.high)
-        problem = f"and high={self.high} are not two steps or two times in order"
-        checks.require(first <= last and in_time[0] == in_time[1], f"{key}.low", self.low, problem)
+            low, high = _seconds(f"{key}.low", str(self.low)), _seconds(f"{key}.high", str(self.high))
+        should = f"and high={self.high} are not two steps or two times in order"
+        checks.require(low <= high and in_time[0] == in_time[1], f"{key}.low", self.low, should)
         if all(in_time):
-            chances = _rounded_up(first / dt, last / dt)
+            chances = _rounded_up(low / dt, high / dt)
         else:
-            chances = [float(low <= k) / (high - low + 1) for k in range(high + 1)]
+            chances = [float(low <= k) / (high - low + 1) for k in range(int(high) + 1)]
         weighted = [self.probability * chance for chance in chances]
         return Sampler([[weighted[0] + 1 - self.probability, *weighted[1:]]], loss=loss)
 
@@ -126,15 +175,18 @@ class Uniform(Law):
 class Geometric(Law):
     """A message arrives in each step with the same probability, as if it were retransmitted until received.
 
-    Delays above ``longest`` are cut to ``longest``; ``mean`` is the mean before this cut.
+    A worked timeline of ``Geometric(mean=1)``: half of the messages sent at t = 0 arrive at t = 0, a quarter
+    at t = 1, an eighth at t = 2, and a sixteenth at t = 3.
     """
 
     mean: Delay = 1
+    """Mean delay before the cut at ``longest``: steps, which may be a fraction, or a time."""
     longest: Delay = 20
+    """Longest delay, to which longer ones are cut: steps, or a time."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         longest = in_steps(f"{key}.longest", self.longest, dt)
-        mean = seconds(f"{key}.mean", self.mean) / dt if isinstance(self.mean, str) else self.mean
+        mean = _seconds(f"{key}.mean", self.mean) / dt if isinstance(self.mean, str) else self.mean
         checks.in_range(f"{key}.mean", mean, 0.0, unit="steps")
         failure = mean / (1 + mean)
         chances = [(1 - failure) * failure**k for k in range(longest)]
@@ -147,6 +199,9 @@ class Burst(Law):
     """Gilbert-Elliott channel of each sender, a Markov chain of a good and a bad state (1960, 1963).
 
     ``Burst(enter, leave, good=0, bad=0, bad_loss=1)`` loses runs of messages, ``1 / leave`` in the mean.
+
+    A worked timeline of ``Burst(good=0, bad=3, bad_loss=0)``, whose channel is bad at t = 0 and t = 1 and
+    good from t = 2 on: messages sent at t = 0, 1 and 2 arrive at t = 3, 4 and 2.
     """
 
     enter: float = 0.05
@@ -179,22 +234,22 @@ class Burst(Law):
 class Trace(Law):
     """Recorded delays of a file, one per step in its order; each sender starts at a random row.
 
-    The file is a CSV table with a column ``delay``: steps, times with their unit, or ``lost``.
+    A worked timeline of a file with the rows 3, 0 and lost: a sender that starts at its first row sends at
+    t = 0 what arrives at t = 3, at t = 1 what arrives at t = 1, and at t = 2 what never arrives.
     """
 
     path: str = ""
+    """CSV table with a column ``delay``: steps, times with their unit, or ``lost``."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.require(bool(self.path), f"{key}.path", "it", "is missing: the file with the delays")
-        with named(self.path):
-            table = parse_table(read_text(Path(self.path)), ["delay"])
-            delays = [self._read(row.cells["delay"], f"line {row.line}: delay", dt) for row in table]
-            if not delays:
+        with named(str(self.path)):
+            rows = parse_table(read_text(Path(str(self.path))), ["delay"])
+            if not rows:
                 raise InputError("line 2: there is no delay under the header")
+            written = {f"line {row.line}: delay": row.cells["delay"] for row in rows}
+            delays = [-1 if d == LOST else in_steps(at, _number(d), dt) for at, d in written.items()]
         return Recorded(delays, loss)
-
-    def _read(self, written: str, key: str, dt: float) -> int:
-        return -1 if written == LOST else in_steps(key, _number(written), dt)
 
 
 @LAWS.register("lag")
@@ -204,6 +259,9 @@ class Lag(Law):
 
     The first message of an episode always draws a lag. Losses (also those of the other law) are not held, but
     drawn for each message. When the lag shrinks, messages overtake each other.
+
+    A worked timeline of ``Lag(Uniform(0, 3), update_period=2)``: at t = 0 a sender draws 3, so that messages
+    sent at t = 0 and t = 1 arrive at t = 3 and t = 4. At t = 2 it draws 0: that message arrives at once.
     """
 
     lag: Any = 0
@@ -220,34 +278,22 @@ class Lag(Law):
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.in_range(f"{key}.hold_probability", self.hold_probability, 0.0, 1.0)
-        for name in ("shared", "stagger"):
-            checks.one_of(f"{key}.{name}", getattr(self, name), (True, False))
-        period = self._period(dt, f"{key}.update_period")
-        for name in ("hold_probability", "stagger"):
-            problem = "has no effect with update_period=episode, which draws one lag per episode"
-            value = getattr(self, name)
-            checks.require(period is not None or not value, f"{key}.{name}", value, problem)
-        chances = _memoryless("lag", self.lag, dt, 0.0, f"{key}.lag")
+        key_of_period, period = f"{key}.update_period", None
+        if self.update_period == "episode":
+            idle = "hold_probability" if self.hold_probability else "stagger"
+            should = "has no effect with update_period=episode, which draws one lag per episode"
+            checks.require(not getattr(self, idle), f"{key}.{idle}", getattr(self, idle), should)
+        else:
+            period = in_steps(key_of_period, self.update_period, dt)
+            checks.require(period > 0, key_of_period, self.update_period, "is not above 0; or write episode")
         return LagSampler(
-            chances,
+            _memoryless("lag", self.lag, dt, 0.0, f"{key}.lag"),
             loss,
             period=period,
             hold_probability=self.hold_probability,
             shared=self.shared,
             stagger=self.stagger,
         )
-
-    def _period(self, dt: float, key: str) -> int | None:
-        """Steps between two draws, None for a whole episode."""
-        written = self.update_period
-        if written == "episode":
-            return None
-        is_word = isinstance(written, str) and written[:1].isalpha()
-        problem = "is neither whole steps such as 3, nor a time such as 3s, nor episode"
-        checks.require(not is_word, key, written, problem)
-        period = in_steps(key, written, dt)
-        checks.require(period > 0, key, written, "is not above 0")
-        return period
 
 
 @LAWS.register("distance")
@@ -260,6 +306,9 @@ class Distance(Law):
     normal distribution (Rappaport, Wireless Communications, 2nd ed., 2002, section 4.9).
 
     The law reads the sender's ``position``, and ``receiver_position`` where it is given, [m], [M, 2].
+
+    A worked timeline of ``Distance(base=1, speed=10)`` and steps of 1 s: a message sent at t = 0 from a place
+    20 m away arrives at t = 3; one sent at t = 1 from the place of the receiver arrives at t = 2.
     """
 
     base: Delay = 0
@@ -280,15 +329,15 @@ class Distance(Law):
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         for name, unit in (("speed", "m/s"), ("range", "m")):
             value = getattr(self, name)
-            above = isinstance(value, int | float) and value > 0  # infinity is allowed
-            checks.require(above, f"{key}.{name}", f"{value} {unit}", f"is not above 0 {unit}")
+            if value != math.inf:  # an infinite speed or range is meant so
+                checks.above(f"{key}.{name}", value, 0.0, unit)
         checks.above(f"{key}.path_loss_exponent", self.path_loss_exponent, 0.0)
         checks.above(f"{key}.shadowing", self.shadowing, 0.0, "dB")
         checks.place(f"{key}.receiver", self.receiver)
         longest = in_steps(f"{key}.longest", self.longest, dt)
-        problem = f"is longer than longest={self.longest}"
-        checks.require(in_steps(f"{key}.base", self.base, dt) <= longest, f"{key}.base", self.base, problem)
-        base = seconds(f"{key}.base", self.base) / dt if isinstance(self.base, str) else self.base
+        should = f"is longer than longest={self.longest}"
+        checks.require(in_steps(f"{key}.base", self.base, dt) <= longest, f"{key}.base", self.base, should)
+        base = _seconds(f"{key}.base", self.base) / dt if isinstance(self.base, str) else self.base
         return ContextSampler(
             partial(self.delays, base),
             longest,
@@ -315,6 +364,9 @@ class Held(Law):
     """Every message is held until the longest delay of another law has passed, so that the delay is constant.
 
     It lets methods for constant delays work with random ones. The same messages are lost.
+
+    A worked timeline of ``Held(Uniform(0, 3))``: a message sent at t = 0 that draws 1 is there at t = 1, is
+    held back, and counts as arrived at t = 3.
     """
 
     law: Law
@@ -327,8 +379,8 @@ def law_of(written: Any, key: str = "delay") -> Law:
     """Convert a setting to a law: a law, steps, a time, or a mapping.
 
     ``{law: uniform, low: 3s, high: 7s}`` names a registered law and its settings; ``{law:
-    my_lab.delays:Satellite, mean: 2s}`` one of one's own, a frozen dataclass derived from ``Law`` in a module
-    that can be imported.
+    my_lab.delays:Satellite, mean: 2s}`` a frozen dataclass derived from ``Law`` in a module that can be
+    imported.
 
     Raises:
         InputError: the law or one of its parameters does not exist.
@@ -336,17 +388,16 @@ def law_of(written: Any, key: str = "delay") -> Law:
     if isinstance(written, Law):
         return written
     if isinstance(written, str) and (written in LAWS or ":" in written):
-        own = "a law of one's own" if ":" in written else "that law"
-        raise InputError(f"{key}: {written} is no delay; {own} is written {{law: {written}}}")
+        raise InputError(f"{key}: {written} is no delay; that law is written {{law: {written}}}")
     if not isinstance(written, Mapping):
         return Constant(_number(written))
     kind = written.get("law")
     law = LAWS.get(kind, f"{key}.law")
-    values = {k: str(v) if k == "path" else _plain(v) for k, v in written.items() if k != "law"}
+    values = {name: _plain(value) for name, value in written.items() if name != "law"}
     names = [field.name for field in fields(law)]
     for name, value in values.items():
-        problem = f"is no setting of the law {kind}, which has {', '.join(names) or 'none'}"
-        checks.require(name in names, f"{key}.{name}", value, problem)
+        should = f"is no setting of the law {kind}, which has {', '.join(names) or 'none'}"
+        checks.require(name in names, f"{key}.{name}", value, should)
     with naming_errors(f"{key}: law {kind}"):
         return law(**values)
 
@@ -357,17 +408,16 @@ def _memoryless(user: str, written: Any, dt: float, loss: float, key: str) -> li
     Raises:
         InputError: it is no law, or one with memory or context.
     """
-    inner = sampler_of(law_of(written, key), dt, loss, key)
-    problem = f"depends on the context of the message, which a {user} does not know"
-    checks.require(not inner.sees_context, key, show(written), problem)
-    checks.require(inner.memoryless, key, show(written), "is not a memoryless law")
+    inner = sampler_of(written, dt, loss, key)
+    should = f"depends on the context of the message, which a {user} does not know"
+    checks.require(not inner.sees_context, key, written, should)
+    checks.require(inner.memoryless, key, written, "is not a memoryless law")
     return inner.chances[0].tolist()[:-1]
 
 
 def _number(written: Any) -> Any:
     """Convert a string of digits to an int: Hydra and CSV files may pass whole steps as strings."""
-    text = written.strip() if isinstance(written, str) else ""
-    return int(text) if text.isdecimal() and len(text) < 10 else written
+    return int(written) if isinstance(written, str) and written.strip().isdecimal() else written
 
 
 def _plain(written: Any) -> Any:
@@ -376,7 +426,8 @@ def _plain(written: Any) -> Any:
     return [_plain(value) for value in written] if is_list else _number(written)
 
 
-def _certain(steps: int) -> list[float]:
+def _only(steps: int) -> list[float]:
+    """Probabilities of 0, 1, ... steps if there is only one delay."""
     return [0.0] * steps + [1.0]
 
 
@@ -384,5 +435,77 @@ def _rounded_up(low: float, high: float) -> list[float]:
     """Probabilities of 0, 1, ... steps for a time uniform in [low, high] steps and rounded up."""
     last = math.ceil(high - 1e-9)
     if high - low < 1e-9:
-        return _certain(last)
+        return _only(last)
     return [max(0.0, min(k, high) - max(k - 1, low)) / (high - low) for k in range(last + 1)]
+
+
+# Links between N agents, each with a law and a loss.
+
+
+def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> Sampler:
+    """Build the sampler of a law for all links, or of a law or a loss for each link.
+
+    Args:
+        delay: what ``law_of`` takes, or an N x N nested list of it (receiver, sender); its diagonal is not
+            used.
+        loss: probability that a message is lost, or an N x N nested list or tensor of it.
+        dt: length of a step [s].
+        key: name of the delay, for errors.
+
+    Raises:
+        InputError: a law or a probability is invalid, or the two are of different sizes.
+    """
+    n = same_size({key: delay, "loss": loss})
+    if n is None:
+        return sampler_of(delay, dt, loss, key)
+    by_link = is_matrix(delay)
+    distinct: list[Law] = []
+    samplers: list[Sampler] = []
+    index = []
+    for i, j in ((i, j) for i in range(n) for j in range(n)):
+        name = f"{key}[{i}][{j}]" if by_link else key
+        law = law_of((0 if i == j else delay[i][j]) if by_link else delay, name)
+        if law not in distinct:
+            distinct.append(law)
+            samplers.append(sampler_of(law, dt, key=name))
+        index.append(distinct.index(law))
+    check_losses("loss", loss)
+    losses = torch.as_tensor(loss, dtype=torch.float64).expand(n, n)
+    return LinkSampler(samplers, torch.tensor(index), losses.flatten().clone())
+
+
+def check_losses(key: str, loss: Any) -> None:
+    """Require a probability, or a nested list or tensor of one for each link.
+
+    Raises:
+        InputError: one is not between 0 and 1.
+    """
+    rows = loss.tolist() if isinstance(loss, Tensor) else loss
+    for probability in [each for row in rows for each in row] if is_matrix(rows) else [rows]:
+        checks.in_range(key, probability, 0.0, 1.0)
+
+
+def same_size(settings: Mapping[str, Any]) -> int | None:
+    """The number N of agents of those settings that are N x N, by name; None if none is.
+
+    Raises:
+        InputError: one is not square, or they are of different sizes.
+    """
+    sizes = {}
+    for key, matrix in settings.items():
+        if is_matrix(matrix):
+            lengths = {len(row) if is_matrix(row) else 0 for row in matrix}
+            should = "is not N x N: a list for each receiver, with an entry for each sender"
+            checks.require(lengths == {len(matrix)}, key, matrix, should)
+            sizes[key] = len(matrix)
+    if len(set(sizes.values())) > 1:
+        found = ", ".join(f"{key} {n} x {n}" for key, n in sizes.items())
+        raise InputError(f"{found}: these are of different numbers of agents")
+    return next(iter(sizes.values()), None)
+
+
+def is_matrix(value: Any) -> bool:
+    """Is a setting given for each link."""
+    if isinstance(value, Tensor):
+        return value.dim() > 0
+    return isinstance(value, Sequence) and not isinstance(value, str)

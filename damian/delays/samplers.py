@@ -1,4 +1,8 @@
-"""Samplers that draw one delay per message, from a table or by a function of the message's context."""
+"""Samplers draw one delay per message, from a table or by a function of the message's context.
+
+Drawing is a pure function of random streams and clocks, so it can be compiled, and a sender draws the same
+delays alone as in a batch.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -8,7 +12,9 @@ from torch import Tensor, nn
 
 from damian.common import checks, counter_rng
 from damian.common.errors import InputError
-from damian.common.text_files import show
+
+_LOSS_DRAW, _HOLD_DRAW, _PHASE_DRAW, _LINK_LOSS_DRAW = 0, 1, 2, 3
+"""Counters that tell the further draws of a message from the draw of its delay."""
 
 
 class MessageContext(NamedTuple):
@@ -35,13 +41,20 @@ class MessageContext(NamedTuple):
 
 
 class Sampler(nn.Module):
-    """Draws delays from a table of probabilities. Drawing is a pure function, so it can be compiled.
+    """Draws delays from a table of probabilities.
+
+    A worked timeline: with the table ``[[0.5, 0, 0, 0.5]]`` half of the messages have no delay, and half of
+    them have 3 steps: one sent at t = 0 arrives at t = 0 or at t = 3, whatever the delays of the others.
 
     Args:
         states: for each of S channel states, the probabilities of the delays 0, 1, ... [steps]; if they sum
             to less than 1, the rest is the probability that the message is lost.
-        turns: transition probabilities between the channel states per step, [S, S]; one state if not given.
+        transitions: probabilities of the transitions between the channel states per step, [S, S]; there is
+            one state if they are not given.
         loss: probability that a message is lost, whatever its delay.
+
+    Raises:
+        InputError: a probability is not within 0 and 1, or the delays have more than 1 in all.
     """
 
     sees_context: bool = False
@@ -50,34 +63,34 @@ class Sampler(nn.Module):
     """Names of the entries that the context must contain."""
     optional_reads: tuple[str, ...] = ()
     """Names of the entries that the context contains where the transform has a key for them."""
-    shared: bool = False
+    same_draws_for_all_agents: bool = False
     """Whether all agents of a world draw the same numbers."""
     chances: Tensor
     _boundaries: Tensor
 
     def __init__(
-        self, states: list[list[float]], turns: list[list[float]] | None = None, loss: float = 0.0
+        self, states: list[list[float]], transitions: list[list[float]] | None = None, loss: float = 0.0
     ) -> None:
         super().__init__()
         checks.in_range("loss", loss, 0.0, 1.0)
         self.longest = max(map(len, states)) - 1
         for chances in states:
             proper = sum(chances) <= 1 + 1e-6 and all(chance >= 0 for chance in chances)
-            checks.require(
-                proper, "chances of the delays", show(chances), "are not at least 0 and at most 1 in all"
-            )
+            should = "are not at least 0 and at most 1 in all"
+            checks.require(proper, "chances of the delays", chances, should)
         arrive = torch.zeros(len(states), self.longest + 1, dtype=torch.float64)
         for row, chances in zip(arrive, states, strict=True):
             row[: len(chances)] = torch.tensor(chances, dtype=torch.float64) * (1 - loss)
         chances = torch.cat([arrive, (1 - arrive.sum(-1, keepdim=True)).clamp(min=0)], -1)
         self.register_buffer("chances", chances, persistent=False)
-        turn = torch.tensor(turns or [[1.0]], dtype=torch.float64)
-        joint = (turn.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)  # of next state and delay, one draw
+        change = torch.tensor(transitions or [[1.0]], dtype=torch.float64)
+        # The next state and the delay are one outcome, so that a message takes a single draw.
+        joint = (change.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)
         boundaries = (joint.cumsum(-1)[:, :-1] * 2**32).round().long()
         self.register_buffer("_boundaries", boundaries, persistent=False)
-        self._bad_share = (turn[0, 1] / (turn[0, 1] + turn[1, 0])).item() if turns else 0.0
+        self._bad_share = (change[0, 1] / (change[0, 1] + change[1, 0])).item() if transitions else 0.0
         likeliest = int(chances[0].argmax())
-        self.certain = likeliest if bool((chances[:, likeliest] == 1).all()) else None
+        self.constant_delay = likeliest if bool((chances[:, likeliest] == 1).all()) else None
         """The delay [steps] if it is always the same, else None."""
 
     @property
@@ -104,16 +117,9 @@ class Sampler(nn.Module):
 
         Args:
             memory: the states before, [M, ...].
-            mask: senders of which an episode begins, [M] bool.
+            mask: senders whose episode begins, [M] bool.
         """
         return memory
-
-    def try_context(self, context: MessageContext) -> None:
-        """Try what computes delays from contexts once, before the first step.
-
-        Raises:
-            InputError: it does not return a finite number of steps for each message.
-        """
 
     def forward(
         self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
@@ -126,8 +132,8 @@ class Sampler(nn.Module):
             memory: state of each channel, [M, ...].
             context: circumstances of the messages; needed only if ``sees_context``.
         """
-        if self.certain is not None:
-            return torch.full_like(streams, self.certain), memory
+        if self.constant_delay is not None:
+            return torch.full_like(streams, self.constant_delay), memory
         draw = counter_rng.bits(streams, clock)
         if len(self.chances) == 1:
             return torch.bucketize(draw, self._boundaries[0], right=True), memory
@@ -138,6 +144,10 @@ class Sampler(nn.Module):
 
 class Recorded(Sampler):
     """Plays back recorded delays; each sender starts at a random position, which is its channel state.
+
+    A worked timeline: of the record 3, 0, -1 a sender that starts at its first row sends at t = 0 what
+    arrives at t = 3, at t = 1 what arrives at t = 1, at t = 2 what never arrives, and at t = 3 what arrives
+    at t = 6.
 
     Args:
         delays: recorded delays [steps], -1 for a lost message.
@@ -170,6 +180,9 @@ class Recorded(Sampler):
 class HeldSampler(Sampler):
     """Gives every message the longest delay of another sampler; the same messages are lost.
 
+    A worked timeline: the other sampler's longest delay is 3 steps, and it draws 1 for a message sent at
+    t = 0: the message is held back from t = 1, and arrives at t = 3.
+
     Args:
         drawn: the other sampler.
     """
@@ -178,9 +191,10 @@ class HeldSampler(Sampler):
         arrival_chances = (1 - drawn.chances[:, -1]).tolist()
         super().__init__([[0.0] * drawn.longest + [chance] for chance in arrival_chances])
         self.drawn = drawn
-        self.sees_context, self.shared = drawn.sees_context, drawn.shared
+        self.sees_context = drawn.sees_context
+        self.same_draws_for_all_agents = drawn.same_draws_for_all_agents
         self.reads, self.optional_reads = drawn.reads, drawn.optional_reads
-        self.certain = None if self.loses else self.longest
+        self.constant_delay = None if self.loses else self.longest
 
     @property
     def memoryless(self) -> bool:
@@ -192,9 +206,6 @@ class HeldSampler(Sampler):
     def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
         return self.drawn.begin_episode(memory, mask)
 
-    def try_context(self, context: MessageContext) -> None:
-        self.drawn.try_context(context)
-
     def forward(
         self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
@@ -202,8 +213,81 @@ class HeldSampler(Sampler):
         return torch.where(delay < self.lost, self.longest, self.lost), memory
 
 
+class LagSampler(Sampler):
+    """Draws a delay (a lag) from a table, and holds it; losses are drawn for each message.
+
+    A worked timeline: with a period of 2 steps and lags of 3 and 0 drawn one after the other, the messages
+    sent at t = 0 and t = 1 arrive at t = 3 and t = 4, those sent at t = 2 and t = 3 at once: they overtake
+    the others.
+
+    The state of a channel is [M, 2] long: the lag, -1 before the first message of an episode, and the number
+    of steps that it is still held.
+
+    Args:
+        chances: probabilities of the lags 0, 1, ... [steps]; if they sum to less than 1, the rest is the
+            probability that a message is lost.
+        loss: probability that a message is lost in addition, whatever its delay.
+        period: steps between two updates; None: one lag per episode.
+        hold_probability: probability that an update keeps the lag.
+        shared: all agents of a world draw the same numbers.
+        stagger: the second update of an episode comes after a random time, from one step to ``period``.
+    """
+
+    def __init__(
+        self,
+        chances: list[float],
+        loss: float,
+        *,
+        period: int | None,
+        hold_probability: float,
+        shared: bool,
+        stagger: bool,
+    ) -> None:
+        super().__init__([chances], loss=loss)
+        arrives = sum(chances)
+        self._lags = Sampler([[chance / arrives for chance in chances]] if arrives else [[1.0]])
+        self._loss = self.chances[0, -1].item() if self.loses else 0.0
+        self._period, self._hold_probability = period or _NEVER, hold_probability
+        self.same_draws_for_all_agents, self._stagger = shared, stagger
+
+    def initial_state(self, streams: Tensor) -> Tensor:
+        return torch.stack([torch.full_like(streams, -1), torch.zeros_like(streams)], -1)
+
+    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
+        return torch.where(mask.unsqueeze(-1), self.initial_state(memory[:, 0]), memory)
+
+    def forward(
+        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
+        if self.constant_delay is not None:
+            return torch.full_like(streams, self.constant_delay), memory
+        lag, wait = memory.unbind(-1)
+        first, due = lag < 0, wait == 0
+        renewed, interval = due, torch.full_like(streams, self._period)
+        if self._hold_probability:
+            draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _HOLD_DRAW))
+            renewed = first | (due & (draw >= self._hold_probability))
+        if self._stagger:
+            phase = counter_rng.bits(streams, clock, torch.full_like(clock, _PHASE_DRAW)) % self._period
+            interval = torch.where(first, 1 + phase, interval)
+        drawn, _ = self._lags(streams, clock, memory)
+        lag = torch.where(renewed, drawn, lag)
+        memory = torch.stack([lag, torch.where(due, interval, wait) - 1], -1)
+        if not self._loss:
+            return lag, memory
+        lost = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW)) < self._loss
+        return torch.where(lost, self.lost, lag), memory
+
+
+_NEVER = 2**40
+"""Steps that no episode lasts."""
+
+
 class ContextSampler(Sampler):
-    """Computes each delay from the context of the message, by a function of one's own.
+    """Computes each delay from the context of the message, by a function.
+
+    A worked timeline: the function returns 2.4 for a message sent at t = 0, which is rounded up to 3 steps:
+    the message arrives at t = 3. For a message sent at t = 1 it returns -1: the message never arrives.
 
     Args:
         delay_fn: pure function of a ``MessageContext`` that returns the delays [steps], [M]; they are rounded
@@ -219,7 +303,7 @@ class ContextSampler(Sampler):
         optional_reads: names of the entries that it reads if the transform has a key for them.
 
     Raises:
-        InputError: an argument is invalid.
+        InputError: an argument is invalid, or ``delay_fn`` does not return one number for each message.
 
     Examples:
         >>> ContextSampler(lambda context: context.n_sending // 4, longest=5, loses=False)
@@ -236,12 +320,11 @@ class ContextSampler(Sampler):
         optional_reads: Sequence[str] = (),
     ) -> None:
         checks.whole("longest", longest, 0, unit="steps")
-        for name, names in (("reads", reads), ("optional_reads", optional_reads)):
-            checks.require(not isinstance(names, str), name, names, "is not a list of names")
+        checks.require(not isinstance(reads, str), "reads", reads, "is not a list of names")
         # The table holds the worst case, because the true chances depend on the contexts: it serves only to
         # tell the longest delay, and whether messages can be lost.
         super().__init__([[0.0] * longest + [float(not loses)]], loss=loss)
-        self.certain = None
+        self.constant_delay = None
         self.sees_context, self.reads, self.optional_reads = True, tuple(reads), tuple(optional_reads)
         self._delay_fn, self._loss, self._loses = delay_fn, loss, loses
 
@@ -251,7 +334,11 @@ class ContextSampler(Sampler):
         if context is None:
             raise ValueError("context: it is missing, but the delays of a ContextSampler depend on it")
         delay = self._delay_fn(context)
-        self._check(delay, streams.shape)
+        # Another shape would be broadcast without a word.
+        if not isinstance(delay, Tensor) or delay.shape != streams.shape or delay.dtype == torch.bool:
+            found = f"{delay.dtype} {[*delay.shape]}" if isinstance(delay, Tensor) else repr(delay)
+            name = getattr(self._delay_fn, "__qualname__", type(self._delay_fn).__name__)
+            raise InputError(f"{name}: {found} is not one number of steps per message, {[*streams.shape]}")
         arrives = delay >= 0  # false for nan too
         steps = torch.where(arrives, delay, 0)
         if steps.dtype.is_floating_point:  # 21.000002 steps are 21
@@ -260,29 +347,86 @@ class ContextSampler(Sampler):
         if self._loses:
             steps = torch.where(arrives, steps, self.lost)
         if self._loss:  # by a draw that is independent of ``context.uniform``
-            draw = counter_rng.uniform(streams, clock, torch.zeros_like(clock))
+            draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LOSS_DRAW))
             steps = torch.where(draw < self._loss, self.lost, steps)
         return steps, memory
 
-    def try_context(self, context: MessageContext) -> None:
-        delay = self._delay_fn(context)
-        self._check(delay, context.sender.shape)
-        bad = delay[~delay.isfinite()].tolist()
-        problem = "is not a finite number of steps; a negative one means that the message is lost"
-        checks.require(not bad, self._name, bad[:1], problem)
+
+class LinkSampler(Sampler):
+    """Draws the delays of messages on the links between N agents, by a law and a loss for each link.
+
+    Links are numbered receiver * N + sender; of the M messages of a step, message m belongs to link m modulo
+    N * N. Every distinct law has one sampler, which draws for all links. The state of a channel is that of
+    all samplers, side by side, [M, S].
+
+    A worked timeline: the link from agent 0 to agent 1 has a constant delay of 3 steps, the link to agent 2
+    one of 1 step. What agent 0 sends at t = 0 arrives at agent 2 at t = 1, and at agent 1 at t = 3.
+
+    Args:
+        samplers: one for each distinct law.
+        law_index: index of each link's sampler, [N * N] long.
+        loss: probability that a message of each link is lost, beside what its sampler loses, [N * N].
+    """
+
+    _law_index: Tensor
+    _loss: Tensor
+
+    def __init__(self, samplers: Sequence[Sampler], law_index: Tensor, loss: Tensor) -> None:
+        longest = max(sampler.longest for sampler in samplers)
+        super().__init__([[0.0] * (longest + 1)])  # the worst case: every message may be lost
+        self.constant_delay = None
+        self.samplers = nn.ModuleList(samplers)
+        self.sees_context = any(sampler.sees_context for sampler in samplers)
+        self.reads = tuple(dict.fromkeys(name for sampler in samplers for name in sampler.reads))
+        self._loses = bool((loss > 0).any())
+        example = torch.zeros(1, dtype=torch.long)
+        self._state_shapes = [sampler.initial_state(example).shape[1:] for sampler in samplers]
+        self.register_buffer("_law_index", law_index, persistent=False)
+        self.register_buffer("_loss", loss, persistent=False)
+
+    def initial_state(self, streams: Tensor) -> Tensor:
+        return _side_by_side([sampler.initial_state(streams) for sampler in self._samplers])
+
+    def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
+        pairs = zip(self._samplers, self._states(memory), strict=True)
+        return _side_by_side([sampler.begin_episode(state, mask) for sampler, state in pairs])
+
+    def forward(
+        self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
+    ) -> tuple[Tensor, Tensor]:
+        n_links = len(self._law_index)
+        n_worlds, delay, states = len(streams) // n_links, torch.zeros_like(streams), []
+        index = self._law_index.repeat(n_worlds)
+        for k, (sampler, state) in enumerate(zip(self._samplers, self._states(memory), strict=True)):
+            drawn, new_state = sampler(streams_for(sampler, streams, n_links), clock, state, context)
+            drawn = torch.where(drawn < sampler.lost, drawn, self.lost)
+            delay = torch.where(index == k, drawn, delay)
+            states.append(new_state)
+        if self._loses:
+            draw = counter_rng.uniform(streams, clock, torch.full_like(clock, _LINK_LOSS_DRAW))
+            delay = torch.where(draw < self._loss.repeat(n_worlds), self.lost, delay)
+        return delay, _side_by_side(states)
 
     @property
-    def _name(self) -> str:
-        """Name of the function."""
-        return getattr(self._delay_fn, "__qualname__", type(self._delay_fn).__name__)
+    def _samplers(self) -> list[Any]:
+        return list(self.samplers)
 
-    def _check(self, delay: Any, shape: torch.Size) -> None:
-        """Require a number of steps for each message."""
-        found = type(delay).__name__
-        if isinstance(delay, Tensor):
-            if delay.shape == shape and delay.dtype != torch.bool:
-                return
-            found = f"a tensor of {delay.dtype} and shape {tuple(delay.shape)}"
-        raise InputError(
-            f"{self._name}: {found} is not one number of steps per message, shape {tuple(shape)}"
-        )
+    def _states(self, memory: Tensor) -> list[Tensor]:
+        """The state of each sampler, [M, ...]."""
+        parts = memory.split([shape.numel() for shape in self._state_shapes], -1)
+        pairs = zip(parts, self._state_shapes, strict=True)
+        return [part.reshape(len(part), *shape) for part, shape in pairs]
+
+
+def _side_by_side(states: list[Tensor]) -> Tensor:
+    return torch.cat([state.reshape(len(state), -1) for state in states], -1)
+
+
+def streams_for(sampler: Sampler, streams: Tensor, n_rows: int) -> Tensor:
+    """The random streams [M] from which a sampler draws, if a world has so many rows.
+
+    With ``same_draws_for_all_agents`` all rows of a world get the stream of the first one.
+    """
+    if not sampler.same_draws_for_all_agents:
+        return streams
+    return streams.view(-1, n_rows)[:, :1].expand(-1, n_rows).reshape(-1)

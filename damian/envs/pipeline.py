@@ -2,7 +2,6 @@
 
 from collections.abc import Collection
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +11,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.text_files import show
 from damian.delays.config import CONTEXT_KEYS
-from damian.delays.laws import law_of
+from damian.delays.laws import law_of, sampler_of
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
 from damian.envs.uav_env import ALL_EXTRAS, UavEnv
@@ -102,9 +101,9 @@ def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
 def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
     """The action delay (paper, section 3.3); actions that a UAV chose while not ready are not sent."""
     delay, clock = scenario.delay, scenario.clock
-    if not has_delay(delay.act, clock.dt) and clock.steps("agents") == 1:
+    if not has_delay(scenario, "act") and clock.steps("agents") == 1:
         return []
-    law, hold = law_of(delay.act, "delay.act"), hold_action(scenario.actions)
+    law, hold = delay.law("act"), hold_action(scenario.actions)
     late = ActionDelay(
         law,
         keys.ACTION,
@@ -170,7 +169,7 @@ def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_dela
     """
     delay = scenario.delay
     uplink = ObservationDelay(
-        delay.uplink,
+        delay.law("obs"),
         keys.MESSAGE,
         keys.RECEIVED,
         loss=delay.loss,
@@ -240,8 +239,8 @@ def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list
     """The reward delay, and the discounted sum of the latest rewards (paper, section 3.5, eq. 4)."""
     delay, dt, reported = scenario.delay, scenario.clock.dt, "message" in extras
     transforms: list[Transform] = []
-    if has_delay(delay.rew, dt):
-        law = law_of(delay.rew, "delay.rew")
+    if has_delay(scenario, "rew"):
+        law = delay.law("rew")
         # With a message delay the server computes in hindsight what was earned.
         earned_key = keys.EARNED_REWARD if reported and not has_message_delay(scenario) else None
         late = RewardDelay(
@@ -269,8 +268,10 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     if clock.steps("server") > 1:
         observations = [*seen, keys.GLOBAL_OBSERVATION]
         transforms.append(SampleAndHold(clock.steps("server"), observations))
-    if scenario.links.kind == "updown" and (scenario.links.loss or has_delay(scenario.links.delay, clock.dt)):
-        transforms.append(downlink_transform(scenario))
+    if scenario.links.kind == "updown":
+        broadcast = sampler_of(scenario.links.delay, clock.dt, key="links.delay")
+        if scenario.links.loss or broadcast.constant_delay != 0:
+            transforms.append(downlink_transform(scenario))
     if clock.steps("agents") > 1:
         transforms.append(SampleAndHold(clock.steps("agents"), seen, ready_key=keys.READY))
     if n_actions:
@@ -324,7 +325,7 @@ def history_since_message(scenario: ScenarioConfig) -> bool:
     """
     delay, clock = scenario.delay, scenario.clock
     slow = clock.steps("server") > 1 or clock.steps("agents") > 1 or scenario.links.kind != "server"
-    immediate = not (slow or has_delay(delay.act, clock.dt))
+    immediate = not (slow or has_delay(scenario, "act"))
     return delay.history > 0 and not scenario.observation.own and immediate and has_message_delay(scenario)
 
 
@@ -340,12 +341,12 @@ def has_server_node(scenario: ScenarioConfig) -> bool:
 
 def has_message_delay(scenario: ScenarioConfig) -> bool:
     """Whether the server may hold an older message of a UAV than the one that the UAV sent in this step."""
-    return scenario.delay.loss > 0 or has_delay(scenario.delay.uplink, scenario.clock.dt)
+    return scenario.delay.loss > 0 or has_delay(scenario, "obs")
 
 
-def has_delay(law: Any, dt: float) -> bool:
-    """Whether a delay law, as written in the settings, ever delays anything."""
-    return law_of(law).sampler(dt).certain != 0
+def has_delay(scenario: ScenarioConfig, name: str) -> bool:
+    """Whether the delay ``obs``, ``act`` or ``rew`` of a scenario ever delays anything."""
+    return scenario.delay.sampler(name, scenario.clock.dt).constant_delay != 0
 
 
 def hold_action(actions: ActionConfig) -> int:

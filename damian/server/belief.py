@@ -1,18 +1,276 @@
-"""Where the source is, as far as messages tell: a Bayes filter over the cells of a ``SourceGrid``.
+"""Where the source is, as far as messages tell: a Bayes filter over the cells of a grid.
 
-All functions are pure and batched. One step of the filter moves the probability as the source may have moved,
-and weighs it with how likely each cell makes what the UAVs have reported of that step. Messages may arrive
-late, out of order or never: a belief is exact for the messages that have arrived, if the filter runs again
-over all steps since the oldest of those that came in late (``damian.transforms.Belief``).
+Three parts: ``SourceGrid`` tabulates what a server assumes of the source (its place, its moves, and who
+detects it), the filter turns reports into probabilities, and a ``Window`` repeats its latest steps when
+messages of them come in late. All functions of the filter are pure and batched.
+
+One step of the filter moves the probability as the source may have moved, and weighs it with how likely each
+cell makes what the UAVs have reported of that step. Messages may arrive late, out of order or never: a belief
+is exact for the messages that have arrived, because the filter runs again over all steps since the oldest of
+those that came in late.
+
+How silence counts is decided here alone: ``report_rows`` makes a row of a table of a report, ``repeated``
+marks the reports that say the same again, ``_log_reports`` tabulates their probabilities.
 """
 
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import shapely
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag, one_hot
 
-from damian.common.tensors import gather_rows
-from damian.server.source_grid import SourceGrid
+from damian.common import checks, devices
+from damian.common.tensors import gather_rows, tree_map
+from damian.world.airspace import Airspace
 from damian.world.messages import Messages
+from damian.world.signal_source import SourceConfig, draw_walks, locate
+
+# The grid: cells, and tables over them.
+
+CELL = 0.8
+"""Edge of a cell over the footprint's radius, if the settings do not give it."""
+MOST_CELLS = 256
+"""A cell whose edge the settings do not give is so large that there are no more cells than about this."""
+LEAST_REPORT_PROBABILITY = 1e-3
+"""Least probability that a UAV reports something else than the grid says: cells are not points."""
+_MAX_CELLS = 10_000
+"""Most cells: the table of moves has as many rows and columns."""
+_SAMPLES = 6
+"""Points along each edge of a cell at which detection is tested."""
+_WALKS, _STEPS, _SEED = 512, 128, 0
+"""Walks, and their steps, from which the moves are counted, and the seed with which they are drawn."""
+STEPS_PER_MOVE = 4
+"""Number of steps over which a move is measured: a source that goes on straight gets further in them than
+one that takes a new direction in each step, as the filter assumes."""
+_RARE = 1e-6
+"""Weight of a move that was never counted."""
+_POINTS_AT_ONCE = 256
+
+
+class SourceGrid(NamedTuple):
+    """Cells in which the source may be, ``K`` of them, in ``R`` regions with ``L`` landing points each."""
+
+    centres: Tensor
+    """Centres of the cells, east, north [m], [K, 2]."""
+    prior: Tensor
+    """Share of each region's area that lies in each cell, [R, K]."""
+    moves: Tensor | None
+    """Weights of the source's moves in a step, from cell to cell, [K, K]; None if it does not move. If there
+    is only one region, they are probabilities."""
+    staying: Tensor
+    """Sum of the weights of the moves from each cell that end in the region, [R, K]."""
+    next_detection: Tensor
+    """Probability that a UAV which lands on a landing point in the next step detects the source there, if the
+    source is in a cell now, [R*L, K]."""
+    next_staying: Tensor
+    """The same for a UAV which stays where it is, [2*R*L + 1, K]. For the landing point of flat id p, row 2p:
+    it detects nothing now; row 2p + 1: it detects the source now. The last row, of zeros: it is in flight."""
+    log_reports: Tensor
+    """Log-probability of what a UAV on a landing point reports if the source emits in a cell,
+    [4*R*L + 1, K]. For the landing point of flat id p, row 2p: it detects nothing; row 2p + 1: it detects the
+    source; 2*R*L further: the same, and so it did in the step before. The last row, of zeros: no report."""
+    emits: float
+    """Probability that the source emits in a step."""
+
+    @property
+    def no_report(self) -> int:
+        """The row of ``log_reports`` that stands for no report."""
+        return len(self.log_reports) - 1
+
+    def to(self, device: torch.device) -> "SourceGrid":
+        """Copy of the grid on another device."""
+        return self._make(each.to(device) if isinstance(each, Tensor) else each for each in self)
+
+
+def build_source_grid(
+    airspace: Airspace, source: SourceConfig, radius: float, dt: float, cell: float | None = None
+) -> SourceGrid:
+    """Lay the grid over all regions, and tabulate what is known of the source.
+
+    How it moves is counted from walks as the settings draw them, which are not those of any episode. Whether
+    it emits is taken as drawn anew at every step: with ``emission=per_stop``, silence counts for too much.
+
+    Args:
+        airspace: regions and landing points.
+        source: settings of the source.
+        radius: radius of a UAV's footprint [m].
+        dt: length of a step [s].
+        cell: edge of a cell [m].
+
+    Raises:
+        InputError: there are too many cells.
+    """
+    polygons = [region.polygon for region in airspace.regions]
+    area = max(polygon.area for polygon in polygons)
+    edge = cell or max(CELL * radius, math.sqrt(area / MOST_CELLS))
+    n_cells = math.ceil(area / edge**2)  # at least
+    should = f"makes {n_cells} cells, more than {_MAX_CELLS}: take larger ones"
+    checks.require(n_cells <= _MAX_CELLS, "observation.belief_cell", f"{edge:g} m", should)
+    columns = _columns(polygons, edge)
+    centres = torch.as_tensor(columns * edge, dtype=torch.float32)
+    squares = shapely.box(*(columns * edge - edge / 2).T, *(columns * edge + edge / 2).T)
+    prior = torch.as_tensor(np.stack([shapely.area(shapely.intersection(squares, p)) for p in polygons]))
+    prior = (prior / prior.sum(-1, keepdim=True)).float()
+    moves, staying = None, torch.ones_like(prior)
+    if source.motion == "dynamic":
+        moves = _moves(columns, _displacements(polygons, source, dt) / edge)
+        staying = (prior > 0).float() @ moves.T
+        if len(polygons) == 1:
+            moves = moves * (prior > 0) / staying.T
+    shares = [
+        _detected_shares(*each, columns * edge, edge, radius)
+        for each in zip(polygons, airspace.points, strict=True)
+    ]
+    detects = LEAST_REPORT_PROBABILITY + (1 - 2 * LEAST_REPORT_PROBABILITY) * torch.cat(shares)
+    log_reports = _log_reports(detects, source.emits, _renewed(centres, moves, edge))
+    grid = SourceGrid(centres, prior, moves, staying, detects, detects, log_reports, source.emits)
+    return grid._replace(next_detection=_one_step_before(grid, detects), next_staying=_staying(grid))
+
+
+def _columns(polygons: list, edge: float) -> np.ndarray:
+    """Column and row numbers of all cells that any of the polygons touches, [K, 2]."""
+    bounds = np.array([polygon.bounds for polygon in polygons])
+    first, last = np.floor(bounds[:, :2].min(0) / edge), np.ceil(bounds[:, 2:].max(0) / edge)
+    axes = (np.arange(a, b + 1) for a, b in zip(first, last, strict=True))
+    columns = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    squares = shapely.box(*((columns - 0.5) * edge).T, *((columns + 0.5) * edge).T)
+    touched = np.zeros(len(columns), dtype=bool)
+    for polygon in polygons:
+        shapely.prepare(polygon)
+        touched |= shapely.intersects(squares, polygon) & ~shapely.touches(squares, polygon)
+    return columns[touched]
+
+
+def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarray:
+    """Moves of the source in steps of ``dt``, counted from walks, [S, 2] metres.
+
+    Independent moves like these get as far in ``STEPS_PER_MOVE`` steps as the source does.
+    """
+    rng, polygons = np.random.default_rng(_SEED), polygons[:_WALKS]
+    source = replace(source, position=None)  # where it begins is not told
+    time = torch.arange(_STEPS + 1, dtype=torch.float64) * dt
+    found = []
+    for polygon in polygons:
+        walk = draw_walks(polygon, source, math.ceil(_WALKS / len(polygons)), rng)
+        n_walks = len(walk.stop)
+        every = tree_map(lambda t: t.repeat_interleave(len(time), 0), walk)
+        place = locate(every, time.repeat(n_walks), source.after_walk == "loop").position
+        place = place.view(n_walks, -1, 2)
+        found.append((place[:, STEPS_PER_MOVE:] - place[:, :-STEPS_PER_MOVE]).reshape(-1, 2))
+    return torch.cat(found).numpy() / math.sqrt(STEPS_PER_MOVE)
+
+
+def _moves(columns: np.ndarray, displacement: np.ndarray) -> Tensor:
+    """Weight of each move from cell to cell, [K, K].
+
+    The source is anywhere in its cell, and moves in any direction alike: the weights are averaged over the
+    symmetries of a square.
+
+    Args:
+        columns: column and row number of each cell, [K, 2].
+        displacement: moves of the source [cells], [S, 2].
+    """
+    reach = int(np.ptp(columns, axis=0).max())
+    weight = np.full((2 * reach + 1, 2 * reach + 1), _RARE)
+    near = displacement[(np.abs(displacement) < reach - 1).all(-1)] if reach > 1 else displacement[:0]
+    whole = np.floor(near).astype(int)
+    part = near - whole
+    for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
+        np.add.at(weight, (whole[:, 0] + dx + reach, whole[:, 1] + dy + reach), share / len(displacement))
+    weight = np.mean([np.rot90(each, turns) for each in (weight, weight.T) for turns in range(4)], 0)
+    offset = columns[None].astype(int) - columns[:, None].astype(int) + reach
+    return torch.as_tensor(weight[offset[..., 0], offset[..., 1]], dtype=torch.float32)
+
+
+def _renewed(centres: Tensor, moves: Tensor | None, edge: float) -> float:
+    """How far the source moves in a step on average, in cells, at most 1; 0 if it does not move."""
+    if moves is None:
+        return 0.0
+    mean = (moves * torch.cdist(centres, centres)).sum() / moves.sum()
+    return min(float(mean) / edge, 1.0)
+
+
+def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
+    """The table ``SourceGrid.log_reports``.
+
+    A cell that a footprint covers in part would be ruled out by the same silence again and again, although a
+    source that stays may be in its other part. So a repeated report counts only as far as the source may have
+    moved since: with probability ``renewed`` it is anywhere in its cell, else it is where it was.
+
+    Args:
+        detects: probability of a detection if the source emits, [P, K].
+        emits: probability that it emits.
+        renewed: share of a cell by which it moves in a step.
+    """
+    silent = 1 - detects
+    again = renewed * silent + (1 - renewed) * silent / (1 - emits * detects)
+    fresh, repeated = (
+        torch.stack(each, 1).flatten(0, 1)
+        for each in ((silent, detects), (again, renewed * detects + 1 - renewed))
+    )
+    return torch.cat([fresh, repeated, torch.ones_like(fresh[:1])]).log()
+
+
+def _one_step_before(grid: SourceGrid, chances: Tensor) -> Tensor:
+    """Probability of a detection by the cell of the source one step before, [P, K].
+
+    Args:
+        grid: cells, moves and emission.
+        chances: probability of the detection if the source emits in a cell, [P, K]; P is a multiple of R, and
+            the same number of rows are of each region.
+    """
+    if grid.moves is None:
+        return grid.emits * chances
+    if len(grid.prior) == 1:
+        return grid.emits * chances @ grid.moves.T
+    inside = (grid.prior > 0).unsqueeze(1)
+    by_region = chances.view(len(grid.prior), -1, chances.shape[-1]) * inside
+    before = (by_region @ grid.moves.T) / grid.staying.unsqueeze(1)
+    return grid.emits * before.view_as(chances)
+
+
+def _staying(grid: SourceGrid) -> Tensor:
+    """The table ``SourceGrid.next_staying``, from the repeated reports of ``SourceGrid.log_reports``."""
+    again = grid.log_reports[grid.no_report // 2 : -1].exp()
+    again[::2] = 1 - again[::2]
+    again = _one_step_before(grid, again)
+    return torch.cat([again, torch.zeros_like(again[:1])])
+
+
+def _detected_shares(
+    polygon: shapely.Geometry, points: Tensor, centres: np.ndarray, edge: float, radius: float
+) -> Tensor:
+    """Share of each cell's part of the polygon that lies in the footprint about each landing point, [L, K].
+
+    Args:
+        polygon: the region.
+        points: its landing points, [L, 2] metres.
+        centres: of the cells, [K, 2] metres.
+        edge: of a cell [m].
+        radius: of a footprint [m].
+    """
+    axis = ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * edge
+    sample = centres[:, None] + np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    shapely.prepare(polygon)
+    inside = shapely.contains_xy(polygon, sample[..., 0], sample[..., 1])
+    inside |= ~inside.any(-1, keepdims=True)  # a corner of the region between the samples
+    weight = torch.as_tensor(inside / inside.sum(-1, keepdims=True), dtype=torch.float32)
+    sample = torch.as_tensor(sample.reshape(-1, 2), dtype=torch.float32)
+    return torch.cat(
+        [
+            ((torch.cdist(part, sample) <= radius).view(len(part), *weight.shape) * weight).sum(-1)
+            for part in points.nan_to_num(posinf=1e30).split(_POINTS_AT_ONCE)
+        ]
+    )
+
+
+# The filter.
 
 _LEAST = 1e-20
 """Added to every likelihood, so that reports which no cell makes possible change nothing."""
@@ -142,3 +400,286 @@ def entropy(belief: Tensor) -> Tensor:
 @entropy.register_fake
 def _(belief: Tensor) -> Tensor:
     return belief.new_empty(belief.shape[:-1])
+
+
+# The beliefs of the latest steps.
+
+
+class Window(NamedTuple):
+    """The latest steps, in a ring of S slots, for B worlds and V receivers of the messages in each world.
+
+    Each slot holds the beliefs after its step, and what the messages of that step report with their delays. A
+    message that comes in late changes what is known of its step; from there the filter runs again. No message
+    is later than the longest delay, so that older beliefs are final.
+
+    The first receiver is the server. If there are more, the others are the N UAVs, each of which knows its
+    own messages at once. The filter runs for a UAV only from where it knows more than the server: before,
+    their beliefs are one.
+    """
+
+    belief: Tensor
+    """Probability of each cell after the messages of the step, [S, V, B, K]."""
+    same_as_server: Tensor
+    """Whether the belief of the receiver is that of the server, and lies only there, [S, V, B] bool."""
+    report: Tensor
+    """What the UAVs report in the step (``report_rows``), [S, N, B]."""
+    delay: Tensor
+    """The delay of these messages [steps], negative if they never arrive, [S, N, B]."""
+    slot: Tensor
+    """The slot of the latest step, [B]."""
+
+
+def empty_window(grid: SourceGrid, longest: int, n_worlds: int, n_agents: int, own: bool) -> Window:
+    """A window for messages that are at most ``longest`` steps late; ``own``: also for each UAV."""
+    device, n_slots, n_viewers = grid.prior.device, longest + 2, 1 + n_agents * own
+    belief = torch.ones(n_slots, n_viewers, n_worlds, grid.prior.shape[-1], device=device)
+    report = torch.full((n_slots, n_agents, n_worlds), grid.no_report, device=device)
+    same = torch.ones(belief.shape[:-1], dtype=torch.bool, device=device)
+    slot, delay = torch.zeros_like(report[0, 0]), torch.full_like(report, -1)
+    return Window(belief, same, report, delay, slot)
+
+
+class Beliefs(NamedTuple):
+    """Probability of each cell after the latest step."""
+
+    server: Tensor
+    """As the server believes, [B, K]."""
+    own: Tensor
+    """As each of the other receivers believes, [B, V - 1, K]."""
+
+
+def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor) -> Beliefs:
+    """Begin new episodes in the worlds of the mask, in place.
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        messages: the first messages [B, N], which all receivers know at once.
+        region: index of the region of each world, [B].
+        mask: worlds that begin an episode, [B] bool.
+    """
+    report = report_rows(grid, messages, torch.ones_like(messages.spotted))
+    _begin(*_parts(grid, window), report, region, mask)
+    return latest(window, window.slot)
+
+
+def advance(
+    grid: SourceGrid, window: Window, report: Tensor, delay: Tensor, region: Tensor, stepped: Tensor
+) -> tuple[Window, Beliefs]:
+    """Take one step: note what is sent, and correct the beliefs by what arrives, in place.
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        report: what the messages of this step report (``report_rows``), [B, N].
+        delay: their delays [steps], negative if they never arrive, [B, N].
+        region: index of the region of each world, [B].
+        stepped: worlds that take the step, [B] bool; nothing of the others changes.
+
+    Returns:
+        The window after the step, and the beliefs of the latest step.
+    """
+    slot, *beliefs = _advance(*_parts(grid, window), report, delay, region, stepped)
+    return window._replace(slot=slot), Beliefs(*beliefs)
+
+
+def latest(window: Window, slot: Tensor) -> Beliefs:
+    """The beliefs of a step, by its slot in each world, [B]."""
+    viewer = torch.arange(window.belief.shape[1], device=slot.device)
+    world = torch.arange(len(slot), device=slot.device).unsqueeze(-1)
+    row, held = _row(window, slot.unsqueeze(-1), viewer, world), window.belief.flatten(0, 2)
+    return Beliefs(held.index_select(0, row[:, 0]), gather_rows(held, row[:, 1:]))
+
+
+# Custom operators, because the number of worlds to work on depends on data, which no compiler can trace. An
+# operator takes no named tuples, so grid and window come in parts: all tensors of the grid, the number
+# ``emits``, the tensors of the window that change, and its slot.
+
+_Tables = list[Tensor | None]
+_Ring = list[Tensor]
+
+
+def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, float, _Ring, Tensor]:
+    return list(grid[:-1]), grid.emits, list(window[:-1]), window.slot
+
+
+@torch.library.custom_op("damian::begin_belief", mutates_args=["ring"])
+def _begin(
+    tables: _Tables, emits: float, ring: _Ring, slot: Tensor, first: Tensor, region: Tensor, mask: Tensor
+) -> None:
+    grid, window = SourceGrid(*tables, emits), Window(*ring, slot)
+    (world,) = _chosen(mask)
+    if not len(world):
+        return
+    begun, at, known, region = (each.index_select(0, world) for each in (mask, slot, first, region))
+    _write(window.belief, _row(window, at, 0, world), first_belief(grid, known, region), begun)
+    window.report.masked_fill_(mask, grid.no_report)  # nothing is in transit
+    _write_step(window.same_as_server, slot, mask.unsqueeze(0), mask)
+    _write_step(window.report, slot, first.T, mask)
+    _write_step(window.delay, slot, torch.zeros_like(first.T), mask)
+
+
+@_begin.register_fake
+def _(tables, emits, ring, slot, first, region, mask):
+    pass
+
+
+@torch.library.custom_op("damian::advance_belief", mutates_args=["ring"])
+def _advance(
+    tables: _Tables,
+    emits: float,
+    ring: _Ring,
+    slot: Tensor,
+    sent: Tensor,
+    sent_delay: Tensor,
+    region: Tensor,
+    stepped: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    grid, window = SourceGrid(*tables, emits), Window(*ring, slot)
+    n_slots = len(window.belief)
+    slot = torch.where(stepped, (slot + 1) % n_slots, slot)
+    _write_step(window.report, slot, sent.T, stepped)
+    _write_step(window.delay, slot, sent_delay.T, stepped)
+    slot_age = (slot - torch.arange(n_slots, device=slot.device).unsqueeze(-1)) % n_slots
+    outdated = _first_outdated(grid, window, slot_age, stepped)
+    for each in _to_compute(grid, window, slot_age, outdated, region):
+        before = window.belief.flatten(0, 2).index_select(0, each.before)
+        new = weigh(predict(grid, before, each.region), likelihood(grid, each.reports))
+        _write(window.belief, each.row, new, each.mask)
+    beliefs = latest(window, slot)
+    return slot, beliefs.server, beliefs.own
+
+
+@_advance.register_fake
+def _(tables, emits, ring, slot, sent, sent_delay, region, stepped):
+    _, n_viewers, n_worlds, n_cells = ring[0].shape
+    server, own = (n_worlds, n_cells), (n_worlds, n_viewers - 1, n_cells)
+    return torch.empty_like(slot), ring[0].new_empty(server), ring[0].new_empty(own)
+
+
+def _first_outdated(grid: SourceGrid, window: Window, slot_age: Tensor, stepped: Tensor) -> Tensor:
+    """How long ago the first step was after which each receiver's belief is outdated, [V, B] steps.
+
+    It is -1 where no belief is. A UAV has the server's belief as long as it had it in the step before and the
+    server has all that the UAV has reported since; this is noted in place.
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        slot_age: how long ago the step of each slot was, [S, B] steps. (Seen from a slot, it is also the slot
+            of the step that was so long ago.)
+        stepped: worlds that take a step, [B] bool.
+    """
+    sent, age = window.report != grid.no_report, slot_age.unsqueeze(1)
+    arrives = (sent & (window.delay == age)).amax(1)
+    first = torch.where(stepped, (arrives * slot_age).amax(0), -1).unsqueeze(0)
+    same = window.same_as_server
+    if same.shape[1] == 1:
+        return first
+    missing = sent & ((window.delay < 0) | (window.delay > age))
+    before = slot_age.gather(0, first + 1).expand(1, *same.shape[1:])  # the slot of the step before
+    own_since = ((missing * (age + 1)).amax(0) - 1).minimum(first)
+    own_since = torch.where(same.gather(0, before)[0, 1:], own_since, first)
+    outdated = torch.cat([first, own_since])
+    same.logical_or_(age <= first).logical_and_(age > outdated)
+    return outdated
+
+
+class _Computed(NamedTuple):
+    """C beliefs that are computed from those of the step before."""
+
+    before: Tensor
+    """Rows of the beliefs of the step before in the flattened ring, [C]."""
+    row: Tensor
+    """Rows of the beliefs, [C]."""
+    mask: Tensor
+    """Which of them change, [C] bool."""
+    region: Tensor
+    """Index of the region, [C]."""
+    reports: Tensor
+    """What their receivers know of the step, as rows of ``SourceGrid.log_reports``, [C, N]."""
+
+
+def _to_compute(
+    grid: SourceGrid, window: Window, slot_age: Tensor, outdated: Tensor, region: Tensor
+) -> Iterator[_Computed]:
+    """The beliefs to compute, step by step, the oldest step first.
+
+    Args:
+        grid: cells and tables.
+        window: beliefs of the latest steps.
+        slot_age: how long ago the step of each slot was, or the slot of the step so long ago, [S, B].
+        outdated: ``_first_outdated``, [V, B] steps.
+        region: index of the region of each world, [B].
+    """
+    n_worlds, n_steps = outdated.shape[1], len(slot_age) - 1
+    due = torch.arange(n_steps, device=slot_age.device).view(-1, 1, 1) <= outdated
+    age, viewer, world = _chosen(due)
+    slot, earlier = (slot_age.flatten().index_select(0, each * n_worlds + world) for each in (age, age + 1))
+    receiver, agent = viewer * n_worlds + world, torch.arange(window.report.shape[1], device=slot.device)
+    at = (slot * len(agent) * n_worlds + world).unsqueeze(-1) + agent * n_worlds
+    unknown = (window.delay < 0) | (window.delay > slot_age.unsqueeze(1))
+    known = window.report.maximum(unknown * grid.no_report)  # no report is the last row
+    reports = gather_rows(repeated(grid, known, known.roll(1, 0)).flatten(), at)
+    if len(outdated) > 1:
+        own = gather_rows(repeated(grid, window.report, window.report.roll(1, 0)).flatten(), at)
+        reports = torch.where(viewer.unsqueeze(-1) == agent + 1, own, reports)
+    work = _Computed(
+        _row(window, earlier, viewer, world),
+        slot * due[0].numel() + receiver,
+        age <= outdated.flatten().index_select(0, receiver),
+        region.index_select(0, world),
+        reports,
+    )
+    counts = [due[0].numel()] * n_steps
+    if devices.data_dependent(due.device):
+        counts = age.bincount().tolist()  # as far as the oldest step of any
+    steps = zip(*(each.split(counts) for each in work), strict=True)
+    return (_Computed(*each) for each in reversed([*steps]))
+
+
+def _row(window: Window, slot: Tensor, viewer: Tensor | int, world: Tensor) -> Tensor:
+    """Where the belief of a receiver lies in the flattened ring, or that of the server, if it is the same.
+
+    Args:
+        window: beliefs of the latest steps.
+        slot: of the step, [*].
+        viewer: number of the receiver, [*].
+        world: number of the world, [*].
+    """
+    n_viewers, n_worlds = window.same_as_server.shape[1:]
+    server = slot * n_viewers * n_worlds + world
+    if n_viewers == 1:
+        return server
+    own = server + viewer * n_worlds
+    return torch.where(gather_rows(window.same_as_server.flatten(), own), server, own)
+
+
+def _chosen(mask: Tensor) -> tuple[Tensor, ...]:
+    """Indices at which a mask is true; all of them where shapes must not depend on data."""
+    if devices.data_dependent(mask.device):
+        return mask.nonzero(as_tuple=True)
+    every = torch.meshgrid(*(torch.arange(n, device=mask.device) for n in mask.shape), indexing="ij")
+    return tuple(each.flatten() for each in every)
+
+
+def _write(held: Tensor, row: Tensor, new: Tensor, mask: Tensor) -> None:
+    """Write beliefs into the ring in place.
+
+    Args:
+        held: the ring, [S, V, B, K].
+        row: rows of the flattened ring, which ``_chosen`` has chosen, [C].
+        new: their new values, [C, K].
+        mask: which of them to change, [C] bool.
+    """
+    flat = held.flatten(0, 2)
+    if devices.data_dependent(held.device):
+        flat.numpy()[row.numpy()] = new.numpy()  # takes a third of the time of ``index_copy_``
+    else:
+        flat.index_copy_(0, row, torch.where(mask.unsqueeze(-1), new, flat.index_select(0, row)))
+
+
+def _write_step(held: Tensor, slot: Tensor, new: Tensor, mask: Tensor) -> None:
+    """Write values [N, B] into the slots [B] of a ring [S, N, B] in place, in the worlds of a mask [B]."""
+    at = slot.expand(1, *held.shape[1:])
+    held.scatter_(0, at, torch.where(mask, new, held.gather(0, at)))

@@ -1,23 +1,38 @@
-"""The features of the paper's Table 2, computed from messages.
+"""Features of messages: those of the paper's Table 2, and those of where the source is believed to be.
 
 ``observe`` is pure and batched, and reads nothing but the messages it is given: the caller decides whether
 these are the latest messages sent or the latest received.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from damian.common import checks, devices
+from damian.common.errors import InputError
 from damian.common.registry import Registry, require_parentheses
 from damian.common.tensors import gather_rows
-from damian.server.feature_cache import FeatureCache, ServerContext
-from damian.world.battery import observed
-from damian.world.coverage import covered_share, own_covered_share, updated_share
+from damian.server.belief import (
+    SourceGrid,
+    chance_of_staying,
+    detection_chance,
+    entropy,
+    first_belief,
+    report_rows,
+)
+from damian.world.battery import BatteryConfig, observed
+from damian.world.coverage import (
+    FootprintTables,
+    KnownCoverage,
+    covered_share,
+    own_covered_share,
+    updated_share,
+)
 from damian.world.messages import Messages
 
 
@@ -26,13 +41,13 @@ class ObservationConfig:
     """Which features the actor and the critic observe."""
 
     local_features: list[str] = field(default_factory=lambda: ["spotted"])
-    """Features of the UAV itself: battery, spotted, or ``package.module:feature`` of one's own."""
+    """Features of the UAV itself: battery, spotted, or ``package.module:feature`` of your own."""
     global_features: list[str] = field(
         default_factory=lambda: ["source_distance", "source_bearing", "source_time"]
     )
     """Features that the server computes from the messages of all UAVs (Table 2): source_distance,
     source_bearing, source_drift, source_time, agent_distances, coverage, mean_distance,
-    mean_distance_not_spotting, mean_distance_spotting, spotting_agents, or one's own."""
+    mean_distance_not_spotting, mean_distance_spotting, spotting_agents, or your own."""
     ctde: bool = False
     """Centralised training, decentralised execution: the actor observes only the local features."""
     time_scale: float | None = None
@@ -53,7 +68,7 @@ class ObservationConfig:
     belief: list[str] = field(default_factory=list)
     """Features of where the source is, by Bayes' rule from all messages that have arrived, appended to what
     actor and critic observe: belief_gain (for each discrete action, the probability that it leads to where
-    the source is detected), belief_moments, belief_map, or ``package.module:feature`` of one's own."""
+    the source is detected), belief_moments, belief_map, or ``package.module:feature`` of your own."""
     belief_cell: float | None = None
     """Edge of a cell of the belief [m]; if not given, 0.8 footprint radii, or more in large regions."""
     window: int = 2
@@ -75,11 +90,9 @@ class ObservationConfig:
         checks.above("observation.age_scale", self.age_scale, 0.0, "s")
         checks.one_of("observation.estimate", self.estimate, ("mean", "newest"))
         checks.whole("observation.window", self.window, 1, 16)
-        blind = "actor" if not self.actor else "critic"  # which does not observe ages
-        problem = f"leaves the {blind} blind"
-        checks.require(
-            bool(self.critic and self.actor), "observation.local_features", self.local_features, problem
-        )
+        should = "leaves the actor or the critic without any feature"  # the critic observes no ages
+        sees = bool(self.critic and self.actor)
+        checks.require(sees, "observation.local_features", self.local_features, should)
 
     @property
     def actor(self) -> list[str]:
@@ -93,58 +106,125 @@ class ObservationConfig:
         return [*self.global_features, *self.local_features, *self.belief]
 
 
-def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
-    """Features by name (Table 2, and of one's own).
+class ServerContext(NamedTuple):
+    """What the server knows besides the messages.
+
+    Fields for features: ``now`` [s] and ``scale`` [m], [*], ``time_scale`` and ``age_scale`` [s], and
+    ``points`` [m], [R*L, 2].
+    """
+
+    now: Tensor
+    """Current time [s], [*]."""
+    scale: Tensor
+    """Largest vertex distance of the region [m], [*]."""
+    time_scale: float
+    """Times are divided by this [s]."""
+    battery: BatteryConfig
+    """Gives the resolution with which battery levels are observed."""
+    footprints: FootprintTables | None
+    """For the feature ``coverage``; None if it is not needed."""
+    points: Tensor
+    """Landing points by flat id, [R*L, 2] metres."""
+    age_scale: float
+    """Ages are divided by this [s]."""
+    newest: bool = False
+    """Estimate the source's position from only the newest detections (``ObservationConfig.estimate``)."""
+    readings: Mapping[str, tuple[int, int]] = MappingProxyType({})
+    """First column, and number of columns, of each reading in ``Messages.readings``, by name."""
+    radius: float = 0.0
+    """Radius of a UAV's footprint [m]."""
+    n_points: int = 0
+    """Largest number of landing points in a region, L."""
+    goals: Tensor | None = None
+    """For ``belief_gain``: the preferred landing points to which each discrete action may lead, as indices in
+    their region, by the flat id of the landing point on which it begins, [C, R*L, A], C at most 2."""
+    grid: SourceGrid | None = None
+    """Cells in which the source may be; None if no feature reads the belief."""
+    belief: Tensor | None = None
+    """Probability that the source is in each cell, [*, K]; if not given, that after these messages, as if
+    they were the first ones."""
+    coverage: KnownCoverage | None = None
+    """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be computed."""
+
+
+class FeatureCache:
+    """Messages, and intermediate results that several features share, each computed once and on demand.
 
     Args:
-        messages: one message of each of N UAVs, [*, N].
+        messages: of N UAVs, [*, N].
         context: with the leading dimensions [*] of the messages.
-        names: features to compute.
-
-    Returns:
-        Each feature [*, N], in [0, 1] if it is one of Table 2; but ``agent_distances`` [*, N, N-1], to the
-        other UAVs in index order, and features of one's own in the shape and range that they declare.
-
-    Raises:
-        ValueError: ``coverage`` is among the names, but the context has no footprint tables.
-        InputError: a feature reads a sensor that does not exist.
+        own_only: messages are [*, N, N] (receiver, sender), and of the values of UAV j that follow from what
+            receiver i knows, only those with i = j are wanted.
     """
-    cache = FeatureCache(messages, context)
-    return {name: FEATURES.get(name, "feature").compute(cache) for name in names}
+
+    def __init__(self, messages: Messages, context: ServerContext, own_only: bool = False) -> None:
+        self.messages, self.context, self.own_only = messages, context, own_only
+        self._shared: dict[Callable, Tensor] = {}
+
+    def __call__(self, compute: Callable[["FeatureCache"], Tensor]) -> Tensor:
+        """The result of ``compute(self)``, from the cache after the first call."""
+        if compute not in self._shared:
+            self._shared[compute] = compute(self)
+        return self._shared[compute]
+
+    def wanted(self, field: Tensor) -> Tensor:
+        """A field [*, N, ...] of the UAVs whose values are wanted: of all, or of one for each *, [*, 1, ...].
+
+        A feature that compares every UAV with every other one computes only these, as [*, N, ...] or
+        [*, 1, ...]; any other may compute all.
+        """
+        if not self.own_only:
+            return field
+        sender = self.context.now.dim()
+        return field.diagonal(0, sender - 1, sender).movedim(-1, sender - 1).unsqueeze(sender)
+
+    def reading(self, name: str) -> Tensor:
+        """Values of a sensor of the settings (``damian.sensor``), [*, N], or [*, N, width] if it has several.
+
+        Raises:
+            InputError: the settings have no such sensor.
+        """
+        known = self.context.readings
+        if name not in known:
+            problem = f"is not one of {', '.join(known)}" if known else "is missing: no sensor is given"
+            raise InputError(f"sensors: {name}, which a feature reads, {problem}")
+        first, width = known[name]
+        values = self.messages.readings.narrow(-1, first, width)
+        return values.squeeze(-1) if width == 1 else values
+
+    @property
+    def region(self) -> Tensor:
+        """Index of the region, [*]."""
+        return self.messages.region(self.context.n_points)
+
+    @property
+    def grid(self) -> SourceGrid:
+        """Cells in which the source may be.
+
+        Raises:
+            InputError: there are none, because no feature declares that it reads the belief.
+        """
+        if self.context.grid is None:
+            raise InputError('belief: only a feature of scope "belief" may read it')
+        return self.context.grid
+
+    @property
+    def belief(self) -> Tensor:
+        """Probability that the source is in each cell of ``grid``, [*, K]."""
+        return self(_belief)
+
+    @property
+    def scale(self) -> Tensor:
+        """Largest vertex distance of the region [m], [*, 1]."""
+        return self.context.scale.unsqueeze(-1)
 
 
-def observe_own(known: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
-    """Features by name, as each UAV computes its own from the messages that it knows.
-
-    Args:
-        known: messages [*, N, N] (receiver, sender).
-        context: with the leading dimensions [*, N] of the messages.
-        names: features to compute.
-
-    Returns:
-        As ``observe``, each feature [*, N] or [*, N, width].
-    """
-    cache, sender = FeatureCache(known, context, own_only=True), known.time.dim() - 1
-    values = {name: FEATURES.get(name, "feature").compute(cache) for name in names}
-    return {
-        name: (each if each.shape[sender] == 1 else cache.wanted(each)).squeeze(sender)
-        for name, each in values.items()
-    }
-
-
-def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
-    """Observation vector in the order of ``names``, [*, N, F] float32, whatever the features' types are."""
-    single = {name for name in names if FEATURES.get(name, "feature").width == 1}
-    columns = [features[name].unsqueeze(-1) if name in single else features[name] for name in names]
-    return torch.cat(columns, -1).float()
-
-
-def feature_bounds(features: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Lowest and highest possible values of features, each in the shape of the feature."""
-    found = {name: FEATURES.get(name, "feature") for name in features}
-    low = {name: torch.full(values.shape, found[name].low) for name, values in features.items()}
-    high = {name: torch.full(values.shape, found[name].high) for name, values in features.items()}
-    return low, high
+def _belief(v: FeatureCache) -> Tensor:
+    """The belief of the context, or that after the first messages, [*, K]."""
+    if v.context.belief is not None:
+        return v.context.belief
+    rows = report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted))
+    return first_belief(v.grid, rows, v.region)
 
 
 class Feature(NamedTuple):
@@ -168,7 +248,7 @@ def feature(
 ) -> Callable[[Callable[[FeatureCache], Tensor]], Feature]:
     """Decorator that makes a feature of a function.
 
-    The function reads ``cache.messages`` (fields [*, N]), ``cache.reading`` (the sensors of one's own) and
+    The function reads ``cache.messages`` (fields [*, N]), ``cache.reading`` (your own sensors) and
     ``cache.context`` (time, scales, landing points), and must be pure, batched over * and, for
     ``env.compile()``, free of branches on data. ``cache(other)`` shares an intermediate result between
     features.
@@ -182,8 +262,8 @@ def feature(
         high: highest possible value. Networks learn best from values about 1 in size.
 
     Raises:
-        InputError: there is no such scope, the width is not positive, the range is empty or not finite, or
-            the decorator has no parentheses.
+        InputError: there is no such scope, the range is empty or not finite, or the decorator has no
+            parentheses.
 
     Examples:
         >>> @feature("local")
@@ -192,8 +272,6 @@ def feature(
     """
     require_parentheses(scope, '@damian.feature("local")')
     checks.one_of("scope of a feature", scope, ("local", "global", "belief", "actor"))
-    if width is not None:
-        checks.whole("width of a feature", width, 1)
     good = math.isfinite(low) and math.isfinite(high) and low < high
     checks.require(good, "range of a feature", f"low={low}, high={high}", "are not finite with low < high")
     return lambda compute: Feature(compute, scope, width, low, high)
@@ -204,7 +282,12 @@ def _not_a_feature(found: Any) -> str | None:
 
 
 FEATURES = Registry[Feature]("feature", _not_a_feature)
-"""Features by name (Table 2); one's own as ``package.module:name``."""
+"""Features by name; those outside the package as ``package.module:name``."""
+
+
+def feature_of(name: str) -> Feature:
+    """The feature of a name or path."""
+    return FEATURES.get(name, "feature")
 
 
 def check_feature(key: str, name: str, scope: str) -> None:
@@ -222,6 +305,62 @@ def check_feature(key: str, name: str, scope: str) -> None:
 def feature_names(scope: str) -> list[str]:
     """Names of the registered features of a scope, in the order of Table 2."""
     return [name for name, found in FEATURES.items() if found.scope == scope]
+
+
+def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
+    """Features by name.
+
+    Args:
+        messages: one message of each of N UAVs, [*, N].
+        context: with the leading dimensions [*] of the messages.
+        names: features to compute.
+
+    Returns:
+        Each feature [*, N], in [0, 1] if it is one of Table 2; but ``agent_distances`` [*, N, N-1], to the
+        other UAVs in index order, and others in the shape and range that they declare.
+
+    Raises:
+        InputError: a feature reads a sensor that does not exist.
+    """
+    cache = FeatureCache(messages, context)
+    return {name: feature_of(name).compute(cache) for name in names}
+
+
+def observe_own(known: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
+    """Features by name, as each UAV computes its own from the messages that it knows.
+
+    Args:
+        known: messages [*, N, N] (receiver, sender).
+        context: with the leading dimensions [*, N] of the messages.
+        names: features to compute.
+
+    Returns:
+        As ``observe``, each feature [*, N] or [*, N, width].
+    """
+    cache, sender = FeatureCache(known, context, own_only=True), known.time.dim() - 1
+    values = {name: feature_of(name).compute(cache) for name in names}
+    return {
+        name: (each if each.shape[sender] == 1 else cache.wanted(each)).squeeze(sender)
+        for name, each in values.items()
+    }
+
+
+def stack(features: dict[str, Tensor], names: list[str]) -> Tensor:
+    """Observation vector in the order of ``names``, [*, N, F] float32, whatever the features' types are."""
+    columns = [
+        features[name].unsqueeze(-1) if feature_of(name).width == 1 else features[name] for name in names
+    ]
+    return torch.cat(columns, -1).float()
+
+
+def feature_bounds(features: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Lowest and highest possible values of features, each in the shape of the feature."""
+    low = {name: torch.full(values.shape, feature_of(name).low) for name, values in features.items()}
+    high = {name: torch.full(values.shape, feature_of(name).high) for name, values in features.items()}
+    return low, high
+
+
+# Table 2.
 
 
 def _has_detected(v: FeatureCache) -> Tensor:
@@ -306,8 +445,7 @@ def _agent_distances(v: FeatureCache) -> Tensor:
 @FEATURES.register("coverage")
 @feature("global")
 def _coverage(v: FeatureCache) -> Tensor:
-    if v.context.footprints is None:
-        raise ValueError("coverage needs the footprint tables")
+    assert v.context.footprints is not None
     trail, points, known = v.messages.trail, v.context.points, v.context.coverage
     if v.own_only:
         return own_covered_share(v.context.footprints, trail, gather_rows(points, trail)).unsqueeze(-1)
@@ -367,6 +505,72 @@ def _spotted(v: FeatureCache) -> Tensor:
 @feature("actor")
 def _age(v: FeatureCache) -> Tensor:
     return (v.messages.age(v.context.now) / v.context.age_scale).clamp(max=1)
+
+
+# Where the source is believed to be (``damian.server.belief``); beyond the paper's Table 2.
+
+RINGS = (1.0, 3.0)
+"""Outer radii of the inner rings of ``belief_map``, in footprint radii; the outermost ring has no end."""
+SECTORS = 8
+"""Sectors of ``belief_map``; the first one is centred on north, the others follow clockwise."""
+
+
+@FEATURES.register("belief_gain")
+@feature("belief", width=None)
+def _belief_gain(v: FeatureCache) -> Tensor:
+    """Probability of detecting the source in the next step from where each discrete action leads, [*, N, A].
+
+    Actions begin at the landing point that the UAV has reached last, are taken to be flown at once, and lead
+    to the nearest landing point, or to the second nearest if another UAV is known to stand there.
+    """
+    everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
+    standing = v.wanted(v.messages.trail[..., 0])
+    rows = v.wanted(report_rows(v.grid, v.messages, torch.ones_like(v.messages.spotted)))
+    stays = chance_of_staying(v.grid, v.belief, rows).unsqueeze(-1)
+    chance = detection_chance(v.grid, v.belief, v.region)
+    chance = chance.scatter(-1, everyone, -chance.gather(-1, everyone))  # negative where a UAV stands
+    chance = chance.unsqueeze(-2).expand(*standing.shape, -1)
+    chance = chance.scatter(-1, (standing % n_points).unsqueeze(-1), stays)
+    goals = v.context.goals
+    assert goals is not None
+    nearest, second = (chance.gather(-1, gather_rows(each, standing)) for each in (goals[0], goals[-1]))
+    return torch.where(nearest < 0, second.abs(), nearest).clamp(max=1)
+
+
+@FEATURES.register("belief_moments")
+@feature("belief", width=4, low=-1.0)
+def _belief_moments(v: FeatureCache) -> Tensor:
+    """Way from the UAV to the mean place (east, north), spread, and entropy over its maximum, [*, N, 4].
+
+    Lengths are over the largest vertex distance of the region, and at most 1.
+    """
+    belief, centres = v.belief, v.grid.centres
+    *mean, square = (belief @ torch.cat([centres, centres.square().sum(-1, True)], -1)).unbind(-1)
+    mean = torch.stack(mean, -1)
+    variance = (square - mean.square().sum(-1)).clamp(min=0)
+    offset = (mean.unsqueeze(-2) - v.wanted(v.messages.position)) / v.scale.unsqueeze(-1)
+    unsure = entropy(belief) / math.log(max(belief.shape[-1], 2))
+    shared = torch.stack([variance.sqrt() / v.context.scale, unsure], -1).unsqueeze(-2)
+    return torch.cat([offset, shared.expand(*offset.shape[:-1], -1)], -1).clamp(-1, 1)
+
+
+@FEATURES.register("belief_map")
+@feature("belief", width=(len(RINGS) + 1) * SECTORS)
+def _belief_map(v: FeatureCache) -> Tensor:
+    """Probability that the source is in each part of three rings about the UAV, [*, N, 24].
+
+    The parts are ``SECTORS`` sectors of each ring, the innermost ring first. A cell counts where its centre
+    is.
+    """
+    position = v.wanted(v.messages.position)
+    east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, K]
+    distance = torch.hypot(east, north) / v.context.radius
+    ring = sum((distance > edge).long() for edge in RINGS)
+    turn = torch.atan2(east, north) / (2 * math.pi)
+    part = ring * SECTORS + (turn * SECTORS).round().long() % SECTORS
+    share = v.belief.unsqueeze(-2).expand_as(east)
+    bins = share.new_zeros(*part.shape[:-1], (len(RINGS) + 1) * SECTORS)
+    return bins.scatter_add(-1, part, share).clamp(max=1)
 
 
 LOCAL, GLOBAL = tuple(feature_names("local")), tuple(feature_names("global"))

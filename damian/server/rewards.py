@@ -1,19 +1,20 @@
-"""The terms of the reward, computed from features (paper, eq. 5-8).
+"""The terms of the reward, computed from features (paper, eq. 5-8), and terms from outside the package.
 
 ``reward`` is pure and batched, as ``observe`` is. A term has the name of its feature; its weight in the
 configuration and its tag in the logs have the same name.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.server.reward_terms import Counters, CustomTerm, custom_term
+from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
+from damian.server.features import FEATURES
 from damian.server.termination import Status
 
 INDIVIDUAL = ("coverage", "spotted", "battery")
@@ -29,6 +30,100 @@ SYSTEM = (
     "mean_distance_spotting",
 )
 """Terms of the system reward (eq. 6)."""
+
+
+class Counters(NamedTuple):
+    """Counts that rewards depend on besides the features."""
+
+    steps: Tensor
+    """Elapsed steps of the episode, [*]."""
+    motions: Tensor
+    """Motions since each UAV last spotted the source, [*, N]."""
+
+
+class RewardTerm(NamedTuple):
+    """A function that computes a reward term, and what it needs."""
+
+    compute: Callable[..., Tensor]
+    """From features by name, each [*, N] or [*, N, width], and counters to the term before it is weighted,
+    [*, N]."""
+    reads: Sequence[str]
+    """Names of the features that it reads."""
+    scope: str
+    """``individual`` (weighted by w_a of eq. 8) or ``system`` (by w_s)."""
+
+
+def reward_term(
+    reads: Sequence[str], scope: str = "individual"
+) -> Callable[[Callable[..., Tensor]], RewardTerm]:
+    """Decorator that makes a reward term of a function.
+
+    The function gets features by name, and ``Counters``; its keyword-only arguments are parameters that a
+    configuration may set. A feature has the shape and the range that it declares: [*, N] in [0, 1] unless it
+    says otherwise, and [*, N, width] if it has several values. The function returns [*, N], and must be pure,
+    batched over * and, for ``env.compile()``, free of branches on data.
+
+    Args:
+        reads: names of the features that it reads, built-in or your own (``package.module:name``).
+        scope: ``individual`` or ``system``.
+
+    Raises:
+        InputError: ``reads`` is no list, there is no such scope, or the decorator has no parentheses.
+
+    Examples:
+        >>> # in lab.py, used as reward.custom=[{term: lab:low_battery, weight: -1, below: 0.5}]
+        >>> @reward_term(reads=["battery"])
+        ... def low_battery(features, counters, *, below=0.3):
+        ...     return (features["battery"] < below).float()
+    """
+    require_parentheses(reads, "@damian.reward_term(reads=[...])")
+    problem = f"is not a list of names: write reads=[{reads!r}]"
+    checks.require(not isinstance(reads, str), "reads of a reward term", reads, problem)
+    checks.one_of("scope of a reward term", scope, ("individual", "system"))
+    return lambda compute: RewardTerm(compute, tuple(reads), scope)
+
+
+def _not_a_term(found: Any) -> str | None:
+    return None if isinstance(found, RewardTerm) else "is no reward term: decorate it with damian.reward_term"
+
+
+REWARD_TERMS = Registry[RewardTerm]("reward term", _not_a_term)
+"""Reward terms from outside the package, by name or as ``package.module:name``."""
+
+
+class CustomTerm(NamedTuple):
+    """A reward term as a configuration uses it."""
+
+    name: str
+    """Key of the term in logs: ``name`` in the settings, or else the function's name."""
+    weight: float
+    """Weight of the term within its scope."""
+    compute: Callable[..., Tensor]
+    reads: Sequence[str]
+    scope: str
+    parameters: Mapping[str, Any]
+    """Keyword arguments of ``compute``."""
+
+
+def custom_term(written: Any, key: str) -> CustomTerm:
+    """Read ``{term: package.module:name, weight: 0.1, ...}``; a ``name`` tells terms of one function apart.
+
+    Args:
+        written: what the configuration says.
+        key: of the setting, for errors.
+
+    Raises:
+        InputError: the term or a feature that it reads does not exist, it has no such parameter, or its
+            weight is no finite number.
+    """
+    path, term, parameters = REWARD_TERMS.read(written, key, "term")
+    for read in term.reads:
+        FEATURES.get(read, f"{key}.term: reads of {path}")
+    weight = parameters.pop("weight", 1.0)
+    checks.weight(f"{key}.weight", weight)
+    name = name_of(parameters, path.rpartition(":")[2], key)
+    check_parameters(term.compute, parameters, path, key)
+    return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)
 
 
 @dataclass
@@ -83,7 +178,7 @@ class RewardConfig:
     penalty: float = 0.0
     """Subtracted from the reward of every UAV when an episode ends without success."""
     custom: list[Any] = field(default_factory=list)
-    """Terms of one's own (``damian.reward_term``), each as ``{term: package.module:name, weight: 0.1}`` with
+    """Your own terms (``damian.reward_term``), each as ``{term: package.module:name, weight: 0.1}`` with
     any parameters of the term beside its weight, and a ``name`` if a term appears twice."""
 
     def __post_init__(self) -> None:
@@ -122,7 +217,7 @@ class RewardConfig:
 
     @property
     def custom_terms(self) -> list[CustomTerm]:
-        """The terms of one's own whose weight is not 0."""
+        """The terms of ``custom`` whose weight is not 0."""
         return [self._custom[name] for name in self.terms if name in self._custom]
 
     @property

@@ -12,22 +12,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.common.errors import InputError
-from damian.common.tensors import gather_rows
-from damian.server import belief_features  # noqa: F401 (it registers its features)
-from damian.server.belief import certain_belief
-from damian.server.feature_cache import ServerContext
-from damian.server.features import ObservationConfig, observe, observe_own, stack
-from damian.server.reward_terms import Counters
-from damian.server.rewards import RewardConfig, final_reward, reward
-from damian.server.source_grid import SourceGrid, build_source_grid
+from damian.common import checks
+from damian.common.errors import naming_errors
+from damian.common.tensors import gather_rows, tree_map
+from damian.server.belief import SourceGrid, build_source_grid, certain_belief
+from damian.server.features import ObservationConfig, ServerContext, feature_of, observe, observe_own, stack
+from damian.server.rewards import Counters, RewardConfig, final_reward, reward
 from damian.server.termination import EpisodeConfig, Status, status
-from damian.server.trial import try_feature, try_term
 from damian.world.airspace import Airspace
 from damian.world.battery import BatteryConfig
 from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.signal_source import SourceConfig
+from damian.world.uav_values import check_uav_values
 
 Features = dict[str, Tensor]
 
@@ -97,10 +94,9 @@ class Server:
         source: SourceConfig | None = None,
         goals: Tensor | None = None,
     ) -> None:
-        if airspace.points.shape[:2].numel() >= MAX_EXACT_INTEGER:
-            raise InputError(
-                "region.lattice_step: a message cannot number so many landing points: take a larger step"
-            )
+        n_points = airspace.points.shape[:2].numel()
+        should = "are more landing points than a message can number: take a larger step"
+        checks.require(n_points < MAX_EXACT_INTEGER, "region.lattice_step", n_points, should)
         self.observation, self.reward, self.episode, self.battery = observation, reward, episode, battery
         self.dt, self.time_scale = dt, time_scale
         widths = readings or {}
@@ -206,18 +202,27 @@ class Server:
         return self.features(messages, steps, belief=belief)
 
     def checked_features(self, messages: Messages, steps: Tensor) -> Features:
-        """The features of ``features``; those of one's own, and one's own reward terms, are tried first.
+        """The features of ``features``, after those and the reward terms from outside the package ran once.
 
         Raises:
-            InputError: a feature or a reward term raises an error, or returns something else than it
-                declares.
+            InputError: one of them raises an error, or does not return finite values in the shape that it
+                declares, which would be broadcast without a word.
         """
-        context = self._context(messages, steps)
-        for name in self._names:
-            try_feature(name, messages, context)
-        features = observe(messages, context, self._names)
+        context, shape = self._context(messages, steps), messages.track.shape
+        for name in (name for name in self._names if ":" in name):
+            with naming_errors(f"feature {name}"):
+                values = observe(messages, context, [name])[name]
+            check_uav_values(f"feature {name}", values, shape, feature_of(name).width)
+            if feature_of(name).scope == "local":  # else an actor would see without delay what others report
+                alike = tree_map(lambda field: field[:, :1].expand_as(field), messages)
+                alone = observe(alike, context, [name])[name][:, :1]
+                should = "but depends on the messages of other UAVs: make it global"
+                checks.require(alone.allclose(values[:, :1]), f"feature {name}", "is local,", should)
+        features, counters = observe(messages, context, self._names), Counters(steps, messages.motions)
         for term in self.reward.custom_terms:
-            try_term(term, features, Counters(steps, messages.motions))
+            with naming_errors(f"reward term {term.name}"):
+                values = term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
+            check_uav_values(f"reward term {term.name}", values, shape)
         return features
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:

@@ -7,8 +7,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from damian.common.text_files import show
-from damian.delays.delay_line import DelayLine
 from damian.delays.laws import law_of, sampler_of
+from damian.delays.line import DelayLine
 from damian.transforms.action_specs import ActionTransform
 from damian.transforms.context import ContextReader
 from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows, sibling_key
@@ -69,7 +69,8 @@ class ActionDelay(ActionTransform):
         super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed, gradients=gradients)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
-        self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
+        self.draws = self.sampler.constant_delay is None
+        self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
         self.line = DelayLine(self.sampler, "generation", gradients)
         self.memory_setting = "ActionDelay: delay", show(delay)
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))

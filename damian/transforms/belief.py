@@ -6,10 +6,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 
 from damian import keys
-from damian.server.belief import report_rows
-from damian.server.belief_window import Beliefs, Window, advance, begin, empty_window
+from damian.server.belief import Beliefs, SourceGrid, Window, advance, begin, empty_window, report_rows
 from damian.server.server import Server
-from damian.server.source_grid import SourceGrid
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import Change, Entries, Memory, as_rows, from_rows
 from damian.transforms.order import KeyUsage
@@ -57,7 +55,7 @@ class Belief(StatefulTransform):
 
     @property
     def row_dims(self) -> dict[str, int]:
-        return dict.fromkeys(("belief", "shared", "report", "delay"), 2)
+        return dict.fromkeys(("belief", "same_as_server", "report", "delay"), 2)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         n_worlds, n_agents = self.rows.numel(), tensordict.get(keys.MESSAGE).shape[-2]
@@ -81,8 +79,8 @@ class Belief(StatefulTransform):
         region = self.server.region_of(messages)
         every = torch.ones_like(region, dtype=torch.bool)
         stepped = entries[keys.STEPPED].reshape(-1) if keys.STEPPED in entries else every
-        slot, beliefs = advance(self._grid, Window(**memory), report, delay, region, stepped)
-        return memory | {"slot": slot}, self._written(beliefs)
+        window, beliefs = advance(self._grid, Window(**memory), report, delay, region, stepped)
+        return window._asdict(), self._written(beliefs)
 
     def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
         """Note a message whose delay nobody knew when it was sent, before the step in which it arrives.

@@ -11,7 +11,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.text_files import listed, show
-from damian.delays.link_sampler import same_size
+from damian.delays.laws import same_size
 from damian.keys import STEPPED
 from damian.transforms.base import StatefulTransform
 from damian.transforms.entries import (

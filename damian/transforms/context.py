@@ -72,7 +72,7 @@ class ContextReader:
             problem = f"{self._name}: the context has no entry NAME: the sampler declares those that it has, "
             entries = Declared(context.entries, f"{problem}reads={list(self.keys)}")
             with naming_errors(self._name):
-                self._sampler.try_context(context._replace(entries=entries))
+                self._sampler(streams, memory["clock"], memory["channel"], context._replace(entries=entries))
         return memory
 
     def read(

@@ -19,7 +19,7 @@ class MemoryTransform(Transform):
 
     draws: bool = False
     """Whether the transform draws random numbers."""
-    shared_streams: bool = False
+    same_draws_for_all_agents: bool = False
     """Whether all agents of a world draw the same numbers."""
     one_level: bool = False
     """Whether its keys must name entries of one batch size, because each row has a part of all of them."""
@@ -195,7 +195,7 @@ class MemoryTransform(Transform):
             worlds = counter_rng.world_seeds(seed, n_worlds, device)
         name = torch.tensor(counter_rng.number_of(stream_name(self)), device=device)
         agents = torch.arange(n_agents, device=device)
-        agents = torch.zeros_like(agents) if self.shared_streams else agents
+        agents = torch.zeros_like(agents) if self.same_draws_for_all_agents else agents
         return counter_rng.bits64(worlds.view(-1, 1), name, agents).flatten()
 
 

@@ -10,8 +10,8 @@ from torchrl.data import Binary, Composite, Unbounded
 
 from damian.common import checks
 from damian.common.text_files import show
-from damian.delays.delay_line import ORDERS, DelayLine, Delivery
 from damian.delays.laws import law_of, sampler_of
+from damian.delays.line import ORDERS, DelayLine, Delivery
 from damian.transforms.base import StatefulTransform
 from damian.transforms.context import ContextReader
 from damian.transforms.entries import (
@@ -99,7 +99,8 @@ class ObservationDelay(StatefulTransform):
         require_as_many(self.in_keys, self.out_keys)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
-        self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
+        self.draws = self.sampler.constant_delay is None
+        self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
         self.line = DelayLine(self.sampler, order, gradients)
         self.memory_setting = "ObservationDelay: delay", show(delay)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (

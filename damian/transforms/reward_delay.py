@@ -11,8 +11,8 @@ from torchrl.data import Composite, Unbounded
 from damian.common import checks, devices
 from damian.common.tensors import expand_mask
 from damian.common.text_files import show
-from damian.delays.delay_line import advance_slot, slot_rows
 from damian.delays.laws import LOSES, law_of, sampler_of
+from damian.delays.line import advance_slot, slot_rows
 from damian.transforms.base import StatefulTransform
 from damian.transforms.batches import expand_to_rows, rows_of_batch
 from damian.transforms.context import ContextReader
@@ -167,7 +167,8 @@ class RewardDelay(RewardTransform):
         )
         law = law_of(delay)
         self.sampler = sampler_of(law, dt)
-        self.draws, self.shared_streams = self.sampler.certain is None, self.sampler.shared
+        self.draws = self.sampler.constant_delay is None
+        self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_past = self.sampler.longest + 1
         self.memory_setting = "RewardDelay: delay", show(delay)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
-from damian.delays.laws import Delay, check_dt, in_steps
+from damian.delays.laws import Delay, in_steps
 from damian.transforms.base import StatefulTransform
 from damian.transforms.batches import expand_to_rows
 from damian.transforms.entries import (
@@ -75,7 +75,7 @@ class SampleAndHold(StatefulTransform):
         super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv, seed, gradients)
         should = "is empty, and so is in_keys_inv: name the entries or the actions to hold"
         checks.require(bool(self.in_keys or self.in_keys_inv), "in_keys", in_keys, should)
-        check_dt(dt)
+        checks.above("dt", dt, 0.0, "s")
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
         self.ready_key, self.stagger = ready_key, stagger

@@ -8,10 +8,9 @@ from torch import Tensor, nn
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
-from damian.delays.broadcast_line import BroadcastLine
-from damian.delays.delay_line import Memory
-from damian.delays.link_sampler import is_matrix, link_sampler, streams_for
-from damian.delays.samplers import MessageContext, Sampler
+from damian.delays.laws import is_matrix, link_sampler
+from damian.delays.line import BroadcastLine, Memory
+from damian.delays.samplers import MessageContext, Sampler, streams_for
 
 _SERVER_STREAM, _TURN_DRAW = 1, 4
 """Counters that tell the server's random streams, and the draws of who may send, from those of the delays."""
@@ -66,7 +65,7 @@ class Topology(nn.Module, ABC):
     def __init__(self, sampler: Sampler, rules: Rules) -> None:
         super().__init__()
         self.sampler, self.rules, self.line = sampler, rules, BroadcastLine(sampler)
-        self.draws = sampler.certain is None or rules.limit is not None
+        self.draws = sampler.constant_delay is None or rules.limit is not None
         self.longest = sampler.longest
 
     @abstractmethod
@@ -198,7 +197,7 @@ class DirectLinks(Topology):
 
     def try_laws(self, memory: Memory, position: Tensor | None) -> None:
         if self.sampler.sees_context:
-            self.sampler.try_context(self._links_context(memory, memory["hears"], position))
+            _try(self.sampler, memory, self._links_context(memory, memory["hears"], position))
 
     def write(self, memory: Memory, contents: list[Tensor]) -> None:
         self.line.write(memory, contents)
@@ -211,7 +210,7 @@ class DirectLinks(Topology):
         sees = self.sampler.sees_context
         context = self._links_context(memory, sent, sending.position) if sees else None
         memory = self.line.step(memory, sent, context)
-        return memory if known is None else self.line.know(memory, known)
+        return memory if known is None else self.line.deliver_now(memory, known)
 
     def received(self, memory: Memory) -> Received:
         n = _n_agents(memory)
@@ -256,7 +255,7 @@ class ServerLinks(Topology):
     def __init__(self, sampler: Sampler, down_sampler: Sampler, rules: Rules) -> None:
         super().__init__(sampler, rules)
         self.down_sampler, self.down_line = down_sampler, BroadcastLine(down_sampler)
-        self.draws = self.draws or down_sampler.certain is None
+        self.draws = self.draws or down_sampler.constant_delay is None
         self.longest += down_sampler.longest
 
     def rows(self, agents: torch.Size) -> torch.Size:
@@ -279,9 +278,9 @@ class ServerLinks(Topology):
         up, down = _parts(memory)
         everyone = torch.ones_like(up["clock"], dtype=torch.bool)
         if self.sampler.sees_context:
-            self.sampler.try_context(self._up_context(up, everyone, _n_agents(down), position))
+            _try(self.sampler, up, self._up_context(up, everyone, _n_agents(down), position))
         if self.down_sampler.sees_context:
-            self.down_sampler.try_context(self._down_context(down, position))
+            _try(self.down_sampler, down, self._down_context(down, position))
 
     def write(self, memory: Memory, contents: list[Tensor]) -> None:
         self.line.write(_parts(memory)[0], contents)
@@ -296,12 +295,12 @@ class ServerLinks(Topology):
         sent = self._may_send(up, sending.wanted.view(-1, n)).view(-1)
         sees = self.sampler.sees_context
         up = self.line.step(up, sent, self._up_context(up, sent, n, sending.position) if sees else None)
-        up = up if known is None else self.line.know(up, known)
+        up = up if known is None else self.line.deliver_now(up, known)
         self.down_line.write(down, self._broadcast(up, n))
         sees = self.down_sampler.sees_context
         context = self._down_context(down, sending.position) if sees else None
         down = self.down_line.step(down, sending.active, context)
-        return _joined(up, down if known is None else self.down_line.know(down, known))
+        return _joined(up, down if known is None else self.down_line.deliver_now(down, known))
 
     def received(self, memory: Memory) -> Received:
         up, down = _parts(memory)
@@ -325,6 +324,11 @@ class ServerLinks(Topology):
         entries = {} if position is None else {"position": position}
         one = torch.ones_like(receiver)
         return self._context(down, -one, receiver, one, entries)
+
+
+def _try(sampler: Sampler, line: Memory, context: MessageContext) -> None:
+    """Draw once, and discard the delays."""
+    sampler(line["streams"], line["clock"], line["channel"], context)
 
 
 def _n_agents(line: Memory) -> int:

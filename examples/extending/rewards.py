@@ -12,7 +12,7 @@ parameters. Its name is its column in metrics.csv: ``reward/low_battery``.
 from torch import Tensor
 
 from damian import reward_term
-from damian.server.reward_terms import Counters
+from damian.server.rewards import Counters
 
 Features = dict[str, Tensor]
 

@@ -12,7 +12,6 @@ from damian import keys
 from damian.common import checks
 from damian.common.threads import available_cores
 from damian.delays.config import DelayConfig
-from damian.delays.laws import law_of
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
@@ -202,25 +201,24 @@ class TrainConfig(ScenarioConfig):
     @property
     def late(self) -> list[str]:
         """Settings by which messages, actions or rewards are late."""
-        laws = {"delay.act": self.delay.act, "delay.rew": self.delay.rew}
-        late = [key for key, law in laws.items() if has_delay(law, self.clock.dt)]
+        late = [f"delay.{name}" for name in ("act", "rew") if has_delay(self, name)]
         return [*["delay.obs"] * has_message_delay(self), *late]
 
     @property
     def longest_delay(self) -> int:
         """Longest delay of a message [steps]."""
-        return self.delay.uplink.sampler(self.clock.dt).longest
+        return self.delay.sampler("obs", self.clock.dt).longest
 
     @property
     def longest_wait(self) -> int:
         """Longest time until all that corrects a step has arrived: its messages, and its reward [steps]."""
-        late_reward = law_of(self.delay.rew, "delay.rew").sampler(self.clock.dt).longest
+        late_reward = self.delay.sampler("rew", self.clock.dt).longest
         return max(self.longest_delay, late_reward) if self.backupdates else self.longest_delay
 
     @property
     def action_delay(self) -> int | None:
         """Delay of every action [steps of the training]; None if it differs between actions."""
-        delay = law_of(self.delay.act, "delay.act").sampler(self.clock.dt).certain
+        delay = self.delay.sampler("act", self.clock.dt).constant_delay
         return None if delay and self.clock.skip else delay  # a step of the training then has any length
 
     @property
@@ -252,7 +250,7 @@ class TrainConfig(ScenarioConfig):
     @property
     def backupdates(self) -> bool:
         """Is back-updating switched on, and can any message or reward be late or lost?"""
-        return self.backupdate and (has_message_delay(self) or has_delay(self.delay.rew, self.clock.dt))
+        return self.backupdate and (has_message_delay(self) or has_delay(self, "rew"))
 
     @property
     def eval_scenario(self) -> ScenarioConfig:

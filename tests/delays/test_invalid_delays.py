@@ -1,109 +1,63 @@
-"""Errors for invalid delay laws, settings of delays and traces: one line each."""
+"""One line for each kind of mistake in a delay law, a trace, or a setting of delays."""
 
 import math
 
 import pytest
+import torch
+from context_law import Crowd
+from transform_cases import ACTION, OBSERVATION, delayed, trace
 
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig
-from damian.delays.laws import LONGEST, Burst, Constant, Trace
+from damian.delays.config import DelayConfig, LinkConfig
+from damian.delays.laws import LONGEST, Burst, Constant, Held, Lag, Uniform
+from damian.delays.samplers import ContextSampler, Sampler
 from damian.envs.scenario import ScenarioConfig
+from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
-
-def trace(tmp_path, *rows: str, header: str = "delay") -> Trace:
-    file = tmp_path / "trace.csv"
-    file.write_text("\n".join([header, *rows]) + "\n")
-    return Trace(str(file))
-
-
-STEPS_OR_TIME = "is neither whole steps such as 3 nor a time such as 3s or 0.5m"
-NO_TIME = "is not a time such as 2s, 0.5m or 1h"
-NOT_ORDERED = "are not two steps or two times"
-PROBABILITY = "delay.obs.probability:"
+STEPS_OR_TIME = "is neither whole steps such as 3 nor a time such as 3s"
 
 INVALID_LAWS = [
-    (-1, "delay.obs: -1 " + STEPS_OR_TIME),
-    (1.5, "delay.obs: 1.5 " + STEPS_OR_TIME),
-    (2.0, "delay.obs: 2.0 " + STEPS_OR_TIME),
-    (True, "delay.obs: True " + STEPS_OR_TIME),
-    (None, "delay.obs: None " + STEPS_OR_TIME),
-    (math.nan, "delay.obs: nan " + STEPS_OR_TIME),
-    (math.inf, "delay.obs: inf " + STEPS_OR_TIME),
-    ([3], "delay.obs: [3] " + STEPS_OR_TIME),
-    (LONGEST + 1, f"delay.obs: {LONGEST + 1} is more than {LONGEST} steps"),
-    ("3h", f"delay.obs: 3h is more than {LONGEST} steps"),
-    ("xs", f"delay.obs: xs {NO_TIME}"),
-    ("s", f"delay.obs: s {NO_TIME}"),
-    ("-3s", "delay.obs: -3.0 s is not above 0 s"),
-    ("nans", "delay.obs: nan s is not above 0 s"),
-    ("infs", "delay.obs: inf s is not above 0 s"),
-    ({}, "delay.obs.law: None is not one of constant, uniform, geometric, burst, trace"),
-    ({"law": "gauss"}, "delay.obs.law: gauss is not one of constant, uniform, geometric, burst, trace"),
-    ({"law": ["uniform"]}, "delay.obs.law: ['uniform'] is not one of constant,"),
-    (
-        {"law": "uniform", "lo": 3},
-        "delay.obs.lo: 3 is no setting of the law uniform, which has low, high, pro",
-    ),
-    ({"law": "constant", 3: 3}, "delay.obs.3: 3 is no setting of the law constant, which has delay"),
-    ({"law": "uniform", "low": -1, "high": 2}, "delay.obs.low: -1 " + STEPS_OR_TIME),
-    ({"law": "uniform", "low": 0.5, "high": 2}, "delay.obs.low: 0.5 " + STEPS_OR_TIME),
-    ({"law": "uniform", "high": True}, "delay.obs.high: True " + STEPS_OR_TIME),
-    ({"law": "uniform", "low": 4, "high": 2}, f"delay.obs.low: 4 and high=2 {NOT_ORDERED}"),
-    ({"law": "uniform", "low": "4s", "high": "2s"}, "delay.obs.low: 4s and high=2s are not two steps or two"),
-    ({"law": "uniform", "low": 2, "high": "4s"}, f"delay.obs.low: 2 and high=4s {NOT_ORDERED}"),
-    ({"law": "uniform", "low": "2s", "high": 4}, f"delay.obs.low: 2s and high=4 {NOT_ORDERED}"),
-    ({"law": "uniform", "high": 2, "probability": 1.5}, f"{PROBABILITY} 1.5 is not between 0 and 1"),
-    ({"law": "uniform", "high": 2, "probability": -0.1}, f"{PROBABILITY} -0.1 is not between 0 and 1"),
-    ({"law": "uniform", "high": 2, "probability": math.nan}, f"{PROBABILITY} nan is not between 0 and"),
-    ({"law": "uniform", "high": 2, "probability": "often"}, f"{PROBABILITY} often is not between 0 an"),
-    ({"law": "uniform", "high": "3h"}, f"delay.obs.high: 3h is more than {LONGEST} steps"),
-    ({"law": "geometric", "mean": -1}, "delay.obs.mean: -1 steps is not at least 0 steps"),
-    ({"law": "geometric", "mean": math.nan}, "delay.obs.mean: nan steps is not at least 0 steps"),
-    ({"law": "geometric", "mean": math.inf}, "delay.obs.mean: inf steps is not at least 0 steps"),
-    ({"law": "geometric", "mean": None}, "delay.obs.mean: None steps is not at least 0 steps"),
-    ({"law": "geometric", "mean": "xs"}, f"delay.obs.mean: xs {NO_TIME}"),
-    ({"law": "geometric", "longest": 2.5}, "delay.obs.longest: 2.5 " + STEPS_OR_TIME),
-    ({"law": "geometric", "longest": LONGEST + 1}, f"delay.obs.longest: {LONGEST + 1} is more than"),
-    ({"law": "burst", "enter": 1.5}, "delay.obs.enter: 1.5 is not between 0 and 1"),
-    ({"law": "burst", "leave": -1}, "delay.obs.leave: -1 is not between 0 and 1"),
-    ({"law": "burst", "enter": 0, "leave": 0}, "delay.obs.enter + leave: 0 is not above 0"),
-    ({"law": "burst", "good_loss": 2}, "delay.obs.good_loss: 2 is not between 0 and 1"),
-    ({"law": "burst", "bad_loss": -0.1}, "delay.obs.bad_loss: -0.1 is not between 0 and 1"),
-    ({"law": "burst", "bad": -3}, "delay.obs.bad: -3 " + STEPS_OR_TIME),
-    ({"law": "burst", "good": {"law": "gauss"}}, "delay.obs.good.law: gauss is not one of constant,"),
-    ({"law": "burst", "bad": {"law": "burst"}}, "delay.obs.bad: {'law': 'burst'} is not a memoryless law"),
-    ({"law": "trace"}, "delay.obs.path: it is missing: the file with the delays"),
+    (-1, f": -1 {STEPS_OR_TIME}"),
+    (1.5, f": 1.5 {STEPS_OR_TIME}"),
+    (None, f": None {STEPS_OR_TIME}"),
+    ("3.5", f": 3.5 {STEPS_OR_TIME}"),
+    ("xs", ": xs is not a time such as 2s"),
+    ("3h", f": 3h is more than {LONGEST} steps"),
+    ("uniform", ": uniform is no delay; that law is written {law: uniform}"),
+    ({"law": "gauss"}, ".law: gauss is not one of constant, uniform, geometric, burst, trace"),
+    ({"law": "uniform", "lo": 3}, ".lo: 3 is no setting of the law uniform, which has low, high, pro"),
+    ({"law": "uniform", "low": 4, "high": 2}, ".low: 4 and high=2 are not two steps or two times"),
+    ({"law": "uniform", "low": 2, "high": "4s"}, ".low: 2 and high=4s are not two steps or two times"),
+    ({"law": "uniform", "high": 2, "probability": 1.5}, ".probability: 1.5 is not between 0 and 1"),
+    ({"law": "geometric", "mean": "far"}, f".mean: far {STEPS_OR_TIME}"),
+    ({"law": "burst", "enter": 0, "leave": 0}, ".enter + leave: 0 is not above 0"),
+    ({"law": "burst", "bad": {"law": "burst"}}, ".bad: {'law': 'burst'} is not a memoryless law"),
+    ({"law": "trace"}, ".path: it is missing: the file with the delays"),
+    ({"law": "lag", "update_period": 0}, ".update_period: 0 is not above 0"),
+    ({"law": "lag", "update_period": "epoch"}, ".update_period: epoch is not a time"),
+    ({"law": "lag", "update_period": "episode", "stagger": True}, ".stagger: True has no effect with upd"),
+    ({"law": "distance", "base": 21}, ".base: 21 is longer than longest=20"),
+    ({"law": "distance", "speed": math.nan}, ".speed: nan m/s is not above 0 m/s"),
+    ({"law": "distance", "receiver": [1, 2, 3]}, ".receiver: [1, 2, 3] is not [x, y] in metres"),
 ]
 
 
 @pytest.mark.parametrize(("setting", "error"), INVALID_LAWS, ids=lambda value: str(value)[:50])
-@pytest.mark.parametrize("name", ["obs", "act", "rew"])
-def test_an_invalid_law_raises_one_line_that_names_its_key(name, setting, error):
-    with pytest.raises(InputError) as caught:
-        ScenarioConfig(delay=DelayConfig(**{name: setting}))
-    message = str(caught.value)
-    assert message.startswith(error.replace("delay.obs", f"delay.{name}"))
-    assert "\n" not in message
+def test_an_invalid_law_raises_one_line_that_names_its_key(setting, error):
+    for name in ("obs", "act", "rew"):
+        with pytest.raises(InputError) as caught:
+            ScenarioConfig(delay=DelayConfig(**{name: setting}))
+        assert str(caught.value).startswith(f"delay.{name}{error}")
+        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("settings", "error"),
     [
-        ({"loss": -0.1}, "delay.loss: -0.1 is not between 0 and 1"),
         ({"loss": 2}, "delay.loss: 2 is not between 0 and 1"),
-        ({"loss": math.nan}, "delay.loss: nan is not between 0 and 1"),
-        ({"loss": "0.1"}, "delay.loss: 0.1 is not between 0 and 1"),
         ({"order": "newest"}, "delay.order: newest is not one of generation, arrival"),
-        ({"order": None}, "delay.order: None is not one of generation, arrival"),
-        ({"history": -1}, "delay.history: -1 actions is not between 0 and 1000 actions"),
-        ({"history": 1001}, "delay.history: 1001 actions is not between 0 and 1000 actions"),
-        ({"history": "4"}, "delay.history: 4 actions is not a whole number"),
         ({"history": 2.5}, "delay.history: 2.5 actions is not a whole number"),
-        ({"history": True}, "delay.history: True actions is not a whole number"),
-        ({"reward_window": 2.5}, "delay.reward_window: 2.5 steps is not a whole number"),
-        ({"reward_discount": 0}, "delay.reward_discount: 0 is not above 0"),
         ({"reward_window": 0}, "delay.reward_window: 0 steps is not between 1 and 10000 steps"),
-        ({"reward_discount": 1.1}, "delay.reward_discount: 1.1 is not between 0 and 1"),
         ({"reward_discount": math.nan}, "delay.reward_discount: nan is not above 0"),
     ],
     ids=str,
@@ -115,72 +69,89 @@ def test_an_invalid_delay_setting_raises_an_error_that_names_its_key(settings, e
 
 
 @pytest.mark.parametrize(
-    ("text", "error"),
+    ("settings", "error"),
     [
-        ("", "is empty"),
-        ("when,late\n1,2\n", "line 1: no column delay; the file has 'late', 'when'"),
-        ("Delay\n2\n", "line 1: no column delay; did you mean 'Delay'?"),
-        ("delay\n", "line 2: there is no delay under the header"),
-        ("delay\n2\nsoon\n", "line 3: delay: soon"),
-        ("delay\n2\n\n3\n-1\n", "line 5: delay: -1"),
-        ("delay\n1.5\n", "line 2: delay: 1.5"),
-        ("when,delay\n1,2\n2\n", "line 3: 1 values for 2 columns"),
-        ("when,delay\n1,2\n1,2,3\n", "line 3: 3 values for 2 columns"),
-        ("delay,delay\n1,2\n", "line 1: the column 'delay' appears 2 times"),
-        ('delay\n1\n"2\n3\n', "line 4: unexpected end of data; give comma-separated values"),
-        ("delay\n" + "1" * 200_000, "line 2: field larger than field limit (131072)"),
-        ("delay\n1\n\0\n", "line 3: a NUL byte is not text"),
-        (f"delay\n0\n{LONGEST + 1}\n", f"line 3: delay: {LONGEST + 1} is more than {LONGEST} steps"),
-        (b"delay\n\xff\n", "byte 6 is not UTF-8 text"),
+        ({"kind": "ring"}, "links.kind: ring is not one of"),
+        ({"delay": 3}, "links.delay: 3 means nothing with links=server"),
+        ({"kind": "matrix", "range": 50.0, "hears": [[True]]}, "links.range: 50.0 does not go with links.he"),
+        ({"kind": "matrix", "delay": [[0, 1], [1, 0]]}, "links: 2 x 2 is not 3 x 3"),
+        ({"kind": "matrix", "loss": [[0, 0, 0], [0, 0, 2], [0, 0, 0]]}, "links.loss: 2 is not between 0 and"),
+        ({"kind": "matrix", "hears": [[1, 1, 1]] * 3}, "links.hears: [[1, 1, 1], [1, 1, 1], [1, 1, 1]] is n"),
     ],
     ids=str,
 )
-def test_an_invalid_trace_raises_one_line_that_names_the_file_and_the_line(tmp_path, text, error):
-    file = tmp_path / "trace.csv"
-    file.write_bytes(text if isinstance(text, bytes) else text.encode())
+def test_an_invalid_setting_of_links_raises_an_error_that_names_its_key(settings, error):
     with pytest.raises(InputError) as caught:
-        DelayConfig(obs={"law": "trace", "path": str(file)}).check(1.0)
-    assert str(caught.value).startswith(f"{file}: {error}")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("name", "error"), [("none.csv", "no such file"), ("", "is not a file")])
-def test_a_missing_trace_raises_an_error_that_names_the_file(tmp_path, name, error):
-    file = tmp_path / name
-    with pytest.raises(InputError) as caught:
-        DelayConfig(act={"law": "trace", "path": str(file)}).check(1.0)
-    assert str(caught.value) == f"{file}: {error}"
-
-
-def test_a_trace_is_refused_as_a_law_of_a_burst_because_it_has_memory(tmp_path):
-    with pytest.raises(InputError) as caught:
-        Burst(good=trace(tmp_path, "1")).sampler(key="delay.obs")
-    assert str(caught.value).startswith("delay.obs.good: Trace(path=")
-
-
-def test_a_loss_probability_outside_0_and_1_is_refused():
-    for loss in (-0.1, 2, math.nan):
-        with pytest.raises(InputError, match=r"loss: .* is not between 0 and 1"):
-            Constant(1).sampler(loss=loss)
+        LinkConfig(**settings).check(3)
+    assert str(caught.value).startswith(error)
 
 
 @pytest.mark.parametrize(
-    ("setting", "error"),
+    ("text", "error"),
     [
-        ("\u00b2", "delay.obs: \u00b2 is neither whole steps"),
-        ("9" * 5000, "is neither whole steps"),
-        ({"law": "trace", "path": "5"}, "5: no such file"),
-        ("1e308s", "1e+308 s is not between 1e-09 and 1e+06 s"),
-        ({"law": "uniform", "low": "2.9s", "high": "2.1s"}, "are not two steps or two times in order"),
+        ("when,late\n1,2\n", "line 1: no column delay"),
+        ("delay\n", "line 2: there is no delay under the header"),
+        ("delay\n2\n\n3\n-1\n", "line 5: delay: -1"),
+        (None, "no such file"),
     ],
 )
-def test_a_setting_that_only_resembles_a_delay_raises_one_line(setting, error):
+def test_an_invalid_trace_raises_one_line_that_names_the_file_and_the_line(tmp_path, text, error):
+    file = tmp_path / "trace.csv"
+    if text is not None:
+        file.write_text(text)
     with pytest.raises(InputError) as caught:
-        DelayConfig(obs=setting).check(1.0)
-    assert error in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
+        DelayConfig(obs={"law": "trace", "path": str(file)}).check(1.0)
+    assert str(caught.value).startswith(f"{file}: {error}")
 
 
-def test_a_reward_delay_that_loses_rewards_is_refused():
-    with pytest.raises(InputError, match="no reward may be lost"):
-        DelayConfig(rew={"law": "burst"}).check(1.0)
+@pytest.mark.parametrize("user", [Lag, lambda law: Burst(bad=law)], ids=["lag", "burst"])
+def test_a_law_with_memory_or_context_is_refused_as_an_inner_law(user, tmp_path):
+    for law in (trace(tmp_path, 1, 2), Held(Lag(Uniform(1, 5)))):
+        with pytest.raises(InputError, match="is not a memoryless law"):
+            user(law).sampler()
+    with pytest.raises(InputError, match="depends on the context of the message"):
+        user(Crowd()).sampler()
+    user(Held(Uniform(0, 2))).sampler()
+
+
+def test_losses_are_refused_where_a_reward_would_be_lost():
+    for make in (lambda: DelayConfig(rew={"law": "burst"}).check(1.0), lambda: RewardDelay(Burst())):
+        with pytest.raises(InputError, match="no reward may be lost"):
+            make()
+
+
+def test_probabilities_that_are_none_are_refused():
+    for chances in ([0.7, 0.7], [-0.1, 1.0], [math.nan]):
+        with pytest.raises(InputError, match=r"chances of the delays: .* at most 1 in all"):
+            Sampler([chances])
+    with pytest.raises(InputError, match="loss: nan is not between 0 and 1"):
+        Constant(1).sampler(loss=math.nan)
+
+
+def test_a_law_that_reads_what_there_is_not_is_refused():
+    with pytest.raises(InputError, match="has no key for position, which the law Crowd reads"):
+        ObservationDelay(Crowd())
+    with pytest.raises(InputError, match=r"delay.act: .* reads altitude, but a law can read only position"):
+        ScenarioConfig(delay=DelayConfig(act=Crowd("altitude")))
+    with pytest.raises(InputError, match="reads: position is not a list of names"):
+        ContextSampler(len, 3, reads="position")
+    env = delayed(ActionDelay(Crowd("seen"), ACTION, context_keys={"seen": "observation"}))
+    td = env.rand_action(env.reset()).exclude(OBSERVATION)
+    with pytest.raises(InputError, match=r"context_keys.seen: .* is missing from the TensorDict"):
+        env.step(td)
+
+
+@pytest.mark.parametrize("delay_fn", [lambda c: 3, lambda c: c.time[:1], lambda c: c.uniform < 0.5])
+def test_a_function_that_does_not_return_a_delay_for_each_message_is_refused_at_the_reset(delay_fn):
+    class Wrong(Crowd):
+        def delays(self, context):
+            return delay_fn(context)
+
+    env = delayed(ObservationDelay(Wrong("seen"), [OBSERVATION], context_keys={"seen": "observation"}))
+    with pytest.raises(InputError, match=r"is not one number of steps per message, \[8\]"):
+        env.reset()
+
+
+def test_a_sampler_of_contexts_needs_one():
+    with pytest.raises(ValueError, match="context: it is missing"):
+        ContextSampler(len, 3)(torch.arange(2), torch.tensor(1), torch.zeros(2))

@@ -196,7 +196,7 @@ class Broken(Law):
         ("reads: altitude", "reads altitude, but a law can read only position"),
         (
             "shape: 2",
-            "Broken.delays: a tensor of torch.float32 and shape (2,) is not one number of steps per",
+            "Broken.delays: torch.float32 [2] is not one number of steps per",
         ),
     ],
 )

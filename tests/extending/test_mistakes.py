@@ -44,7 +44,7 @@ LAW = "law wrong:Rush"
         ),
         (
             {"mistake": "none"},
-            f"delay.obs: {LAW} returns a NoneType from sampler(dt, loss, key), not a Sampler",
+            f"delay.obs: the NoneType of sampler(dt, loss, key) of the {LAW} is no Sampler",
         ),
         (
             {},
@@ -63,11 +63,6 @@ LAW = "law wrong:Rush"
             {"mistake": "compares", "start": "3s"},
             f"{LAW}: TypeError: '>' not supported between instances of 'Tensor' and 'str'"
             + line("(context.time > self.start).long()"),
-        ),
-        (
-            {"mistake": "undefined"},
-            "Rush.undefined: [inf] is not a finite number of steps; a negative one means that the message is "
-            "lost",
         ),
         (
             {"mistake": "undeclared"},
@@ -93,8 +88,8 @@ def test_trying_a_law_changes_no_episode():
 
 
 def test_a_law_without_its_braces_is_told_how_to_write_it():
-    for written, own in (("wrong:Rush", "a law of one's own"), ("uniform", "that law")):
-        message = f"delay.obs: {written} is no delay; {own} is written {{law: {written}}}"
+    for written in ("wrong:Rush", "uniform"):
+        message = f"delay.obs: {written} is no delay; that law is written {{law: {written}}}"
         check({"delay": lambda written=written: DelayConfig(obs=written)}, message)
 
 
@@ -124,9 +119,6 @@ def test_a_mistake_in_a_sensor_is_one_line(written, message):
     check({"sensors": lambda: [written]}, message)
 
 
-OTHERS = "is local, but depends on the messages of other UAVs: make it global, or read only the UAV's own"
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -134,10 +126,9 @@ OTHERS = "is local, but depends on the messages of other UAVs: make it global, o
             "absent",
             "AttributeError: 'FeatureCache' object has no attribute 'message'" + line("cache.message.track"),
         ),
-        ("percent", "[100.0] lies outside of low=0 and high=50, which it declares"),
         ("divided", "[nan] is not finite"),
-        ("mean_battery", OTHERS),
-        ("newest", OTHERS),
+        ("mean_place", "is local, but depends on the messages of other UAVs: make it global"),
+        ("single", "shape [8, 3] is not [8, 3, 2] = [initial conditions, UAVs, values]"),
     ],
 )
 def test_a_mistake_in_a_feature_is_one_line(name, message):
@@ -166,8 +157,7 @@ def test_observations_and_rewards_are_float32_whatever_a_component_returns(name,
     [
         (
             "undeclared",
-            "reward term undeclared: it reads the feature battery, which is missing from its "
-            "reads=['spotted']",
+            "reward term undeclared: KeyError: 'battery'" + line('features["battery"] + features'),
         ),
         ("scalar", "reward term scalar: a float is not a tensor"),
         ("hopeless", "reward term hopeless: [nan] is not finite"),

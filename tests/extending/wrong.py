@@ -5,13 +5,12 @@ from typing import Any
 
 import numpy as np
 import shapely
-import torch
 from torch import Tensor
 
 from damian import ContextSampler, Law, MessageContext, feature, reward_term, sensor
 from damian.common.tensors import tree_where
 from damian.server.features import FeatureCache
-from damian.server.reward_terms import Counters
+from damian.server.rewards import Counters
 from damian.world.airspace import Airspace
 from damian.world.config import WorldConfig
 from damian.world.messages import Messages
@@ -44,9 +43,6 @@ class Rush(Law):
 
     def compares(self, context: MessageContext) -> Tensor:
         return (context.time > self.start).long()
-
-    def undefined(self, context: MessageContext) -> Tensor:
-        return torch.where(context.sender == 1, torch.inf, context.time)
 
     def undeclared(self, context: MessageContext) -> Tensor:
         return context.entries["position"][:, 0]
@@ -83,11 +79,6 @@ def absent(cache: FeatureCache) -> Tensor:
     return cache.message.track  # type: ignore[attr-defined]
 
 
-@feature("local", high=50.0)
-def percent(cache: FeatureCache) -> Tensor:
-    return cache.messages.battery
-
-
 @feature("local", high=1e9)
 def divided(cache: FeatureCache) -> Tensor:
     return 0 / cache.messages.track
@@ -105,17 +96,16 @@ def precise(cache: FeatureCache) -> Tensor:
     return cache.messages.battery.double() / 100
 
 
-@feature("local", high=100.0)
-def mean_battery(cache: FeatureCache) -> Tensor:
-    battery = cache.messages.battery
-    return battery.mean(-1, keepdim=True).expand_as(battery)
+@feature("local", low=-1e3, high=1e3)
+def mean_place(cache: FeatureCache) -> Tensor:
+    east = cache.messages.position[..., 0]
+    return east.mean(-1, keepdim=True).expand_as(east)
 
 
 @feature("local", width=2)
-def newest(cache: FeatureCache) -> Tensor:
-    """The first value follows from the UAV's own message, the second one from all messages."""
-    time, latest = cache.messages.time, cache.messages.time.amax(-1, keepdim=True)
-    return torch.stack([time, latest.expand_as(time)], -1) / cache.context.time_scale
+def single(cache: FeatureCache) -> Tensor:
+    """It declares two values for each UAV."""
+    return cache.messages.track
 
 
 @reward_term(reads=["spotted"])

@@ -101,7 +101,7 @@ def test_held_messages_are_lost_as_often_as_before(law, tmp_path):
     assert after.equal(torch.where(before == free.lost, held.lost, longest))
     assert 0.1 < (after == held.lost).float().mean() < 0.5
     assert held.loses
-    assert held.certain is None
+    assert held.constant_delay is None
 
 
 def test_holding_messages_changes_nothing_without_delay():

@@ -12,9 +12,17 @@ from torch import Tensor
 
 from damian.common.errors import InputError
 from damian.envs.scenario import make_simulation
-from damian.server.belief import chance_of_staying, detection_chance
-from damian.server.belief_window import _advance, _begin, empty_window, latest
-from damian.server.source_grid import SourceGrid, build_source_grid
+from damian.server.belief import (
+    SourceGrid,
+    _advance,
+    _begin,
+    _parts,
+    build_source_grid,
+    chance_of_staying,
+    detection_chance,
+    empty_window,
+    latest,
+)
 from damian.world.signal_source import SourceConfig
 
 LONGEST = 4
@@ -69,14 +77,14 @@ class Flight:
     def begin(self, mask: Tensor) -> None:
         new = self.rows()
         self.first = torch.where(mask.unsqueeze(-1), new, self.first)
-        _begin(*self.grid, *self.window, new, self.region, mask)
+        _begin(*_parts(self.grid, self.window), new, self.region, mask)
         self.beliefs = together(latest(self.window, self.window.slot))
         for world in mask.nonzero().squeeze(-1).tolist():
             self.steps[world] = []
 
     def step(self, stepped: Tensor) -> None:
         rows, delay = self.rows(), self.draw(LONGEST + 2, *self.first.shape) - 1
-        slot, *beliefs = _advance(*self.grid, *self.window, rows, delay, self.region, stepped)
+        slot, *beliefs = _advance(*_parts(self.grid, self.window), rows, delay, self.region, stepped)
         self.beliefs = together(beliefs)
         self.window = self.window._replace(slot=slot)
         for world in stepped.nonzero().squeeze(-1).tolist():
@@ -141,7 +149,7 @@ def test_a_message_changes_nothing_before_it_arrives():
         for flight, row in zip(flights, (loud, quiet), strict=True):
             sent = row if age == 0 else nothing
             delay = torch.full((1, 3), 3)
-            slot, *beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+            slot, *beliefs = _advance(*_parts(grid, flight.window), sent, delay, flight.region, everyone)
             flight.beliefs = together(beliefs)
             flight.window = flight.window._replace(slot=slot)
         assert torch.equal(flights[0].beliefs, flights[1].beliefs) == (age < 3)
@@ -162,9 +170,9 @@ def test_a_uav_shares_the_servers_belief_from_where_the_server_knows_its_reports
     def step(delay_of_the_first_uav: int) -> list[bool]:
         """Which UAVs share the belief after a step in which the first one hears the source."""
         sent, delay = torch.tensor([[1, 4, 6]]), torch.tensor([[delay_of_the_first_uav, 0, 0]])
-        slot, *beliefs = _advance(*grid, *flight.window, sent, delay, flight.region, everyone)
+        slot, *beliefs = _advance(*_parts(grid, flight.window), sent, delay, flight.region, everyone)
         flight.window, flight.beliefs = flight.window._replace(slot=slot), together(beliefs)
-        shared = flight.window.shared[slot, 1:, 0].flatten().tolist()
+        shared = flight.window.same_as_server[slot, 1:, 0].flatten().tolist()
         assert shared == [torch.equal(own, beliefs[0][0]) for own in beliefs[1][0]]
         return shared
 
@@ -172,7 +180,7 @@ def test_a_uav_shares_the_servers_belief_from_where_the_server_knows_its_reports
     assert step(2) == [False, True, True]
     assert step(0) == [False, True, True]
     assert step(0) == [True, True, True]  # it arrives
-    assert flight.window.shared[:, 1:].all()  # so that the steps in between are shared too
+    assert flight.window.same_as_server[:, 1:].all()  # so that the steps in between are shared too
     assert all(step(-1) == [False, True, True] for _ in range(2))
     assert all(step(0) == [False, True, True] for _ in range(LONGEST + 3))  # it never arrives
     flight.begin(everyone)
@@ -192,12 +200,12 @@ def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Te
         return 2 * point + (heard & (torch.rand(n_worlds, 1) < grid.emits))
 
     cell = torch.multinomial(grid.prior[0], n_worlds, replacement=True)
-    _begin(*grid, *window, reports(cell), region, everyone)
+    _begin(*_parts(grid, window), reports(cell), region, everyone)
     said, was = [], []
     for _ in range(n_steps):
         cell = torch.multinomial(grid.moves[cell], 1).squeeze(-1) if grid.moves is not None else cell
         delay = torch.where(torch.rand(n_worlds, 3) < 0.5, 0, torch.randint(-1, LONGEST + 1, (n_worlds, 3)))
-        slot, beliefs, _ = _advance(*grid, *window, reports(cell), delay, region, everyone)
+        slot, beliefs, _ = _advance(*_parts(grid, window), reports(cell), delay, region, everyone)
         window = window._replace(slot=slot)
         said.append(beliefs)
         was.append(torch.nn.functional.one_hot(cell, beliefs.shape[-1]))

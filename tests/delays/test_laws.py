@@ -1,4 +1,4 @@
-"""Delay laws: frequencies of delays and losses, and playback of traces."""
+"""Delay laws: frequencies of delays and losses, playback of traces, and how a setting becomes a law."""
 
 import math
 
@@ -76,7 +76,7 @@ def test_delays_and_losses_are_as_frequent_as_the_law_says(name, loss):
 
 def test_a_sampler_knows_its_longest_delay_and_its_certain_delay_if_there_is_one():
     samplers = {name: law.sampler(dt) for name, (law, dt, _) in LAWS.items()}
-    assert {name: (sampler.longest, sampler.certain) for name, sampler in samplers.items()} == {
+    assert {name: (sampler.longest, sampler.constant_delay) for name, sampler in samplers.items()} == {
         "none": (0, 0),
         "steps": (3, 3),
         "a time, rounded up": (2, 2),
@@ -171,7 +171,7 @@ def test_a_trace_is_played_in_order_from_a_random_start_and_wraps_around(tmp_pat
 def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
     rows = ['2021,"2s"', "2022,lost", "2023, 3 ", "2024,0s", "2025,0.1m"]
     sampler = trace(tmp_path, *rows, header="when,delay").sampler(dt=1.5)
-    assert (sampler.longest, sampler.lost, sampler.certain) == (4, 5, None)
+    assert (sampler.longest, sampler.lost, sampler.constant_delay) == (4, 5, None)
     first = sample(sampler, 100, 5).T.tolist()
     assert {tuple(row) for row in first} == {tuple(([2, 5, 3, 0, 4] * 2)[k : k + 5]) for k in range(5)}
 

@@ -1,0 +1,235 @@
+"""Samplers of laws that hold delays or read the context: frequencies, rounding, and what they tell."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from delay_twin import drawn
+from helpers import play
+from torch import Tensor
+from transform_cases import (
+    ACTION,
+    N_AGENTS,
+    OBSERVATION,
+    REWARD,
+    ROWS,
+    WORLDS,
+    choices,
+    delayed,
+    trace,
+)
+
+from damian.common import counter_rng
+from damian.delays.laws import Burst, Distance, Geometric, Held, Lag, Law, Uniform
+from damian.delays.line import BroadcastLine, DelayLine
+from damian.delays.samplers import ContextSampler, MessageContext, Recorded, Sampler
+from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
+
+LAW, SENDERS = Uniform(1, 5), 20_000
+
+
+def require_share(found: Tensor, expected: float) -> None:
+    """Is the share of true flags as expected, within five standard deviations of a binomial distribution?"""
+    deviation = math.sqrt(max(expected * (1 - expected), 1e-9) / found.numel())
+    assert abs(found.double().mean().item() - expected) < 5 * deviation
+
+
+# Worked timelines of the docstrings.
+
+
+@pytest.mark.parametrize(("order", "ages"), [("generation", [1, 2, 0, 1]), ("arrival", [1, 2, 0, 3])])
+def test_the_timeline_of_a_delay_line(order, ages):
+    line, zero = DelayLine(Recorded([3, 1, 0, 2], 0.0), order), torch.zeros(1, dtype=torch.long)
+    memory = line.init_memory([torch.zeros(1)], zero) | {"channel": zero}
+    for t, age in enumerate(ages, 1):
+        memory, delivery = line.step(memory, [torch.tensor([float(t)])], None)
+        assert delivery.age.item() == age
+        assert delivery.held[0].item() == t - age
+
+
+def test_the_timeline_of_a_broadcast_line():
+    line, zero = BroadcastLine(Recorded([1, 3], 0.0)), torch.zeros(2, dtype=torch.long)
+    memory = line.init_memory([torch.zeros(1)], zero, zero) | {"channel": torch.tensor([0, 1])}
+    sent, nothing, held = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool), []
+    for t in range(4):
+        line.write(memory, [torch.tensor([10.0 + t])])
+        memory = line.step(memory, nothing if t else sent)
+        held.append(line.held(memory)[0].tolist())
+    assert held == [[0.0, 0.0], [10.0, 0.0], [10.0, 0.0], [10.0, 10.0]]
+
+
+# Lags.
+
+
+def sample(lag: Lag, n_senders: int, n_steps: int, loss: float = 0.0) -> Tensor:
+    """Delays of one episode, [T, M]."""
+    return drawn(lag.sampler(loss=loss), counter_rng.world_seeds(5, n_senders), n_steps)
+
+
+def test_without_holding_the_lags_are_the_delays_of_the_other_law():
+    for law in (LAW, Geometric(2, 6), Uniform("3s", "7s", 0.15)):
+        assert sample(Lag(law), 500, 50).equal(drawn(law.sampler(), counter_rng.world_seeds(5, 500), 50))
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.3, 0.95])
+def test_an_update_keeps_the_lag_with_the_hold_probability(probability):
+    delays = sample(Lag(Uniform(0, 999), 2, hold_probability=probability), 2000, 41)
+    kept = delays[1:] == delays[:-1]
+    assert kept[::2].all()
+    require_share(kept[1::2], probability + (1 - probability) / 1000)
+
+
+def test_staggered_senders_update_at_times_spread_evenly_over_the_period():
+    period = 5
+    changed = sample(Lag(Uniform(0, 9999), period, stagger=True), 5000, 26).diff(dim=0) != 0
+    first = changed[:period].int().argmax(0)  # 0: in the step after the first
+    for phase in range(period):
+        require_share(first == phase, 1 / period)
+    due = torch.arange(25).unsqueeze(-1) % period == first
+    assert changed[~due].double().mean() < 0.001  # the first update may have drawn the same lag again
+    assert changed[due].double().mean() > 0.999
+
+
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("make", [ObservationDelay, ActionDelay, RewardDelay])
+def test_the_agents_of_a_world_have_the_same_lags_exactly_if_they_share_them(make, shared):
+    key = {ObservationDelay: [OBSERVATION], ActionDelay: ACTION, RewardDelay: REWARD}[make]
+    transform = make(Lag(LAW, shared=shared), key)
+    play(delayed(transform), choices(n_steps=2))
+    streams = transform.memory["streams"].view(len(WORLDS), N_AGENTS)
+    assert (streams == streams[:, :1]).all() == shared
+    assert len(set(streams.flatten().tolist())) == (len(WORLDS) if shared else len(ROWS))
+
+
+@dataclasses.dataclass(frozen=True)
+class Lossy(Law):
+    """A law that loses some messages itself."""
+
+    chances: tuple[float, ...] = (0.25, 0.25)
+
+    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
+        return Sampler([[*self.chances]], loss=loss)
+
+
+@pytest.mark.parametrize(("law", "loss"), [(Uniform(0, 1), 0.5), (Lossy(), 0.0), (Lossy((0.4, 0.4)), 0.375)])
+def test_losses_are_drawn_for_each_message_and_lags_are_held(law, loss):
+    lag = Lag(law, "episode")
+    delays = sample(lag, 2000, 20, loss)
+    lost = delays == lag.sampler().lost
+    require_share(lost, 0.5)
+    require_share(lost[1:] & lost[:-1], 0.25)
+    ones = (delays == 1).any(0)
+    require_share(ones, 0.5)
+    assert not (ones & (delays == 0).any(0)).any()
+
+
+# Runs of losses.
+
+
+def test_a_trace_plays_its_runs_of_losses_back_and_other_losses_add_to_them(tmp_path):
+    rows = [0, 1, "lost", "lost", "lost", 2, 0, "lost", "lost", 3, 0, 0]
+    found = []
+    for loss in (0.0, 0.3):
+        transform = ObservationDelay(trace(tmp_path, *rows), [OBSERVATION], loss=loss, delay_key="delay")
+        outputs = play(delayed(transform), choices())[1::2]
+        found.append(torch.stack([td["agents", "delay"].flatten() for td in outputs], -1))
+    codes = [-1 if row == "lost" else row for row in rows]
+    rotations = [(codes * 5)[start : start + found[0].shape[1]] for start in range(len(codes))]
+    assert all(row in rotations for row in found[0].tolist())
+    assert found[1].equal(torch.where(found[1] == -1, found[1], found[0]))
+    require_share(found[1][found[0] >= 0] == -1, 0.3)
+
+
+def test_a_burst_loses_runs_of_messages_of_the_mean_length_1_over_leave():
+    sampler = Burst(enter=0.1, leave=0.25, good=0, bad=0, bad_loss=1.0).sampler()
+    lost = drawn(sampler, counter_rng.world_seeds(5, 2000), 200) == sampler.lost
+    ended = lost[:-1] & ~lost[1:]
+    length = lost[:-1].sum().item() / ended.sum().item()  # lost messages per run
+    assert abs(length - 4) < 5 * math.sqrt(12 / ended.sum().item())  # the variance is (1 - leave) / leave^2
+
+
+# Contexts.
+
+
+def context_of(uniform: Tensor, dt: float = 1.0, **entries: Tensor) -> MessageContext:
+    """A context of messages about which nothing but a random number and some entries are known."""
+    zero = torch.zeros_like(uniform).long()
+    return MessageContext(zero, zero - 1, zero + 1, zero.float(), uniform, dt, entries)
+
+
+@pytest.mark.parametrize(("loses", "expected"), [(True, [6, 5, 6, 3, 5, 0]), (False, [0, 5, 0, 3, 5, 0])])
+def test_delays_are_rounded_up_and_cut_and_negative_ones_are_lost(loses, expected):
+    values = torch.tensor([math.nan, math.inf, -0.5, 2.1, 99.0, 0.0])
+    sampler = ContextSampler(lambda _: values, 5, loses=loses)
+    delay, _ = sampler(torch.arange(6), torch.tensor(1), torch.zeros(6), context_of(torch.rand(6)))
+    assert delay.tolist() == expected
+    assert (sampler.longest, sampler.lost, sampler.constant_delay, sampler.loses) == (5, 6, None, loses)
+
+
+def test_the_rounding_errors_of_a_float_cost_no_step():
+    senders = torch.tensor([7, 14, 17, 19])
+    delays = senders * 0.3 / 0.1  # in float32: 21.000002, 42.000004, ...
+    assert (delays.ceil() > 3 * senders).any()
+    for values, expected in ((delays, 3 * senders), (delays.round() + 0.001, 3 * senders + 1)):
+        sampler = ContextSampler(lambda _, values=values: values, 100)
+        delay, _ = sampler(senders, torch.tensor(1), senders, context_of(torch.rand(4)))
+        assert delay.equal(expected)
+
+
+def test_losses_whatever_the_delay_do_not_depend_on_the_random_number_of_the_context():
+    sampler = ContextSampler(lambda context: (context.uniform < 0.5).long(), 1, loss=0.3, loses=False)
+    streams, clock = counter_rng.world_seeds(5, 2 * SENDERS), torch.tensor(3)
+    uniform = counter_rng.uniform(streams, clock)
+    delay, _ = sampler(streams, clock, torch.zeros_like(streams), context_of(uniform))
+    for some in (uniform < 0.5, uniform >= 0.5):
+        require_share(delay[some] == sampler.lost, 0.3)
+
+
+# Distances.
+
+
+def at_distance(law: Distance, distance: float, loss: float = 0.0, dt: float = 1.0, **entries) -> Tensor:
+    """Delays of messages sent at this distance east of the origin [M], -1 for a lost one."""
+    streams, clock = counter_rng.world_seeds(3, SENDERS), torch.tensor(1)
+    place = torch.tensor([[distance, 0.0]]).expand(SENDERS, 2)
+    context = context_of(counter_rng.uniform(streams, clock), dt, position=place, **entries)
+    sampler = law.sampler(dt, loss)
+    delay, _ = sampler(streams, clock, torch.zeros_like(streams), context)
+    return torch.where(delay == sampler.lost, -1, delay)
+
+
+def test_half_of_the_messages_are_lost_at_the_range_and_more_beyond_it():
+    law = Distance(range=100.0, path_loss_exponent=3.0, shadowing=8.0)
+    require_share(at_distance(law, 100.0) == -1, 0.5)
+    expected = 0.5 * math.erfc(30 * math.log10(100 / 80) / 8 / math.sqrt(2))  # 30 dB per decade
+    require_share(at_distance(law, 80.0) == -1, expected)
+    require_share(at_distance(law, 100.0, 0.4) == -1, 0.7)
+    sharp = Distance(range=100.0, shadowing=0.01)
+    assert [(at_distance(sharp, each) == -1).double().mean() for each in (99.0, 101.0)] == [0.0, 1.0]
+    assert (at_distance(Distance(), 1e6) >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("law", "dt", "steps"),
+    [
+        (Distance(), 1.0, 0),
+        (Distance(base=1, speed=40.0), 1.0, 4),
+        (Distance(speed=50.0), 0.5, 4),
+        (Distance(base="0.5s", speed=40.0), 1.0, 3),
+        (Distance(base="0.6s", speed=40.0), 1.0, 4),
+        (Distance(base=1, speed=5.0, longest=7), 1.0, 7),
+        (Distance(speed=20.0, receiver=[100.0, 60.0]), 1.0, 3),
+    ],
+    ids=str,
+)
+def test_the_delay_is_the_base_plus_the_distance_over_the_speed_rounded_up(law, dt, steps):
+    assert (at_distance(law, 100.0, dt=dt) == steps).all()
+
+
+def test_the_place_of_the_receiver_in_the_context_replaces_that_of_the_settings():
+    place = torch.tensor([[100.0, -40.0]]).expand(SENDERS, 2)
+    assert (at_distance(Distance(speed=10.0), 100.0, receiver_position=place) == 4).all()
+    keys = {"position": "observation", "receiver_position": "observation"}
+    transform = ObservationDelay(Held(Distance(speed=1.0)), [OBSERVATION], context_keys=keys)
+    assert set(transform.contexts.keys) == set(keys)

@@ -1,0 +1,264 @@
+"""Late messages, actions and rewards beside senders in plain Python, whose episodes end at random steps."""
+
+import copy
+import math
+from typing import Any
+
+import pytest
+import torch
+from context_law import LONGEST, Crowd, twin_delay
+from delay_twin import Counting, Purse, Receiver
+from delayed_envs import choices as uav_choices
+from helpers import all_same, everything, play, square
+from transform_cases import (
+    ACTION,
+    N_AGENTS,
+    OBSERVATION,
+    REWARD,
+    ROWS,
+    STEPS,
+    WORLDS,
+    after,
+    before,
+    choices,
+    column,
+    delayed,
+)
+
+from damian.common import counter_rng
+from damian.delays.config import DelayConfig
+from damian.delays.laws import Geometric, Lag, Law, Uniform
+from damian.envs.pipeline import make_env
+from damian.keys import POSITION
+from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
+
+DT = 2.0
+LAWS: dict[str, Law] = {
+    "each message": Lag(Uniform(1, 5)),
+    "time": Lag(Uniform(1, 5), "8s"),
+    "episode": Lag(Uniform(1, 5), "episode"),
+    "hold": Lag(Uniform(1, 5), 2, hold_probability=0.5),
+    "all": Lag(Uniform(1, 5), 3, hold_probability=0.4, shared=True, stagger=True),
+    "context": Crowd("seen", column=4),
+}
+every_law = pytest.mark.parametrize("name", LAWS)
+
+
+class LagSender:
+    """Delays of one sender's messages by a law ``Lag``."""
+
+    def __init__(self, lag: Lag, stream: int, loss: float) -> None:
+        self.stream, self.lag, self.loss = torch.tensor(stream), lag, loss
+        self.period = {"episode": math.inf, "8s": 4}.get(str(lag.update_period), lag.update_period)
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        self.held, self.update_at = None, 0
+
+    def bits(self, *counters: int) -> int:
+        return int(counter_rng.bits(self.stream, *map(torch.tensor, counters)))
+
+    def share(self, *counters: int) -> float:
+        return float(counter_rng.uniform(self.stream, *map(torch.tensor, counters)))
+
+    def send(self, now: int, value: float, n_sending: int) -> int | None:
+        """The delay of the message that is sent at this step; None if it is lost."""
+        drawn = 1 + 5 * self.bits(now) // 2**32
+        if self.held is None:
+            self.held = drawn
+            self.update_at = now + (1 + self.bits(now, 2) % self.period if self.lag.stagger else self.period)
+        elif now == self.update_at:
+            self.update_at = now + self.period
+            if self.share(now, 1) >= self.lag.hold_probability:
+                self.held = drawn
+        return None if self.share(now, 0) < self.loss else self.held
+
+
+class CrowdSender(LagSender):
+    """Delays of one sender's messages by the law ``Crowd``; the first one is sent after so many steps."""
+
+    def __init__(self, agent: int, stream: int, loss: float = 0.0, first: int = 1) -> None:
+        self.agent, self.stream, self.loss, self.first = agent, torch.tensor(stream), loss, first
+        self.begin()
+
+    def begin(self) -> None:
+        self.elapsed = self.first
+
+    def send(self, now: int, value: float, n_sending: int) -> int | None:
+        delay = twin_delay(value, n_sending, self.agent, self.elapsed, self.share(now))
+        self.elapsed += 1
+        return None if self.share(now, 0) < self.loss else delay
+
+
+def senders(transform: Any, law: Law, loss: float = 0.0, first: int = 1) -> list[LagSender]:
+    """A sender for each row, with the random stream of the transform."""
+    streams = zip(transform.memory["streams"].tolist(), ROWS, strict=True)
+    return [
+        LagSender(law, stream, loss) if isinstance(law, Lag) else CrowdSender(n, stream, loss, first)
+        for stream, (_, n) in streams
+    ]
+
+
+def options(name: str) -> dict[str, Any]:
+    """Arguments of a transform that delays by this law."""
+    return {"dt": DT, "context_keys": {"seen": "observation"} if name == "context" else None}
+
+
+@every_law
+@pytest.mark.parametrize(
+    ("order", "loss", "sent_key"), [("generation", 0.0, None), ("arrival", 0.25, "message_sent")]
+)
+def test_messages_are_as_late_as_the_twin_says(name, order, loss, sent_key):
+    law, further = LAWS[name], {"loss": loss, "order": order, "sent_key": sent_key, "delay_key": "delay"}
+    transform = ObservationDelay(law, [OBSERVATION], [("agents", "held")], **further, **options(name))
+    outputs = play(delayed(transform), choices())
+    observed, message_sent = column(outputs, *OBSERVATION), column(outputs, "agents", "message_sent")
+    held, found = column(outputs, "agents", "held"), column(outputs, "agents", "delay")
+    done, seen = column(outputs, "done"), set()
+    for sender, (w, n) in zip(senders(transform, law, loss), ROWS, strict=True):
+        receiver = Receiver(order)
+        receiver.begin(0, observed[0][w][n])
+        for now in range(1, STEPS + 1):
+            at = 2 * now - 1
+            n_sending = sum(message_sent[at][w]) if sent_key else N_AGENTS
+            delay = sender.send(now, observed[at][w][n][4], n_sending)
+            delay = delay if sent_key is None or message_sent[at][w][n] else None
+            receiver.step(now, observed[at][w][n], delay)
+            assert found[at][w][n] == [-1 if delay is None else delay]
+            assert held[at][w][n] == receiver.holds.content
+            seen.add(delay)
+            if done[at][w][0]:
+                receiver.begin(now, observed[at + 1][w][n])
+                sender.begin()
+    assert len(seen) > 3
+
+
+@every_law
+def test_actions_are_as_late_as_the_twin_says(name):
+    law, chosen, default, loss = LAWS[name], choices(), 5, 0.2
+    further = {"sent_key": "ready", "default": default, "loss": loss}
+    transform = ActionDelay(law, ACTION, **further, **options(name))
+    outputs = play(delayed(transform), chosen)
+    seen, ready = before(outputs, *OBSERVATION), before(outputs, "agents", "ready")
+    observed, done = after(outputs, *OBSERVATION), after(outputs, "done")
+    for sender, (w, n) in zip(senders(transform, law, loss, first=0), ROWS, strict=True):
+        receiver = Receiver("generation")
+        receiver.begin(0, default)
+        for t in range(STEPS):
+            delay = sender.send(t + 1, seen[t][w][n][4], sum(ready[t][w]))
+            receiver.step(t + 1, chosen[t][w, n].item(), delay if ready[t][w][n] else None)
+            assert observed[t][w][n][5] == receiver.holds.content
+            if done[t][w][0]:
+                receiver.begin(t + 1, default)
+                sender.begin()
+
+
+@every_law
+def test_rewards_are_as_late_as_the_twin_says_and_none_is_lost(name):
+    law = Crowd("seen", column=4, loses=False) if name == "context" else LAWS[name]
+    earned = after(play(Counting(WORLDS, N_AGENTS), choices()), *REWARD)
+    transform = RewardDelay(law, REWARD, **options(name))
+    outputs = play(delayed(transform), choices())
+    seen, received, done = after(outputs, *OBSERVATION), after(outputs, *REWARD), after(outputs, "done")
+    for sender, (w, n) in zip(senders(transform, law), ROWS, strict=True):
+        purse = Purse()
+        for t in range(STEPS):
+            delay = sender.send(t + 1, seen[t][w][n][4], N_AGENTS) or 0
+            ended = done[t][w][0]
+            assert received[t][w][n][0] == purse.step(t, earned[t][w][n][0], delay, ended)
+            if ended:
+                sender.begin()
+
+
+def test_in_a_scenario_a_law_reads_the_true_position_at_the_instant_of_sending():
+    env = make_env(everything("polynomial", delay=DelayConfig(obs=Crowd())), 4, extras=["message"])
+    td, numbers = env.reset(), set()
+    stream = next(stream for name, stream in env.state_dict().items() if name.endswith("streams"))
+    people = [CrowdSender(row % 3, each) for row, each in enumerate(stream.tolist())]
+    for now, action in enumerate(uav_choices(env, 25), 1):
+        stepped, td = env.step_and_maybe_reset(td.set(ACTION, action))
+        found, truth = stepped["next"], stepped["next", "agents", "position"]
+        ended, state = found["done"].view(-1), env.uav_env.state
+        place = state.position[..., :2] + env.uav_env.simulation.airspace.offset[state.region].unsqueeze(1)
+        assert truth[~ended].equal(place[~ended])
+        sent = found["agents", "message_sent"].tolist()
+        for row, sender in enumerate(people):
+            w, n = divmod(row, 3)
+            delay = sender.send(now, truth[w, n, 0].item(), sum(sent[w]))
+            expected = -1 if delay is None or not sent[w][n] else delay
+            assert found["agents", "delay"][w, n].item() == expected
+            numbers.add(sum(sent[w]))
+            if ended[w]:
+                sender.begin()
+    assert numbers == {0, 1, 2, 3}
+
+
+def test_without_a_law_that_reads_it_no_position_is_output():
+    env = make_env(square(delay=DelayConfig(obs=3, act=Lag(2))), 2)
+    assert POSITION not in env.rollout(3).keys(True)
+
+
+def test_a_held_law_loses_the_same_messages_and_delays_the_others_equally():
+    free, held = (
+        play(env := make_env(everything(delay=delay), 4, extras=["message"]), uav_choices(env, 20))
+        for delay in (DelayConfig(obs=Crowd()), DelayConfig(obs=Crowd(), hold="max"))
+    )
+    one, other = (torch.stack([td["agents", "delay"] for td in outputs[1::2]]) for outputs in (free, held))
+    assert other.equal(torch.where(one == -1, -1, LONGEST))
+    assert (one == -1).any()
+
+
+def one_of_each(name: str) -> list[Any]:
+    law, reward = LAWS[name], Crowd("seen", column=4, loses=False) if name == "context" else LAWS[name]
+    return [
+        ActionDelay(law, ACTION, loss=0.1, **options(name)),
+        ObservationDelay(law, [OBSERVATION], loss=0.1, **options(name)),
+        RewardDelay(reward, REWARD, **options(name)),
+    ]
+
+
+@pytest.mark.parametrize("name", ["episode", "all", "context"])
+def test_a_world_alone_has_the_same_delays_as_in_a_batch(name):
+    batch = play(delayed(*one_of_each(name)), choices(n_steps=20))
+    for w, world in enumerate(WORLDS):
+        alone = play(delayed(*one_of_each(name), worlds=[world]), choices([world], 20))
+        assert all_same([td[w : w + 1] for td in batch], alone)
+
+
+@pytest.mark.parametrize("name", [name for name in LAWS if name != "context"])
+def test_a_copy_and_a_loaded_state_go_on_with_the_same_delays(name):
+    env = delayed(*one_of_each(name))
+    play(env, choices(n_steps=9))
+    copied, loaded = copy.deepcopy(env), delayed(*one_of_each(name))
+    play(loaded, choices(n_steps=4))
+    loaded.base_env.__dict__.update(copy.deepcopy(env.base_env).__dict__)
+    loaded.transform.load_state_dict(copy.deepcopy(env.transform.state_dict()))
+    runs = []
+    for each in (env, copied, loaded):
+        steps = [each.step(each.rand_action().set(ACTION, action))["next"] for action in choices(n_steps=9)]
+        runs.append(steps)
+    assert all_same(*runs[:2])
+    assert all_same(*runs[1:])
+
+
+@pytest.mark.slow
+def test_a_compiled_environment_has_the_same_delays():
+    delay = DelayConfig(
+        obs={"law": "lag", "lag": {"law": "uniform", "high": 4}, "update_period": "2s", "stagger": True},
+        act={"law": "distance", "speed": 30, "range": 90},
+        rew=Lag(Geometric(1, 4), 2, hold_probability=0.5),
+        loss=0.1,
+    )
+    eager, compiled = (make_env(square(delay=delay), 4, seed=5, extras=["message"]) for _ in range(2))
+    compiled.compile(backend="eager")
+    one, other = (play(env, uav_choices(eager, 20)) for env in (eager, compiled))
+    assert all_same(one, other)
+
+
+def test_a_lag_of_0_is_the_identity():
+    lag = Lag(Uniform(0, 3, probability=0.0), 3, hold_probability=0.5, shared=True, stagger=True)
+    transforms = [ActionDelay(lag, ACTION), ObservationDelay(lag, [OBSERVATION]), RewardDelay(lag, REWARD)]
+    plain = play(Counting(WORLDS, N_AGENTS), choices())
+    found = play(delayed(*transforms), choices())
+    assert all_same([td.exclude(("agents", "age")) for td in found], plain)
