@@ -145,10 +145,6 @@ class Sampler(nn.Module):
 class Recorded(Sampler):
     """Plays back recorded delays; each sender starts at a random position, which is its channel state.
 
-    A worked timeline: of the record 3, 0, -1 a sender that starts at its first row sends at t = 0 what
-    arrives at t = 3, at t = 1 what arrives at t = 1, at t = 2 what never arrives, and at t = 3 what arrives
-    at t = 6.
-
     Args:
         delays: recorded delays [steps], -1 for a lost message.
         loss: probability that a message is lost in addition.
@@ -179,9 +175,6 @@ class Recorded(Sampler):
 
 class HeldSampler(Sampler):
     """Gives every message the longest delay of another sampler; the same messages are lost.
-
-    A worked timeline: the other sampler's longest delay is 3 steps, and it draws 1 for a message sent at
-    t = 0: the message is held back from t = 1, and arrives at t = 3.
 
     Args:
         drawn: the other sampler.
@@ -216,10 +209,6 @@ class HeldSampler(Sampler):
 class LagSampler(Sampler):
     """Draws a delay (a lag) from a table, and holds it; losses are drawn for each message.
 
-    A worked timeline: with a period of 2 steps and lags of 3 and 0 drawn one after the other, the messages
-    sent at t = 0 and t = 1 arrive at t = 3 and t = 4, those sent at t = 2 and t = 3 at once: they overtake
-    the others.
-
     The state of a channel is [M, 2] long: the lag, -1 before the first message of an episode, and the number
     of steps that it is still held.
 
@@ -228,9 +217,7 @@ class LagSampler(Sampler):
             probability that a message is lost.
         loss: probability that a message is lost in addition, whatever its delay.
         period: steps between two updates; None: one lag per episode.
-        hold_probability: probability that an update keeps the lag.
-        shared: all agents of a world draw the same numbers.
-        stagger: the second update of an episode comes after a random time, from one step to ``period``.
+        hold_probability, shared, stagger: as in the law ``Lag``.
     """
 
     def __init__(

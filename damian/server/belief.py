@@ -11,6 +11,9 @@ those that came in late.
 
 How silence counts is decided here alone: ``report_rows`` makes a row of a table of a report, ``repeated``
 marks the reports that say the same again, ``_log_reports`` tabulates their probabilities.
+
+Everywhere, ``grid`` is a ``SourceGrid``, ``rows`` are rows of its table ``log_reports`` [*, N], a ``belief``
+is the probability of each of its K cells [*, K], and ``region`` the index of the region [*].
 """
 
 import math
@@ -169,11 +172,8 @@ def _moves(columns: np.ndarray, displacement: np.ndarray) -> Tensor:
     """Weight of each move from cell to cell, [K, K].
 
     The source is anywhere in its cell, and moves in any direction alike: the weights are averaged over the
-    symmetries of a square.
-
-    Args:
-        columns: column and row number of each cell, [K, 2].
-        displacement: moves of the source [cells], [S, 2].
+    symmetries of a square. ``columns`` are those of ``_columns``, [K, 2], ``displacement`` moves [cells],
+    [S, 2].
     """
     reach = int(np.ptp(columns, axis=0).max())
     weight = np.full((2 * reach + 1, 2 * reach + 1), _RARE)
@@ -201,12 +201,8 @@ def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
 
     A cell that a footprint covers in part would be ruled out by the same silence again and again, although a
     source that stays may be in its other part. So a repeated report counts only as far as the source may have
-    moved since: with probability ``renewed`` it is anywhere in its cell, else it is where it was.
-
-    Args:
-        detects: probability of a detection if the source emits, [P, K].
-        emits: probability that it emits.
-        renewed: share of a cell by which it moves in a step.
+    moved since: with probability ``renewed``, the share of a cell by which it moves in a step, it is anywhere
+    in its cell, else it is where it was. ``detects`` is the probability of a detection if it emits, [P, K].
     """
     silent = 1 - detects
     again = renewed * silent + (1 - renewed) * silent / (1 - emits * detects)
@@ -220,10 +216,7 @@ def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
 def _one_step_before(grid: SourceGrid, chances: Tensor) -> Tensor:
     """Probability of a detection by the cell of the source one step before, [P, K].
 
-    Args:
-        grid: cells, moves and emission.
-        chances: probability of the detection if the source emits in a cell, [P, K]; P is a multiple of R, and
-            the same number of rows are of each region.
+    ``chances`` is that if the source emits in a cell, [P, K]; P / R rows are of each of the R regions.
     """
     if grid.moves is None:
         return grid.emits * chances
@@ -246,15 +239,7 @@ def _staying(grid: SourceGrid) -> Tensor:
 def _detected_shares(
     polygon: shapely.Geometry, points: Tensor, centres: np.ndarray, edge: float, radius: float
 ) -> Tensor:
-    """Share of each cell's part of the polygon that lies in the footprint about each landing point, [L, K].
-
-    Args:
-        polygon: the region.
-        points: its landing points, [L, 2] metres.
-        centres: of the cells, [K, 2] metres.
-        edge: of a cell [m].
-        radius: of a footprint [m].
-    """
+    """Share of each cell's part of the polygon in the footprint about each landing point, [L, K]."""
     axis = ((np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5) * edge
     sample = centres[:, None] + np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     shapely.prepare(polygon)
@@ -277,36 +262,19 @@ _LEAST = 1e-20
 
 
 def repeated(grid: SourceGrid, rows: Tensor, before: Tensor) -> Tensor:
-    """The rows, with those that are as in the step before marked as repeated, [*, N].
-
-    Args:
-        grid: cells and tables.
-        rows: rows of ``SourceGrid.log_reports``, [*, N].
-        before: the rows of the same UAVs one step before, [*, N].
-    """
+    """The rows, with those marked as repeated that are as ``before``, one step earlier; [*, N] each."""
     same = (rows == before) & (rows != grid.no_report)
     return torch.add(rows, same, alpha=grid.no_report // 2)  # takes a third of the time of ``where``
 
 
 def report_rows(grid: SourceGrid, messages: Messages, sent: Tensor) -> Tensor:
-    """Rows of ``SourceGrid.log_reports`` for messages, [*, N]; a UAV in flight detects nothing.
-
-    Args:
-        grid: cells and tables.
-        messages: the latest message of each UAV, [*, N].
-        sent: which of them were sent in this step, [*, N] bool.
-    """
+    """The rows of messages [*, N], if ``sent`` in this step [*, N] bool; a UAV in flight detects nothing."""
     row = 2 * messages.trail[..., 0] + messages.spotted
     return torch.where(sent & ~messages.in_flight, row, grid.no_report)
 
 
 def likelihood(grid: SourceGrid, rows: Tensor) -> Tensor:
-    """Probability of N reports of one step by the cell of the source, [*, K].
-
-    Args:
-        grid: cells and tables.
-        rows: rows of ``SourceGrid.log_reports``, [*, N].
-    """
+    """Probability of N reports of one step by the cell of the source, [*, K]."""
     log = embedding_bag(rows.flatten(0, -2), grid.log_reports, mode="sum")  # gathers and sums at once
     match = log.exp_().view(*rows.shape[:-1], log.shape[-1])
     if grid.emits < 1:
@@ -316,13 +284,7 @@ def likelihood(grid: SourceGrid, rows: Tensor) -> Tensor:
 
 
 def predict(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
-    """The belief one step later, before any message of that step, [*, K].
-
-    Args:
-        grid: cells and tables.
-        belief: probability of each cell, [*, K].
-        region: index of the region, [*].
-    """
+    """The belief one step later, before any message of that step, [*, K]."""
     if grid.moves is None:
         return belief
     if len(grid.prior) == 1:  # the moves are probabilities
@@ -332,44 +294,25 @@ def predict(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
 
 
 def weigh(predicted: Tensor, likely: Tensor) -> Tensor:
-    """The belief after the messages of a step, [*, K].
-
-    Args:
-        predicted: the belief before them, [*, K].
-        likely: their ``likelihood``, [*, K].
-    """
+    """The belief after the messages of a step, from that before them and their ``likelihood``, [*, K]."""
     weighed = predicted * likely
     return weighed.div_(weighed.sum(-1, keepdim=True))
 
 
 def first_belief(grid: SourceGrid, rows: Tensor, region: Tensor) -> Tensor:
-    """The belief at the beginning of an episode, when everyone's first message is known, [*, K].
-
-    Args:
-        grid: cells and tables.
-        rows: rows of ``SourceGrid.log_reports`` for the first messages (``report_rows``), [*, N].
-        region: index of the region, [*].
-    """
+    """The belief at the beginning of an episode, when everyone's first message is known, [*, K]."""
     return weigh(gather_rows(grid.prior, region), likelihood(grid, rows))
 
 
 def certain_belief(grid: SourceGrid, source: Tensor) -> Tensor:
-    """The belief of somebody who knows the cell in which the source is, [*, K].
-
-    Args:
-        grid: cells and tables.
-        source: position of the source, east, north [m], [*, 2].
-    """
+    """The belief of somebody who knows the place of the source, east, north [m], [*, 2]; [*, K]."""
     return one_hot(torch.cdist(source, grid.centres).argmin(-1), len(grid.centres)).to(source.dtype)
 
 
 def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
     """Probability that a UAV which lands on a landing point of the region next detects the source, [*, L].
 
-    Args:
-        grid: cells and tables.
-        belief: probability of each cell now, one step before the landing, [*, K].
-        region: index of the region, [*].
+    The belief is that of now, one step before the landing.
     """
     if len(grid.prior) == 1:
         return belief @ grid.next_detection.T
@@ -381,11 +324,7 @@ def chance_of_staying(grid: SourceGrid, belief: Tensor, rows: Tensor) -> Tensor:
     """Probability that a UAV which stays where it is detects the source in the next step, [*, N].
 
     That is less than for a UAV which lands there, if it has just detected nothing; and 0 for one in flight.
-
-    Args:
-        grid: cells and tables.
-        belief: probability of each cell now, [*, K].
-        rows: rows of ``SourceGrid.log_reports`` for what the UAVs report now, not marked as repeated, [*, N].
+    The rows are what the UAVs report now, not marked as repeated.
     """
     chance = gather_rows(grid.next_staying, rows.clamp(max=len(grid.next_staying) - 1))
     return chance.mul_(belief.unsqueeze(-2)).sum(-1)
@@ -455,7 +394,7 @@ def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, 
         grid: cells and tables.
         window: beliefs of the latest steps.
         messages: the first messages [B, N], which all receivers know at once.
-        region: index of the region of each world, [B].
+        region: of each world, [B].
         mask: worlds that begin an episode, [B] bool.
     """
     report = report_rows(grid, messages, torch.ones_like(messages.spotted))
@@ -473,7 +412,7 @@ def advance(
         window: beliefs of the latest steps.
         report: what the messages of this step report (``report_rows``), [B, N].
         delay: their delays [steps], negative if they never arrive, [B, N].
-        region: index of the region of each world, [B].
+        region: of each world, [B].
         stepped: worlds that take the step, [B] bool; nothing of the others changes.
 
     Returns:
@@ -542,10 +481,10 @@ def _advance(
     _write_step(window.delay, slot, sent_delay.T, stepped)
     slot_age = (slot - torch.arange(n_slots, device=slot.device).unsqueeze(-1)) % n_slots
     outdated = _first_outdated(grid, window, slot_age, stepped)
-    for each in _to_compute(grid, window, slot_age, outdated, region):
-        before = window.belief.flatten(0, 2).index_select(0, each.before)
-        new = weigh(predict(grid, before, each.region), likelihood(grid, each.reports))
-        _write(window.belief, each.row, new, each.mask)
+    for before, row, changes, within, reports in _to_compute(grid, window, slot_age, outdated, region):
+        old = window.belief.flatten(0, 2).index_select(0, before)
+        new = weigh(predict(grid, old, within), likelihood(grid, reports))
+        _write(window.belief, row, new, changes)
     beliefs = latest(window, slot)
     return slot, beliefs.server, beliefs.own
 
@@ -561,14 +500,8 @@ def _first_outdated(grid: SourceGrid, window: Window, slot_age: Tensor, stepped:
     """How long ago the first step was after which each receiver's belief is outdated, [V, B] steps.
 
     It is -1 where no belief is. A UAV has the server's belief as long as it had it in the step before and the
-    server has all that the UAV has reported since; this is noted in place.
-
-    Args:
-        grid: cells and tables.
-        window: beliefs of the latest steps.
-        slot_age: how long ago the step of each slot was, [S, B] steps. (Seen from a slot, it is also the slot
-            of the step that was so long ago.)
-        stepped: worlds that take a step, [B] bool.
+    server has all that the UAV has reported since; this is noted in place. ``slot_age`` tells how long ago
+    the step of each slot was, [S, B]; read the other way, it is the slot of the step that was so long ago.
     """
     sent, age = window.report != grid.no_report, slot_age.unsqueeze(1)
     arrives = (sent & (window.delay == age)).amax(1)
@@ -585,25 +518,10 @@ def _first_outdated(grid: SourceGrid, window: Window, slot_age: Tensor, stepped:
     return outdated
 
 
-class _Computed(NamedTuple):
-    """C beliefs that are computed from those of the step before."""
-
-    before: Tensor
-    """Rows of the beliefs of the step before in the flattened ring, [C]."""
-    row: Tensor
-    """Rows of the beliefs, [C]."""
-    mask: Tensor
-    """Which of them change, [C] bool."""
-    region: Tensor
-    """Index of the region, [C]."""
-    reports: Tensor
-    """What their receivers know of the step, as rows of ``SourceGrid.log_reports``, [C, N]."""
-
-
 def _to_compute(
     grid: SourceGrid, window: Window, slot_age: Tensor, outdated: Tensor, region: Tensor
-) -> Iterator[_Computed]:
-    """The beliefs to compute, step by step, the oldest step first.
+) -> Iterator[tuple[Tensor, ...]]:
+    """The C beliefs to compute from those of the step before, step by step, the oldest step first.
 
     Args:
         grid: cells and tables.
@@ -611,6 +529,11 @@ def _to_compute(
         slot_age: how long ago the step of each slot was, or the slot of the step so long ago, [S, B].
         outdated: ``_first_outdated``, [V, B] steps.
         region: index of the region of each world, [B].
+
+    Yields:
+        For each step the rows in the flattened ring of the beliefs of the step before [C], those of the
+        beliefs [C], which of them change [C] bool, their regions [C], and what their receivers know of the
+        step, as rows of ``SourceGrid.log_reports`` [C, N].
     """
     n_worlds, n_steps = outdated.shape[1], len(slot_age) - 1
     due = torch.arange(n_steps, device=slot_age.device).view(-1, 1, 1) <= outdated
@@ -624,28 +547,19 @@ def _to_compute(
     if len(outdated) > 1:
         own = gather_rows(repeated(grid, window.report, window.report.roll(1, 0)).flatten(), at)
         reports = torch.where(viewer.unsqueeze(-1) == agent + 1, own, reports)
-    work = _Computed(
-        _row(window, earlier, viewer, world),
-        slot * due[0].numel() + receiver,
-        age <= outdated.flatten().index_select(0, receiver),
-        region.index_select(0, world),
-        reports,
-    )
+    before, row = _row(window, earlier, viewer, world), slot * due[0].numel() + receiver
+    changes = age <= outdated.flatten().index_select(0, receiver)
     counts = [due[0].numel()] * n_steps
     if devices.data_dependent(due.device):
         counts = age.bincount().tolist()  # as far as the oldest step of any
-    steps = zip(*(each.split(counts) for each in work), strict=True)
-    return (_Computed(*each) for each in reversed([*steps]))
+    work = (before, row, changes, region.index_select(0, world), reports)
+    return reversed([*zip(*(each.split(counts) for each in work), strict=True)])
 
 
 def _row(window: Window, slot: Tensor, viewer: Tensor | int, world: Tensor) -> Tensor:
-    """Where the belief of a receiver lies in the flattened ring, or that of the server, if it is the same.
+    """Rows of the flattened ring in which the beliefs of receivers lie, or the server's if they are the same.
 
-    Args:
-        window: beliefs of the latest steps.
-        slot: of the step, [*].
-        viewer: number of the receiver, [*].
-        world: number of the world, [*].
+    Slot, number of the receiver and number of the world are [*] each.
     """
     n_viewers, n_worlds = window.same_as_server.shape[1:]
     server = slot * n_viewers * n_worlds + world
@@ -664,14 +578,7 @@ def _chosen(mask: Tensor) -> tuple[Tensor, ...]:
 
 
 def _write(held: Tensor, row: Tensor, new: Tensor, mask: Tensor) -> None:
-    """Write beliefs into the ring in place.
-
-    Args:
-        held: the ring, [S, V, B, K].
-        row: rows of the flattened ring, which ``_chosen`` has chosen, [C].
-        new: their new values, [C, K].
-        mask: which of them to change, [C] bool.
-    """
+    """Write new values [C, K] into rows [C] of the flattened ring [S, V, B, K], where a mask [C] is true."""
     flat = held.flatten(0, 2)
     if devices.data_dependent(held.device):
         flat.numpy()[row.numpy()] = new.numpy()  # takes a third of the time of ``index_copy_``

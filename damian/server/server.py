@@ -58,7 +58,12 @@ class ServerOutputs(NamedTuple):
 
 
 class Server:
-    """Computes features, rewards and status from messages [*, N], with any leading dimensions.
+    """Computes features, rewards and status from messages, with any leading dimensions.
+
+    In all methods ``messages`` are one message of each UAV [*, N], ``steps`` the elapsed steps of the episode
+    [*], ``source_over`` tells whether the source has finished its walk [*], ``coverage`` is that of an
+    earlier step of the same worlds, which saves time, and ``belief`` the probability that the source is in
+    each cell of ``grid`` [*, K]; without it, these are the first messages of the episode.
 
     Args:
         observation: which features the actor and the critic observe.
@@ -138,8 +143,7 @@ class Server:
     def action_columns(self, features: Features) -> slice | None:
         """The columns of the actors' observations that hold ``belief_gain``; None if they do not observe it.
 
-        Args:
-            features: features of any messages, as returned by ``features``.
+        The features may be those of any messages.
         """
         names = self.observation.actor
         if "belief_gain" not in names:
@@ -159,16 +163,7 @@ class Server:
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
     ) -> ServerOutputs:
-        """Observations, rewards and status of messages.
-
-        Args:
-            messages: one message of each UAV, [*, N].
-            steps: elapsed steps of the episode, [*].
-            source_over: has the source finished its walk, [*] or [*, 1]; if not given, it never has.
-            coverage: of an earlier step of the same worlds, which saves time.
-            belief: probability that the source is in each cell of ``grid``, [*, K]; if not given, these are
-                the first messages of the episode.
-        """
+        """Observations, rewards and status of messages; without ``source_over`` the source never ends."""
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         features = self.features(messages, steps, coverage=coverage, belief=belief)
         result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
@@ -183,21 +178,12 @@ class Server:
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
     ) -> Features:
-        """The features that observations and rewards are made of (paper, Table 2).
-
-        Args:
-            messages: one message of each UAV, [*, N].
-            steps: elapsed steps of the episode, [*].
-            names: features to compute; if not given, all that an observation or a reward term needs.
-            coverage: of an earlier step of the same worlds, which saves time.
-            belief: probability that the source is in each cell of ``grid``, [*, K]; if not given, these are
-                the first messages of the episode.
-        """
+        """The features of these names, or all that an observation or a reward term needs (paper, Table 2)."""
         context = self._context(messages, steps)._replace(coverage=coverage, belief=belief)
         return observe(messages, context, names or self._names)
 
     def privileged_features(self, messages: Messages, steps: Tensor, source: Tensor) -> Features:
-        """The features of somebody who knows where the source is, [*, 2] metres; other arguments as above."""
+        """The features of somebody who knows where the source is, [*, 2] metres."""
         belief = None if self.grid is None else certain_belief(self.grid, source)
         return self.features(messages, steps, belief=belief)
 
@@ -263,7 +249,7 @@ class Server:
         Args:
             known: the message of each UAV that each UAV knows, [*, N, N] (receiver, sender).
             steps: elapsed steps of the episode, [*].
-            belief: that of each UAV, [*, N, K]; if not given, these are the first messages of the episode.
+            belief: that of each UAV, [*, N, K].
         """
         context = self._context(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
         context = context._replace(belief=belief)
@@ -272,14 +258,7 @@ class Server:
     def reward_and_status(
         self, features: Features, messages: Messages, steps: Tensor, source_over: Tensor
     ) -> RewardAndStatus:
-        """Rewards (paper, eq. 5-8) and the end of the episode (section 4.1).
-
-        Args:
-            features: features of the messages, as returned by ``features``.
-            messages: one message of each UAV, [*, N].
-            steps: elapsed steps of the episode, [*].
-            source_over: has the source finished its walk, [*].
-        """
+        """Rewards (paper, eq. 5-8) and the end of the episode (section 4.1); features are of the messages."""
         counters = Counters(steps, messages.motions)
         ended = status(messages, steps, source_over, self.dt, self.episode)
         terms = reward(features, counters, self.reward)
@@ -287,7 +266,7 @@ class Server:
         return RewardAndStatus(sum(terms.values(), start=final), terms, ended)
 
     def _context(self, messages: Messages, steps: Tensor) -> ServerContext:
-        """What the server knows besides the messages after the elapsed steps [*]."""
+        """What the server knows besides the messages."""
         return ServerContext(
             now=steps * self.dt,
             scale=self.scales(messages),
