@@ -480,9 +480,10 @@ def check_losses(key: str, loss: Any) -> None:
     Raises:
         InputError: one is not between 0 and 1.
     """
-    rows = loss.tolist() if isinstance(loss, Tensor) else loss
-    for probability in [each for row in rows for each in row] if is_matrix(rows) else [rows]:
-        checks.in_range(key, probability, 0.0, 1.0)
+    written: Any = loss.tolist() if isinstance(loss, Tensor) else loss
+    for row in written if is_matrix(written) else [[written]]:
+        for probability in row:
+            checks.in_range(key, probability, 0.0, 1.0)
 
 
 def same_size(settings: Mapping[str, Any]) -> int | None:

@@ -446,7 +446,7 @@ def _parts(grid: SourceGrid, window: Window) -> tuple[_Tables, float, _Ring, Ten
 def _begin(
     tables: _Tables, emits: float, ring: _Ring, slot: Tensor, first: Tensor, region: Tensor, mask: Tensor
 ) -> None:
-    grid, window = SourceGrid(*tables, emits), Window(*ring, slot)
+    grid, window = SourceGrid._make([*tables, emits]), Window._make([*ring, slot])
     (world,) = _chosen(mask)
     if not len(world):
         return
@@ -474,7 +474,7 @@ def _advance(
     region: Tensor,
     stepped: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    grid, window = SourceGrid(*tables, emits), Window(*ring, slot)
+    grid, window = SourceGrid._make([*tables, emits]), Window._make([*ring, slot])
     n_slots = len(window.belief)
     slot = torch.where(stepped, (slot + 1) % n_slots, slot)
     _write_step(window.report, slot, sent.T, stepped)

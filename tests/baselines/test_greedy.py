@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import clock, everything, sent_messages, walking
+from helpers import everything, sent_messages, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.baselines.random import random_policy
-from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -94,13 +93,6 @@ def test_an_old_detection_still_counts_for_a_static_source_but_not_for_a_moving_
     assert (distance[1] > 2 * radius).all()
 
 
-def test_a_source_just_lost_is_searched_for_around_the_silent_footprint_and_not_in_it():
-    env = field(source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
-    td = detection(env, [200.0, 200.0], ago=2.0)
-    distance = torch.linalg.vector_norm(landing_points(env, td)[1] - sent_messages(td).position[0, 1])
-    assert env.uav_env.simulation.radius < distance < 3 * env.uav_env.simulation.radius
-
-
 @pytest.mark.parametrize("task", [SEARCH, COVER], ids=["search", "coverage"])
 def test_before_any_detection_every_uav_flies_to_fresh_ground_nearest_to_itself(task):
     env = field(reward=task)
@@ -109,15 +101,6 @@ def test_before_any_detection_every_uav_flies_to_fresh_ground_nearest_to_itself(
     distance = torch.cdist(end, start)
     assert (distance.diagonal() > env.uav_env.simulation.radius).all()
     assert torch.equal(distance.argmin(-1), torch.arange(3))
-
-
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_a_uav_flies_as_near_as_it_can_to_a_source_beyond_its_reach(kind):
-    env = field(actions=replace(FINE, kind=kind))
-    td, place = detection(env, [380.0, 380.0]), torch.tensor([380.0, 380.0])
-    start, end = sent_messages(td).position[0, 0], landing_points(env, td)[0]
-    assert (start - place).norm() > 300 + env.uav_env.simulation.radius
-    assert (start - place).norm() - (end - place).norm() > 250
 
 
 @pytest.mark.parametrize(
@@ -210,41 +193,6 @@ def distances(some: Tensor, others: Tensor) -> Tensor:
     return torch.linalg.vector_norm(some.unsqueeze(1) - others, dim=-1)
 
 
-def test_no_uav_flies_further_than_a_continuous_action_reaches():
-    env = field(actions=ActionConfig(kind="continuous", distances=[100.0]))
-    action = greedy_policy(env)(detection(env, [200.0, 45.0]))["agents", "action"]
-    assert 0 < action[..., 0].max() <= 1
-
-
-def test_the_policy_takes_the_time_of_the_newest_message_as_the_current_time():
-    env = field(source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
-    td = detection(env, [200.0, 200.0], 8)
-    held, flying = sent_messages(td), torch.tensor([True, False, False])
-    older = held._replace(time=torch.where(flying, 1.0, held.time)).pack()
-    ends = [landing_points(env, each) for each in (td, td.clone().set(("agents", "message"), older))]
-    assert torch.equal(ends[0][1:], ends[1][1:])
-
-
-def test_the_age_of_messages_counts_in_seconds():
-    moving = SourceConfig(level_db=135.0, motion="dynamic", speed=20.0)
-    actions = []
-    for period, age in (("1s", 9), ("3s", 3), ("1s", 3)):
-        env = field(delay=DelayConfig(obs=9), source=moving, clock=clock(period))
-        td = detection(env, [200.0, 200.0])
-        td["agents", "received"] = td["agents", "message"]
-        td["agents", "age"].fill_(age)
-        actions.append(greedy_policy(env)(td)["agents", "action"])
-    assert torch.equal(actions[0], actions[1])
-    assert not torch.equal(actions[0], actions[2])
-
-
-def test_long_after_a_detection_fresh_ground_near_it_is_searched_first():
-    moving = SourceConfig(level_db=135.0, motion="dynamic", speed=20.0)
-    env = field(source=moving)
-    ends = [landing_points(env, detection(env, place, 8)) for place in ([100.0, 350.0], [350.0, 100.0])]
-    assert not torch.equal(*ends)
-
-
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 @pytest.mark.parametrize("obs", [0, 2])
@@ -272,18 +220,6 @@ def test_footprints_hold_only_real_landing_points_of_their_own_region():
         expected = (distance <= env.uav_env.simulation.radius).sum(0)
         assert torch.equal(n_near[region, : len(real)], expected.float())
     assert not env.uav_env.simulation.airspace.points.isfinite().all()
-
-
-@pytest.mark.parametrize("actions", [FINE, CONTINUOUS], ids=["discrete", "continuous"])
-def test_uavs_fly_to_the_nearest_of_equally_good_landing_points(actions):
-    env = make_env(everything(actions=actions), 4, extras=["message"])
-    policy = Greedy(env.uav_env)
-    assert not policy.real.all()
-    # All gain lies on the padding of smaller regions' tables, which the policy must ignore.
-    policy.near = (~policy.real).float().unsqueeze(1).expand_as(policy.near)
-    action = policy(env.reset()["agents", "message"])
-    distance = actions.table()[action, 0] if actions is FINE else action[..., 0]
-    assert (distance == 0).all()
 
 
 def test_the_policy_reads_received_messages_and_not_sent_ones():
@@ -316,36 +252,3 @@ def test_with_any_number_of_uavs_the_policy_is_clearly_better_than_the_random_on
             env.set_seed(5)
             scores.append(evaluate(env, policy, 50).return_)
         assert scores[0] > 2 * scores[1]
-
-
-@pytest.mark.parametrize("actions", [FINE, CONTINUOUS], ids=["discrete", "continuous"])
-def test_a_uav_last_heard_of_at_its_takeoff_chooses_from_where_it_will_land(actions):
-    env = field(actions=actions)
-    td = detection(env, [200.0, 200.0])
-    held, points = sent_messages(td), env.uav_env.simulation.points
-    goal = int((points - torch.tensor([120.0, 300.0])).norm(dim=-1).argmin())
-    first = torch.tensor([True, False, False]).unsqueeze(-1)
-    flies = held._replace(target=torch.where(first, points[goal], held.target))
-    stands = flies._replace(
-        time=torch.where(first[:, 0], 0.0, held.time),  # so long ago that its silence does not count
-        position=torch.where(first, points[goal], held.position),
-        trail=torch.where(first, goal, held.trail),
-    )
-    assert flies.in_flight.tolist() == [[True, False, False]] * 2
-    assert not stands.in_flight.any()
-    chosen = [
-        greedy_policy(env)(td.clone().set(("agents", "message"), each.pack()))["agents", "action"]
-        for each in (held, flies, stands)
-    ]
-    assert torch.equal(chosen[1], chosen[2])
-    assert not torch.equal(chosen[0], chosen[1])
-
-
-def test_a_region_with_too_many_landing_points_is_refused_in_one_line():
-    region = RegionConfig(kind="vertices", vertices=[[0, 0], [4000, 0], [4000, 4000], [0, 4000]])
-    env = make_env(ScenarioConfig(agents=1, region=region), extras=["message"])
-    n_points = int(env.uav_env.simulation.airspace.n_points[0])
-    with pytest.raises(InputError) as error:
-        greedy_policy(env)
-    line = f"region.lattice_step: {n_points} landing points are too many for the scripted policy"
-    assert str(error.value) == f"{line}: take a larger step"

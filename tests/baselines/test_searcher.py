@@ -59,14 +59,6 @@ def test_all_uavs_fly_to_where_they_detect_the_source():
         assert (distance < env.uav_env.simulation.radius).all()
 
 
-def test_a_uav_that_cannot_reach_the_source_flies_towards_it():
-    env = believing(reach=40.0)
-    td, centre = certain(env, [80.0, 80.0])
-    before = env.server.messages(td[keys.MESSAGE]).position[0]
-    after = places_after(env, td)
-    assert ((after - centre).norm(dim=-1) < (before - centre).norm(dim=-1) - 20.0).all()
-
-
 def test_no_uav_aims_at_a_landing_point_on_which_another_one_stands():
     env = believing()
     held = env.server.messages(env.reset()[keys.MESSAGE])

@@ -39,18 +39,6 @@ def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
     check_features(random_worlds(seed, n_agents, heard, spots), newest)
 
 
-@pytest.mark.parametrize("n_agents", [1, 2, 5])
-@pytest.mark.parametrize(("heard", "spots"), [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
-def test_features_are_right_when_no_uav_or_every_uav_has_detected_or_spots_the_source(n_agents, heard, spots):
-    check_features(random_worlds(1, n_agents, heard, spots, n_worlds=20))
-
-
-def test_before_any_detection_all_features_of_the_source_are_1():
-    messages, server = messages_of(random_worlds(0, 3, 0.0, 0.0))
-    names = ["source_distance", "source_bearing", "source_drift", "source_time"]
-    assert all((value == 1).all() for value in observe(messages, server, names).values())
-
-
 def one_world(*places, **changed):
     """One world with UAVs at these places; the first has detected the source, the last has these changes."""
     uavs = [twin.Uav(place) for place in places]

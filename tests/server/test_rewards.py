@@ -116,13 +116,6 @@ def status_of(spots, empty=False, steps=5, over=False, **ends):
     return tuple(flag.item() for flag in ended)
 
 
-def test_success_at_the_last_step_terminates_and_does_not_truncate():
-    ends = {"max_steps": 5, "success_share": 1.0}
-    assert status_of([True, True], **ends) == (True, True, False)
-    assert status_of([True, False], **ends) == (False, False, True)
-    assert status_of([True, False], steps=4, **ends) == (False, False, False)
-
-
 def test_empty_batteries_or_the_end_of_the_sources_walk_terminate_without_success():
     ends = {"max_steps": 5, "discharged_share": 0.5}
     assert status_of([False, False], empty=True, **ends) == (False, True, False)
