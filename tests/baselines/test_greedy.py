@@ -84,15 +84,6 @@ def test_all_uavs_fly_to_the_latest_detection_and_the_uav_that_made_it_stays(act
     assert distance[1] == 0
 
 
-def test_an_old_detection_still_counts_for_a_static_source_but_not_for_a_moving_one():
-    moving = SourceConfig(level_db=135.0, motion="dynamic", speed=20.0)
-    ends = [landing_points(env, detection(env, [200.0, 200.0], 8)) for env in (field(), field(source=moving))]
-    distance = [torch.linalg.vector_norm(end[::2], dim=-1) for end in ends]  # from the middle of the field
-    radius = field().uav_env.simulation.radius
-    assert (distance[0] <= 2 * radius).all()
-    assert (distance[1] > 2 * radius).all()
-
-
 @pytest.mark.parametrize("task", [SEARCH, COVER], ids=["search", "coverage"])
 def test_before_any_detection_every_uav_flies_to_fresh_ground_nearest_to_itself(task):
     env = field(reward=task)
@@ -209,17 +200,6 @@ def test_actions_are_legal_in_every_kind_of_region_and_do_not_depend_on_the_othe
         assert env.action_spec.contains(rollout[:, 0].select(*env.action_keys))
     two_worlds = rollout[3:5, 5].exclude(("agents", "action"))
     assert torch.equal(policy(two_worlds)["agents", "action"], action[3:5, 5])
-
-
-def test_footprints_hold_only_real_landing_points_of_their_own_region():
-    env = make_env(everything(), 2, extras=["message"])
-    n_near = Greedy(env.uav_env).near.sum(1)
-    for region, points in enumerate(env.uav_env.simulation.airspace.points):
-        real = points[points[:, 0].isfinite()]
-        distance = torch.linalg.vector_norm(real.unsqueeze(0) - real.unsqueeze(1), dim=-1)
-        expected = (distance <= env.uav_env.simulation.radius).sum(0)
-        assert torch.equal(n_near[region, : len(real)], expected.float())
-    assert not env.uav_env.simulation.airspace.points.isfinite().all()
 
 
 def test_the_policy_reads_received_messages_and_not_sent_ones():

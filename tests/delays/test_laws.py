@@ -72,28 +72,9 @@ def test_delays_and_losses_are_as_frequent_as_the_law_says(name, loss):
     law, dt, chances = LAWS[name]
     sampler = law.sampler(dt, loss)
     check_chances(sampler, {k: chance * (1 - loss) for k, chance in chances.items()}, sample(sampler))
-
-
-def test_a_sampler_knows_its_longest_delay_and_its_certain_delay_if_there_is_one():
-    samplers = {name: law.sampler(dt) for name, (law, dt, _) in LAWS.items()}
-    assert {name: (sampler.longest, sampler.constant_delay) for name, sampler in samplers.items()} == {
-        "none": (0, 0),
-        "steps": (3, 3),
-        "a time, rounded up": (2, 2),
-        "a time of whole steps": (3, 3),
-        "uniform steps": (5, None),
-        "uniform steps, rarely": (4, None),
-        "the paper's": (7, None),
-        "the paper's at a coarser step": (4, None),
-        "uniform within a step": (2, None),
-        "a single time": (2, None),
-        "uniform, never": (7, 0),
-        "geometric": (6, None),
-        "geometric in time": (4, None),
-        "geometric of mean 0": (20, 0),
-        "a burst that never begins": (5, None),
-        "a burst that never ends": (2, None),
-    }
+    if loss == 0 and not isinstance(law, Burst):
+        only = next(iter(chances)) if [*chances.values()] == [1.0] else None
+        assert sampler.constant_delay == only
 
 
 @pytest.mark.parametrize("name", ["uniform steps", "the paper's", "geometric"])
@@ -125,13 +106,6 @@ def share(flags: Tensor) -> tuple[float, int]:
 
 
 BURST = Burst(enter=0.05, leave=0.2, good=0, bad=5, bad_loss=0.0)
-
-
-def test_a_channel_starts_in_its_stationary_distribution():
-    bad = sample(BURST.sampler(), 50_000, 2) == 5
-    for step in bad:
-        found, n = share(step)
-        assert within(found, 0.05 / 0.25, math.sqrt(0.2 * 0.8 / n))
 
 
 def test_a_channel_changes_state_with_its_probabilities_so_that_a_burst_lasts_1_over_leave_steps():
@@ -179,11 +153,6 @@ def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
 def test_general_losses_add_to_those_of_a_trace(tmp_path):
     sampler = trace(tmp_path, "1", "1", "2", "lost").sampler(loss=0.25)
     check_chances(sampler, {1: 0.375, 2: 0.1875}, sample(sampler, 4000, 25))
-
-
-def test_a_trace_of_nothing_but_losses_delivers_nothing(tmp_path):
-    sampler = trace(tmp_path, "lost").sampler()
-    assert (sample(sampler, 10, 10) == sampler.lost).all()
 
 
 @pytest.mark.parametrize(

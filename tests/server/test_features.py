@@ -75,15 +75,6 @@ def test_bearing_and_drift_have_no_rounding_errors_at_the_estimated_position_of_
     assert (features["source_drift"] == 0.5).all()
 
 
-def test_the_source_is_estimated_at_the_mean_position_of_the_latest_detections():
-    messages, server = one_world((0.0, 0.0), (100.0, 0.0), (50.0, 0.0), heard_at=2.0)
-    heard = torch.tensor([[[0.0, 100.0], [0.0, 0.0], [100.0, -100.0]]])
-    messages = messages._replace(detected_position=heard)  # UAV 1 has not detected it.
-    features = observe(messages, server, ["source_distance", "source_time"])
-    assert features["source_distance"][0].tolist() == pytest.approx([0.2, 0.2, 0.0])
-    assert features["source_time"][0].tolist() == pytest.approx([5 / 60] * 3)
-
-
 def test_messages_may_have_any_leading_dimensions():
     messages, server = messages_of(random_worlds(0, 3, 0.5, 0.5))
     expected = stack(observe(messages, server, NAMES), NAMES)
