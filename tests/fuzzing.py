@@ -31,7 +31,6 @@ from damian.recipes.shared.composition_errors import COMPOSITION_ERRORS, foreign
 from damian.recipes.shared.known_settings import CONF, default_options, groups, known_settings
 from damian.recipes.shared.launch import checked
 from damian.recipes.shared.settings import TrainConfig
-from damian.world import landing
 from damian.world.regions import polygon
 
 SMALL = (
@@ -270,12 +269,12 @@ def check_line(line: str, given: list[str], program: str = "train") -> None:
 @contextmanager
 def small_limits() -> Iterator[None]:
     """Refuse as too large what would take seconds to build, instead of what takes minutes."""
-    before = landing.MAX_TABLE_BYTES, polygon.MAX_CANDIDATES
-    landing.MAX_TABLE_BYTES, polygon.MAX_CANDIDATES = 10_000_000, 20_000
+    before = polygon.MAX_CANDIDATES
+    polygon.MAX_CANDIDATES = 20_000
     try:
         yield
     finally:
-        landing.MAX_TABLE_BYTES, polygon.MAX_CANDIDATES = before
+        polygon.MAX_CANDIDATES = before
 
 
 def is_affordable(config: TrainConfig) -> bool:

@@ -47,14 +47,10 @@ def compiled(function: Function, **options: Any) -> Function:
     )
 
 
-LONG_ROWS: dict[str, Any] = {
+_INDUCTOR: dict[str, Any] = {
     # Guards on tensors stay, since shapes may change. Settings never do, and checking them takes as long as
     # running a kernel.
     "guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe,
-}
-"""Options of a graph whose innermost loops are long, so that vectors make them fast."""
-_INDUCTOR: dict[str, Any] = {
-    **LONG_ROWS,
     # The innermost loops run over a few UAVs: vectors of 16 lanes would be mostly idle, and slower.
     "cpp.simdlen": 1,
 }

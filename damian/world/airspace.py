@@ -1,17 +1,44 @@
 """Operative regions as padded tensors, with a test for inside a polygon and a search for landing points."""
 
+import math
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 import torch
+from numpy.typing import NDArray
+from shapely.geometry import MultiPolygon, Polygon
 from torch import Tensor
 
 from damian.common.errors import InputError
-from damian.common.tensors import tree_map
-from damian.world.nearest import LandingGrid, build_grid
-from damian.world.regions.polygon import landing_lattice, largest_vertex_distance
+from damian.common.tensors import gather_rows, tree_map
+from damian.world.regions.polygon import RESOLUTION, Floats, landing_lattice, largest_vertex_distance
 from damian.world.regions.region import Region
+
+_ID_BITS = 24
+"""Bits of a landing point's id below its distance; a message cannot number more points either."""
+_NEVER = torch.iinfo(torch.int64).max
+_SLOTS = 2**18
+"""Distances computed at once, which bounds the memory: a few arrays of 2 MB, to stay in a CPU's cache."""
+
+
+class Cells(NamedTuple):
+    """The landing points that may be among the nearest ones of a place, by the square cell in which it lies.
+
+    Cells of R regions, C in all, lie side by side; those outside of the polygon have no points.
+    """
+
+    point: Tensor
+    """Ids of the landing points within their region, W for each cell with -1 behind the last, [C, W] int32."""
+    first: Tensor
+    """Index of the first cell of each region, [R]."""
+    shape: Tensor
+    """Number of columns and rows of a region's cells, [R, 2]."""
+    corner: Tensor
+    """Lower left corner of each region's cells, [R, 2] metres, float64."""
+    side: Tensor
+    """Side of a region's cells, [R, 1] metres, float64."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +50,7 @@ class Airspace:
     Attributes:
         points: landing points, [R, L, 2] metres east and north of the local origin of their region.
         exact_points: the same in double precision, by which the nearest ones are found.
-        grid: the same sorted into cells, to search for the nearest ones.
+        cells: those that may be nearest to a place.
         n_points: number of real landing points, [R].
         edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres, double precision.
         scale: largest distance between two vertices, [R] metres; features divide distances by it.
@@ -33,7 +60,7 @@ class Airspace:
 
     points: Tensor
     exact_points: Tensor
-    grid: LandingGrid
+    cells: Cells
     n_points: Tensor
     edges: Tensor
     scale: Tensor
@@ -47,9 +74,9 @@ class Airspace:
 
     def to(self, device: torch.device) -> "Airspace":
         """Copy of the airspace on another device."""
-        moved = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("regions", "grid")}
-        grid = tree_map(lambda t: t.to(device), self.grid)
-        return replace(self, grid=grid, **{name: tensor.to(device) for name, tensor in moved.items()})
+        moved = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("regions", "cells")}
+        cells = tree_map(lambda t: t.to(device), self.cells)
+        return replace(self, cells=cells, **{name: tensor.to(device) for name, tensor in moved.items()})
 
 
 def build_airspace(
@@ -82,7 +109,7 @@ def build_airspace(
     return Airspace(
         points=points.float(),
         exact_points=points,
-        grid=build_grid(lattices, [r.polygon.area for r in regions], 2 * n_agents - 1),
+        cells=build_cells(lattices, [region.polygon for region in regions], 2 * n_agents - 1),
         n_points=torch.tensor([len(lattice) for lattice in lattices]),
         # A padded edge has zero length, so the inside test never counts it.
         edges=_padded(edges, 0.0),
@@ -108,6 +135,101 @@ def inside(edges: Tensor, target: Tensor) -> Tensor:
     # A horizontal edge divides by zero here, but it never straddles, so the result is not used.
     crossing = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
     return ((straddles & (x < crossing)).sum(-1) % 2).bool()
+
+
+def nearest_points(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: int) -> Tensor:
+    """The ``n`` landing points nearest to each target, nearest first.
+
+    The nearest landing point is the one at the smallest distance in whole centimetres and, of several, the
+    one with the lowest id. Distances are computed in double precision about the region's own centre, so that
+    which points are equally near depends neither on rounding errors nor on where the coordinates begin.
+
+    Args:
+        cells: of the airspace.
+        points: ``Airspace.exact_points``, [R, L, 2] metres.
+        region: indices of the regions, [M].
+        target: places inside their regions, [M, 2] metres, float64.
+        n: number of points, at most as many as ``build_cells`` was told.
+
+    Returns:
+        Ids within their region, [M, n]; -1 behind the last one of a region that has fewer than n.
+    """
+    parts = [t.split(max(_SLOTS // cells.point.shape[1], 1)) for t in (region, target)]
+    return torch.cat([_nearest(cells, points, *part, n) for part in zip(*parts, strict=True)])
+
+
+def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: int) -> Tensor:
+    """As ``nearest_points``, all targets at once."""
+    corner, side, shape, first = (
+        gather_rows(t, region) for t in (cells.corner, cells.side, cells.shape, cells.first)
+    )
+    column, row = ((target - corner) / side).long().clamp(min=0).minimum(shape - 1).unbind(-1)
+    point = gather_rows(cells.point, first + row * shape[:, 0] + column).long()
+    flat = point.clamp(min=0) + (region * points.shape[1]).unsqueeze(-1)
+    east, north = (gather_rows(points.flatten(0, 1), flat) - target.unsqueeze(1)).unbind(-1)
+    # Half a centimetre is rounded up: the small term is far above rounding errors.
+    centimetres = (100 * (east * east + north * north).sqrt() + 0.500001).long()
+    order = ((centimetres << _ID_BITS) + point).masked_fill_(point < 0, _NEVER)
+    best = order.topk(n, largest=False).values
+    return torch.where(best == _NEVER, -1, best & (1 << _ID_BITS) - 1)
+
+
+def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], n: int) -> Cells:
+    """List the landing points that may be among the n nearest ones of any place in each cell.
+
+    The n points nearest to a cell's centre are at most half a diagonal farther from any place in the cell, so
+    the n nearest ones of that place are at most two halves farther from the centre than the n-th of these.
+
+    Args:
+        lattices: landing points of each region, [L, 2] metres.
+        polygons: of the regions.
+        n: number of points.
+    """
+    tables, shapes, corners, sides = [], [], [], []
+    for lattice, polygon in zip(lattices, polygons, strict=True):
+        west, south, east, north = polygon.bounds
+        side = math.sqrt(polygon.area / len(lattice))
+        half = side * math.sqrt(0.5) + RESOLUTION
+        columns, rows = (int(length / side) + 1 for length in (east - west, north - south))
+        row, column = np.divmod(np.arange(columns * rows), columns)
+        centre = np.stack([west + (column + 0.5) * side, south + (row + 0.5) * side], -1)
+        used = np.flatnonzero(shapely.dwithin(polygon, shapely.points(centre), half))
+        found, point = _within_reach(lattice, centre[used], min(n, len(lattice)), side, 2 * half)
+        slot = np.arange(len(found)) - np.searchsorted(found, found)
+        table = np.full((len(centre), slot.max() + 1), -1)
+        table[used[found], slot] = point
+        tables.append(table)
+        shapes.append((columns, rows))
+        corners.append((west, south))
+        sides.append([side])
+    widest = max(table.shape[1] for table in tables)
+    padded = [np.pad(t, ((0, 0), (0, widest - t.shape[1])), constant_values=-1) for t in tables]
+    first = np.cumsum([0, *map(len, tables)])[:-1]
+    fields = (
+        np.concatenate(padded).astype(np.int32),
+        first,
+        np.array(shapes),
+        np.array(corners),
+        np.array(sides),
+    )
+    return Cells(*map(torch.as_tensor, fields))
+
+
+def _within_reach(lattice: Floats, place: Floats, n: int, side: float, farther: float) -> NDArray[np.int64]:
+    """Pairs of places and landing points: for each place the n nearest points and all that are a bit farther.
+
+    Returns:
+        Indices of the places, in ascending order, and of the points, [2, P].
+    """
+    tree, targets = shapely.STRtree(shapely.points(lattice).tolist()), shapely.points(place)
+    reach = np.full(len(place), side * math.sqrt(n / math.pi))
+    while True:
+        found = tree.query(targets, predicate="dwithin", distance=reach)[0]
+        few = np.bincount(found, minlength=len(place)) < n
+        if not few.any():
+            pairs = tree.query(targets, predicate="dwithin", distance=reach + farther)
+            return pairs[:, np.argsort(pairs[0], kind="stable")]
+        reach[few] *= 1.25
 
 
 def _edges(polygon: shapely.Geometry) -> np.ndarray:

@@ -9,7 +9,7 @@ A step only has to look masks up, combine them with OR and count the bits that s
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,19 +18,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from damian.common.compiling import LONG_ROWS, compiled
-from damian.common.errors import InputError
 from damian.common.tensors import gather_rows
 
-# Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact.
 _GRID = 321
-# Words and table rows of the worlds computed at once, which bounds the memory of many UAVs in many worlds:
-# 2 MiB on a CPU, to stay in its cache; 128 MiB on a GPU and in compiled graphs, which grow with the number of
-# chunks.
+"""Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact."""
 _CHUNK_WORDS, _CHUNK_WORDS_LARGE = 2**18, 2**24
-
-# Landing points whose samples are tested at once, which bounds the memory: arrays of 16 MiB.
+"""Words and table rows of the worlds computed at once, which bounds the memory of many UAVs in many worlds:
+2 MiB on a CPU, to stay in its cache; 128 MiB on a GPU and in compiled graphs, which grow with the number of
+chunks."""
 _POINTS_AT_ONCE = 1024
+"""Landing points whose samples are tested at once, which bounds the memory: arrays of 16 MiB."""
 
 
 class FootprintTables(NamedTuple):
@@ -68,14 +65,7 @@ def build_tables(
             ``r * L + l``. Rows of NaN are padding, where nothing counts as covered.
         radius: radius of the footprint [m].
         words: number of int64 words of a mask, with 64 samples each.
-
-    Raises:
-        InputError: the radius is not a positive length, or there are no words.
     """
-    if not (math.isfinite(radius) and radius > 0):
-        raise InputError(f"footprint radius: {radius} m: must be finite and above 0 m")
-    if words < 1:
-        raise InputError(f"words: {words} words of 64 samples: must be 1 or more")
     offsets = radius * _unit_disc_samples(64 * words)
     outside = [_outside(*pair, offsets) for pair in zip(polygons, points, strict=True)]
     masks = torch.cat([_overlap(words), *map(_packed, outside)])
@@ -122,20 +112,12 @@ def updated_share(tables: FootprintTables, point_ids: Tensor, points: Tensor, kn
     changed = (point_ids != known.trail).flatten(-2).any(-1) | (known.share[..., 0] < 0)
     n_uavs, n_last = point_ids.shape[-2:]
     ids, share = point_ids.reshape(-1, n_uavs, n_last), known.share.reshape(-1, n_uavs)
-    compiles = torch.compiler.is_compiling()
-    updated = _update_share(*tables, ids, points, share, changed.reshape(-1), compiles)
-    return updated.view(known.share.shape)
+    return _update_share(*tables, ids, points, share, changed.reshape(-1)).view(known.share.shape)
 
 
 @torch.library.custom_op("damian::update_share", mutates_args=())
 def _update_share(
-    masks: Tensor,
-    cells_per_metre: float,
-    ids: Tensor,
-    points: Tensor,
-    share: Tensor,
-    changed: Tensor,
-    compiles: bool,
+    masks: Tensor, cells_per_metre: float, ids: Tensor, points: Tensor, share: Tensor, changed: Tensor
 ) -> Tensor:
     """The shares ``[b, N]``, computed again for the worlds of ``changed [b]``.
 
@@ -143,50 +125,22 @@ def _update_share(
     """
     updated, worlds = share.clone(), changed.nonzero().squeeze(-1)
     if len(worlds):
-        ids, tables = ids.index_select(0, worlds), FootprintTables(masks, cells_per_metre)
-        compute = _share_by_graph if compiles else _share_at
-        updated.index_copy_(0, worlds, compute(tables, ids, points))
+        ids = ids.index_select(0, worlds)
+        tables = FootprintTables(masks, cells_per_metre)
+        updated.index_copy_(0, worlds, covered_share(tables, ids, gather_rows(points, ids)))
     return updated
 
 
 @_update_share.register_fake
-def _(masks, cells_per_metre, ids, points, share, changed, compiles):  # compilers need only the shape
+def _(masks, cells_per_metre, ids, points, share, changed):  # compilers need only the shape
     return torch.empty_like(share)
 
 
-def _share_at(tables: FootprintTables, ids: Tensor, points: Tensor) -> Tensor:
-    """:func:`covered_share` at flat ids ``[b, N, n]`` of the landing points ``[R * L, 2]``, ``[b, N]``."""
-    return covered_share(tables, ids, gather_rows(points, ids))
-
-
-def _share_by_graph(tables: FootprintTables, ids: Tensor, points: Tensor) -> Tensor:
-    """:func:`_share_at`, compiled once for any number of worlds."""
-    graph = _share_graph(tables.cells_per_metre, *tables.masks.shape, *points.shape, *ids.shape[1:])
-    shares = []
-    for part in ids.split(_worlds_at_once(tables, ids, large=True)):
-        torch._dynamo.mark_dynamic(part, 0)
-        # A graph of a single world would be a special one, which takes seconds to compile.
-        shares.append(graph(tables.masks, part, points) if len(part) > 1 else _share_at(tables, part, points))
-    return torch.cat(shares)
-
-
-@functools.cache
-def _share_graph(cells_per_metre: float, *_sizes: int) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-    """A graph of its own for each scale and all sizes but the number of worlds, because no guard checks the
-    scale, and other sizes would compile the same graph again and again."""
-
-    def share(masks: Tensor, ids: Tensor, points: Tensor) -> Tensor:
-        tables = FootprintTables(masks, cells_per_metre)
-        return _covered_share(tables, ids, gather_rows(points, ids))
-
-    return compiled(share, options=LONG_ROWS)
-
-
-def _worlds_at_once(tables: FootprintTables, point_ids: Tensor, large: bool = False) -> int:
+def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:
     """Number of worlds of ``point_ids [b, N, n]`` to look up together; depends on shapes only."""
     _, n_uavs, n_last = point_ids.shape
     words_per_world = n_uavs * n_last * (n_uavs + n_last - 1 + tables.masks.shape[-1])
-    large = large or point_ids.device.type != "cpu" or torch.compiler.is_compiling()
+    large = point_ids.device.type != "cpu" or torch.compiler.is_compiling()
     return max(1, (_CHUNK_WORDS_LARGE if large else _CHUNK_WORDS) // words_per_world)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from damian.common import checks
 from damian.common.tensors import tree_map
-from damian.world.airspace import Airspace
+from damian.world.airspace import Airspace, nearest_points
 from damian.world.config import WorldConfig
 from damian.world.regions.places import local_places
 from damian.world.regions.region import Region
@@ -90,7 +90,8 @@ def _given_starts(config: WorldConfig, airspace: Airspace, region: int) -> Tenso
     """Landing points nearest to the given start positions, [N]."""
     given, name = config.region.start_positions or [], airspace.regions[region].name
     local = torch.as_tensor(local_places("region.start_positions", given, airspace.regions[region]))
-    points = airspace.grid.nearest(torch.full((len(local),), region), local, 1).squeeze(-1)
+    regions = torch.full((len(local),), region)
+    points = nearest_points(airspace.cells, airspace.exact_points, regions, local, 1).squeeze(-1)
     taken: dict[int, int] = {}
     for i, point in enumerate(points.tolist()):
         first = taken.setdefault(point, i)

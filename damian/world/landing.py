@@ -1,6 +1,5 @@
 """Actions (paper, section 4.2): a distance and a heading that lead to a landing point of the UAV's own."""
 
-import functools
 import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -12,25 +11,15 @@ from tqdm import tqdm
 
 from damian.common import checks, devices
 from damian.common.tensors import gather_rows
-from damian.world.airspace import Airspace, inside
-from damian.world.nearest import LandingGrid
+from damian.world.airspace import Airspace, Cells, inside, nearest_points
 
-MAX_TABLE_BYTES = 4_000_000_000
-"""Largest size of the tables of discrete actions [bytes]."""
-_POINTS_AT_ONCE = 1024
-"""Landing points whose actions are ranked together."""
-_KEEPERS_AT_ONCE = 2**22
-"""Landing points of contested worlds that are booked together, which bounds the memory: 32 MB."""
-_COMPARED_AGENTS = 16
-"""Most UAVs of a world whose choices are compared in pairs; with more, all are settled in turn."""
+BOOKING_CHUNK = 2**22
+"""Landing points of all worlds in which UAVs book together, which bounds the memory: 32 MB."""
 _FEW_AGENTS = 4
-"""Most UAVs of a world that get landing points one after the other. With more, rounds in which all of them
-ask at once are faster: they take 1.7 times as long with 3 UAVs, the same with 5, and 0.4 times with 8."""
+"""Most UAVs of a world that book one after the other. In a compiled step with 3 UAVs this takes 0.2 times as
+long as rounds in which all of them ask; with 8 UAVs it takes 5 times as long, with 20 UAVs 50 times."""
 _EDGES_AT_ONCE = 2**18
 """Pairs of target and polygon edge compared at once, which bounds the memory: a few arrays of 2 MB."""
-_COMPARES_ALL = 1024
-"""Up to so many landing points, all are compared where shapes may not depend on data. With more, a GPU waits
-for the number of cells to search, in each step, because this costs less."""
 
 
 @dataclass
@@ -97,9 +86,6 @@ class Candidates:
         airspace: regions and their landing points.
         config: settings of the actions.
         n_agents: number of UAVs N.
-
-    Raises:
-        InputError: too many landing points to rank for every discrete action.
     """
 
     def __init__(self, airspace: Airspace, config: ActionConfig, n_agents: int) -> None:
@@ -126,16 +112,16 @@ class Candidates:
         action = action.double().clamp(0, 1)
         move = displacement(action[..., 0] * self.max_distance, action[..., 1] * 2 * math.pi).flatten(0, 1)
         own, base = flat.flatten(), (flat - flat % self.airspace.max_points).flatten()
-        target = gather_rows(self.airspace.exact_points.flatten(0, 1), own) + move
-        regions = region.unsqueeze(-1).expand_as(flat).flatten()
+        exact_points, regions = self.airspace.exact_points, region.unsqueeze(-1).expand_as(flat).flatten()
+        target = gather_rows(exact_points.flatten(0, 1), own) + move
         nearest = _nearest_inside(
             self.airspace.edges,
-            [*self.airspace.grid],
+            [*self.airspace.cells],
+            exact_points,
             regions,
             target,
             own - base,
             self.n_candidates,
-            self.airspace.max_points,
         )
         points = self.airspace.points.flatten(0, 1)
         offset = gather_rows(points, nearest + base.unsqueeze(-1)) - gather_rows(points, own).unsqueeze(1)
@@ -155,64 +141,50 @@ class Candidates:
         action, if no listed distance is 0).
         """
         table = self.config.table(torch.float64)
-        self._require_fitting(self.airspace.points.shape[:2].numel() * len(table))
-        # Adding 0 makes a negative 0 positive, so that actions which hold are equal, and are ranked once.
-        move, alike = torch.unique(displacement(table[:, 0], table[:, 1]) + 0.0, dim=0, return_inverse=True)
         shape = (*self.airspace.points.shape[:2], len(table))
         self.distance = torch.zeros(shape)
-        ranking = Ranking(
+        self.ranking = Ranking(
             torch.zeros(*shape, self.n_candidates, dtype=torch.int32), torch.zeros(*shape, self.n_candidates)
         )
         counts = self.airspace.n_points.tolist()
-        with tqdm(total=sum(counts), desc="landing points", delay=1, leave=False) as bar:
-            for region, count in enumerate(counts):
-                for own in torch.arange(count).split(_POINTS_AT_ONCE):
-                    ranked, within = self._rank_from(region, own, move)
-                    for table_of_all, part in zip(ranking, ranked, strict=True):
-                        table_of_all[region, own] = part[:, alike].to(table_of_all.dtype)
-                    first = ranked.distance[..., 0].where(within, torch.inf)
-                    self.distance[region, own] = first[:, alike]
-                    bar.update(len(own))
-        self.ranking = Ranking(*(each.flatten(0, 2) for each in ranking))
+        for region, count in enumerate(tqdm(counts, desc="regions", delay=1, leave=False)):
+            ranked, within = self._rank_from(region, count, displacement(table[:, 0], table[:, 1]))
+            for table_of_all, part in zip(self.ranking, ranked, strict=True):
+                table_of_all[region, :count] = part.to(table_of_all.dtype)
+            self.distance[region, :count] = ranked.distance[..., 0].where(within, torch.inf)
+        self.ranking = Ranking(*(each.flatten(0, 2) for each in self.ranking))
         self.distance = self.distance.flatten(0, 1)
         holds = table[:, 0] == 0
         self.can_hold = bool(holds.any())
         self.hold = torch.arange(len(table)) == int(holds.int().argmax())
 
-    def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
+    def _rank_from(self, region: int, count: int, move: Tensor) -> tuple[Ranking, Tensor]:
         """Rank the landing points for flights within a region; a UAV holds if its target lies outside.
 
         Args:
             region: index of the region.
-            own: landing points where UAVs stand, [P].
+            count: number of its landing points P, at each of which a UAV may stand.
             move: displacements east and north, [A, 2] metres.
 
         Returns:
             Candidates, [P, A, K], and whether each target lies inside, [P, A].
         """
         polygon, points = self.airspace.regions[region].polygon, self.airspace.points[region]
-        target = self.airspace.exact_points[region][own].unsqueeze(1) + move
+        target = self.airspace.exact_points[region, :count].unsqueeze(1) + move
         shapely.prepare(polygon)
         within = torch.as_tensor(shapely.contains_xy(polygon, *target.numpy().transpose(2, 0, 1)))
-        nearest = own.view(-1, 1, 1).repeat(1, len(move), self.n_candidates)
-        regions = torch.full((int(within.sum()),), region)
-        found = self.airspace.grid.nearest(regions, target[within], self.n_candidates)
-        nearest[within] = torch.where(found < 0, nearest[within], found)
-        offset = gather_rows(points, nearest) - points[own, None, None]
+        own = torch.arange(count).unsqueeze(-1).expand_as(within)
+        nearest = _nearest_or_own(
+            self.airspace.cells,
+            self.airspace.exact_points,
+            torch.full((within.numel(),), region),
+            target.flatten(0, 1),
+            own.flatten(),
+            within.flatten(),
+            self.n_candidates,
+        ).view(*within.shape, -1)
+        offset = gather_rows(points, nearest) - points[:count, None, None]
         return Ranking(nearest, torch.linalg.vector_norm(offset, dim=-1)), within
-
-    def _require_fitting(self, n_lists: int) -> None:
-        """Refuse tables that are too large for the memory of a usual machine."""
-        size = n_lists * (8 * self.n_candidates + 4)
-        n_points, n_actions = n_lists // self.config.n_actions, self.config.n_actions
-        checks.require(
-            size <= MAX_TABLE_BYTES,
-            "region.lattice_step",
-            f"{n_points} landing points with {n_actions} actions and {self.n_candidates} candidates each",
-            f"need {size / 1e9:.1f} GB, more than {MAX_TABLE_BYTES / 1e9:g} GB: raise region.lattice_step, "
-            "set region.n_landing_points, list fewer actions.distances or actions.headings, lower "
-            "region.pool, or take actions.kind=continuous",
-        )
 
     def to(self, device: torch.device) -> "Candidates":
         """Move the tables to a device, in place."""
@@ -225,37 +197,41 @@ class Candidates:
 
 @torch.library.custom_op("damian::nearest_inside", mutates_args=())
 def _nearest_inside(
-    edges: Tensor, grid: list[Tensor], region: Tensor, target: Tensor, own: Tensor, n: int, n_points: int
+    edges: Tensor, cells: list[Tensor], points: Tensor, region: Tensor, target: Tensor, own: Tensor, n: int
 ) -> Tensor:
     """Landing points nearest to targets, [M, n]; ``own`` instead of missing ones, and if a target is outside.
 
-    This is a custom operator because the number of cells searched depends on the data, which a compiler
+    This is a custom operator because the number of targets inside depends on the data, which a compiler
     cannot trace.
 
     Args:
         edges: of the polygons, [R, E, 4] metres.
-        grid: the fields of the landing points' ``LandingGrid``.
+        cells: the fields of ``Airspace.cells``.
+        points: ``Airspace.exact_points``.
         region: indices of the regions, [M].
         target: [M, 2] metres.
         own: landing points where the UAVs stand, [M].
         n: number of points.
-        n_points: largest number of landing points of a region.
     """
     at_once = max(_EDGES_AT_ONCE // edges.shape[1], 1)
     parts = zip(region.split(at_once), target.split(at_once), strict=True)
     within = torch.cat([inside(edges.index_select(0, r), t) for r, t in parts])
-    nearest = own.unsqueeze(-1).repeat(1, n)
-    if n_points <= _COMPARES_ALL and not devices.data_dependent(own.device):
-        found = LandingGrid(*grid).nearest_of_all(region, target, n, n_points)
-        return torch.where(within.unsqueeze(-1) & (found >= 0), found, nearest)
-    found = LandingGrid(*grid).nearest(region[within], target[within], n)
-    nearest[within] = torch.where(found < 0, nearest[within], found)
-    return nearest
+    return _nearest_or_own(Cells(*cells), points, region, target, own, within, n)
 
 
 @_nearest_inside.register_fake
-def _(edges, grid, region, target, own, n, n_points):  # compilers need only the shape
+def _(edges, cells, points, region, target, own, n):  # compilers need only the shape
     return own.new_empty(len(own), n)
+
+
+def _nearest_or_own(
+    cells: Cells, points: Tensor, region: Tensor, target: Tensor, own: Tensor, within: Tensor, n: int
+) -> Tensor:
+    """As ``_nearest_inside``, where ``within`` [M] says which targets lie inside."""
+    nearest = own.unsqueeze(-1).repeat(1, n)
+    found = nearest_points(cells, points, region[within], target[within], n)
+    nearest[within] = torch.where(found < 0, nearest[within], found)
+    return nearest
 
 
 def assign_landing_points(
@@ -263,8 +239,7 @@ def assign_landing_points(
 ) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point.
 
-    A point is free to a UAV if no other UAV stands on it or is bound for it; its own point always is. Most
-    UAVs get their first candidate; only worlds in which two UAVs may conflict are assigned one by one.
+    A point is free to a UAV if no other UAV stands on it or is bound for it; its own point always is.
 
     Args:
         ranking: candidates, as M lists of K.
@@ -277,123 +252,80 @@ def assign_landing_points(
     Returns:
         Point that each UAV books, [B, N].
     """
-    if torch.compiler.is_compiling() and row.shape[1] <= _FEW_AGENTS:
+    if row.shape[1] <= _FEW_AGENTS or not devices.data_dependent(row.device):
         return _assign_one_by_one(ranking, row, standing, reach)
-    reached = gather_rows(ranking.distance[:, 0], row) <= reach
-    choice = torch.where(reached, gather_rows(ranking.point[:, 0], row).long(), standing)
-    departs = choice != standing
-    # A UAV that is not alone in standing on a point or choosing it may have to yield.
-    if row.shape[1] <= _COMPARED_AGENTS:
-        claims = choice.unsqueeze(-1) == torch.cat([standing, choice], -1).unsqueeze(-2)
-        contested = (departs & (claims.sum(-1, dtype=torch.int32) > 1)).any(-1)
-    else:
-        contested = departs.any(-1)
-    return _settle(*ranking, row, standing, reach, choice, contested, n_points)
+    return _assign_in_rounds(*ranking, row, standing, reach, n_points)
 
 
 def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
-    """The same for few UAVs, one after the other in all worlds; a graph makes a single kernel of it.
+    """Each UAV takes its first free candidate, one after the other in all worlds; nothing depends on data.
 
-    A UAV takes the first of its candidates that it need not pass over. It passes over one in reach that
-    another UAV stands on, or that an earlier one has booked; one out of reach, or its own, means holding.
+    A candidate out of reach means holding.
     """
-    point, distance = (gather_rows(table, row).unbind(-1) for table in ranking)
-    reached = [each <= reach for each in distance]
-    points = [torch.where(r, each.long(), standing).unbind(1) for r, each in zip(reached, point, strict=True)]
-    stands, no = standing.unbind(1), torch.zeros_like(standing[:, 0], dtype=torch.bool)
-    goals: list[Tensor] = []
-    for i, own in enumerate(stands):
-        goal, taken = own, [*stands[:i], *goals, *stands[i + 1 :]]
-        for candidate in (each[i] for each in reversed(points)):
-            clashes = (candidate == point for point in taken)
-            refused = (candidate != own) & functools.reduce(torch.logical_or, clashes, no)
-            goal = torch.where(refused, goal, candidate)
-        goals.append(goal)
-    return torch.stack(goals, 1)
+    reached = gather_rows(ranking.distance, row) <= reach.unsqueeze(-1)
+    wishes = torch.where(reached, gather_rows(ranking.point, row).long(), standing.unsqueeze(-1))
+    taken, goals = standing.t().unsqueeze(-1), []
+    for own, wish in zip(standing.split(1, 1), wishes.unbind(1), strict=True):
+        free = (wish == own) | ~(wish == taken).any(0)
+        goals.append(wish.gather(-1, free.byte().argmax(-1, keepdim=True)))  # of several, the first one
+        taken = torch.cat([taken, goals[-1].unsqueeze(0)])
+    return torch.cat(goals, 1)
 
 
-@torch.library.custom_op("damian::settle", mutates_args=())
-def _settle(
-    point: Tensor,
-    distance: Tensor,
-    row: Tensor,
-    standing: Tensor,
-    reach: Tensor,
-    choice: Tensor,
-    contested: Tensor,
-    n_points: int,
+@torch.library.custom_op("damian::assign_in_rounds", mutates_args=())
+def _assign_in_rounds(
+    point: Tensor, distance: Tensor, row: Tensor, standing: Tensor, reach: Tensor, n_points: int
 ) -> Tensor:
-    """The choices [B, N], with those of the contested worlds [B] made again in index order.
-
-    This is a custom operator because the number of contested worlds depends on the data, which a compiler
-    cannot trace.
-    """
-    if not devices.data_dependent(choice.device):
-        return _assign_serially(Ranking(point, distance), row, standing, reach)
-    settled, worlds = choice.clone(), contested.nonzero().squeeze(-1)
-    if not len(worlds):
-        return settled
-    ranking, at_once = Ranking(point, distance), max(_KEEPERS_AT_ONCE // n_points, 1)
-    for part in worlds.split(at_once):
-        rows, places, reaches, choices = (
-            each.index_select(0, part) for each in (row, standing, reach, choice)
-        )
-        if row.shape[1] <= _FEW_AGENTS:
-            goals = _assign_serially(ranking, rows, places, reaches)
-        else:
-            goals = _assign_in_order(ranking, rows, places, reaches, choices, n_points)
-        settled.index_copy_(0, part, goals)
-    return settled
-
-
-@_settle.register_fake
-def _(point, distance, row, standing, reach, choice, contested, n_points):  # compilers need only the shape
-    return torch.empty_like(choice)
-
-
-def _assign_in_order(
-    ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, choice: Tensor, n_points: int
-) -> Tensor:
-    """Serial assignment by deferred acceptance (Gale and Shapley, 1962); arguments as above.
+    """The same by deferred acceptance (Gale and Shapley, 1962); the fields of the ranking come first.
 
     All UAVs ask for their best candidate. Each point keeps the earliest UAV that has asked for it; all others
     ask for their next one, and so does a UAV that has to yield to an earlier one. As the earliest UAV that
     ever asks for a free point keeps it, this ends with what the UAVs would take one after the other. A round
     costs as much as there are UAVs that ask.
+
+    This is a custom operator because the number of rounds depends on the data, which a compiler cannot trace.
     """
-    points, distances, stands = ranking.point.flatten(), ranking.distance.flatten(), standing.flatten()
-    asked, reach, booked = row.flatten() * ranking.point.shape[1], reach.flatten(), choice.flatten().clone()
+    at_once, points, distances = max(BOOKING_CHUNK // n_points, 1), point.flatten(), distance.flatten()
+    first = row * point.shape[1]
+    parts = zip(*(each.split(at_once) for each in (first, standing, reach)), strict=True)
+    return torch.cat([_rounds(points, distances, *part, n_points) for part in parts])
+
+
+@_assign_in_rounds.register_fake
+def _(point, distance, row, standing, reach, n_points):  # compilers need only the shape
+    return torch.empty_like(standing)
+
+
+def _rounds(
+    points: Tensor, distances: Tensor, first: Tensor, standing: Tensor, reach: Tensor, n_points: int
+) -> Tensor:
+    """The rounds of some worlds.
+
+    Args:
+        points: of all lists behind each other, [M*K].
+        distances: as ``points``.
+        first: index of each UAV's first candidate among them, [B, N].
+        standing: as in ``assign_landing_points``, like the other arguments.
+    """
+    asked, stands, reach = first.flatten().clone(), standing.flatten(), reach.flatten()
     # A world's first point, and the UAV that each point keeps, as a flat number; those of a world count up in
     # index order.
-    base = (torch.arange(len(row), device=row.device) * n_points).repeat_interleave(row.shape[1])
-    nobody = row.numel()
-    keeper = torch.full((len(row) * n_points,), nobody, device=row.device).index_fill_(0, base + stands, -1)
-    asking = (booked != stands).nonzero().squeeze(-1)
-    wanted = (base + booked).index_select(0, asking)
+    base = (torch.arange(len(first), device=first.device) * n_points).repeat_interleave(first.shape[1])
+    nobody = first.numel()
+    keeper = torch.full((len(first) * n_points,), nobody, device=first.device)
+    keeper.index_fill_(0, base + stands, -1)
+    booked, asking = stands.clone(), torch.arange(nobody, device=first.device)
     while len(asking):
+        candidate, own = asked.index_select(0, asking), stands.index_select(0, asking)
+        point = points.index_select(0, candidate).long()
+        flies = (distances.index_select(0, candidate) <= reach.index_select(0, asking)) & (point != own)
+        booked.index_copy_(0, asking, torch.where(flies, point, own))
+        asking, point = asking[flies], point[flies]
+        wanted = base.index_select(0, asking) + point
         before = keeper.index_select(0, wanted)
         keeper.scatter_reduce_(0, wanted, asking, "amin")
         kept = keeper.index_select(0, wanted) == asking
         displaced = before[kept]
         asking = torch.cat([asking[~kept], displaced[displaced < nobody]])
-        candidate = asked.index_select(0, asking) + 1
-        asked.index_copy_(0, asking, candidate)
-        point, own = points.index_select(0, candidate).long(), stands.index_select(0, asking)
-        flies = (distances.index_select(0, candidate) <= reach.index_select(0, asking)) & (point != own)
-        booked.index_copy_(0, asking, torch.where(flies, point, own))
-        asking, point = asking[flies], point[flies]
-        wanted = base.index_select(0, asking) + point
+        asked.index_add_(0, asking, torch.ones_like(asking))
     return booked.view_as(standing)
-
-
-def _assign_serially(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
-    """The same, one UAV after the other in all worlds, so that nothing depends on data."""
-    reached = gather_rows(ranking.distance, row) <= reach.unsqueeze(-1)
-    wishes = torch.where(reached, gather_rows(ranking.point, row).long(), standing.unsqueeze(-1))
-    taken = torch.cat([standing, torch.full_like(standing, -1)], -1)
-    for i in range(standing.shape[1]):
-        own, wish = standing[:, i : i + 1], wishes[:, i]
-        free = (wish == own) | (wish.unsqueeze(-1) != taken.unsqueeze(1)).all(-1)
-        first = free.byte().argmax(-1, keepdim=True)  # of several, the first one
-        taken[:, standing.shape[1] + i] = wish.gather(-1, first).squeeze(-1)
-    return taken[:, standing.shape[1] :].clone()

@@ -12,7 +12,7 @@ from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
-from damian.world.airspace import Airspace
+from damian.world.airspace import Airspace, nearest_points
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
 from damian.world.config import WorldConfig
 from damian.world.messages import Messages
@@ -344,5 +344,6 @@ def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
             first = places[int((local == place).all(-1).nonzero()[0])]
             problem = "are the same place: list each once"
             checks.require(first is places[i], "battery.charging_points", f"{first} and {places[i]}", problem)
-        charges[index, airspace.grid.nearest(torch.full((len(local),), index), local, 1).squeeze(-1)] = True
+        regions = torch.full((len(local),), index)
+        charges[index, nearest_points(airspace.cells, airspace.exact_points, regions, local, 1)] = True
     return charges.flatten()

@@ -32,7 +32,6 @@ from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED, REWARD
 from damian.server.termination import EpisodeConfig
 from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
-from damian.world import coverage
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 
@@ -273,8 +272,7 @@ def test_an_action_delay_of_j_steps_has_the_effect_of_j_more_steps_of_observatio
         for name, changed in {**DELAYS, "nothing": {}}.items()
     ],
 )
-def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, changed, monkeypatch):
-    monkeypatch.setattr(coverage, "_share_by_graph", coverage._share_at)  # it would compile for seconds
+def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, changed):
     scenario = everything(motion, **changed)
     at_once, graph = delayed(scenario), delayed(scenario).compile(backend="eager")
     base = at_once.base_env

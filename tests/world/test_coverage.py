@@ -13,9 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Point, Polygon
-from torch._dynamo import lookup_backend
 
-from damian.common.errors import InputError
 from damian.world import coverage
 from damian.world.coverage import KnownCoverage, build_tables, covered_share, updated_share
 
@@ -232,28 +230,6 @@ def test_only_worlds_that_have_changed_are_computed_again(square, monkeypatch):
     assert sizes == [1]
 
 
-@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
-def test_one_graph_computes_the_shares_of_any_number_of_worlds(square, monkeypatch, backend):
-    tables, _, points = square
-    graphs, make = [], lookup_backend(backend)
-
-    def compiled(function, **_):
-        return torch.compile(
-            function, fullgraph=True, isolate_recompiles=True, backend=lambda *g: graphs.append(g) or make(*g)
-        )
-
-    monkeypatch.setattr(coverage, "compiled", compiled)
-    monkeypatch.setattr(coverage, "_CHUNK_WORDS_LARGE", (16 + 3) * 3 * 2 * 20)  # about 20 worlds
-    coverage._share_graph.cache_clear()
-    places = torch.tensor(points, dtype=torch.float32)
-    for n_worlds in (5, 1, 2, 39, 41, 20, 3):
-        ids, positions = at_random(points, (n_worlds, 3, 2), seed=n_worlds)
-        got = coverage._share_by_graph(tables, ids, places)
-        assert torch.equal(got, covered_share(tables, ids, positions))
-    coverage._share_graph.cache_clear()
-    assert len(graphs) == 1
-
-
 def test_permuting_the_uavs_permutes_their_shares(square):
     tables, _, points = square
     ids, positions = at_random(points, (8, 4, 2))
@@ -320,14 +296,3 @@ def test_coverage_compiles_to_one_graph(square):
     ids, positions = at_random(points, (7, 3, 2))
     compiled = torch.compile(covered_share, fullgraph=True, backend="eager")
     assert torch.equal(compiled(tables, ids, positions), covered_share(tables, ids, positions))
-
-
-@pytest.mark.parametrize("radius", [0, -3.0, math.nan, math.inf])
-def test_a_radius_that_is_not_positive_and_finite_is_refused(radius):
-    with pytest.raises(InputError, match=r"^footprint radius: \S+ m: must be finite and above 0 m$"):
-        build_tables([shapely.box(0, 0, 1, 1)], np.zeros((1, 1, 2)), radius)
-
-
-def test_tables_without_words_are_refused():
-    with pytest.raises(InputError, match=r"^words: 0 words of 64 samples: must be 1 or more$"):
-        build_tables([shapely.box(0, 0, 1, 1)], np.zeros((1, 1, 2)), R, words=0)

@@ -9,30 +9,26 @@ import torch
 import twin
 from exact_distance import nearest_by_loop
 from helpers import SQUARE, both_kinds, heading
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.affinity import scale, translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
+from damian.world import airspace as search
 from damian.world import landing
-from damian.world.airspace import build_airspace, inside
+from damian.world.airspace import build_airspace, build_cells, inside, nearest_points
 from damian.world.config import WorldConfig
-from damian.world.landing import (
-    ActionConfig,
-    Candidates,
-    Ranking,
-    _assign_serially,
-    assign_landing_points,
-    displacement,
-)
+from damian.world.landing import ActionConfig, Candidates, Ranking, assign_landing_points, displacement
 from damian.world.regions.config import RegionConfig
 from damian.world.regions.region import Region
 from damian.world.simulation import Simulation
 
+# Booking.
+
 
 def random_bookings(seed, n_worlds, n_agents, n_points, together):
-    """Random preferences, standing points (at most 3 if ``together``) and flags of UAVs that may choose."""
+    """Random preferences, standing points (at most 3 if ``together``), and reach, below 0 for some UAVs."""
     rng = np.random.default_rng(seed)
     n_candidates = min(2 * n_agents - 1, n_points)
     ranked = np.stack([rng.permutation(n_points)[:n_candidates] for _ in range(40)])
@@ -42,99 +38,47 @@ def random_bookings(seed, n_worlds, n_agents, n_points, together):
         standing = rng.integers(0, min(n_points, 3), (n_worlds, n_agents))
     else:
         standing = np.stack([rng.permutation(n_points)[:n_agents] for _ in range(n_worlds)])
-    ready = rng.random((n_worlds, n_agents)) < rng.choice([0.3, 0.8, 1.0])
-    return ranked, row, standing, ready
+    ranking = Ranking(torch.as_tensor(ranked).int(), torch.as_tensor(rng.random(ranked.shape)))
+    reach = torch.as_tensor(rng.uniform(-0.3, 1.2, row.shape))
+    return ranking, torch.as_tensor(row), torch.as_tensor(standing), reach
 
 
-def booked(ranked, row, standing, ready):
-    """Points booked by UAVs, ready or not, whose reach is unlimited."""
-    ranking = Ranking(ranked, torch.zeros(ranked.shape))
-    return assign_landing_points(ranking, row, standing, torch.where(ready, 0.0, -1.0), 64)
+def booked_by_twin(ranking, row, standing, reach):
+    """Points that UAVs book one after the other; out of reach means holding."""
+    worlds = []
+    for b in range(len(row)):
+        wishes = [
+            [p if d <= reach[b, i] else standing[b, i].item() for p, d in zip(*pair, strict=True)]
+            for i, k in enumerate(row[b].tolist())
+            for pair in [(ranking.point[k].tolist(), ranking.distance[k].tolist())]
+        ]
+        worlds.append(twin.assign_landing_points(wishes, standing[b].tolist(), [True] * len(wishes)))
+    return worlds
 
 
-def bookings_within_reach(seed, n_agents, n_points, together):
-    """Random bookings of 30 worlds in which some UAVs must stay, and some reach few points."""
-    ranked, row, standing, _ = map(torch.as_tensor, random_bookings(seed, 30, n_agents, n_points, together))
-    generator = torch.Generator().manual_seed(seed)
-    ranking = Ranking(ranked.int(), torch.rand(ranked.shape, generator=generator))
-    return ranking, row, standing, 1.5 * torch.rand(row.shape, generator=generator) - 0.3
-
-
-def deferred_acceptance(ranking, row, standing, reach, n_points):
-    """Points booked by deferred acceptance, which otherwise serves only worlds with many UAVs."""
-    reached = ranking.distance[row, 0] <= reach
-    choice = torch.where(reached, ranking.point[row, 0].long(), standing)
-    return landing._assign_in_order(ranking, row, standing, reach, choice, n_points)
-
-
+@pytest.mark.parametrize("few", [0, 25])
 @given(
     seed=st.integers(0, 2**32 - 1),
     n_agents=st.integers(1, 25),
     spare=st.integers(0, 20),
     together=st.booleans(),
 )
-def test_booking_equals_a_sequential_loop(seed, n_agents, spare, together):
+def test_booking_at_once_and_one_by_one_equals_a_sequential_loop(few, seed, n_agents, spare, together):
     n_points = n_agents + spare
     case = random_bookings(seed, 6, n_agents, n_points, together)
-    ranked, row, standing, ready = map(torch.as_tensor, case)
-    ours = booked(ranked.int(), row, standing, ready)
-    expected = [
-        twin.assign_landing_points(ranked[row[b]].tolist(), standing[b].tolist(), ready[b].tolist())
-        for b in range(6)
-    ]
-    assert ours.tolist() == expected
-    reach = torch.where(ready, 0.0, -1.0)
-    assert _assign_serially(Ranking(ranked, torch.zeros(ranked.shape)), row, standing, reach).equal(ours)
-
-
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    n_agents=st.integers(1, 4),
-    spare=st.integers(0, 6),
-    together=st.booleans(),
-)
-def test_booking_of_few_uavs_one_by_one_equals_the_other_ways(seed, n_agents, spare, together):
-    n_points = n_agents + spare
-    ranking, row, standing, reach = bookings_within_reach(seed, n_agents, n_points, together)
-    one_by_one = landing._assign_one_by_one(ranking, row, standing, reach)
-    assert one_by_one.equal(assign_landing_points(ranking, row, standing, reach, n_points))
-    assert one_by_one.equal(deferred_acceptance(ranking, row, standing, reach, n_points))
-
-
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    n_agents=st.integers(1, 20),
-    spare=st.integers(0, 6),
-    together=st.booleans(),
-)
-def test_deferred_acceptance_equals_serial_assignment_with_any_reach(seed, n_agents, spare, together):
-    n_points = n_agents + spare
-    ranking, row, standing, reach = bookings_within_reach(seed, n_agents, n_points, together)
-    deferred = deferred_acceptance(ranking, row, standing, reach, n_points)
-    assert deferred.equal(_assign_serially(ranking, row, standing, reach))
-
-
-@given(seed=st.integers(0, 2**32 - 1), n_agents=st.integers(2, 12), spare=st.integers(0, 6))
-def test_uavs_on_different_points_never_book_the_same(seed, n_agents, spare):
-    case = random_bookings(seed, 20, n_agents, n_agents + spare, False)
-    ranked, row, standing, ready = map(torch.as_tensor, case)
-    ours = booked(ranked.int(), row, standing, ready)
-    assert all(len(set(world)) == n_agents for world in ours.tolist())
-    assert ours[~ready].equal(standing[~ready])
-
-
-def test_of_two_uavs_that_choose_one_point_the_first_gets_it_and_the_other_its_next():
-    ranked = torch.tensor([[5, 7, 1], [5, 0, 2]], dtype=torch.int32)
-    row, standing = torch.tensor([[0, 1], [1, 0]]), torch.tensor([[1, 2], [1, 2]])
-    ready = torch.ones(2, 2, dtype=torch.bool)
-    assert booked(ranked, row, standing, ready).tolist() == [[5, 0], [5, 7]]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(landing, "_FEW_AGENTS", few)
+        patch.setattr(landing, "BOOKING_CHUNK", 4 * n_points)  # four worlds at once
+        ours = assign_landing_points(*case, n_points)
+    assert ours.tolist() == booked_by_twin(*case)
+    assert together or all(len({*world}) == n_agents for world in ours.tolist())
+    assert ours[case[-1] < 0].equal(case[2][case[-1] < 0])
 
 
 def test_a_point_that_a_uav_leaves_in_this_step_is_not_free_yet():
-    ranked = torch.tensor([[5, 7, 1], [1, 6, 2]], dtype=torch.int32)
+    ranking = Ranking(torch.tensor([[5, 7, 1], [1, 6, 2]]), torch.zeros(2, 3))
     row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
-    ready = torch.ones(1, 2, dtype=torch.bool)
-    assert booked(ranked, row, standing, ready).tolist() == [[5, 6]]
+    assert assign_landing_points(ranking, row, standing, torch.zeros(1, 2), 8).tolist() == [[5, 6]]
 
 
 def test_a_point_out_of_reach_of_one_uav_goes_to_another_that_can_fly_there():
@@ -144,12 +88,59 @@ def test_a_point_out_of_reach_of_one_uav_goes_to_another_that_can_fly_there():
     assert assign_landing_points(ranking, row, standing, torch.tensor([[9.0, 9.0]]), 8).tolist() == [[5, 2]]
 
 
-def test_uavs_on_a_common_start_may_stay_there_or_leave():
-    ranked = torch.tensor([[3, 0, 1, 2, 4], [4, 0, 1, 2, 3]], dtype=torch.int32)
-    row, standing = torch.tensor([[0, 0, 1]]), torch.tensor([[3, 3, 3]])
-    ready = torch.ones(1, 3, dtype=torch.bool)
-    assert booked(ranked, row, standing, ready).tolist() == [[3, 3, 4]]
+# Nearest points.
 
+
+def some_points(rng, kind, n) -> np.ndarray:
+    """Scattered points, points in two far clusters, or a lattice whose points are often equally far."""
+    if kind == "lattice":
+        east, north = np.divmod(np.arange(n), math.ceil(math.sqrt(n)))
+        return np.stack([east * 30.0, north * 30 * math.sin(math.pi / 4)], -1)[rng.permutation(n)]
+    points = rng.uniform(-200, 200, (n, 2))
+    return points + 5000.0 * (kind == "clusters") * rng.integers(0, 2, (n, 1))
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kinds=st.lists(st.sampled_from(["scattered", "clusters", "lattice"]), min_size=1, max_size=3),
+    n=st.integers(1, 9),
+)
+def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds, n):
+    rng = np.random.default_rng(seed)
+    lattices = [some_points(rng, kind, int(rng.integers(1, 40))) for kind in kinds]
+    polygons = [shapely.MultiPoint(points).buffer(rng.uniform(1, 500)) for points in lattices]
+    region, target = rng.integers(len(kinds), size=12), np.empty((12, 2))
+    for i, (points, polygon) in enumerate((lattices[r], polygons[r]) for r in region):
+        angle = math.radians(45 * rng.integers(8))  # from a landing point, by a round distance
+        move = rng.choice([0.0, 15.0, 30.0, 45.005]) * np.array([math.sin(angle), math.cos(angle)])
+        target[i] = points[rng.integers(len(points))] + move
+        while rng.random() < 0.5 or not shapely.contains_xy(polygon, *target[i]):
+            target[i] = rng.uniform(*np.split(np.array(polygon.bounds), 2))
+    most = max(map(len, lattices))
+    padded = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), constant_values=np.inf) for p in lattices])
+    n = min(n, most)
+    cells = build_cells(lattices, polygons, n)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, "_SLOTS", int(rng.choice([10, 2**18])))
+        ours = nearest_points(cells, *map(torch.as_tensor, (padded, region, target)), n)
+    expected = [
+        nearest_by_loop(lattices[r].tolist(), t, n) for r, t in zip(region, target.tolist(), strict=True)
+    ]
+    assert ours.tolist() == expected
+
+
+@pytest.mark.parametrize("distance", [10.0, 12.345, 0.005, 77.775, 100 * math.sqrt(2)])
+def test_of_points_at_one_distance_in_any_direction_the_lowest_id_is_nearest(distance):
+    angles = np.radians(np.arange(1, 360))
+    points = distance * np.stack([np.sin(angles), np.cos(angles)], -1)
+    cells = build_cells([points], [shapely.Point(0, 0).buffer(2 * distance)], 359)
+    origin = torch.zeros(1, 2, dtype=torch.float64)
+    ours = nearest_points(cells, torch.as_tensor(points[None]), torch.zeros(1).long(), origin, 359)
+    assert ours.tolist() == [list(range(359))]
+
+
+# Inside tests.
 
 HORSESHOE = Polygon([(0, 0), (10, 0), (10, 8), (7, 8), (7, 3), (3, 3), (3, 8), (0, 8)])
 HOLED = Polygon([(-4, -3), (9, -5), (12, 4), (3, 9), (-6, 5)], [[(0, 0), (4, 0), (4, 4), (0, 4)]])
@@ -169,9 +160,10 @@ def star(rng):
     return Polygon(shell).buffer(0).difference(Polygon(hole))
 
 
-def check_inside(polygon, rng):
-    """Assert that ``inside`` agrees with shapely at random targets away from the boundary."""
-    airspace = build_airspace([Region(polygon, "test", None, None)], 1.0, 45.0, None, 1)
+@pytest.mark.parametrize("polygon", [*POLYGONS.values(), *map(star, map(np.random.default_rng, range(5)))])
+def test_inside_equals_shapelys_contains(polygon):
+    rng = np.random.default_rng(3)
+    airspace = build_airspace([Region(polygon, "test")], 1.0, 45.0, None, 1)
     west, south, east, north = polygon.bounds
     target = rng.uniform([west - 1, south - 1], [east + 1, north + 1], (2000, 2))
     # A quarter of the targets have the y of some corner, so that their rays meet the ends of edges.
@@ -186,21 +178,13 @@ def check_inside(polygon, rng):
     assert ours.numpy().tolist() == expected.tolist()
 
 
-@pytest.mark.parametrize("name", POLYGONS)
-def test_inside_equals_shapelys_contains(name):
-    check_inside(POLYGONS[name], np.random.default_rng(3))
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_inside_equals_shapelys_contains_for_jagged_polygons(seed):
-    rng = np.random.default_rng(seed)
-    check_inside(star(rng), rng)
+# Candidates.
 
 
 def candidates(kind):
     """Candidates and action settings for two regions, the first with a notch, and one kind of actions."""
     notch = Polygon([(0, 0), (210, 0), (210, 190), (120, 190), (100, 60), (80, 190), (0, 190)])
-    regions = [Region(notch, "notch", None, None), Region(HORSESHOE.buffer(40), "oval", None, None)]
+    regions = [Region(notch, "notch"), Region(HORSESHOE.buffer(40), "oval")]
     airspace = build_airspace(regions, 30.0, 45.0, None, 3)
     config = ActionConfig(
         kind=kind, distances=[0.0, 41.7, 97.3, 153.9], headings=[-130.0, -31.0, 5.0, 77.0, 180.0]
@@ -208,7 +192,7 @@ def candidates(kind):
     return Candidates(airspace, config, 3), config
 
 
-def test_discrete_and_continuous_actions_have_the_same_first_candidate():
+def test_discrete_and_continuous_actions_have_the_same_candidates():
     discrete, config = candidates("discrete")
     continuous, _ = candidates("continuous")
     airspace, table = discrete.airspace, config.table()
@@ -226,35 +210,6 @@ def test_discrete_and_continuous_actions_have_the_same_first_candidate():
         assert ranking.point[row][..., :1].long().equal(expected.point[expected_row][..., :1])
         compared += row.numel()
     assert compared == 20 * int(airspace.n_points.sum())
-
-
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_candidates_are_the_points_nearest_the_target_or_the_uavs_own_point(kind):
-    tables, config = candidates(kind)
-    polygon = tables.airspace.regions[0].polygon
-    points = tables.airspace.points[0].tolist()
-    flat = torch.arange(int(tables.airspace.n_points[0]))[:, None]
-    rng = np.random.default_rng(0)
-    number = torch.as_tensor(rng.integers(config.n_actions, size=flat.shape))
-    share = torch.as_tensor(rng.random((*flat.shape, 2)), dtype=torch.float32)
-    displacements = config.table()[number[:, 0]]
-    if kind == "continuous":
-        displacements = share[:, 0] * torch.tensor([153.9, 2 * math.pi])
-    action = number if kind == "discrete" else share
-    ranking, row = tables.rank(flat, torch.zeros(len(flat), dtype=torch.long), action)
-    outside = 0
-    for own, (distance, bearing) in enumerate(displacements.tolist()):
-        x, y = points[own]
-        target = (x + distance * math.sin(bearing), y + distance * math.cos(bearing))
-        ranked = ranking.point[row[own, 0]].tolist()
-        assert len(ranked) == 2 * 3 - 1
-        if shapely.contains_xy(polygon, *target):
-            nearest = sorted(math.dist(p, target) for p in points)[:5]
-            assert [math.dist(points[p], target) for p in ranked] == pytest.approx(nearest, abs=1e-3)
-        else:
-            assert ranked == [own] * 5
-            outside += 1
-    assert 10 < outside < len(displacements) - 10
 
 
 @pytest.mark.parametrize("name", POLYGONS)
@@ -278,18 +233,6 @@ def test_the_landing_points_of_actions_are_ranked_as_by_a_loop_in_exact_arithmet
     assert 10 < outside < 80
 
 
-def test_tables_that_do_not_fit_are_refused_with_their_size():
-    airspace = build_airspace([Region(shapely.box(0, 0, 7000, 7000), "large")], 30.0, 45.0, None, 100)
-    with pytest.raises(InputError) as error:
-        Candidates(airspace, ActionConfig(), 100)
-    assert str(error.value) == (
-        "region.lattice_step: 76657 landing points with 40 actions and 199 candidates each need 4.9 GB, more "
-        "than 4 GB: raise region.lattice_step, set region.n_landing_points, list fewer actions.distances or "
-        "actions.headings, lower region.pool, or take actions.kind=continuous"
-    )
-    Candidates(airspace, ActionConfig(kind="continuous"), 100)
-
-
 def test_headings_are_clockwise_from_north():
     displaced = displacement(torch.tensor([10.0] * 4), torch.tensor([0.0, 90, 180, 270]).deg2rad())
     expected = [[0.0, 10.0], [10.0, 0.0], [0.0, -10.0], [-10.0, 0.0]]
@@ -303,23 +246,6 @@ def test_the_table_holds_every_heading_of_the_first_distance_then_of_the_next():
     assert config.table().tolist() == [pytest.approx(row) for row in expected]
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"kind": "both"}, "actions.kind: both is not one of discrete, continuous"),
-        ({"distances": []}, "actions.distances: [] is empty"),
-        ({"headings": []}, "actions.headings: [] is empty"),
-        ({"distances": [-1.0]}, "actions.distances: -1.0 m is not at least 0 m"),
-        ({"distances": [0.0]}, "actions.distances (largest): 0.0 m is not above 0 m"),
-        ({"headings": [400.0]}, "actions.headings: 400.0 deg is not between -360 and 360 deg"),
-    ],
-)
-def test_wrong_actions_are_named_with_their_value_and_unit(changed, message):
-    with pytest.raises(InputError) as error:
-        ActionConfig(**changed)
-    assert str(error.value) == message
-
-
 @both_kinds
 def test_actions_that_lead_nowhere_are_refused_unless_there_is_one_landing_point(kind):
     def build(distance, kept=None):
@@ -327,9 +253,7 @@ def test_actions_that_lead_nowhere_are_refused_unless_there_is_one_landing_point
         actions = ActionConfig(kind, distances=[0.0, distance], headings=[90.0])
         return Simulation(WorldConfig(agents=1, region=region, actions=actions), 1.0, trail=1, seed=0)
 
-    with pytest.raises(
-        InputError, match=r"actions.distances: \[0.0, 10.0\] \[m\] lead from no landing point"
-    ):
+    with pytest.raises(InputError, match=r"actions.distances: .* lead from no landing point"):
         build(10.0)
     assert build(16.0).candidates.max_distance == 16.0
     assert build(10.0, kept=1).airspace.max_points == 1

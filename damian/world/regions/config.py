@@ -12,11 +12,10 @@ import numpy as np
 from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry
-from damian.world.nearest import RESOLUTION
 from damian.world.regions.fir import read_fir
 from damian.world.regions.geojson import read_geojson
 from damian.world.regions.places import check_places
-from damian.world.regions.polygon import polygon_from_vertices, random_polygon
+from damian.world.regions.polygon import RESOLUTION, polygon_from_vertices, random_polygon
 from damian.world.regions.region import Region, centred, check_regions
 
 

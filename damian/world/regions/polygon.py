@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 
 MAX_COORDINATE_M = checks.METRES
 """No local coordinate is larger [m]."""
+RESOLUTION = 0.01
+"""Distances of landing points that differ by less are not told apart [m]."""
 MAX_CANDIDATES = 5_000_000
 """Largest number of lattice points in the bounding box of a polygon."""
 _MAX_POINTS = 1000
