@@ -30,11 +30,10 @@ import hydra
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
-from damian.advice.desk import Desk
 from damian.advice.fleet import Fleet, Waiting
-from damian.advice.inbox import read_inbox, write_answer
-from damian.advice.node import Node, for_uavs, served
-from damian.advice.tables import read_file
+from damian.advice.node import Node, for_uavs, scenario_of_service
+from damian.advice.rows import read_file
+from damian.advice.session import AdviceSession, read_inbox, write_answer
 from damian.baselines.greedy import greedy_policy
 from damian.common import checks
 from damian.common.errors import InputError
@@ -120,8 +119,8 @@ def without_token(config: AdviseConfig) -> AdviseConfig:
 store_schema("advise_schema", AdviseConfig)
 
 
-def make_desk(config: AdviseConfig, folder: Path | None, is_locked: bool = False) -> Desk:
-    """The desk of the policy that the settings name; journals lie in a folder, if there is one.
+def make_session(config: AdviseConfig, folder: Path | None, is_locked: bool = False) -> AdviceSession:
+    """The session of the policy that the settings name; journals lie in a folder, if there is one.
 
     Args:
         config: all settings.
@@ -140,7 +139,7 @@ def make_desk(config: AdviseConfig, folder: Path | None, is_locked: bool = False
 
     overrides = without_token(config).overrides
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": overrides}
-    return Desk(make_fleet, folder, about, config.durable, is_locked)
+    return AdviceSession(make_fleet, folder, about, config.durable, is_locked)
 
 
 def make_policy(config: AdviseConfig, node: Node) -> TensorDictModuleBase:
@@ -164,15 +163,13 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
     now = time.time()
     with named(path):
         rows = read_file(path)
-    desk = make_desk(config, None)
+    session = make_session(config, None)
     with nullcontext() if config.uavs else named(path):
-        uavs = config.uavs or list(dict.fromkeys(str(row.get("id")).strip() for _, row in rows))
-        checked = desk.check_new(FLEET, uavs)
-    desk.create(FLEET, checked)
+        session.create(FLEET, config.uavs or list(dict.fromkeys(report.id for _, report in rows)))
     with named(path):
-        desk.report(FLEET, rows, now, file=True)
+        session.report(FLEET, rows, now, file=True)
         try:
-            answer = desk.advise(FLEET, desk.fleet(FLEET).clock)
+            answer = session.advise(FLEET, session.fleet(FLEET).clock)
         except Waiting as error:
             raise InputError(str(error)) from None
     save_config(without_token(config), folder)
@@ -188,7 +185,7 @@ def note(config: AdviseConfig) -> None:
 def advise(config: AdviseConfig, folder: Path) -> None:
     """Answer reports from where the settings say."""
     config.check_source()
-    served(config.eval_scenario)
+    scenario_of_service(config.eval_scenario)
     note(config)
     if config.reports is not None:
         answer_table(config, folder)
@@ -201,11 +198,11 @@ def advise(config: AdviseConfig, folder: Path) -> None:
     if inbox is not None and is_same(inbox, journals):
         raise InputError(f"journal: {journals} is the folder of the tables too: name another one")
     alone = nullcontext() if inbox is None or is_same(inbox, folder) else locked(inbox, "folder")
-    with alone, closing(make_desk(config, journals, is_same(journals, folder))) as desk:
+    with alone, closing(make_session(config, journals, is_same(journals, folder))) as session:
         if inbox is None:
-            serve(config, desk)
+            serve(config, session)
         else:
-            watch(inbox, desk, config.uavs)
+            watch(inbox, session, config.uavs)
 
 
 def is_same(one: Path, other: Path) -> bool:
@@ -213,7 +210,7 @@ def is_same(one: Path, other: Path) -> bool:
     return os.path.realpath(one) == os.path.realpath(other)
 
 
-def serve(config: AdviseConfig, desk: Desk) -> None:
+def serve(config: AdviseConfig, session: AdviceSession) -> None:
     """Answer over HTTP until the program is stopped.
 
     Raises:
@@ -222,7 +219,7 @@ def serve(config: AdviseConfig, desk: Desk) -> None:
     try:
         uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
     except ImportError as error:
-        missing = f"needs {error.name}, which is not installed: pip install starlette uvicorn httptools"
+        missing = f"needs {error.name}, which is not installed: pip install 'damian[advise]'"
         raise InputError(f"port: {config.port} {missing}") from None
     given = config.token or os.environ.get("DAMIAN_TOKEN")
     check_token("DAMIAN_TOKEN", given)
@@ -233,7 +230,11 @@ def serve(config: AdviseConfig, desk: Desk) -> None:
         print(f"token: {token}")
     print(f"listening on http://{host}:{port}", flush=True)
     options = uvicorn.Config(
-        service.make_app(desk, token), log_level="warning", access_log=False, timeout_keep_alive=30, ws="none"
+        service.make_app(session, token),
+        log_level="warning",
+        access_log=False,
+        timeout_keep_alive=30,
+        ws="none",
     )
     gc.collect()
     gc.freeze()  # else every full collection looks through all of torch, for a tenth of a second
@@ -255,18 +256,18 @@ def listening(config: AdviseConfig) -> socket.socket:
     return listener
 
 
-def watch(inbox: Path, desk: Desk, uavs: Sequence[str]) -> None:
+def watch(inbox: Path, session: AdviceSession, uavs: Sequence[str]) -> None:
     """Answer every table that comes into a folder, until the program is stopped.
 
     Raises:
         InputError: no UAVs are given.
         RunError: the folder is not there any more, or cannot be written.
     """
-    desk.create(FLEET, desk.check_new(FLEET, list(uavs)))
+    session.create(FLEET, uavs)
     print(f"watching {inbox}", flush=True)
     while True:
-        if not read_inbox(desk, FLEET, inbox, time.time()):
-            desk.advance(time.time())
+        if not read_inbox(session, FLEET, inbox, time.time()):
+            session.advance(time.time())
             time.sleep(0.2)
 
 

@@ -27,9 +27,6 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from damian.advice.fleet import Fleet
-from damian.advice.node import Node, for_uavs
-from damian.advice.playback import episode_of, head_of
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common import checks
@@ -44,7 +41,6 @@ from damian.show.film import VIEWS, check_gif, save_film
 from damian.show.geojson import origin_of, save_geojson
 from damian.show.replay_page import save_page
 
-from .advise import AdviseConfig
 from .evaluate import stored_actor
 from .shared.flown_policy import FlownPolicyConfig
 from .shared.inheritance import key_of, without
@@ -132,10 +128,14 @@ def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
     Raises:
         InputError: it is no journal.
     """
-    told = head_of(Path(str(config.journal)))["about"].get("overrides") or []
+    from damian.advice.journal import read_head  # noqa: PLC0415 (needs pydantic, which only advice does)
+
+    from .advise import AdviseConfig  # noqa: PLC0415
+
+    told = read_head(Path(str(config.journal))).about.overrides
     of_advice = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
     replaced = [*map(key_of, config.overrides), *of_advice, "checkpoint", "eval_episodes"]
-    overrides = [*without([str(word) for word in told], replaced), *config.overrides]
+    overrides = [*without(told, replaced), *config.overrides]
     settings: FlyConfig = checked(composed_with("fly", overrides), "fly")
     settings.overrides = overrides
     return settings
@@ -147,14 +147,18 @@ def episode_of_journal(config: FlyConfig) -> Episode:
     Raises:
         InputError: the journal is damaged, its fleet never began, or nothing of it lies in the span.
     """
+    from damian.advice.fleet import Fleet  # noqa: PLC0415 (needs pydantic, which only advice does)
+    from damian.advice.journal import read_head  # noqa: PLC0415
+    from damian.advice.node import Node, for_uavs  # noqa: PLC0415
+    from damian.advice.playback import episode_of  # noqa: PLC0415
+
     path = Path(str(config.journal))
-    head = head_of(path)
-    uavs = head["uavs"]
-    node = Node(for_uavs(config.eval_scenario, len(uavs)), config.seed, reward_terms=True)
-    fleet = Fleet(node, uavs, greedy_policy(node.env))
+    head = read_head(path)
+    node = Node(for_uavs(config.eval_scenario, len(head.uavs)), config.seed, reward_terms=True)
+    fleet = Fleet(node, head.uavs, greedy_policy(node.env))
     span = None if config.span is None else (config.span[0], config.span[1])
-    about = {name: head["about"].get(name) for name in ("policy", "checkpoint")}
-    about |= {"overrides": list(config.overrides), "fleet": head["fleet"]}
+    about = {"policy": head.about.policy, "checkpoint": head.about.checkpoint}
+    about |= {"overrides": list(config.overrides), "fleet": head.fleet}
     return episode_of(path, fleet, about, span, partial(tqdm, unit=" lines", delay=1))
 
 

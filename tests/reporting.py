@@ -11,10 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 
 from damian import keys
 from damian.advice.fleet import Fleet
-from damian.advice.ground import Ground
+from damian.advice.known import Ground
 from damian.advice.node import Node
-from damian.advice.reports import Report, read_rows
-from damian.advice.tables import json_rows
+from damian.advice.rows import Report, read_json
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 
@@ -104,7 +103,19 @@ class Reporter:
 
 def as_reports(rows: Sequence[dict[str, Any]], now: float) -> list[Report]:
     """Rows as the service reads them from JSON."""
-    return read_rows(json_rows(json.dumps(list(rows))), now, file=False) if rows else []
+    reports = [report for _, report in read_json(json.dumps(list(rows)))] if rows else []
+    for report in reports:
+        report.stamp(now)
+    return reports
+
+
+def advise(fleet: Fleet, now: float, asking: Sequence[str] | None = None) -> list[int]:
+    """Let UAVs choose, and tell them; returns the numbers of those that have chosen."""
+    choice = fleet.choose(now, asking)
+    if choice is None:
+        return []
+    fleet.tell(choice)
+    return [*choice.decisions]
 
 
 def flights(
@@ -126,8 +137,8 @@ def flights(
     for step in range(n_steps):
         now = reporter.time_of(step) + 0.2 * reporter.dt
         for report in as_reports(reporter.arriving(step), now):
-            fleet.check(report, now)
-            fleet.report(report, now)
+            fleet.check(report)
+            fleet.report(report)
         fleet.advance(now + 0.1)
         acted = policy(shown.clone())
         ready = shown[keys.READY][0].nonzero().flatten().tolist()

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import damian
-from damian.advice.journal import head
+from damian.advice.journal import About, Head
 
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -119,7 +119,8 @@ def trained(tmp_path_factory) -> Path:
 
 def write_journal(path: Path) -> None:
     """A journal of two UAVs, each of whose reports comes in up to a second late."""
-    lines = [head("north", ["A", "B"], {"overrides": ["region=llanbedr"]})]
+    head = Head(fleet="north", uavs=["A", "B"], about=About(overrides=["region=llanbedr"]))
+    lines = [head.model_dump()]
     for n in range(60):
         row = {"ID": "AB"[n % 2], "time": 1000.0 + n, "lat": 52.811, "lon": -4.128, "sequence": n // 2}
         lines.append({"received": 1000.0 + n + 0.1 * (n % 10), "reports": [row]})

@@ -2,17 +2,15 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from damian.advice.clocks import step_at
-from damian.advice.journal import SUFFIX, entries, reports_of
-from damian.advice.reports import Report, read_rows
-from damian.advice.tables import read_file
+from damian.advice.fleet import step_at
+from damian.advice.journal import SUFFIX, Received, read_head, read_lines
+from damian.advice.rows import Report, read_file
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.delays.laws import LONGEST, LOST
@@ -68,19 +66,18 @@ def read_log(path: Path) -> list[Report]:
         InputError: the file is something else, or there are fewer than two reports.
     """
     if path.suffix == SUFFIX or path.name.endswith(".ended"):
-        reports = []
-        for number, entry in enumerate(entries(path), 1):
-            if "reports" in entry:
-                with named(f"{path}: line {number}"):
-                    received, found = reports_of(entry)
-                reports += [replace(report, received=received) for report in found]
+        read_head(path)
+        lines = [line for _, line in read_lines(path)]
+        reports = [report for line in lines if isinstance(line, Received) for report in line.reports]
     else:
         with named(path):
             rows = read_file(path)
-            for where, row in rows:
-                if "time" not in row or not {"receive time", "aoi"} & row.keys():
+            for where, report in rows:
+                said = report.model_fields_set
+                if "time" not in said or not {"received", "aoi"} & said:
                     raise InputError(f"{where}: it needs time and receive time, or time and AoI")
-            reports = read_rows(rows, math.nan, file=True)
+                report.stamp(math.nan, file=True)
+        reports = [report for _, report in rows]
     if len(reports) < 2:
         raise InputError(f"{path}: {len(reports)} reports are too few to tell how late they are")
     return reports
@@ -100,8 +97,8 @@ def fit(reports: Iterable[Report]) -> Fit:
     found: list[Message] = []
     kinds: set[str] = set()
     start, pauses = _began(reports), 0
-    by_uav = sorted(reports, key=lambda report: (report.uav, report.time, report.received))
-    for uav, own in groupby(by_uav, lambda report: report.uav):
+    by_uav = sorted(reports, key=lambda report: (report.id, report.time, report.received))
+    for uav, own in groupby(by_uav, lambda report: report.id):
         first_copies = [next(copies) for _, copies in groupby(own, lambda report: report.time)]
         gaps, kind = _gaps(first_copies)
         kinds.add(kind)
@@ -121,9 +118,9 @@ def _began(reports: Sequence[Report]) -> float:
     """When the fleet of these reports began [s], as ``damian advise`` has it: once a report of each UAV has
     come in, at the oldest one of their newest ones."""
     newest: dict[str, float] = {}
-    n_uavs = len({report.uav for report in reports})
-    for report in sorted(reports, key=lambda report: report.received):  # type: ignore[arg-type,return-value]
-        newest[report.uav] = max(report.time, newest.get(report.uav, -math.inf))
+    n_uavs = len({report.id for report in reports})
+    for report in sorted(reports, key=lambda report: report.received):
+        newest[report.id] = max(report.time, newest.get(report.id, -math.inf))
         if len(newest) == n_uavs:
             break
     return min(newest.values())

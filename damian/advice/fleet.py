@@ -6,9 +6,11 @@ in which it was generated, and counts from the step in which it came in; its age
 the former.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -16,21 +18,71 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
-from damian.advice.clocks import LIFE, check_ahead, check_first, check_life, step_at
-from damian.advice.decisions import TOLD, Choices, Decision, Told
-from damian.advice.ground import Ground
-from damian.advice.known import Known, UavLog, messages_of
-from damian.advice.node import FOREVER, LateMessage, Memories, Node, Reported
-from damian.advice.reports import Report
+from damian.advice.known import FilledReport, Ground, UavLog, messages_of
+from damian.advice.node import LateMessage, Memories, Node, Reported
+from damian.advice.rows import Advice, FleetStatus, Report, UavStatus, written
+from damian.common.checks import SECONDS
 from damian.common.errors import InputError
 from damian.common.text_files import listed, show
-from damian.envs.uav_env import Outputs
 from damian.learners.recurrent import AgentGRU
 from damian.world.messages import Messages
 from damian.world.state import State
 
+FUTURE = 1.0
+"""How far the clock of a UAV may be ahead of that of the server [s]."""
+FIRST = 3600.0
+"""How old a report may be when it comes in, while its fleet has not begun [s]: the fleet would begin then."""
+LIFE = SECONDS
+"""How long a fleet lasts [s]."""
 SILENT_STEPS = 1000
 """Steps without any report after which beliefs stand still."""
+GRACE = 60.0
+"""A landing point stays booked for so long after a late arrival [s], unless the UAV reports to be there."""
+TOLD = 64
+"""Decisions of a UAV that are kept: a late report in flight was of one of them."""
+NEVER_DECIDED = 2**31
+"""Steps since the latest decision of a UAV that is ready to choose."""
+_ROUNDING = 1e-3
+"""Share of a step by which times may be rounded."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a UAV was told to do."""
+
+    step: int
+    """The step in which it chose."""
+    time: float
+    """When it was told [s]."""
+    action: Any
+    """The action: a number, or distance and heading in [0, 1]."""
+    origin: int
+    """Landing point from which it flies."""
+    goal: int
+    """Landing point to which it flies; the same if it holds."""
+    duration: float
+    """Expected duration of the flight [s]."""
+
+    @property
+    def expires(self) -> float:
+        """When the landing point is no longer booked, unless the UAV reports to be there [s]."""
+        return self.time + 2 * self.duration + GRACE
+
+
+class Choice(NamedTuple):
+    """What UAVs have chosen, and have not been told yet."""
+
+    decisions: dict[int, Decision]
+    """By the numbers of the UAVs."""
+    action: Tensor
+    """Actions of all UAVs, of which those of these UAVs count, [1, N, ...]."""
+    hidden: Tensor | None
+    """Hidden states after the choice, [1, N, H]."""
+
+
+def step_at(time: float, start: float, dt: float) -> int:
+    """The step of ``dt`` seconds since ``start`` [s] in which a time [s] lies."""
+    return math.floor((time - start) / dt + _ROUNDING)
 
 
 class Waiting(Exception):
@@ -66,13 +118,19 @@ class Fleet:
         self.start: float | None = None
         """When step 0 began [s]; None until every UAV has reported."""
         self.step, self.clock = 0, 0.0
-        self.held: list[Known] = []
-        self.told: Told = [deque(maxlen=TOLD) for _ in self.uavs]
-        self.pending: list[tuple[int, int, Known]] = []  # step from which it counts, UAV, report
-        self.arrived: list[tuple[int, Known]] = []  # those that count from this step on
+        self.held: list[FilledReport] = []
+        """The message of each UAV that the server holds."""
+        self.told: list[deque[Decision]] = [deque(maxlen=TOLD) for _ in self.uavs]
+        """The latest decisions of each UAV, oldest first."""
+        self.pending: list[tuple[int, int, FilledReport]] = []
+        """Reports that count later: the step from which they do, the number of the UAV, the report."""
+        self.arrived: list[tuple[int, FilledReport]] = []
+        """Reports that count from this step on, with the numbers of the UAVs."""
         self.before: Memories | None = None
+        """What the node remembers after the step before; ``after`` this step; None in the first one."""
         self.after: Memories = []
-        self.outputs: Outputs | None = None
+        self.outputs: TensorDictBase | None = None
+        """Outputs of this step, and the messages ``sent`` that are held in it; None until they are needed."""
         self.sent: Messages | None = None
         self.first_step = self.last_arrival = 0
         self.hidden = self.hidden_after = _no_hidden(policy, len(self.uavs))
@@ -85,40 +143,46 @@ class Fleet:
         """The step in which an instant lies."""
         return step_at(time, self.start or 0.0, self.node.dt)
 
-    def check(self, report: Report, received: float, now: float | None = None) -> None:
+    def check(self, report: Report, now: float | None = None) -> None:
         """Check a report before it is added.
 
         Args:
-            report: the report.
-            received: when it came in, by the clock of the fleet, which never goes back [s].
+            report: the report; it came in by the clock of the fleet, which never goes back.
             now: the time, if it comes in now; None for one that is recorded [s].
 
         Raises:
             InputError: the UAV is of another fleet, its clock is wrong, the report is from another region, or
                 it came in so late that steps cannot be counted.
         """
-        if report.uav not in self.number:
-            raise InputError(f"ID: {show(report.uav)} is no UAV of this fleet: {listed(self.uavs)}")
-        check_ahead(report, received if now is None else now)
-        if now is not None and self.start is None:
-            check_first(report, now)
-        check_life(self.start, received)
-        self.logs[self.number[report.uav]].check(report)
+        if report.id not in self.number:
+            raise InputError(f"ID: {show(report.id)} is no UAV of this fleet: {listed(self.uavs)}")
+        for name, time in (("time", report.time), ("source time", report.source_time)):
+            ahead = 0.0 if time is None else time - (report.received if now is None else now)
+            if ahead > FUTURE:
+                late = f"{time:.13g} s is {ahead:.1f} s after it came in"
+                raise InputError(f"{name}: {late}: set the clock of the UAV")
+        if now is not None and self.start is None and report.time < now - FIRST:
+            # A clock that was never set counts from 1970 or from when it was switched on.
+            early = f"{report.time:.13g} s is {now - report.time:.1f} s before it came in"
+            most = f"more than the {FIRST:g} s of a first report"
+            raise InputError(f"time: {early}, {most}: set the clock of the UAV")
+        self._check_life(report.received)
+        self.logs[self.number[report.id]].check(report)
 
-    def report(self, report: Report, received: float) -> str:
+    def _check_life(self, now: float) -> None:
+        """Check that the steps of the fleet can still be counted."""
+        if self.start is not None and now - self.start > LIFE:
+            raise InputError(f"time: the fleet began more than {LIFE:g} s ago: end it, and begin a new one")
+
+    def report(self, report: Report) -> str:
         """Add a checked report.
-
-        Args:
-            report: the report.
-            received: when it came in [s].
 
         Returns:
             ``new``, ``late`` (an older one, which is kept in its place), ``duplicate`` (one that was
             generated at the same time came in before), or ``old`` (generated before the fleet began).
         """
-        self.advance(received)  # what comes in late fills in no earlier step
-        received = self.clock
-        uav = self.number[report.uav]
+        self.advance(report.received)  # what comes in late fills in no earlier step
+        uav = self.number[report.id]
         log = self.logs[uav]
         log.received += 1
         if log.has(report.time):
@@ -130,19 +194,19 @@ class Fleet:
         if self.start is None:
             log.add(report, 0, None)
             if not self._missing():
-                self._begin(received)
+                self._begin()
             return "late" if late else "new"
         if report.time < self.start:
             return "old"
-        now = self.step_of(received)
+        now = self.step_of(self.clock)
         step = min(self.step_of(report.time), now)
-        detected = None if report.detected is None else max(self.step_of(report.detected), 0)
+        detected = None if report.source_time is None else max(self.step_of(report.source_time), 0)
         sent = next((each for each in reversed(self.told[uav]) if each.step < step), None)
-        known = log.add(report, step, detected, sent and (sent.origin, sent.goal))
+        filled = log.add(report, step, detected, sent and (sent.origin, sent.goal))
         due = max(now, self.step)
         if self.node.scenario.delay.hold == "max":
             due = max(due, step + self.node.law_longest)
-        self.pending.append((due, uav, known))
+        self.pending.append((due, uav, filled))
         self.outputs = self.sent = None
         self._collect()
         return "late" if late else "new"
@@ -153,16 +217,16 @@ class Fleet:
         found = zip(self.uavs, self.logs, strict=True)
         return [uav for uav, log in found if log.newest is None or log.newest.report.time < oldest]
 
-    def _begin(self, received: float) -> None:
+    def _begin(self) -> None:
         """Begin with the newest report of each UAV."""
-        newest = [log.known[-1].report for log in self.logs]
+        newest = [log.reports[-1].report for log in self.logs]
         self.start = min(report.time for report in newest)
-        self.step = self.first_step = self.last_arrival = max(self.step_of(received), 0)
+        self.step = self.first_step = self.last_arrival = max(self.step_of(self.clock), 0)
         for log, report in zip(self.logs, newest, strict=True):
-            detected = None if report.detected is None else max(self.step_of(report.detected), 0)
-            log.known.clear()
+            detected = None if report.source_time is None else max(self.step_of(report.source_time), 0)
+            log.reports.clear()
             log.add(report, min(self.step_of(report.time), self.step), detected)
-        self.held = [log.known[-1] for log in self.logs]
+        self.held = [log.reports[-1] for log in self.logs]
 
     def _collect(self) -> None:
         """Let the reports that count by now arrive."""
@@ -172,13 +236,13 @@ class Fleet:
         self.pending = [each for each in self.pending if each[0] > self.step]
         self.outputs, self.sent, self.last_arrival = None, None, self.step
         by_arrival = self.node.scenario.delay.order == "arrival"
-        for _, uav, known in sorted(due, key=lambda each: each[2].report.time):
+        for _, uav, filled in sorted(due, key=lambda each: each[2].report.time):
             held = self.held[uav]
             # Of those that arrive in the same step, the one that was generated last counts as the last.
             earlier = by_arrival and not any(each is held for _, each in self.arrived)
-            self.arrived.append((uav, known))
-            if earlier or known.report.time > held.report.time:
-                self.held[uav] = known
+            self.arrived.append((uav, filled))
+            if earlier or filled.report.time > held.report.time:
+                self.held[uav] = filled
 
     # Steps.
 
@@ -194,7 +258,7 @@ class Fleet:
                 self.before = self.node.skip(self.before, following - self.step)
             else:
                 if self.hidden is not None and self.hidden_after is self.hidden:
-                    self.ask_policy([])  # hidden states change in every step
+                    _, self.hidden_after = self.ask_policy([])  # hidden states change in every step
                 self._observe()
                 following, self.before = self.step + 1, self.after
             self.previous = self.action, self.chosen
@@ -207,40 +271,36 @@ class Fleet:
         quiet = self.step >= self.last_arrival + SILENT_STEPS
         return quiet and not self.chosen.any() and not self.previous[1].any()
 
-    def _observe(self) -> Outputs:
+    def _observe(self) -> TensorDictBase:
         """The outputs of the step, from what has arrived by now."""
         if self.outputs is None:
-            reported, state = self._reported(), self._state([])
+            reported = self._reported()
             if self.before is None:
-                self.after, self.outputs = self.node.begin(state, reported)
+                self.after, self.outputs = self.node.begin(reported)
             else:
-                self.after, self.outputs = self.node.step(self.before, state, reported, *self.previous)
+                self.after, self.outputs = self.node.step(self.before, reported, *self.previous)
         return self.outputs
 
     def _reported(self) -> Reported:
         late = {}
-        for uav, known in self.arrived:
-            if self.first_step < known.step < self.step:
-                late[uav, known.step] = known
+        for uav, filled in self.arrived:
+            if self.first_step < filled.step < self.step:
+                late[uav, filled.step] = filled
         self.sent = self._messages(self.held)
-        rows = self.sent.pack()
-        if late:
-            rows = torch.cat([rows, self._messages([*late.values()]).pack()])
-        steps = torch.tensor([known.step for known in self.held])
-        fresh = {uav for uav, known in self.arrived if known.step == self.step}
-        n = len(self.uavs)
+        rows = self._messages([*late.values()]).pack() if late else ()
+        fresh = {uav for uav, filled in self.arrived if filled.step == self.step}
+        on_time = [uav in fresh and filled.step == self.step for uav, filled in enumerate(self.held)]
         return Reported(
-            held=rows[:n],
-            age=self.step - steps,
-            on_time=torch.tensor([uav in fresh and self.held[uav].step == self.step for uav in range(n)]),
+            state=self._state([]),
+            age=self.step - torch.tensor([filled.step for filled in self.held]),
+            on_time=torch.tensor(on_time),
             late=[
-                LateMessage(row, uav, self.step - step)
-                for row, (uav, step) in zip(rows[n:], late, strict=True)
+                LateMessage(row, uav, self.step - step) for row, (uav, step) in zip(rows, late, strict=True)
             ],
         )
 
-    def _messages(self, known: Sequence[Known]) -> Messages:
-        return messages_of(known, self.node.server, self.points, self.node.dt)
+    def _messages(self, reports: Sequence[FilledReport]) -> Messages:
+        return messages_of(reports, self.node.server, self.points, self.node.dt)
 
     def _state(self, asking: Sequence[int]) -> State:
         """The state of the world, as far as it is known; the UAVs that ask are ready to choose."""
@@ -254,7 +314,7 @@ class Fleet:
             steps=torch.tensor([self.step]),
             goal=goal,
             origin=goal,
-            elapsed=torch.where(ready, FOREVER, -1),
+            elapsed=torch.where(ready, NEVER_DECIDED, -1),
             battery=sent.battery.unsqueeze(0),
             track=sent.track.unsqueeze(0),
             sent=type(sent)._make(field.unsqueeze(0) for field in sent),
@@ -271,8 +331,8 @@ class Fleet:
 
     # Advice.
 
-    def advise(self, now: float, asking: Sequence[str] | None = None) -> list[int]:
-        """Let UAVs choose.
+    def choose(self, now: float, asking: Sequence[str] | None = None) -> Choice | None:
+        """Let UAVs choose; the fleet stays as it is until they are told (``tell``).
 
         Args:
             now: the time [s].
@@ -280,8 +340,7 @@ class Fleet:
                 flight.
 
         Returns:
-            Numbers of the UAVs that have chosen now; those that have chosen in this step before do not choose
-            again.
+            What those have chosen that have not chosen in this step before; None if there are none.
 
         Raises:
             InputError: a UAV is of another fleet, or the fleet began too long ago.
@@ -291,20 +350,18 @@ class Fleet:
         self.advance(now)
         if self.start is None:
             missing = self._missing()
-            known = any(self.logs[self.number[uav]].known for uav in missing)
-            since = f" that is newer than {LIFE:g} s" if known else ""
+            has_old = any(self.logs[self.number[uav]].reports for uav in missing)
+            since = f" that is newer than {LIFE:g} s" if has_old else ""
             raise Waiting(f"no advice yet: no report of {listed(missing)}{since} has come in")
-        check_life(self.start, self.clock)
+        self._check_life(self.clock)
         if numbers is None:
-            numbers = [uav for uav, known in enumerate(self.held) if not known.report.flies]
+            numbers = [uav for uav, held in enumerate(self.held) if not held.report.flies]
         chosen = self.chosen[0].tolist()
         choosing = [uav for uav in numbers if not chosen[uav]]
         if choosing:  # else what has come in since then need not be looked at yet
             ready = self._observe()[keys.READY][0].tolist()
             choosing = [uav for uav in choosing if ready[uav]]
-        if choosing:
-            self.choose(choosing, self.ask_policy(choosing))
-        return choosing
+        return self.choice(choosing, *self.ask_policy(choosing)) if choosing else None
 
     def numbers_of(self, asking: Sequence[str] | None) -> list[int] | None:
         """Numbers of the UAVs that ask."""
@@ -315,17 +372,16 @@ class Fleet:
 
     def observe(self, asking: Sequence[int]) -> TensorDictBase:
         """What the policy reads, if these UAVs are ready to choose."""
-        outputs = dict(self._observe())
-        if keys.ACTION_MASK in outputs:
-            outputs[keys.ACTION_MASK] = self.node.simulation.action_mask(self._state(asking))
-        tensordict = self.node.worlds.to_tensordict(outputs)
+        tensordict = self._observe().clone(False)
+        if keys.ACTION_MASK in tensordict.keys(True):
+            tensordict[keys.ACTION_MASK] = self.node.simulation.action_mask(self._state(asking))
         if self.hidden is not None:
             tensordict[keys.HIDDEN] = self.hidden.clone()
         return tensordict
 
     @torch.no_grad()
-    def ask_policy(self, choosing: Sequence[int]) -> Tensor:
-        """Actions of all UAVs, [1, N, ...], of which those that choose count."""
+    def ask_policy(self, choosing: Sequence[int]) -> tuple[Tensor, Tensor | None]:
+        """Actions of all UAVs, of which those that choose count, [1, N, ...]; hidden states, [1, N, H]."""
         read = self.observe(choosing)
         if self.drawn:
             with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
@@ -334,40 +390,40 @@ class Fleet:
         else:
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 chosen = self.policy(read)
-        if self.hidden is not None:
-            self.hidden_after = chosen[keys.HIDDEN].detach()
-        return chosen[keys.ACTION]
+        return chosen[keys.ACTION], None if self.hidden is None else chosen[keys.HIDDEN].detach()
 
-    def choose(self, choosing: Sequence[int], action: Tensor) -> None:
-        """Send UAVs to the landing points to which their actions lead.
+    def choice(self, choosing: Sequence[int], action: Tensor, hidden: Tensor | None) -> Choice:
+        """To which landing points the actions of UAVs lead.
 
         Args:
             choosing: numbers of these UAVs.
             action: actions of all UAVs, [1, N, ...].
+            hidden: hidden states after the choice, [1, N, H].
         """
-        valid = torch.tensor([[uav in choosing for uav in range(len(self.uavs))]])
         before = self._state(choosing)
-        state = self.node.simulation.decide(before, action, valid)
+        state = self.node.simulation.decide(before, action, self._mask(choosing))
         vehicles = self.node.simulation.vehicles
         length = vehicles.length(before.goal, state.goal)
         duration = (2 * vehicles.vertical + vehicles.shortest_time(length)) * (length > 0)
-        for uav in choosing:
-            values = action[0, uav].tolist()
-            origin, goal = int(before.goal[0, uav]), int(state.goal[0, uav])
-            self.told[uav].append(
-                Decision(self.step, self.clock, values, origin, goal, float(duration[0, uav]))
-            )
+        columns = zip(
+            *(each[0].tolist() for each in (action, before.goal, state.goal, duration)), strict=True
+        )
+        decided = [Decision(self.step, self.clock, *values) for values in columns]
+        return Choice({uav: decided[uav] for uav in choosing}, action, hidden)
+
+    def tell(self, choice: Choice) -> None:
+        """Note that UAVs have been told what they have chosen in this step."""
+        for uav, decision in choice.decisions.items():
+            self.told[uav].append(decision)
+        valid = self._mask([*choice.decisions])
         self.chosen = self.chosen | valid
-        mask = valid.view(*valid.shape, *[1] * (action.dim() - 2))
-        self.action = torch.where(mask, action, self.action)
+        self.action = torch.where(
+            valid.view(*valid.shape, *[1] * (choice.action.dim() - 2)), choice.action, self.action
+        )
+        self.hidden_after = choice.hidden
 
-    def choices(self) -> Choices:
-        """What the UAVs have chosen so far, for ``take_back``."""
-        return Choices([deque(each, TOLD) for each in self.told], self.action, self.chosen, self.hidden_after)
-
-    def take_back(self, before: Choices) -> None:
-        """Take back what UAVs have chosen in this step since ``choices``, because they were not told."""
-        self.told, self.action, self.chosen, self.hidden_after = before
+    def _mask(self, uavs: Sequence[int]) -> Tensor:
+        return torch.tensor([[uav in uavs for uav in range(len(self.uavs))]])
 
     def decision(self, uav: int) -> Decision | None:
         """What a UAV was told last."""
@@ -375,7 +431,51 @@ class Fleet:
 
     def _forget_choices(self) -> None:
         self.action = self.node.env.full_action_spec[keys.ACTION].zero()
-        self.chosen = torch.zeros(1, len(self.uavs), dtype=torch.bool)
+        self.chosen = self._mask([])
+
+    # Answers.
+
+    def advice(self, uavs: Sequence[int] | None = None) -> list[Advice]:
+        """What UAVs of these numbers, or all, have been told last; the fleet has begun."""
+        numbers = range(len(self.uavs)) if uavs is None else uavs
+        return [self.advice_of(uav, self.decision(uav)) for uav in numbers]
+
+    def advice_of(self, uav: int, decision: Decision | None) -> Advice:
+        """What a decision tells a UAV."""
+        place: tuple[Any, Any] = (None, None)
+        heading = distance = duration = arrival = step = None
+        state = "none"
+        if decision is not None:
+            moves, step = decision.goal != decision.origin, decision.step
+            distance, course = self.ground.way(decision.origin, decision.goal)
+            heading, place = course if moves else None, self.ground.place(decision.goal)
+            state = ("fly" if moves else "hold") if step == self.step else "bound"
+            duration, arrival = round(decision.duration, 2), written(decision.time + decision.duration)
+        return Advice(
+            ID=self.uavs[uav],
+            state=state,
+            **dict(zip(self.ground.columns, place, strict=True)),
+            heading=heading,
+            distance=distance,
+            duration=duration,
+            arrival=arrival,
+            step=step,
+            age=cast(float, self._age(self.held[uav])),
+        )
+
+    def status(self, name: str) -> FleetStatus:
+        """What is known of the fleet of this name: where its UAVs are believed to be, how reports come in."""
+        rows = []
+        for uav, log in zip(self.uavs, self.logs, strict=True):
+            newest, counts = log.newest, {"late": log.late, "duplicates": log.duplicates}
+            place = dict(zip(self.ground.columns, newest.report.place, strict=True)) if newest else {}
+            rows.append(UavStatus(ID=uav, age=self._age(newest), **place, reports=log.received, **counts))
+        start = None if self.start is None else written(self.start)
+        return FleetStatus(fleet=name, start=start, step=self.step, dt=self.node.dt, uavs=rows)
+
+    def _age(self, filled: FilledReport | None) -> float | None:
+        """Age of a report [s]."""
+        return None if filled is None else round(max(self.clock - filled.report.time, 0.0), 3)
 
 
 def _no_hidden(policy: Any, n_uavs: int) -> Tensor | None:

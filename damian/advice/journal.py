@@ -2,22 +2,72 @@
 
 A line is handed to the operating system before its request is answered, so that nothing that was acknowledged
 is lost if the process is killed at any time. The first line says which fleet it is.
+
+A further kind of request that changes a fleet, such as an acknowledgement, needs a model of its line here (in
+``KINDS``), and a place in ``replay`` (``session.py``), which does again what the line says.
 """
 
-import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Literal
 
-from damian.advice.reports import LATEST, Report, read_rows
-from damian.advice.tables import checked_rows, no_constant
+from pydantic import BaseModel, Field, model_validator
+
+from damian.advice.rows import Advice, Number, Report, Time, Uavs, parsed_json, validated
 from damian.common.atomic_files import writing
 from damian.common.errors import InputError
-from damian.common.text_files import named, one_line, show
+from damian.common.text_files import named
 
-FORMAT, VERSION = "damian-advice", 1
 SUFFIX = ".jsonl"
+FleetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+
+
+class About(BaseModel):
+    """Which policy advises by which settings."""
+
+    policy: str | None = None
+    checkpoint: str | None = None
+    overrides: list[str] = []
+
+
+class Head(BaseModel):
+    """The first line of a journal."""
+
+    journal: Literal["damian-advice"] = "damian-advice"
+    version: Literal[1] = 1
+    fleet: FleetName
+    uavs: Uavs
+    about: About
+
+
+class Received(BaseModel):
+    """A line about reports that came in together."""
+
+    received: Time
+    reports: list[Report]
+
+    @model_validator(mode="after")
+    def _stamp(self) -> "Received":
+        for report in self.reports:
+            report.stamp(self.received)
+        return self
+
+
+class Advised(BaseModel):
+    """A line about UAVs that have chosen and were told so."""
+
+    asked: Time
+    step: int = 0
+    told: dict[str, int | tuple[Number, Number]]
+    """Their actions, by ID."""
+    advice: list[Advice] = []
+    """What they were told."""
+
+
+Line = Received | Advised
+KINDS: dict[str, type[Line]] = {"reports": Received, "told": Advised}
+"""The lines after the first one, by a key that no other kind has."""
 
 
 class Journal:
@@ -41,25 +91,25 @@ class Journal:
             self._torn = self._end < size
             self._cut()
 
-    def append(self, entry: dict[str, Any]) -> None:
+    def append(self, line: Head | Line) -> None:
         """Write a line.
 
         Raises:
             RunError: it cannot be written, such as on a full disk; nothing of it is left.
         """
-        line = json.dumps(entry, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        text = line.model_dump_json(by_alias=True, exclude_none=True).encode() + b"\n"
         with writing(self.path):
             self._cut()
             self._torn = True
             try:
-                if os.write(self._file, line) != len(line):
+                if os.write(self._file, text) != len(text):
                     raise OSError(None, "the disk is full")
                 if self._durable:
                     os.fsync(self._file)
             except OSError:
                 self._cut()
                 raise
-            self._end, self._torn = self._end + len(line), False
+            self._end, self._torn = self._end + len(text), False
 
     def _cut(self) -> None:
         """Remove what is left of a line that could not be written."""
@@ -72,61 +122,38 @@ class Journal:
         os.close(self._file)
 
 
-def entries(path: Path) -> Iterator[dict[str, Any]]:
-    """The lines of a journal, its head first; an unfinished line at its end is left out.
+def read_head(path: Path) -> Head:
+    """The first line of a journal.
 
     Raises:
-        InputError: it is no journal of this version, or a line is damaged.
+        InputError: it is no journal of this version, or the line is damaged.
     """
     with named(path):
-        try:
-            text = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"it cannot be read: {error.strerror}") from None
-        *lines, _ = text.split(b"\n")
-        for number, line in enumerate(lines, 1):
-            entry = _parsed(line, number)
-            if number == 1 and (entry.get("journal"), entry.get("version")) != (FORMAT, VERSION):
-                raise InputError(f"line 1: it is no journal of damian advise of version {VERSION}")
-            if number == 1 and not isinstance(entry.get("fleet"), str):
-                raise InputError("line 1: it is damaged: the name of the fleet is missing")
-            yield entry
-        if not lines:
-            raise InputError("it is empty")
+        first, *_ = _texts(path)
+        return validated(Head, parsed_json(first, "line 1"), "line 1: it does not begin a journal")
 
 
-def _parsed(line: bytes, number: int) -> dict[str, Any]:
-    try:
-        entry = json.loads(line, parse_constant=no_constant)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"line {number}: it is damaged: {one_line(str(error))[:200]}") from None
-    if not isinstance(entry, dict):
-        raise InputError(f"line {number}: it is no object")
-    for name in ("received", "asked"):
-        value = entry.get(name)
-        if isinstance(value, int | float) and not _is_time(value):
-            raise InputError(f"line {number}: it is damaged: {name}: {show(value)} is not a time [s]")
-    return entry
-
-
-def _is_time(value: Any) -> bool:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and abs(value) <= LATEST  # which NaN is not
-
-
-def reports_of(entry: Mapping[str, Any]) -> tuple[float, list[Report]]:
-    """When the reports of a line came in [s], and the reports.
+def read_lines(path: Path) -> Iterator[tuple[int, Line]]:
+    """The lines after the first one, with their numbers; an unfinished one at the end is left out.
 
     Raises:
-        InputError: the line is damaged.
+        InputError: the file cannot be read, or a line is damaged.
     """
-    received, found = entry.get("received"), entry.get("reports")
-    if not _is_time(received) or not isinstance(found, list):
-        raise InputError("it is damaged: no reports, or no time at which they came in")
-    rows = checked_rows([(f"row {n}", row) for n, row in enumerate(found, 1)])
-    return cast(float, received), read_rows(rows, cast(float, received), file=False)
+    with named(path):
+        for number, text in enumerate(_texts(path)[1:], 2):
+            where = f"line {number}"
+            found = parsed_json(text, where)
+            kind = next((KINDS[key] for key in KINDS if isinstance(found, dict) and key in found), None)
+            if kind is None:
+                raise InputError(f"{where}: it is damaged: it has none of {', '.join(KINDS)}")
+            yield number, validated(kind, found, f"{where}: it is damaged")
 
 
-def head(name: str, uavs: list[str], about: dict[str, Any]) -> dict[str, Any]:
-    """The first line of a journal."""
-    return {"journal": FORMAT, "version": VERSION, "fleet": name, "uavs": uavs, "about": about}
+def _texts(path: Path) -> list[bytes]:
+    try:
+        *lines, _ = path.read_bytes().split(b"\n")
+    except OSError as error:
+        raise InputError(f"it cannot be read: {error.strerror}") from None
+    if not lines:
+        raise InputError("it is empty")
+    return lines

@@ -1,26 +1,92 @@
-"""What the server node knows of a UAV: its reports in the order in which they were generated, as messages."""
+"""What the server node knows of a UAV: its reports in the order in which they were generated, as messages.
+
+Places in reports count as the landing points nearest to them.
+"""
 
 import bisect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
+import numpy as np
+import shapely
 import torch
 from torch import Tensor
 
-from damian.advice.ground import DEGREES, Ground
-from damian.advice.reports import Report
+from damian.advice.rows import DEGREES, METRES, Place, Report
 from damian.common.errors import InputError
 from damian.server.server import Server
+from damian.world.airspace import Airspace
 from damian.world.battery import observed
 from damian.world.messages import Messages
+from damian.world.regions.geodesy import to_latlon, to_local
 
 KEPT = 512
 """Reports of a UAV that are kept: a late one changes what newer ones left open."""
+REMEMBERED = 10_000
+"""Places whose landing points are remembered, because each is looked up several times."""
+DIGITS = {DEGREES: 8, METRES: 3}
+"""Decimals of a place in answers: a millimetre."""
+
+
+class Ground:
+    """Landing points of a region, as reports and answers name places.
+
+    Args:
+        airspace: the first of its regions is flown over.
+        reach: longest distance of a reported place from the nearest landing point [m].
+    """
+
+    def __init__(self, airspace: Airspace, reach: float) -> None:
+        self.region, self.reach = airspace.regions[0], reach
+        self.columns = METRES if self.region.origin is None else DEGREES
+        self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
+        self._tree = shapely.STRtree(np.asarray(shapely.points(self.points)))
+        self.landing_point = lru_cache(REMEMBERED)(self._landing_point)
+        """Number of the landing point nearest to a place; ``InputError`` if it is farther than ``reach``."""
+        self.place = lru_cache(REMEMBERED)(self._place)
+        """Where a landing point is, in ``columns``."""
+        self.way = lru_cache(REMEMBERED)(self._way)
+        """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
+
+    def _landing_point(self, place: Place) -> int:
+        x, y = self.local(place)
+        point = int(self._tree.nearest(shapely.Point(x, y)))
+        away = float(np.hypot(*(self.points[point] - (x, y))))
+        if away > self.reach:
+            names, unit = self.columns, "m" if self.region.origin is None else "deg"
+            raise InputError(
+                f"{names[0]}, {names[1]}: {place[0]:.10g}, {place[1]:.10g} {unit} is {away:.0f} m away from "
+                f"the nearest landing point of {self.region.name}, more than {self.reach:.0f} m"
+            )
+        return point
+
+    def local(self, place: Place) -> tuple[float, float]:
+        """A place, east and north of the origin of the region [m]."""
+        first, second = place
+        if self.region.origin is None:
+            return first - self.region.offset[0], second - self.region.offset[1]
+        x, y = to_local(first, second, self.region.origin)
+        return float(x), float(y)
+
+    def _place(self, point: int) -> Place:
+        x, y = self.points[point]
+        if self.region.origin is None:
+            place = x + self.region.offset[0], y + self.region.offset[1]
+        else:
+            place = to_latlon(x, y, self.region.origin)
+        digits = DIGITS[self.columns]
+        return round(float(place[0]), digits), round(float(place[1]), digits)
+
+    def _way(self, origin: int, goal: int) -> tuple[float, float]:
+        east, north = (float(each) for each in self.points[goal] - self.points[origin])
+        heading = math.degrees(math.atan2(east, north)) % 360
+        return round(math.hypot(east, north), 2), round(heading, 2)
 
 
 @dataclass
-class Known:
+class FilledReport:
     """A report with all that it leaves open filled in from the ones generated before it."""
 
     report: Report
@@ -31,7 +97,7 @@ class Known:
     point: int = 0
     """Landing point where the UAV is; in flight, where it took off."""
     target: int = 0
-    """Landing point that it is bound for."""
+    """Landing point to which it flies."""
     track: float = 0.0
     """Heading of its latest flight [rad]."""
     battery: float = 100.0
@@ -47,7 +113,7 @@ class Known:
     trail: tuple[int, ...] = ()
     """Its latest landing points, newest first."""
     readings: tuple[float, ...] = ()
-    """Readings of its sensors of one's own."""
+    """Readings of sensors of your own."""
 
 
 class UavLog:
@@ -61,13 +127,13 @@ class UavLog:
 
     def __init__(self, ground: Ground, window: int, n_readings: int) -> None:
         self.ground, self.window, self.n_readings = ground, window, n_readings
-        self.known: list[Known] = []
+        self.reports: list[FilledReport] = []
         self.received = self.late = self.duplicates = 0
 
     @property
-    def newest(self) -> Known | None:
+    def newest(self) -> FilledReport | None:
         """The report that was generated last."""
-        return self.known[-1] if self.known else None
+        return self.reports[-1] if self.reports else None
 
     def check(self, report: Report) -> None:
         """Check what a report says of places and readings.
@@ -75,10 +141,10 @@ class UavLog:
         Raises:
             InputError: a place is far from any landing point, or there is another number of readings.
         """
-        if report.degrees != (self.ground.columns == DEGREES):
-            own, other = ("lat, lon [deg]", "x, y [m]")[:: 1 if self.ground.columns == DEGREES else -1]
-            raise InputError(f"{other}: places in {self.ground.region.name} are {own}")
-        for place in (report.place, report.detected_at, report.target, *(report.previous or ())):
+        if report.in_degrees != (self.ground.columns == DEGREES):
+            own, name = ", ".join(self.ground.columns), self.ground.region.name
+            raise InputError(f"places in {name} are {own}: give those of {report.id} in {own}")
+        for place in (report.place, report.source_place, report.target, *(report.previous or ())):
             if place is not None:
                 self.ground.landing_point(place)
         n = self.n_readings
@@ -88,17 +154,17 @@ class UavLog:
     def has(self, time: float) -> bool:
         """Has a report that was generated at this time come in before."""
         at = self._place_of(time)
-        return at < len(self.known) and self.known[at].report.time == time
+        return at < len(self.reports) and self.reports[at].report.time == time
 
     def _place_of(self, time: float) -> int:
-        """Number of known reports that were generated before this time; mostly all."""
-        if not self.known or self.known[-1].report.time < time:
-            return len(self.known)
-        return bisect.bisect_left(self.known, time, key=_generated)
+        """Number of reports that were generated before this time; mostly all."""
+        if not self.reports or self.reports[-1].report.time < time:
+            return len(self.reports)
+        return bisect.bisect_left(self.reports, time, key=lambda filled: filled.report.time)
 
     def add(
         self, report: Report, step: int, detected: int | None, sent: tuple[int, int] | None = None
-    ) -> Known:
+    ) -> FilledReport:
         """Add a report, in its place by the time when it was generated.
 
         Args:
@@ -107,100 +173,95 @@ class UavLog:
             detected: the step of the detection that it names.
             sent: landing points from which and to which the UAV had last been sent by then.
         """
-        known = Known(report, step, sent, detected=detected)
+        filled = FilledReport(report, step, sent, detected=detected)
         at = self._place_of(report.time)
-        self.known.insert(at, known)
-        for i in range(at, len(self.known)):
-            self._fill(self.known[i], self.known[i - 1] if i else None)
-        del self.known[: max(len(self.known) - KEPT, 0)]
-        return known
+        self.reports.insert(at, filled)
+        for i in range(at, len(self.reports)):
+            self._fill(self.reports[i], self.reports[i - 1] if i else None)
+        del self.reports[: max(len(self.reports) - KEPT, 0)]
+        return filled
 
-    def _fill(self, known: Known, before: Known | None) -> None:
+    def _fill(self, filled: FilledReport, before: FilledReport | None) -> None:
         """Fill in what a report leaves open."""
-        report, near = known.report, self.ground.landing_point
+        report, near = filled.report, self.ground.landing_point
         here = near(report.place)
-        known.point = known.target = here
-        if report.flies and known.sent:  # it is on its way, and took off from where it was sent
-            known.point, known.target = known.sent
+        filled.point = filled.target = here
+        if report.flies and filled.sent:  # it is on its way, and took off from where it was sent
+            filled.point, filled.target = filled.sent
         elif report.flies and before:
-            known.point = known.target = before.point
+            filled.point = filled.target = before.point
         if report.target is not None:
-            known.target = near(report.target)
-        known.track = before.track if before else 0.0
+            filled.target = near(report.target)
+        filled.track = before.track if before else 0.0
         if report.track is not None:
-            known.track = math.radians(report.track) % (2 * math.pi)
-        known.battery = before.battery if before else 100.0
+            filled.track = math.radians(report.track) % (2 * math.pi)
+        filled.battery = before.battery if before else 100.0
         if report.battery is not None:
-            known.battery = report.battery
-        known.spotted = report.spotted and not report.flies
-        self._fill_detection(known, before)
-        known.motions = 0 if before is None or before.spotted else before.motions
-        known.motions += before is not None
+            filled.battery = report.battery
+        filled.spotted = report.source_spotted and not report.flies
+        self._fill_detection(filled, before)
+        filled.motions = 0 if before is None or before.spotted else before.motions
+        filled.motions += before is not None
         if report.motions is not None:
-            known.motions = report.motions
-        known.trail = self._trail(known, before)
-        known.readings = before.readings if before else (0.0,) * self.n_readings
+            filled.motions = report.motions
+        filled.trail = self._trail(filled, before)
+        filled.readings = before.readings if before else (0.0,) * self.n_readings
         if report.readings is not None:
-            known.readings = report.readings
+            filled.readings = report.readings
 
-    def _fill_detection(self, known: Known, before: Known | None) -> None:
-        report = known.report
-        if known.spotted:
-            known.detected, known.detected_at = known.step, known.point
-        elif report.detected is not None:
-            place, held = report.detected_at, before and before.detected_at
-            known.detected_at = (
-                self.ground.landing_point(place)
-                if place is not None
-                else (held if held is not None else known.point)
-            )
+    def _fill_detection(self, filled: FilledReport, before: FilledReport | None) -> None:
+        report = filled.report
+        if filled.spotted:
+            filled.detected, filled.detected_at = filled.step, filled.point
+        elif report.source_time is not None:
+            if report.source_place is not None:
+                filled.detected_at = self.ground.landing_point(report.source_place)
+            else:
+                held = before and before.detected_at
+                filled.detected_at = filled.point if held is None else held
         elif before is not None:
-            known.detected, known.detected_at = before.detected, before.detected_at
+            filled.detected, filled.detected_at = before.detected, before.detected_at
 
-    def _trail(self, known: Known, before: Known | None) -> tuple[int, ...]:
+    def _trail(self, filled: FilledReport, before: FilledReport | None) -> tuple[int, ...]:
         previous: Sequence[int] = before.trail if before else ()
-        if known.report.previous is not None:
-            trail = [known.point, *map(self.ground.landing_point, known.report.previous)]
-        elif previous and previous[0] == known.point:
+        if filled.report.previous is not None:
+            trail = [filled.point, *map(self.ground.landing_point, filled.report.previous)]
+        elif previous and previous[0] == filled.point:
             trail = [*previous]
         else:
-            trail = [known.point, *previous]
+            trail = [filled.point, *previous]
         return tuple([*trail, *[trail[-1]] * self.window][: self.window])
 
 
-def _generated(known: Known) -> float:
-    return known.report.time
-
-
-def messages_of(known: Sequence[Known], server: Server, points: Tensor, dt: float) -> Messages:
+def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor, dt: float) -> Messages:
     """Messages as the simulation would send them, [n].
 
     Args:
-        known: the reports.
+        reports: the reports.
         server: gives the resolution of battery levels.
         points: landing points, [L, 2] metres.
         dt: length of a step [s].
     """
-    steps = torch.tensor([each.step for each in known])
-    detected = torch.tensor([-1 if each.detected is None else each.detected for each in known])
-    battery = torch.tensor([each.battery for each in known])
-    nowhere = torch.zeros(len(known), 2)
-    at = torch.tensor([each.detected_at or 0 for each in known])
-    empty = torch.zeros(len(known), dtype=torch.bool)
+    steps = torch.tensor([each.step for each in reports])
+    detected = torch.tensor([-1 if each.detected is None else each.detected for each in reports])
+    battery = torch.tensor([each.battery for each in reports])
+    nowhere = torch.zeros(len(reports), 2)
+    at = torch.tensor([each.detected_at or 0 for each in reports])
+    empty = torch.zeros(len(reports), dtype=torch.bool)
     if server.battery.enabled:
         empty = observed(battery, server.battery) <= 0
     has_detected = detected >= 0
     return Messages(
         time=steps * dt,
-        position=points[[each.point for each in known]],
-        target=points[[each.target for each in known]],
-        track=torch.tensor([each.track for each in known]),
+        position=points[[each.point for each in reports]],
+        target=points[[each.target for each in reports]],
+        track=torch.tensor([each.track for each in reports]),
         battery=battery,
-        spotted=torch.tensor([each.spotted for each in known]),
+        spotted=torch.tensor([each.spotted for each in reports]),
         empty=empty,
-        motions=torch.tensor([each.motions for each in known]),
+        motions=torch.tensor([each.motions for each in reports]),
         detected_time=torch.where(has_detected, detected * dt, -1.0),
         detected_position=torch.where(has_detected.unsqueeze(-1), points[at], nowhere),
-        trail=torch.tensor([each.trail for each in known]),
-        readings=torch.tensor([each.readings for each in known]).view(len(known), -1),
+        trail=torch.tensor([each.trail for each in reports]),
+        readings=torch.tensor([each.readings for each in reports]).view(len(reports), -1),
     )

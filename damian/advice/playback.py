@@ -8,7 +8,7 @@ knows where the source was.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, cast
@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from damian import keys
-from damian.advice.answers import written
-from damian.advice.desk import checked_ids, replay
 from damian.advice.fitting import fit
 from damian.advice.fleet import Decision, Fleet
-from damian.advice.journal import entries, reports_of
-from damian.advice.reports import Report
+from damian.advice.journal import Line, Received, read_lines
+from damian.advice.rows import Report, written
+from damian.advice.session import replay
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.show.episode import Episode, Floats, cells_of, fixed_of
@@ -33,7 +32,7 @@ MOST_STEPS = 20_000
 
 
 @dataclass
-class Known:
+class ServerView:
     """What the server node knew in each of S steps of N UAVs."""
 
     steps: list[int] = field(default_factory=list)
@@ -56,20 +55,6 @@ class Known:
     """What UAVs were told to do, by number."""
 
 
-def head_of(path: Path) -> dict[str, Any]:
-    """The first line of a journal: ``fleet``, ``uavs``, and ``about`` (policy, checkpoint, overrides).
-
-    Raises:
-        InputError: it is no journal, or its first line is damaged.
-    """
-    head = next(entries(path))
-    with named(f"{path}: line 1"):
-        head["uavs"] = checked_ids(head.get("uavs"))
-        if not isinstance(head.get("about"), dict):
-            raise InputError("it is damaged: about is missing")
-    return head
-
-
 def episode_of(
     path: Path,
     fleet: Fleet,
@@ -90,70 +75,66 @@ def episode_of(
     Raises:
         InputError: the journal is damaged, not every UAV has reported, or the span has no steps or too many.
     """
-    known, reports = _knowledge(path, fleet, span or (0.0, math.inf), progress)
-    steps = np.array(known.steps)
+    view, reports = _read(path, fleet, span or (0.0, math.inf), progress)
+    steps = np.array(view.steps)
     truth = [_hindsight(fleet, reports[uav], steps) for uav in range(len(fleet.uavs))]
     columns = {name: np.stack([each[name] for each in truth], 1) for name in truth[0]}
-    columns["target"] = _targets(fleet, known.told, columns["position"][0, :, :2], steps)
-    columns["sent"], columns["delay"] = _messages(fleet, known, reports, steps)
-    columns |= {name: _stacked(getattr(known, name)) for name in ("believed", "age", "reward")}
+    columns["target"] = _targets(fleet, view.told, columns["position"][0, :, :2], steps)
+    columns["sent"], columns["delay"] = _messages(fleet, view, reports, steps)
+    columns |= {name: _stacked(getattr(view, name)) for name in ("believed", "age", "reward")}
     columns["sent"][0], columns["reward"][0] = False, 0.0
-    terms = {name: _stacked(rows) for name, rows in known.terms.items()}
+    terms = {name: _stacked(rows) for name, rows in view.terms.items()}
     for rows in terms.values():
         rows[0] = 0.0
-    began = cast(float, fleet.start) + known.steps[0] * fleet.node.dt
+    began = cast(float, fleet.start) + view.steps[0] * fleet.node.dt
     flight = {"uavs": fleet.uavs, "began": written(began)}
     parts: dict[str, Any] = {**fixed_of(fleet.node.worlds, {**about, **flight}, 0), **columns}
     return Episode(
         **parts,
         instant=False,
-        success=known.success,
+        success=view.success,
         time=np.arange(len(steps)) * fleet.node.dt,
         source=None,
         emits=None,
         reward_terms=terms,
-        cells=cells_of(fleet.node.worlds) if known.belief else None,
-        belief=_stacked(known.belief) if known.belief else None,
+        cells=cells_of(fleet.node.worlds) if view.belief else None,
+        belief=_stacked(view.belief) if view.belief else None,
     )
 
 
-def _knowledge(
+def _read(
     path: Path, fleet: Fleet, span: tuple[float, float], progress: Callable
-) -> tuple[Known, list[list[Report]]]:
+) -> tuple[ServerView, list[list[Report]]]:
     """What was known in the steps of a span, and all reports of each UAV."""
-    known, reports, end = Known(), [[] for _ in fleet.uavs], math.inf
-    for number, entry in enumerate(progress(list(entries(path))[1:]), 2):
+    view, reports, end = ServerView(), [[] for _ in fleet.uavs], math.inf
+    for number, line in progress(list(read_lines(path))):
         with named(f"{path}: line {number}"):
             if fleet.step <= end:
-                _take(fleet, known, entry, span)
+                _take(fleet, view, line, span)
             if fleet.start is not None:
                 end = fleet.first_step + span[1] / fleet.node.dt
-            if "reports" in entry:
-                received, found = reports_of(entry)
-                for report in found:
-                    for uav in fleet.numbers_of([report.uav]) or ():
-                        reports[uav].append(replace(report, received=received))
+            for report in line.reports if isinstance(line, Received) else ():
+                for uav in fleet.numbers_of([report.id]) or ():
+                    reports[uav].append(report)
     if fleet.start is None:
         raise InputError(f"{path}: the fleet never began: not every UAV has reported")
-    _advance(fleet, known, fleet.clock, span, is_last=True)
-    if not known.steps:
+    _advance(fleet, view, fleet.clock, span, is_last=True)
+    if not view.steps:
         whole = f"the journal tells of 0 to {(fleet.step - fleet.first_step) * fleet.node.dt:g} s"
         raise InputError(f"span: no step lies between {span[0]:g} and {span[1]:g} s: {whole}")
-    return known, reports
+    return view, reports
 
 
-def _take(fleet: Fleet, known: Known, entry: dict[str, Any], span: tuple[float, float]) -> None:
+def _take(fleet: Fleet, view: ServerView, line: Line, span: tuple[float, float]) -> None:
     """Apply the reports or decisions of a line, after the steps before it."""
-    now, told = entry.get("received", entry.get("asked")), entry.get("told")
-    if isinstance(now, int | float):
-        _advance(fleet, known, now, span)
-    replay(fleet, entry)
-    for uav in told if isinstance(told, dict) else ():
-        known.told.append((fleet.number[uav], cast(Decision, fleet.decision(fleet.number[uav]))))
+    _advance(fleet, view, line.received if isinstance(line, Received) else line.asked, span)
+    replay(fleet, line)
+    for uav in () if isinstance(line, Received) else line.told:
+        view.told.append((fleet.number[uav], cast(Decision, fleet.decision(fleet.number[uav]))))
 
 
 def _advance(
-    fleet: Fleet, known: Known, now: float, span: tuple[float, float], is_last: bool = False
+    fleet: Fleet, view: ServerView, now: float, span: tuple[float, float], is_last: bool = False
 ) -> None:
     """Take the steps up to an instant, and note those in the span; the last one is noted at the end.
 
@@ -167,30 +148,30 @@ def _advance(
     if first > fleet.step:
         fleet.advance(min(now, start + math.ceil(first) * dt))
     until = min(fleet.step_of(now) + is_last, last + 1)
-    if until - fleet.step + len(known.steps) > MOST_STEPS and first <= fleet.step:
+    if until - fleet.step + len(view.steps) > MOST_STEPS and first <= fleet.step:
         raise InputError(f"span: it has more than {MOST_STEPS} steps of {dt:g} s: give FIRST and LAST [s]")
     while first <= fleet.step < until:
-        _note(fleet, known)
+        _note(fleet, view)
         fleet.advance(start + (fleet.step + 1) * dt)
 
 
-def _note(fleet: Fleet, known: Known) -> None:
+def _note(fleet: Fleet, view: ServerView) -> None:
     """Note what the server node knows at the end of a step."""
-    known.steps.append(fleet.step)
+    view.steps.append(fleet.step)
     for uav, each in fleet.arrived:
         sent = each.step, uav
-        known.delay[sent] = min(fleet.step - each.step, known.delay.get(sent, fleet.step))
+        view.delay[sent] = min(fleet.step - each.step, view.delay.get(sent, fleet.step))
     outputs = fleet.observe([])
-    known.believed.append(fleet.points[[each.point for each in fleet.held]])
-    known.age.append(outputs[keys.AGE][0, :, 0] * fleet.node.dt)
+    view.believed.append(fleet.points[[each.point for each in fleet.held]])
+    view.age.append(outputs[keys.AGE][0, :, 0] * fleet.node.dt)
     reward = outputs.get(keys.REWARD, None)
-    known.reward.append(known.age[-1] * 0 if reward is None else cast(Tensor, reward)[0, :, 0])
+    view.reward.append(view.age[-1] * 0 if reward is None else cast(Tensor, reward)[0, :, 0])
     for name in fleet.node.server.reward.terms:
         term = outputs.get((*keys.REWARD_TERMS, name), None)
-        known.terms.setdefault(name, []).append(known.age[-1] * 0 if term is None else cast(Tensor, term)[0])
+        view.terms.setdefault(name, []).append(view.age[-1] * 0 if term is None else cast(Tensor, term)[0])
     if (belief := outputs.get(keys.BELIEF, None)) is not None:
-        known.belief.append(cast(Tensor, belief)[0])
-    known.success = bool(outputs[keys.SUCCESS])
+        view.belief.append(cast(Tensor, belief)[0])
+    view.success = bool(outputs[keys.SUCCESS])
 
 
 def _hindsight(fleet: Fleet, reports: Sequence[Report], steps: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
@@ -199,10 +180,10 @@ def _hindsight(fleet: Fleet, reports: Sequence[Report], steps: NDArray[np.int64]
     at = np.clip([fleet.step_of(report.time) for report in ordered], fleet.first_step, None)
     of_step = {int(step): report for step, report in zip(at, ordered, strict=True)}
     knots, latest = np.array(list(of_step)), list(of_step.values())
-    places = np.array([(*fleet.ground.local(each.place), max(each.altitude or 0.0, 0.0)) for each in latest])
+    places = np.array([(*fleet.ground.local(each.place), max(each.fla or 0.0, 0.0)) for each in latest])
     position = np.stack([np.interp(steps, knots, axis) for axis in places.T], -1)
     newest = np.clip(np.searchsorted(knots, steps, side="right") - 1, 0, None)
-    spots = np.array([each.spotted and not each.flies for each in latest])
+    spots = np.array([each.source_spotted and not each.flies for each in latest])
     headings = [None if each.track is None else math.radians(each.track) for each in latest]
     return {
         "position": position,
@@ -236,12 +217,12 @@ def _targets(
 
 
 def _messages(
-    fleet: Fleet, known: Known, reports: Sequence[Sequence[Report]], steps: NDArray[np.int64]
+    fleet: Fleet, view: ServerView, reports: Sequence[Sequence[Report]], steps: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Whether a UAV sent a message in a step, and its delay [steps], -1 if it never arrived, [S, N] each."""
     sent = np.zeros((len(steps), len(fleet.uavs)), bool)
     delay = np.zeros(sent.shape, int)
-    for (step, uav), lag in known.delay.items():
+    for (step, uav), lag in view.delay.items():
         if step >= steps[0]:
             sent[step - steps[0], uav], delay[step - steps[0], uav] = True, lag
     for message in fit([report for own in reports for report in own]).messages:

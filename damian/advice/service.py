@@ -20,9 +20,9 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from damian.advice.desk import Desk, NoFleet
 from damian.advice.fleet import Waiting
-from damian.advice.tables import Rows, as_csv, csv_rows, json_rows, parsed_json
+from damian.advice.rows import Rows, as_csv, as_rows, parsed_json, read_csv, read_json
+from damian.advice.session import AdviceSession, NoFleet
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 
@@ -44,15 +44,15 @@ def fleet_token(token: str, name: str) -> str:
     return base64.urlsafe_b64encode(digest).decode().rstrip("=")
 
 
-def make_app(desk: Desk, token: str, clock: Callable[[], float] = time.time) -> Starlette:
+def make_app(session: AdviceSession, token: str, clock: Callable[[], float] = time.time) -> Starlette:
     """The service as an ASGI application.
 
     Args:
-        desk: the fleets.
+        session: the fleets.
         token: of the service.
         clock: the current time [s].
     """
-    service = Service(desk, token, clock)
+    service = Service(session, token, clock)
     routes = [
         Route("/fleets/{name}", service.put, methods=["PUT"]),
         Route("/fleets/{name}", service.get, methods=["GET"]),
@@ -63,12 +63,12 @@ def make_app(desk: Desk, token: str, clock: Callable[[], float] = time.time) -> 
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        ticking = asyncio.create_task(_tick(desk, clock))
+        ticking = asyncio.create_task(_tick(session, clock))
         try:
             yield
         finally:
             ticking.cancel()
-            desk.close()
+            session.close()
 
     handlers: dict[Any, Any] = {
         InputError: lambda _, error: _error(422, str(error)),
@@ -80,10 +80,10 @@ def make_app(desk: Desk, token: str, clock: Callable[[], float] = time.time) -> 
     return Starlette(routes=routes, lifespan=lifespan, exception_handlers=handlers)
 
 
-async def _tick(desk: Desk, clock: Callable[[], float]) -> None:
+async def _tick(session: AdviceSession, clock: Callable[[], float]) -> None:
     """Let the fleets take their steps, one fleet at a time, so that requests come in between."""
     while True:
-        for fleet in list(desk.fleets.values()):
+        for fleet in list(session.fleets.values()):
             fleet.advance(clock())
             await asyncio.sleep(0)
         await asyncio.sleep(TICK)
@@ -92,53 +92,52 @@ async def _tick(desk: Desk, clock: Callable[[], float]) -> None:
 class Service:
     """The requests; arguments as of ``make_app``."""
 
-    def __init__(self, desk: Desk, token: str, clock: Callable[[], float]) -> None:
-        self.desk, self.token, self.clock = desk, token, clock
+    def __init__(self, session: AdviceSession, token: str, clock: Callable[[], float]) -> None:
+        self.session, self.token, self.clock = session, token, clock
         self._making = asyncio.Lock()
 
     async def put(self, request: Request) -> Response:
         """Create a fleet; or say its token again, if it has these UAVs."""
         name = self._name(request, whole=True)
         body = parsed_json(await _body(request), "body")
-        uavs = self.desk.check_new(name, body.get("uavs") if isinstance(body, dict) else None)
+        uavs = self.session.check_new(name, body.get("uavs") if isinstance(body, dict) else None).uavs
         async with self._making:
-            known = name in self.desk.fleets
-            made = None if known else await asyncio.to_thread(self.desk.make, uavs)
-            uavs = self.desk.check_new(name, uavs)  # another request may have come in between
-            created = self.desk.create(name, uavs, made)
+            known = name in self.session.fleets
+            made = None if known else await asyncio.to_thread(self.session.make, uavs)
+            created = self.session.create(name, uavs, made)  # another request may have come in between
         answer = {"fleet": name, "uavs": uavs, "token": fleet_token(self.token, name)}
         return JSONResponse(answer, 201 if created else 200)
 
     async def get(self, request: Request) -> Response:
         """What is known of a fleet."""
-        return JSONResponse(self.desk.status(self._name(request)))
+        return JSONResponse(self.session.status(self._name(request)).model_dump(exclude_unset=True))
 
     async def delete(self, request: Request) -> Response:
         """End a fleet."""
-        self.desk.end(self._name(request, whole=True), self.clock())
+        self.session.end(self._name(request, whole=True), self.clock())
         return Response(status_code=204)
 
     async def reports(self, request: Request) -> Response:
         """Take reports."""
         name = self._name(request)
-        self.desk.fleet(name)
+        self.session.fleet(name)
         body = await _body(request)
-        found = self.desk.report(name, _rows(request, body), self.clock())
+        found = self.session.report(name, _rows(request, body), self.clock())
         return JSONResponse({"accepted": len(found), "found": found})
 
     async def advice(self, request: Request) -> Response:
         """Advise all UAVs, or those that ask: ``?uav=A&uav=B``; as a table with ``?format=csv``."""
         name, wanted = self._name(request), request.query_params
-        self.desk.fleet(name)
+        self.session.fleet(name)
         unknown = {*wanted} - {"uav", "format"}
         kind = wanted.get("format", "csv" if _CSV in request.headers.get("accept", "") else "json")
         if unknown or kind not in ("csv", "json"):
             raise InputError("query: give uav=ID, once for each that asks, and format=json or csv")
         asking = wanted.getlist("uav") or None
-        answer = self.desk.advise(name, self.clock(), asking, only=asking is not None)
+        answer = self.session.advise(name, self.clock(), asking, only=asking is not None)
         if kind == "csv":
             return Response(as_csv(answer), media_type=_CSV)
-        return JSONResponse({"fleet": name, "advice": answer})
+        return JSONResponse({"fleet": name, "advice": as_rows(answer)})
 
     def _name(self, request: Request, whole: bool = False) -> str:
         """The fleet of a request that may do what it asks.
@@ -161,10 +160,10 @@ def _rows(request: Request, body: bytes) -> Rows:
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind == _CSV:
         try:
-            return csv_rows(body.decode("utf-8-sig"))
+            return read_csv(body.decode("utf-8-sig"))
         except UnicodeDecodeError as error:
             raise InputError(f"body: byte {error.start} is not UTF-8 text") from None
-    return json_rows(body, lines=kind == _LINES)
+    return read_json(body, lines=kind == _LINES)
 
 
 async def _body(request: Request) -> bytes:

@@ -89,8 +89,7 @@ def test_clocks_that_differ_are_told(log):
     ("name", "text", "message"),
     [
         ("x.jsonl", "", "it is empty"),
-        ("x.jsonl", "{}\n", "line 1: it is no journal of damian advise of version 1"),
-        ("x.jsonl", "nonsense\n", "line 1: it is damaged"),
+        ("x.jsonl", "{}\n", "line 1: it does not begin a journal"),
         ("x.csv", "ID,lat,lon\nA,1,2\nB,1,2", "line 2: it needs time and receive time, or time and AoI"),
         ("x.csv", "ID,time,AoI,lat,lon\nA,1,1,1,2", "1 reports are too few to tell how late they are"),
     ],

@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reporting import START, flights
+from reporting import START, advise, flights
 
 from damian import keys
-from damian.advice.clocks import FIRST, LIFE
-from damian.advice.decisions import GRACE
-from damian.advice.fleet import Fleet, Waiting
+from damian.advice.fleet import FIRST, GRACE, LIFE, Fleet, Waiting
 from damian.advice.node import Node
-from damian.advice.reports import Report
+from damian.advice.rows import Report
 from damian.baselines.greedy import greedy_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
@@ -82,10 +80,10 @@ def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task,
                 assert torch.equal(read[key], shown[key]), (step, key)
         held = shown.get(keys.RECEIVED, shown[keys.MESSAGE])
         assert torch.equal(read[keys.RECEIVED], held), step
-        chosen = fleet.advise(fleet.clock, [fleet.uavs[uav] for uav in ready])
+        chosen = advise(fleet, fleet.clock, [fleet.uavs[uav] for uav in ready])
         assert chosen == ready
         assert torch.equal(fleet.action[0, ready], action[0, ready])
-        spotted += sum(known.spotted for known in fleet.held)
+        spotted += sum(held.spotted for held in fleet.held)
         assert all(here.report.time <= fleet.clock for here in fleet.held)
         moved += sum(fleet.decision(uav).origin != fleet.decision(uav).goal for uav in ready)
     assert moved > 3
@@ -95,29 +93,43 @@ def test_a_fleet_observes_and_advises_what_the_simulation_does_bit_for_bit(task,
 SILENT = 40
 
 
-def fleet_of(policy=greedy_policy, **changed) -> Fleet:
+def fleet_of(**changed) -> Fleet:
     node = Node(scenario_of(**changed), 3)
-    return Fleet(node, ["a", "b", "c"], policy(node.env))
+    return Fleet(node, ["a", "b", "c"], greedy_policy(node.env))
 
 
-def told(fleet: Fleet, uav: str, time: float, point: int, **changed) -> str:
-    report = Report(uav=uav, time=time, place=fleet.ground.place(point), **changed)
-    fleet.check(report, time + 0.1)
-    return fleet.report(report, time + 0.1)
+def report_of(
+    fleet: Fleet, uav: str, time: float, point: int, received: float | None = None, **more
+) -> Report:
+    lat, lon = fleet.ground.place(point)
+    report = Report(**{"id": uav, "time": time, "lat": lat, "lon": lon, **more})
+    report.stamp(time + 0.1 if received is None else received)
+    return report
+
+
+def told(fleet: Fleet, *given, **more) -> str:
+    report = report_of(fleet, *given, **more)
+    fleet.check(report)
+    return fleet.report(report)
+
+
+def begun(distance: int = 30, time: float = START, **changed) -> Fleet:
+    """A fleet that has begun, whose UAVs stand so many landing points apart."""
+    fleet = fleet_of(**changed)
+    for i, uav in enumerate(fleet.uavs):
+        told(fleet, uav, time, 200 + distance * i)
+    return fleet
 
 
 @pytest.mark.parametrize("task", ["belief", "clocks"])
 def test_after_a_long_silence_it_does_not_matter_when_somebody_asked(task, monkeypatch):
     """One fleet takes every step when it comes, another one many at once."""
     monkeypatch.setattr("damian.advice.fleet.SILENT_STEPS", SILENT)
-    fleets = [fleet_of(**TASKS[task]) for _ in range(2)]
-    for fleet in fleets:
-        for i, uav in enumerate(fleet.uavs):
-            told(fleet, uav, START, 30 * i, spotted=i == 1)
+    fleets = [begun(**TASKS[task]) for _ in range(2)]
     for step in range(0, 3 * SILENT, 7):
         fleets[0].advance(START + step)
     for fleet in fleets:
-        told(fleet, "a", START + 3 * SILENT + 5.5, 17, spotted=True)
+        told(fleet, "a", START + 3 * SILENT + 5.5, 17, source_spotted=True)
         fleet.advance(START + 3 * SILENT + 9)
     one, other = (fleet.observe([0, 1, 2]) for fleet in fleets)
     assert torch.equal(one[keys.OBSERVATION], other[keys.OBSERVATION])
@@ -129,10 +141,8 @@ def test_after_a_long_silence_the_history_holds_no_action_that_had_been_reflecte
     observed = []
     for silent in (SILENT, 1000):
         monkeypatch.setattr("damian.advice.fleet.SILENT_STEPS", silent)
-        fleet = fleet_of(**TASKS["history"])
-        for i, uav in enumerate(fleet.uavs):
-            told(fleet, uav, START, 30 * i)
-        fleet.advise(START + 3, ["a"])
+        fleet = begun(**TASKS["history"])
+        advise(fleet, START + 3, ["a"])
         told(fleet, "a", START + 8, fleet.decision(0).goal)
         fleet.advance(START + 3 * SILENT)
         observed.append(fleet.observe([0])[keys.OBSERVATION])
@@ -140,23 +150,19 @@ def test_after_a_long_silence_the_history_holds_no_action_that_had_been_reflecte
 
 
 def test_a_missing_uav_keeps_its_last_message_and_grows_old():
-    fleet = fleet_of(observation=replace(SEEN, age_scale=100.0))
-    for i, uav in enumerate(fleet.uavs):
-        told(fleet, uav, START, 30 * i)
+    fleet = begun(observation=replace(SEEN, age_scale=100.0))
     for step in range(1, 30):
         told(fleet, "a", START + step, 0)
-        fleet.advise(START + step + 0.2, ["a"])
+        advise(fleet, START + step + 0.2, ["a"])
     ages = fleet.observe([0])[keys.OBSERVATION][0, :, -1]
     assert ages.tolist() == [0.0, pytest.approx(0.29), pytest.approx(0.29)]
-    assert fleet.held[1].point == 30
+    assert fleet.held[1].point == 230
 
 
 def test_a_landing_point_that_somebody_was_sent_to_is_not_given_away():
     """The UAV does not report any more; after a while it is believed where it was last."""
-    fleet = fleet_of(actions=ActionConfig(distances=[0.0, 60.0], headings=[0.0, 90.0, 180.0, 270.0]))
-    for i, uav in enumerate(fleet.uavs):
-        told(fleet, uav, START, 200 + i)
-    fleet.advise(START + 1, ["a"])
+    fleet = begun(1, actions=ActionConfig(distances=[0.0, 60.0], headings=[0.0, 90.0, 180.0, 270.0]))
+    advise(fleet, START + 1, ["a"])
     decision = fleet.decision(0)
     assert decision.goal != decision.origin
     told(fleet, "a", START + 3, decision.origin)
@@ -169,34 +175,30 @@ def test_a_landing_point_that_somebody_was_sent_to_is_not_given_away():
 
 
 def test_a_uav_in_flight_is_not_asked_and_took_off_from_where_it_was_sent():
-    fleet = fleet_of()
-    for i, uav in enumerate(fleet.uavs):
-        told(fleet, uav, START, 200 + i)
-    fleet.advise(START + 1)
+    fleet = begun(1)
+    advise(fleet, START + 1)
     decision = fleet.decision(0)
-    told(fleet, "a", START + 2, 300, altitude=5.0, spotted=True)
-    assert fleet.advise(START + 3) == [1, 2]
+    told(fleet, "a", START + 2, 300, fla=5.0, source_spotted=True)
+    assert advise(fleet, START + 3) == [1, 2]
     held = fleet.held[0]
     assert (held.point, held.target, held.spotted) == (decision.origin, decision.goal, False)
 
 
 def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
-    fleet = fleet_of()
-    for i, uav in enumerate(fleet.uavs):
-        told(fleet, uav, START, 200 + i)
+    fleet = begun(1)
     assert told(fleet, "a", START + 5, 210) == "new"
-    assert fleet.report(Report("a", START + 3, fleet.ground.place(205), spotted=True), START + 6) == "late"
+    assert told(fleet, "a", START + 3, 205, START + 6, source_spotted=True) == "late"
+    assert told(fleet, "a", START + 3, 205, START + 6) == "duplicate"
+    assert told(fleet, "a", START - 3, 205, START + 6) == "old"
     fleet.advance(START + 7)
     assert (fleet.held[0].point, fleet.held[0].detected, fleet.held[0].detected_at) == (210, 3, 205)
 
 
 def test_the_clock_of_the_service_never_goes_back():
-    fleet = fleet_of()
-    for i, uav in enumerate(fleet.uavs):
-        told(fleet, uav, START, 200 + i)
-    fleet.advise(START + 10)
-    fleet.advise(START + 4)
-    assert fleet.report(Report("a", START + 5, fleet.ground.place(1)), START + 6) == "new"
+    fleet = begun()
+    advise(fleet, START + 10)
+    advise(fleet, START + 4)
+    assert told(fleet, "a", START + 5, 1, START + 6) == "new"
     assert (fleet.step, fleet.clock) == (10, START + 10)
 
 
@@ -205,18 +207,17 @@ def test_the_clock_of_the_service_never_goes_back():
     [
         ({"uav": "d"}, "ID: 'd' is no UAV of this fleet: a, b, c"),
         ({"time": START + 60}, "time: 1700000060 s is 60.0 s after it came in"),
-        ({"detected": START + 60}, "source time: 1700000060 s is 60.0 s after it came in"),
-        ({"place": (0.0, 0.0)}, "lat, lon: 0, 0 deg is "),
-        ({"target": (0.0, 0.0)}, "lat, lon: 0, 0 deg is "),
-        ({"degrees": False}, "x, y [m]: places in LlanbedrTest are lat, lon [deg]"),
+        ({"source_time": START + 60}, "source time: 1700000060 s is 60.0 s after it came in"),
+        ({"lat": 0.0}, "lat, lon: 0, -4.1"),
+        ({"target_lat": 0.0, "target_lon": 0.0}, "lat, lon: 0, 0 deg is "),
+        ({"lat": None, "lon": None, "x": 0.0, "y": 0.0}, "places in LlanbedrTest are lat, lon"),
         ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
     ],
 )
 def test_what_no_uav_of_the_fleet_can_say_is_refused(changed, message):
     fleet = fleet_of()
-    report = Report(**{"uav": "a", "time": START, "place": fleet.ground.place(3), **changed})
     with pytest.raises(InputError) as error:
-        fleet.check(report, START)
+        fleet.check(report_of(fleet, point=3, received=START, **{"uav": "a", "time": START, **changed}))
     assert str(error.value).startswith(message)
 
 
@@ -224,13 +225,11 @@ def test_what_comes_in_late_fills_in_no_earlier_step_whenever_steps_are_taken():
     """A fleet that is restored from its journal takes its steps later than it did."""
     seen = []
     for steps_at_once in (True, False):
-        fleet = fleet_of(**TASKS["history"])
-        for i, uav in enumerate(fleet.uavs):
-            told(fleet, uav, START, 200 + i, battery=80.0)
-        told(fleet, "a", START + 5, 210)
+        fleet = begun(1, **TASKS["history"])
+        told(fleet, "a", START + 5, 210, battery=80.0)
         if steps_at_once:
             fleet.advance(START + 6.5)
-        fleet.report(Report("a", START + 3, fleet.ground.place(205), battery=10.0), START + 6.6)
+        told(fleet, "a", START + 3, 205, START + 6.6, battery=10.0)
         fleet.advance(START + 7)
         seen.append(fleet.observe([0])[keys.HISTORY])
     assert torch.equal(*seen)
@@ -239,75 +238,58 @@ def test_what_comes_in_late_fills_in_no_earlier_step_whenever_steps_are_taken():
 def test_a_first_report_that_is_old_when_it_comes_in_shows_a_clock_that_was_never_set():
     """The fleet would begin in 1970 and be over at once. In a journal it stays what it was."""
     fleet = fleet_of()
-    report = Report("a", 12.0, fleet.ground.place(3))
-    message = (
-        "time: 12 s is 1699999988.0 s before it came in, more than the 3600 s of a first report: set the"
-    )
-    with pytest.raises(InputError, match=message):
-        fleet.check(report, START, START)
-    fleet.check(replace(report, time=START - FIRST), START, START)
+    report = report_of(fleet, "a", 12.0, 3, START)
+    with pytest.raises(
+        InputError, match=r"time: 12 s is 1699999988\.0 s before it came in, more than the 3600 s"
+    ):
+        fleet.check(report, START)
+    fleet.check(report_of(fleet, "a", START - FIRST, 3, START), START)
+    fleet.check(report)
+    fleet = begun()
     fleet.check(report, START)
-    for i, uav in enumerate(fleet.uavs):
-        told(fleet, uav, START, 30 * i)
-    fleet.check(report, START, START)
-    assert fleet.report(report, START) == "old", "it changes nothing any more"
+    assert fleet.report(report) == "old", "it changes nothing any more"
 
 
-def test_a_fleet_begins_with_reports_of_the_time_that_it_lasts():
+def test_a_fleet_begins_with_reports_of_the_time_that_it_lasts_and_then_ends():
     """One UAV reports, and the others come when its report is too old for a fleet to begin with it."""
-    fleet = fleet_of()
+    fleet, late = fleet_of(), START + 2 * LIFE
     told(fleet, "a", START, 0)
-    late = START + 2 * LIFE
     told(fleet, "b", late, 30)
     told(fleet, "c", late, 60)
     with pytest.raises(Waiting, match=r"no report of a that is newer than 1e\+06 s has come in"):
-        fleet.advise(late + 1)
+        fleet.choose(late + 1)
     told(fleet, "a", late + 2, 3)
-    assert fleet.advise(late + 3) == [0, 1, 2]
+    assert advise(fleet, late + 3) == [0, 1, 2]
     assert fleet.start == late
-
-
-def test_a_fleet_that_began_too_long_ago_neither_takes_reports_nor_advises():
-    fleet = fleet_of()
-    for i, uav in enumerate(fleet.uavs):
-        told(fleet, uav, START, 30 * i)
-    assert fleet.advise(START + LIFE - 1) == [0, 1, 2]
     message = r"the fleet began more than 1e\+06 s ago: end it, and begin a new one"
     with pytest.raises(InputError, match=message):
-        told(fleet, "a", START + LIFE + 1, 0)
+        told(fleet, "a", late + LIFE + 1, 0)
     with pytest.raises(InputError, match=message):
-        fleet.advise(START + LIFE + 1)
+        fleet.choose(late + LIFE + 1)
 
 
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("task", ["history", "belief", "clocks", "flights"])
 def test_fleets_that_share_a_node_do_not_see_each_other(task):
     """Beside another fleet, which began earlier elsewhere, a fleet observes what it does alone."""
-    scenario = scenario_of(**TASKS[task])
 
-    def flown(node: Node, beside: Fleet | None) -> list[dict]:
+    def flown(node: Node, beside: Fleet | None) -> list:
         fleet, seen = Fleet(node, ["a", "b", "c"], greedy_policy(node.env)), []
         for step in range(12):
-            for other in [beside] if beside else []:
-                told(other, "b", START + step, 90 - step, battery=50.0, spotted=step % 2 == 0)
-                other.advise(START + step + 0.5)
+            if beside:
+                told(beside, "b", START + step, 90 - step, battery=50.0, source_spotted=step % 2 == 0)
+                advise(beside, START + step + 0.5)
             for i, uav in enumerate(fleet.uavs):
-                told(fleet, uav, START + step - i, 30 * i + step, spotted=step == 5)
-            fleet.advise(START + step + 0.5)
+                told(fleet, uav, START + step - i, 30 * i + step, START + step, source_spotted=step == 5)
+            advise(fleet, START + step + 0.5)
             read = fleet.observe([0, 1, 2])
-            seen.append(
-                {key: read[key] for key in (keys.OBSERVATION, keys.HISTORY) if key in read.keys(True)}
-            )
-        return [*seen, {uav: list(each) for uav, each in zip(fleet.uavs, fleet.told, strict=True)}]
+            seen += [read[key].tolist() for key in (keys.OBSERVATION, keys.HISTORY) if key in read.keys(True)]
+        return [*seen, *map(list, fleet.told)]
 
+    scenario = scenario_of(**TASKS[task])
     shared = Node(scenario, 3)
     beside = Fleet(shared, ["a", "b", "c"], greedy_policy(shared.env))
     for i, uav in enumerate(beside.uavs):
-        told(beside, uav, START - 20, 200 + i, spotted=True)
-    beside.advise(START - 10)
-    *alone, told_alone = flown(Node(scenario, 3), None)
-    *together, told_together = flown(shared, beside)
-    assert told_alone == told_together
-    for one, other in zip(alone, together, strict=True):
-        assert one.keys() == other.keys() != set()
-        assert all(torch.equal(one[key], other[key]) for key in one)
+        told(beside, uav, START - 20, 200 + i, source_spotted=True)
+    advise(beside, START - 10)
+    assert flown(Node(scenario, 3), None) == flown(shared, beside)

@@ -20,8 +20,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from damian.advice.reports import read_rows
-from damian.advice.tables import read_file
+from damian.advice.rows import read_file
 from damian.common.errors import InputError
 from damian.recipes import advise as advise_program
 from damian.recipes import bench, compare, evaluate, oracle, pendulum, spread, train
@@ -280,7 +279,9 @@ def test_reports_of_any_content_are_refused_in_one_line_or_read(content, kind):
         path.write_bytes(content)
         line, reports = None, []
         try:
-            reports = read_rows(read_file(path), 1e9, file=True)
+            reports = [report for _, report in read_file(path)]
+            for report in reports:
+                report.stamp(1e9, file=True)
         except InputError as error:
             line = str(error)
     assert reports or (line and len(line) <= LONGEST_LINE)

@@ -9,7 +9,7 @@ import pytest
 from helpers import check_refused
 from PIL import Image
 
-from damian.advice.journal import Journal, head
+from damian.advice.journal import About, Head, Journal, Received
 from damian.recipes.fly import main
 from damian.recipes.shared.launch import launch
 from damian.show.episode import Episode
@@ -35,13 +35,13 @@ def show(tmp_path, monkeypatch):
 def write_journal(path: Path) -> None:
     """Two UAVs that report their places for six seconds, the second one a second late."""
     journal = Journal(path)
-    about = {"policy": "mode", "checkpoint": "runs/gone", "overrides": [*WORDS, "checkpoint=runs/gone"]}
-    journal.append(head("north", ["A", "B"], about))
+    about = About(policy="mode", checkpoint="runs/gone", overrides=[*WORDS, "checkpoint=runs/gone"])
+    journal.append(Head(fleet="north", uavs=["A", "B"], about=about))
     for second in range(6):
         for uav, late in (("A", 0.2), ("B", 1.2)):
             place = {"lat": 52.811 + 1e-4 * second, "lon": -4.1290, "battery": 100 - second}
             row = {"id": uav, "time": 1.7e9 + second, "source spotted": second == 3, **place}
-            journal.append({"received": 1.7e9 + second + late, "reports": [row]})
+            journal.append(Received(received=1.7e9 + second + late, reports=[row]))
     journal.close()
 
 
