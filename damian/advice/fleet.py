@@ -212,10 +212,8 @@ class Fleet:
         return "late" if late else "new"
 
     def _missing(self) -> list[str]:
-        """The UAVs for which the fleet waits: each must have a report in which the fleet can begin."""
-        oldest = self.clock - LIFE
-        found = zip(self.uavs, self.logs, strict=True)
-        return [uav for uav, log in found if log.newest is None or log.newest.report.time < oldest]
+        """The UAVs for which the fleet waits."""
+        return [uav for uav, log in zip(self.uavs, self.logs, strict=True) if log.newest is None]
 
     def _begin(self) -> None:
         """Begin with the newest report of each UAV."""
@@ -349,10 +347,7 @@ class Fleet:
         numbers = self.numbers_of(asking)
         self.advance(now)
         if self.start is None:
-            missing = self._missing()
-            has_old = any(self.logs[self.number[uav]].reports for uav in missing)
-            since = f" that is newer than {LIFE:g} s" if has_old else ""
-            raise Waiting(f"no advice yet: no report of {listed(missing)}{since} has come in")
+            raise Waiting(f"no advice yet: no report of {listed(self._missing())} has come in")
         self._check_life(self.clock)
         if numbers is None:
             numbers = [uav for uav, held in enumerate(self.held) if not held.report.flies]

@@ -58,7 +58,6 @@ class Advised(BaseModel):
     """A line about UAVs that have chosen and were told so."""
 
     asked: Time
-    step: int = 0
     told: dict[str, int | tuple[Number, Number]]
     """Their actions, by ID."""
     advice: list[Advice] = []

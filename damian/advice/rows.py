@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -80,20 +80,24 @@ def _printable(uav: str) -> str:
     return uav
 
 
-def _split(separator: str | None) -> BeforeValidator:
+def _text_split_at(separator: str | None) -> BeforeValidator:
     return BeforeValidator(lambda value: value.split(separator) if isinstance(value, str) else value)
 
 
-Number = Annotated[float, Field(allow_inf_nan=False), BeforeValidator(_no_flag)]
-Time = Annotated[float, Field(ge=0, le=LATEST), BeforeValidator(_seconds)]
+Number: TypeAlias = Annotated[float, Field(allow_inf_nan=False), BeforeValidator(_no_flag)]
+Time: TypeAlias = Annotated[float, Field(ge=0, le=LATEST), BeforeValidator(_seconds)]
 """A time [s], as a number or as ISO 8601."""
-Latitude, Longitude = Annotated[Number, Field(ge=-90, le=90)], Annotated[Number, Field(ge=-180, le=180)]
-Coordinate = Annotated[Number, Field(ge=-2e7, le=2e7)]
-Count = Annotated[int, Field(ge=0, le=2**31), BeforeValidator(_no_flag)]
-# A table in which a cell of the column is empty has 1.0 for 1 where it comes from a table of numbers.
-Flag = Annotated[bool, BeforeValidator(lambda v: v.removesuffix(".0") if isinstance(v, str) else v)]
-UavId = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
-Uavs = Annotated[list[UavId], Field(min_length=1, max_length=MAX_UAVS), AfterValidator(_distinct)]
+Count: TypeAlias = Annotated[int, Field(ge=0, le=2**31), BeforeValidator(_no_flag)]
+# Tables of numbers in which a cell is empty have 1.0 for 1.
+Flag: TypeAlias = Annotated[
+    bool, BeforeValidator(lambda v: v.removesuffix(".0") if isinstance(v, str) else v)
+]
+Latitude: TypeAlias = Annotated[Number, Field(ge=-90, le=90, description="latitude [deg]")]
+Longitude: TypeAlias = Annotated[Number, Field(ge=-180, le=180, description="longitude [deg]")]
+Coordinate: TypeAlias = Annotated[Number, Field(ge=-2e7, le=2e7, description="east or north [m]")]
+Pair: TypeAlias = Annotated[tuple[Coordinate, Coordinate], _text_split_at(None)]
+UavId: TypeAlias = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
+Uavs: TypeAlias = Annotated[list[UavId], Field(min_length=1, max_length=MAX_UAVS), AfterValidator(_distinct)]
 """IDs of the UAVs of a fleet."""
 
 _TEXT = ConfigDict(str_strip_whitespace=True, coerce_numbers_to_str=True)
@@ -107,7 +111,7 @@ class FleetRequest(BaseModel):
 
     model_config = _TEXT
 
-    uavs: Uavs = Field(description=f"IDs of 1 to {MAX_UAVS} UAVs, each of 1 to 64 printable characters")
+    uavs: Uavs
 
 
 class Report(BaseModel):
@@ -116,51 +120,50 @@ class Report(BaseModel):
     The names of the fields, with a space for ``_``, are the columns of tables; journals keep the same ones.
     """
 
-    model_config = _TEXT | ConfigDict(extra="forbid", alias_generator=lambda name: name.replace("_", " "))
+    model_config = _TEXT | ConfigDict(
+        extra="forbid", alias_generator=lambda name: name.replace("_", " "), use_attribute_docstrings=True
+    )
 
-    id: UavId = Field(description="ID of the UAV")
-    received: Time = Field(
-        math.nan, alias="receive time", exclude=True, description="when it came in [s]; only in files"
-    )
-    aoi: Number = Field(
-        0.0, ge=0, le=LATEST, exclude=True, description="age when it came in [s], if there is no time"
-    )
-    time: Time = Field(math.nan, description="when the observation was generated [s], or ISO 8601")
-    lat: Latitude | None = Field(None, description="latitude [deg]")
-    lon: Longitude | None = Field(None, description="longitude [deg]")
-    x: Coordinate | None = Field(None, description="east [m], over a region without a place on Earth")
-    y: Coordinate | None = Field(None, description="north [m]")
-    source_spotted: Flag = Field(False, description="1 if the UAV spots the source, else 0")
-    source_time: Time | None = Field(None, description="when it detected the source last [s], or ISO 8601")
-    source_lat: Latitude | None = Field(None, description="where it was then [deg]")
-    source_lon: Longitude | None = Field(None, description="where it was then [deg]")
-    source_x: Coordinate | None = Field(None, description="where it was then [m]")
-    source_y: Coordinate | None = Field(None, description="where it was then [m]")
-    track: Annotated[Number, Field(ge=-360, le=360)] | None = Field(
-        None, description="heading of its latest flight, clockwise from north [deg]"
-    )
-    takeoff_landing_time: Time | None = Field(None, description="when it took off or landed last [s]")
-    battery: Annotated[Number, Field(ge=0, le=100)] | None = Field(None, description="battery level [%]")
-    fla: Annotated[Number, Field(ge=-500, le=1e5)] | None = Field(
-        None, description="flight altitude [m]: above 0 in flight"
-    )
-    target_lat: Latitude | None = Field(None, description="landing point to which it flies [deg]")
-    target_lon: Longitude | None = Field(None, description="landing point to which it flies [deg]")
-    target_x: Coordinate | None = Field(None, description="landing point to which it flies [m]")
-    target_y: Coordinate | None = Field(None, description="landing point to which it flies [m]")
-    previous: (
-        Annotated[
-            tuple[Annotated[tuple[Coordinate, Coordinate], _split(None)], ...],
-            Field(max_length=16),
-            _split(";"),
-        ]
-        | None
-    ) = Field(None, description="landing points before, newest first: [[53.1, -4.5]] or 53.1 -4.5; 53.2 -4.5")
-    motions: Count | None = Field(None, description="decisions since it last detected the source before")
-    readings: Annotated[tuple[Number, ...], Field(max_length=1000), _split(";")] | None = Field(
-        None, description="readings of sensors of your own"
-    )
-    sequence: Count | None = Field(None, description="number of the report, which grows by one")
+    id: UavId
+    received: Time = Field(math.nan, alias="receive time", exclude=True)
+    """When it came in [s]; a column of files only."""
+    aoi: Annotated[Number, Field(ge=0, le=LATEST)] = Field(0.0, exclude=True)
+    """Age of the observation when it came in [s], if there is no time."""
+    time: Time = math.nan
+    """When the observation was generated [s]."""
+    lat: Latitude | None = None
+    lon: Longitude | None = None
+    x: Coordinate | None = None
+    y: Coordinate | None = None
+    source_spotted: Flag = False
+    """Whether the UAV spots the source."""
+    source_time: Time | None = None
+    """When it detected the source last [s]; its place is where it was then."""
+    source_lat: Latitude | None = None
+    source_lon: Longitude | None = None
+    source_x: Coordinate | None = None
+    source_y: Coordinate | None = None
+    track: Annotated[Number, Field(ge=-360, le=360)] | None = None
+    """Heading of its latest flight, clockwise from north [deg]."""
+    takeoff_landing_time: Time | None = None
+    """When it took off or landed last [s]."""
+    battery: Annotated[Number, Field(ge=0, le=100)] | None = None
+    """Battery level [%]."""
+    fla: Annotated[Number, Field(ge=-500, le=1e5)] | None = None
+    """Flight altitude [m]: above 0 in flight."""
+    target_lat: Latitude | None = None
+    """Landing point to which it flies."""
+    target_lon: Longitude | None = None
+    target_x: Coordinate | None = None
+    target_y: Coordinate | None = None
+    previous: Annotated[tuple[Pair, ...], Field(max_length=16), _text_split_at(";")] | None = None
+    """Landing points where it was before, newest first: [[53.1, -4.5]], or 53.1 -4.5; 53.2 -4.5."""
+    motions: Count | None = None
+    """Decisions (holding included) since it last detected the source before."""
+    readings: Annotated[tuple[Number, ...], Field(max_length=1000), _text_split_at(";")] | None = None
+    """Readings of sensors of your own."""
+    sequence: Count | None = None
+    """Number of the report, which grows by one."""
 
     @property
     def in_degrees(self) -> bool:
@@ -347,17 +350,11 @@ def _described(model: type[BaseModel], error: ErrorDetails) -> str:
         return problem
     if error["type"] == "missing":
         return f"{'.'.join(path)}: it is missing"
+    meanings = {field.alias or name: field.description for name, field in model.model_fields.items()}
     if error["type"] == "extra_forbidden":
-        return f"{show(path[0])} is no column; they are {', '.join(columns_of(model))}"
-    meaning = columns_of(model).get(path[0])
-    problem = f"{'.'.join(path)[:100]}: {show(error['input'])}: {problem}"
-    return f"{problem} ({meaning})" if meaning else problem
-
-
-def columns_of(model: type[BaseModel]) -> dict[str, str | None]:
-    """The columns of a model, and what they mean."""
-    fields = model.model_fields.items()
-    return {field.validation_alias or field.alias or name: field.description for name, field in fields}
+        return f"{show(path[0])} is no column; they are {', '.join(meanings)}"
+    meaning = f" ({meaning.rstrip('.')})" if (meaning := meanings.get(path[0])) else ""
+    return f"{'.'.join(path)[:100]}: {show(error['input'])}: {problem}{meaning}"
 
 
 # What goes out.

@@ -212,7 +212,7 @@ class AdviceSession:
         if choice is not None:
             told = {fleet.uavs[uav]: decision.action for uav, decision in choice.decisions.items()}
             advice = [fleet.advice_of(*each) for each in choice.decisions.items()]
-            line = Advised.model_construct(asked=fleet.clock, step=fleet.step, told=told, advice=advice)
+            line = Advised.model_construct(asked=fleet.clock, told=told, advice=advice)
             self._write(name, line)
             fleet.tell(choice)
         return fleet.advice(fleet.numbers_of(asking) if only else None)

@@ -1,7 +1,6 @@
 """Delays of real reports become the trace that made them."""
 
 import json
-import random
 
 import pytest
 
@@ -62,27 +61,6 @@ def test_a_law_reads_the_trace(log, tmp_path, capsys):
     sampler = Trace(str(out)).sampler()
     assert sampler.longest == 4
     assert sampler.loses
-
-
-def test_irregular_reports_show_no_losses(log):
-    generator = random.Random(0)
-    times = sorted(generator.uniform(0, 100) for _ in range(50))
-    lines = "\n".join(f"A,{time},{time + 0.5},53.1,-4.5" for time in times)
-    fitted = fit(read_log(log(f"ID,time,receive time,lat,lon\n{lines}")))
-    assert (fitted.n_lost, fitted.losses) == (0, "not to be seen (no numbers, no period)")
-
-
-def test_a_uav_that_starts_anew_loses_nothing(log):
-    lines = "\n".join(f"A,{i},{i + 0.5},53.1,-4.5,{i % 5}" for i in range(10))
-    assert fit(read_log(log(f"ID,time,receive time,lat,lon,sequence\n{lines}"))).n_lost == 0
-
-
-def test_clocks_that_differ_are_told(log):
-    lines = "\n".join(f"A,{i + 0.5},{i},53.1,-4.5" for i in range(10))
-    fitted = fit(read_log(log(f"ID,time,receive time,lat,lon\n{lines}")))
-    assert fitted.ahead == 10
-    assert fitted.delays.max() == 0
-    assert "clocks differ" in summary(fitted)
 
 
 @pytest.mark.parametrize(

@@ -149,16 +149,6 @@ def test_after_a_long_silence_the_history_holds_no_action_that_had_been_reflecte
     assert torch.equal(*observed)
 
 
-def test_a_missing_uav_keeps_its_last_message_and_grows_old():
-    fleet = begun(observation=replace(SEEN, age_scale=100.0))
-    for step in range(1, 30):
-        told(fleet, "a", START + step, 0)
-        advise(fleet, START + step + 0.2, ["a"])
-    ages = fleet.observe([0])[keys.OBSERVATION][0, :, -1]
-    assert ages.tolist() == [0.0, pytest.approx(0.29), pytest.approx(0.29)]
-    assert fleet.held[1].point == 230
-
-
 def test_a_landing_point_that_somebody_was_sent_to_is_not_given_away():
     """The UAV does not report any more; after a while it is believed where it was last."""
     fleet = begun(1, actions=ActionConfig(distances=[0.0, 60.0], headings=[0.0, 90.0, 180.0, 270.0]))
@@ -250,22 +240,19 @@ def test_a_first_report_that_is_old_when_it_comes_in_shows_a_clock_that_was_neve
     assert fleet.report(report) == "old", "it changes nothing any more"
 
 
-def test_a_fleet_begins_with_reports_of_the_time_that_it_lasts_and_then_ends():
-    """One UAV reports, and the others come when its report is too old for a fleet to begin with it."""
-    fleet, late = fleet_of(), START + 2 * LIFE
-    told(fleet, "a", START, 0)
-    told(fleet, "b", late, 30)
-    told(fleet, "c", late, 60)
-    with pytest.raises(Waiting, match=r"no report of a that is newer than 1e\+06 s has come in"):
-        fleet.choose(late + 1)
-    told(fleet, "a", late + 2, 3)
-    assert advise(fleet, late + 3) == [0, 1, 2]
-    assert fleet.start == late
+def test_a_fleet_waits_for_every_uav_and_lasts_for_a_while():
+    fleet = fleet_of()
+    told(fleet, "b", START, 30)
+    with pytest.raises(Waiting, match="no advice yet: no report of a, c has come in"):
+        fleet.choose(START + 1)
+    for uav, point in (("a", 0), ("c", 60)):
+        told(fleet, uav, START, point)
+    assert advise(fleet, START + LIFE - 1) == [0, 1, 2]
     message = r"the fleet began more than 1e\+06 s ago: end it, and begin a new one"
     with pytest.raises(InputError, match=message):
-        told(fleet, "a", late + LIFE + 1, 0)
+        told(fleet, "a", START + LIFE + 1, 0)
     with pytest.raises(InputError, match=message):
-        fleet.choose(late + LIFE + 1)
+        fleet.choose(START + LIFE + 1)
 
 
 @pytest.mark.sample(2)

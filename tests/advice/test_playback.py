@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reporting import START, Reporter, names_of
+from reporting import Reporter, names_of
 from tensordict.nn import TensorDictModuleBase
 
 from damian import keys
 from damian.advice.fleet import Fleet
-from damian.advice.journal import About, Advised, Head, Journal, Received
+from damian.advice.journal import About, Advised, Head, Journal
 from damian.advice.node import Node
 from damian.advice.playback import episode_of
 from damian.advice.rows import read_json
@@ -107,6 +107,9 @@ def test_a_journal_tells_what_the_server_knew_bit_for_bit(flown, told):
     np.testing.assert_allclose(told.reward, recorded.reward, atol=1e-6)
     for name, term in recorded.reward_terms.items():
         np.testing.assert_allclose(told.reward_terms[name], term, atol=1e-6)
+    np.testing.assert_allclose(told.target, recorded.target, atol=0.01)
+    assert (told.source, told.emits, told.names) == (None, None, names_of(3))
+    assert told.about["began"] == "2023-11-14T22:13:20.000Z"
     assert told.reward[1:].any()
     assert (told.age > 0).any()
 
@@ -144,15 +147,6 @@ def test_where_uavs_were_is_what_they_reported_in_hindsight(flown, told):
             np.testing.assert_allclose(told.true[:, uav, axis], straight, atol=1.0)
 
 
-def test_targets_are_what_the_uavs_were_told(flown, told):
-    np.testing.assert_allclose(told.target, flown[0].target, atol=0.01)
-
-
-def test_nobody_knows_the_source_and_uavs_have_their_ids(told):
-    assert (told.source, told.emits, told.names) == (None, None, names_of(3))
-    assert told.about["began"] == "2023-11-14T22:13:20.000Z"
-
-
 def test_a_span_is_a_part_of_the_flight(flown, told, scenario):
     first = int(np.flatnonzero(told.reward.any(-1))[0])
     last = first + 10
@@ -171,38 +165,6 @@ def test_a_span_is_a_part_of_the_flight(flown, told, scenario):
         InputError, match="span: no step lies between 100 and 200 s: the journal tells of 0 to"
     ):
         episode_of(flown[1], fleet_of(names_of(3)), {}, (100.0, 200.0))
-
-
-def test_a_silence_of_years_has_too_many_steps_unless_a_span_is_given(flown, tmp_path, monkeypatch):
-    monkeypatch.setattr("damian.advice.fleet.SILENT_STEPS", 40)
-    path = tmp_path / "x.jsonl"
-    path.write_bytes(flown[1].read_bytes())
-    Journal(path).append(Advised(asked=START + 1e8, told={}))
-    with pytest.raises(InputError, match="span: it has more than 20000 steps of 1 s: give FIRST and LAST"):
-        episode_of(path, fleet_of(names_of(3)), {})
-    assert episode_of(path, fleet_of(names_of(3)), {}, (1e8 - 10, 1e8)).n_steps == 10
-
-
-def test_a_uav_that_reports_no_heading_points_where_it_came_from_and_flies_as_high_as_it_says(tmp_path):
-    path, fleet = tmp_path / "x.jsonl", fleet_of(["a"], replace(SCENARIO, agents=1))
-    written = Journal(path)
-    written.append(Head(fleet="x", uavs=["a"], about=About()))
-    points = [fleet.ground.points[0], fleet.ground.points[0] + (60.0, 0.0)]
-    for second, height in ((0.0, 0.0), (4.0, 5.0), (8.0, 0.0)):
-        place = fleet.ground.place(fleet.ground.landing_point(place_of(fleet, points[second > 0])))
-        row = {"id": "a", "time": START + second, "lat": place[0], "lon": place[1], "fla": height}
-        written.append(Received(received=START + second + 0.1, reports=[row]))
-    episode = episode_of(path, fleet, {})
-    np.testing.assert_allclose(episode.position[:, 0, 2], np.interp(episode.time, [0, 4, 8], [0, 5, 0]))
-    way = episode.true[-1, 0] - episode.true[0, 0]
-    assert np.hypot(*way) > 10
-    steps = np.flatnonzero(np.diff(episode.true[:, 0], axis=0).any(-1)) + 1
-    np.testing.assert_allclose(episode.track[steps, 0], np.arctan2(*way) % (2 * np.pi), atol=1e-9)
-
-
-def place_of(fleet: Fleet, point) -> tuple[float, float]:
-    nearest = np.hypot(*(fleet.ground.points - point).T).argmin()
-    return fleet.ground.place(int(nearest))
 
 
 def test_a_journal_without_a_flight_is_refused(tmp_path):

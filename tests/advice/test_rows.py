@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from damian.advice.rows import Advice, Report, UavStatus, as_csv, as_rows, read_csv, read_file, read_json
+from damian.advice.rows import Advice, Report, UavStatus, as_csv, as_rows, read_csv, read_json
 from damian.common.errors import InputError
 
 ROW = {"ID": "B", "time": 1.75e9, "lat": 52.8, "lon": -4.1, "source_spotted": 0, "battery": 80.0}
@@ -23,23 +23,6 @@ def test_columns_may_be_written_in_any_case_and_unknown_values_are_left_out():
     assert (report.place, report.source_place, report.flies) == ((52.8, -4.1), None, False)
     again = json.loads(report.model_dump_json(by_alias=True, exclude_none=True))
     assert read_json(json.dumps(again))[0][1] == report, "journals keep what was said"
-
-
-@pytest.mark.parametrize("kind", ["csv", "json", "jsonl"])
-def test_files_are_read_by_their_names(tmp_path, kind):
-    path = tmp_path / f"reports.{kind}"
-    line = json.dumps(ROW)
-    texts = {
-        "csv": "ID,lat,lon\nB,52.8,-4.1\n\nC,1,2",
-        "json": f"[{line}, {line}]",
-        "jsonl": f"{line}\n\n{line}",
-    }
-    path.write_text(texts[kind])
-    assert [where for where, _ in read_file(path)] == (["row 1", "row 2"] if kind == "json" else _lines(kind))
-
-
-def _lines(kind: str) -> list[str]:
-    return ["line 2", "line 4"] if kind == "csv" else ["line 1", "line 3"]
 
 
 def test_times_follow_from_what_a_row_says():
@@ -63,7 +46,7 @@ REFUSED = {
     "a flag": ({"battery": True}, "battery: True: it is not a number"),
     "out of range": (
         {"battery": 101},
-        "battery: 101: Input should be less than or equal to 100 (battery level",
+        "battery: 101: Input should be less than or equal to 100 (Battery level",
     ),
     "no place": ({"lat": None, "lon": None}, "lat, lon: they are missing"),
     "half a place": ({"lat": None}, "lat: it is missing"),

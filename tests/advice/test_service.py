@@ -82,34 +82,23 @@ def test_reports_go_in_and_landing_points_come_out(client, fleet, session, clock
     clock.now += 5
     assert {each["state"] for each in client.get(f"{fleet}/advice?uav=B").json()["advice"]} <= {"fly", "hold"}
     assert [e["ID"] for e in client.get(f"{fleet}/advice?uav=B").json()["advice"]] == ["B"]
-    assert [e["step"] for e in client.get(f"{fleet}/advice").json()["advice"]] == [5, 5, 5]
-
-
-def test_tables_go_in_and_come_out_as_csv(client, fleet, session):
-    lines = ["ID,source time,lat,lon,source spotted,track,takeoff-landing time,battery,AoI,FLA"]
-    for i, uav in enumerate(UAVS):
-        lat, lon = session.fleets["north"].ground.place(40 * i)
-        lines.append(f"{uav},NA,{lat},{lon},0,90,NA,NA,{i},0")
+    later = row("A", 7, session, time=NOW + 4)
+    table = f"{','.join(later)}\n{','.join(map(str, later.values()))}"
     headers = {"Content-Type": "text/csv; charset=utf-8"}
-    assert client.post(f"{fleet}/reports", content="\n".join(lines), headers=headers).status_code == 200
+    found = [
+        client.post(f"{fleet}/reports", content=table, headers=headers).json()["found"] for _ in range(2)
+    ]
+    assert found == [["new"], ["duplicate"]]
     head, *table = client.get(f"{fleet}/advice?format=csv").text.splitlines()
     assert head == "ID,state,lat,lon,heading,distance,duration,arrival,step,age"
-    assert [line.split(",")[0] for line in table] == UAVS
-    assert [float(line.split(",")[-1]) for line in table] == [0.0, 1.0, 2.0]
-
-
-def test_late_double_and_missing_reports_are_told_apart(client, fleet, session, clock):
-    client.post(f"{fleet}/reports", json=rows(session))
-    clock.now += 10
-    later = row("A", 7, session, time=NOW + 9)
-    older = row("A", 3, session, time=NOW + 4)
-    found = [client.post(f"{fleet}/reports", json=each).json()["found"] for each in (later, older, later)]
-    assert found == [["new"], ["late"], ["duplicate"]]
-    client.get(f"{fleet}/advice")
-    assert session.fleets["north"].held[0].point == 7
+    assert [(line.split(",")[0], line.split(",")[-1]) for line in table] == [
+        ("A", "1.0"),
+        ("B", "5.0"),
+        ("C", "5.0"),
+    ]
     status = client.get(fleet).json()
-    assert [each["age"] for each in status["uavs"]] == [1.0, 10.0, 10.0]
-    assert status["uavs"][0] | {"reports": 4, "late": 1, "duplicates": 1} == status["uavs"][0]
+    assert (status["step"], status["dt"], status["uavs"][0]["reports"]) == (5, 1.0, 3)
+    assert status["uavs"][0] == status["uavs"][0] | {"ID": "A", "age": 1.0, "late": 0, "duplicates": 1}
 
 
 def test_a_wrong_row_is_refused_with_its_place_and_nothing_is_taken(client, fleet, session):
@@ -138,13 +127,6 @@ def test_who_has_the_wrong_token_learns_nothing(client, fleet, session):
     assert client.delete("/fleets/south", headers=own).status_code == 401
     assert client.put("/fleets/west", json={"uavs": ["W"]}, headers=own).status_code == 401
     assert client.get("/fleets/nowhere").status_code == 404
-
-
-def test_fleets_do_not_see_each_other(client, fleet, session):
-    client.put("/fleets/south", json={"uavs": UAVS})
-    client.post(f"{fleet}/reports", json=rows(session))
-    assert client.get("/fleets/south/advice").status_code == 409
-    assert all(each["reports"] == 0 for each in client.get("/fleets/south").json()["uavs"])
 
 
 def test_a_fleet_is_created_once_and_can_be_ended(client, fleet, session):
@@ -210,12 +192,6 @@ def test_after_any_nonsense_the_service_goes_on(client, fleet, session, n):
     assert not any(log.reports for log in session.fleets["north"].logs)
     assert client.post(f"{fleet}/reports", json=rows(session)).status_code == 200
     assert client.get(f"{fleet}/advice").status_code == 200
-
-
-@pytest.mark.parametrize("path", ["/", "/fleets/", "/fleets/north", "/fleets/%00/advice", "/x" * 2000])
-def test_any_path_and_method_is_answered(client, fleet, path):
-    for method in ("GET", "POST", "PUT", "DELETE", "PATCH", "HEAD", "OPTIONS"):
-        assert client.request(method, path).status_code < 500
 
 
 def test_a_wrong_question_for_advice_is_refused(client, fleet, session):

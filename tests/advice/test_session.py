@@ -289,34 +289,6 @@ def test_nobody_is_told_what_the_journal_does_not_say(make_session, monkeypatch,
         assert now.hidden.equal(again.hidden)
 
 
-def test_a_fleet_whose_journal_cannot_be_begun_is_not_there(make_session, monkeypatch):
-    session = make_session()
-    with monkeypatch.context() as full:
-        full.setattr(Journal, "append", fail)
-        with pytest.raises(RunError):
-            session.create("north", UAVS)
-    assert not session.fleets
-    begun(session).close()
-    assert [*make_session().fleets] == ["north"]
-
-
-def test_a_fleet_whose_journal_cannot_be_renamed_goes_on(make_session, monkeypatch, tmp_path):
-    session = begun(make_session())
-
-    def forbid(*_):
-        raise OSError(13, "Permission denied")
-
-    with monkeypatch.context() as broken:
-        broken.setattr(Path, "rename", forbid)
-        with pytest.raises(RunError, match=r"north\.jsonl: .*Permission denied"):
-            session.end("north", START + 1)
-    assert report(session, "A", START + 2, 1) == ["new"]
-    assert len(lines_of(tmp_path / "journals" / "north.jsonl")) == 4
-    session.end("north", START + 3)
-    assert not session.fleets
-    assert [path.suffix for path in (tmp_path / "journals").iterdir()] == [".ended"]
-
-
 # Clocks.
 
 
@@ -330,15 +302,3 @@ def test_what_is_accepted_can_be_restored_after_the_clock_was_wrong(make_session
         session.advise("north", START + 1)
     session.close()
     assert [*make_session().fleets] == ["north"]
-
-
-def test_an_unset_clock_does_not_begin_a_fleet_and_one_that_was_ahead_does_no_harm(make_session):
-    session = make_session()
-    session.create("north", UAVS)
-    with pytest.raises(InputError, match=r"row 1: time: 12 s is 1699999988\.0 s before it came in"):
-        report(session, "A", 12.0, now=START)
-    session.advance(START + 3000)
-    for i, uav in enumerate(UAVS):
-        assert report(session, uav, START, 40 * i) == ["new"]
-    session.close()
-    assert make_session().fleet("north").start == START

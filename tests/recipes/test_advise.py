@@ -13,17 +13,15 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from helpers import check_refused
 
-from damian.advice.session import MAY_DIFFER, AdviceSession, read_inbox
+from damian.advice.session import AdviceSession, read_inbox
 from damian.common.errors import RunError
 from damian.recipes.advise import AdviseConfig, main, make_session
 from damian.recipes.shared.launch import launch
-from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import main as train
 from damian.runs.run_lock import is_locked, locked
 from damian.world.regions.config import RegionConfig
@@ -85,17 +83,6 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
     assert all(each["state"] in ("fly", "hold") for each in answer)
 
 
-def test_a_region_of_metres_has_places_in_metres(run):
-    Path("metres.json").write_text(
-        json.dumps([{"ID": 1, "x": 10, "y": 20, "time": 5}, {"ID": 2, "x": 60, "y": 20, "time": 5}])
-    )
-    vertices = "region.vertices=[[-200,-200],[200,-200],[200,200],[-200,200]]"
-    folder = run(*SCRIPT, "region=vertices", vertices, "reports=metres.json")
-    answer = json.loads((folder / "advice.json").read_text())
-    assert all(abs(each["x"]) < 200 and abs(each["y"]) < 200 for each in answer)
-    assert all(each["arrival"] >= 5.0 for each in answer), "in the time of the table"
-
-
 REFUSALS = [
     (["policy=greedy"], "reports: is missing: give one of reports=FILE, folder=FOLDER, port=NUMBER"),
     (["reports=table.csv", "port=0"], "reports: reports and port are given: give one of"),
@@ -149,11 +136,6 @@ def test_no_file_keeps_the_token_however_it_is_written(run, monkeypatch, word):
     assert {*kept} == {"config.yaml", "run.json", "north.jsonl"}
     assert not [name for name, text in kept.items() if TOKEN in text]
     assert "token=..." in kept["run.json"]
-
-
-def test_every_setting_of_the_service_itself_may_change_with_a_restart():
-    own = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
-    assert own <= {*MAY_DIFFER}
 
 
 def session_of(folder: Path) -> AdviceSession:
