@@ -30,7 +30,7 @@ class Cells(NamedTuple):
     """
 
     point: Tensor
-    """Ids of landing points within their region, W for each cell, -1 behind the last, [C, W] int32."""
+    """Ids of landing points within their region, W for each cell with -1 behind the last, [C, W] int32."""
     first: Tensor
     """Index of the first cell of each region, [R]."""
     shape: Tensor

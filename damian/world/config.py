@@ -27,13 +27,13 @@ class WorldConfig:
     battery: BatteryConfig = field(default_factory=BatteryConfig)
     actions: ActionConfig = field(default_factory=ActionConfig)
     sensors: list[Any] = field(default_factory=list)
-    """Sensors of one's own (``damian.sensor``), whose readings the messages carry: each
+    """Your own sensors (``damian.sensor``), whose readings the messages carry: each
     ``package.module:name``, or ``{sensor: package.module:name, ...}`` with parameters of the sensor."""
 
     def __post_init__(self) -> None:
         checks.types("", self)
         checks.whole("agents", self.agents, 1, 1000)  # their distances grow with the square
-        if self.motion.kind == "polynomial":  # a model of one's own refuses them when it is built
+        if self.motion.kind == "polynomial":  # others refuse them when they are built
             flight_levels(self.motion, self.agents)
         sensors_of(self.sensors)  # refuses what is no sensor
         starts = self.region.start_positions

@@ -1,4 +1,4 @@
-"""Actions (paper, section 4.2): a distance and a heading that lead to a landing point of the UAV's own."""
+"""Actions (paper, section 4.2): a distance and a heading that lead to a landing point for one UAV alone."""
 
 import math
 from dataclasses import dataclass, field
@@ -239,12 +239,12 @@ def assign_landing_points(
 ) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point.
 
-    A point is free to a UAV if no other UAV stands on it or is bound for it; its own point always is.
+    A point is free to a UAV if no other UAV stands on it or flies to it; its own point always is.
 
     Args:
         ranking: candidates, as M lists of K.
         row: row of each UAV among these lists, [B, N].
-        standing: point that each UAV stands on or is bound for, [B, N].
+        standing: point on which each UAV stands or to which it flies, [B, N].
         reach: largest distance that the UAV may fly now [m], negative if it may not choose, [B, N]. A
             candidate farther away does not count, and stays free for other UAVs.
         n_points: largest number of landing points of a region.

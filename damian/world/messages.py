@@ -1,7 +1,7 @@
 """The messages that UAVs send to the server node: their fields, and each message as one row of numbers.
 
 To add a field, declare it in ``Messages`` and fill it in ``Simulation._sense``; packing, delays and replay
-follow from the declaration. Values that a sensor of one's own reads (``damian.sensor``) lie in ``readings``.
+follow from the declaration. Values that a user's sensor reads (``damian.sensor``) lie in ``readings``.
 """
 
 from typing import Annotated, NamedTuple, get_type_hints
@@ -34,7 +34,7 @@ class Messages(NamedTuple):
     position: Annotated[Tensor, Column(2)]
     """Position of the UAV, east, north [m]."""
     target: Annotated[Tensor, Column(2)]
-    """Landing point that the UAV is bound for, east, north [m]."""
+    """Landing point to which the UAV flies, or on which it stands, east, north [m]."""
     track: Annotated[Tensor, Column()]
     """Heading of the latest flight, clockwise from north [rad]."""
     battery: Annotated[Tensor, Column()]
@@ -52,7 +52,7 @@ class Messages(NamedTuple):
     trail: Annotated[Tensor, Column(None, torch.long)]
     """Flat ids of the UAV's last landing points, newest first, [*, N, window]."""
     readings: Annotated[Tensor, Column(None)]
-    """Readings of the sensors of one's own, beside each other in the order of the settings, [*, N, K]."""
+    """Readings of the user's sensors, beside each other in the order of the settings, [*, N, K]."""
 
     @classmethod
     def blank(cls, trail: Tensor, n_readings: int = 0) -> "Messages":
@@ -74,7 +74,7 @@ class Messages(NamedTuple):
     def unpack(cls, rows: Tensor, n_readings: int = 0) -> "Messages":
         """Messages from their rows; float fields are views of the rows.
 
-        A row does not tell where the trail ends, so ``Server.messages``, which knows it, is the way to unpack
+        A row does not say where the trail ends, so ``Server.messages``, which knows it, is the way to unpack
         the messages of an environment.
 
         Args:
@@ -87,7 +87,7 @@ class Messages(NamedTuple):
 
     @property
     def in_flight(self) -> Tensor:
-        """Whether the message was sent at a takeoff, so that its UAV is bound for another point, [*, N]."""
+        """Whether the message was sent at a takeoff, so that its UAV flies to another point, [*, N]."""
         return (self.position != self.target).any(-1)
 
     def region(self, n_points: int) -> Tensor:

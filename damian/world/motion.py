@@ -26,7 +26,7 @@ class MotionConfig:
 
     kind: str = "instant"
     """``instant``: a UAV is at its target when the step ends; ``polynomial``: flights take several steps;
-    ``package.module:Class``: a ``MotionModel`` of one's own."""
+    ``package.module:Class``: your own ``MotionModel``."""
     degree: int = 5
     """Degree of the time law of each phase: 3, 5 or 7."""
     max_speed: float = 5.0
@@ -43,11 +43,11 @@ class MotionConfig:
     """Vertical distance between the flight levels of two UAVs [m]."""
 
     options: Any = None
-    """Settings of a motion model of one's own, as a mapping."""
+    """Settings of your own motion model, as a mapping."""
 
     def __post_init__(self) -> None:
         checks.types("motion", self)
-        if ":" not in str(self.kind):  # ``damian.world.vehicles`` imports one's own
+        if ":" not in str(self.kind):  # ``damian.world.vehicles`` imports it
             checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
             problem = f"mean nothing with motion.kind={self.kind}"
             checks.require(self.options is None, "motion.options", self.options, problem)

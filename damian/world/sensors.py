@@ -1,4 +1,4 @@
-"""Sensors of one's own: functions of the true state of the worlds, whose readings the messages carry."""
+"""Sensors that a user adds: functions of the true state of the worlds, whose readings the messages carry."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.errors import InputError, naming_errors
+from damian.common.errors import InputError
 from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
 from damian.world.messages import Messages
 from damian.world.state import State
-from damian.world.uav_values import check_uav_values
 
 
 class Sensor(NamedTuple):
@@ -23,17 +22,6 @@ class Sensor(NamedTuple):
     """Number of values for each UAV."""
     name: str
     """Name of the reading: ``name`` in the settings, or else the function's name."""
-
-    def check(self, state: State, world: Any) -> None:
-        """Try the sensor once.
-
-        Raises:
-            InputError: it raises an error, or does not return finite values of the shape that it declares.
-        """
-        with naming_errors(f"sensors: {self.name}"):
-            values = self.compute(state, world)
-        why = f", as width={self.width} asks for"
-        check_uav_values(f"sensors: {self.name}", values, state.track.shape, self.width, why)
 
     def read(self, state: State, world: Any) -> Tensor:
         """The values as columns, [B, N, width] float32.
@@ -86,7 +74,7 @@ def _not_a_sensor(found: Any) -> str | None:
 
 
 SENSORS = Registry[Sensor]("sensor", _not_a_sensor)
-"""Sensors of one's own, as ``package.module:name``."""
+"""Sensors, as ``package.module:name``."""
 
 
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:

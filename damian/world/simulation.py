@@ -3,8 +3,9 @@
 Steps are pure functions of (state, action) over tensors, so that a step compiles into a few kernels.
 """
 
+import copy
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -13,15 +14,28 @@ from torch import Tensor
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
+from damian.world.airspace import Airspace, nearest_points
 from damian.world.battery import observed
 from damian.world.config import WorldConfig
-from damian.world.initial import InitialConditions, draw_initial_conditions
 from damian.world.landing import Candidates, assign_landing_points
 from damian.world.messages import Messages
+from damian.world.regions.places import local_places
+from damian.world.regions.region import Region
 from damian.world.sensors import sensors_of
-from damian.world.signal_source import footprint_radius, locate
+from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, locate
 from damian.world.state import EPISODE, INITIAL_CONDITION, SEED, PackedState, State, StateLayout
-from damian.world.vehicles import check_model, make_model
+from damian.world.vehicles import make_model
+
+
+class InitialConditions(NamedTuple):
+    """Q initial conditions, the same number for each region."""
+
+    region: Tensor
+    """Index of the region, [Q]."""
+    start: Tensor
+    """Landing point of each UAV within its region, [Q, N]."""
+    walk: Walk
+    """Walk of the source over at most K stops, [Q, K]."""
 
 
 class Simulation:
@@ -47,7 +61,7 @@ class Simulation:
         self.radius = footprint_radius(config.source)
         self.airspace = config.airspace(rng)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
-        drawn = draw_initial_conditions(config, self.airspace, rng)
+        drawn = _draw_initial_conditions(config, self.airspace, rng)
         self.walk = drawn.walk
         self.vehicles = make_model(config, self.airspace, dt)
         self.points = self.airspace.points.flatten(0, 1)
@@ -197,7 +211,7 @@ class Simulation:
         return length.where(length.isfinite(), 0.0)
 
     def _require_moves(self, shortest: Tensor) -> None:
-        """Refuse actions none of which leads from any landing point to another one.
+        """Refuse actions if none of them leads from any landing point to another one.
 
         Args:
             shortest: as ``_shortest_flights`` returns it.
@@ -274,10 +288,80 @@ class Simulation:
                 goal.unsqueeze(-1).repeat(1, 1, trail), sum(sensor.width for sensor in self.sensors.values())
             ),
         )
-        check_model(self.vehicles, self.config.motion.kind, state)
-        for sensor in self.sensors.values():
-            sensor.check(state, self)
         return self._sense(state)
+
+
+def _draw_initial_conditions(
+    config: WorldConfig, airspace: Airspace, rng: np.random.Generator
+) -> InitialConditions:
+    """Draw the start points of the UAVs and the walks of the source, on the CPU.
+
+    Raises:
+        InputError: a given start position or source position lies outside the region, or two start
+            positions lead to one landing point.
+    """
+    per_region = config.region.initial_conditions // len(airspace.regions)
+    walks, starts = [], []
+    for index, region in enumerate(airspace.regions):
+        walks.append(draw_walks(region.polygon, _in_region(config.source, region), per_region, rng))
+        starts.append(_draw_starts(config, airspace, index, per_region, rng))
+    stops = max(walk.arrive.shape[1] for walk in walks)
+    padded = [_pad(walk, stops) for walk in walks]
+    region = torch.arange(len(airspace.regions)).repeat_interleave(per_region)
+    walk = tree_map(lambda *parts: torch.cat(parts), *padded)
+    return InitialConditions(region, torch.cat(starts), walk)
+
+
+def _pad(walk: Walk, stops: int) -> Walk:
+    """Pad walks to the given number of stops; the source never reaches the padded ones."""
+    missing = stops - walk.arrive.shape[1]
+
+    def repeat_last(field: Tensor) -> Tensor:
+        last = field[:, -1:]
+        return torch.cat([field, last.expand(-1, missing, *last.shape[2:])], 1)
+
+    never = walk.arrive.new_full((len(walk.arrive), missing), torch.inf)
+    return tree_map(repeat_last, walk)._replace(arrive=torch.cat([walk.arrive, never], 1))
+
+
+def _in_region(source: SourceConfig, region: Region) -> SourceConfig:
+    """The source with its given position, if any, in local metres of a region."""
+    if source.position is None:
+        return source
+    moved = copy.copy(source)  # not checked again
+    moved.position = local_places("source.position", [source.position], region)[0].tolist()
+    return moved
+
+
+def _draw_starts(
+    config: WorldConfig, airspace: Airspace, region: int, n: int, rng: np.random.Generator
+) -> Tensor:
+    """Landing points where the UAVs start, [n, N]: the given ones, one for all UAVs, or one for each."""
+    if config.region.start_positions is not None:
+        return _given_starts(config, airspace, region).expand(n, -1).clone()
+    n_points = int(airspace.n_points[region])
+    if config.region.start_together:
+        return torch.as_tensor(rng.integers(n_points, size=(n, 1))).repeat(1, config.agents)
+    return torch.as_tensor(rng.random((n, n_points))).topk(config.agents, dim=-1).indices
+
+
+def _given_starts(config: WorldConfig, airspace: Airspace, region: int) -> Tensor:
+    """Landing points nearest to the given start positions, [N]."""
+    given, name = config.region.start_positions or [], airspace.regions[region].name
+    local = torch.as_tensor(local_places("region.start_positions", given, airspace.regions[region]))
+    regions = torch.full((len(local),), region)
+    points = nearest_points(airspace.cells, airspace.exact_points, regions, local, 1).squeeze(-1)
+    taken: dict[int, int] = {}
+    for i, point in enumerate(points.tolist()):
+        first = taken.setdefault(point, i)
+        checks.require(
+            first == i or config.region.start_together,
+            "region.start_positions",
+            f"{given[first]} and {given[i]}",
+            f"lead to the same landing point of {name}: take places farther apart, or let UAVs share it by "
+            "region.start_together=true",
+        )
+    return points
 
 
 def _nearest_other(points: Tensor) -> Tensor:

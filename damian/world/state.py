@@ -24,7 +24,7 @@ class State(NamedTuple):
     origin: Tensor
     """Flat id of the landing point of departure, [B, N]."""
     goal: Tensor
-    """Flat id of the landing point that the UAV stands on or is bound for, [B, N]."""
+    """Flat id of the landing point on which the UAV stands or to which it flies, [B, N]."""
     elapsed: Tensor
     """Simulation steps since the latest decision, [B, N]."""
     vertical: Tensor

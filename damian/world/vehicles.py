@@ -11,7 +11,7 @@ from torch import Tensor
 from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.registry import Registry
-from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
+from damian.common.tensors import expand_mask, gather_rows, tree_where
 from damian.world.airspace import Airspace, nearest_points
 from damian.world.battery import charge_gain, cruise_range, flight_drain, used_so_far, vertical_drain
 from damian.world.config import WorldConfig
@@ -36,14 +36,14 @@ class MotionModel(ABC):
     """Motion of N UAVs in B worlds, as pure functions of their state.
 
     Args:
-        config: settings of the world, of which motion, battery and the number of UAVs are used.
+        config: settings of the world; motion, battery and the number of UAVs are used.
         airspace: regions and their landing points.
         dt: length of a simulation step [s].
     """
 
     instant: bool
-    """Whether a UAV is at its target as soon as a step ends; if not, each UAV needs a flight level of its
-    own, within those of the region."""
+    """Whether a UAV is at its target as soon as a step ends; if not, no two UAVs share a flight level, and
+    all levels lie within those of the region."""
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         self.motion, self.battery, self.dt = config.motion, config.battery, dt
@@ -81,7 +81,7 @@ class MotionModel(ABC):
         """Start flights to the landing points ``goal``.
 
         Args:
-            state: state before; its ``goal`` is the point where each UAV stands or is bound for.
+            state: state before; in its ``goal`` is the point on which each UAV stands or to which it flies.
             goal: flat ids of the assigned landing points, [B, N].
             ready: whether the UAV has just chosen an action, [B, N] bool.
             departs: whether the UAV has just chosen to fly, [B, N] bool.
@@ -151,74 +151,19 @@ def _not_a_model(found: Any) -> str | None:
 
 
 MOTION_MODELS = Registry[type[MotionModel]]("motion model", _not_a_model)
-"""Motion models by ``motion.kind``; one's own as ``package.module:Class``."""
+"""Motion models by ``motion.kind``, or as ``package.module:Class``."""
 
 
 def make_model(config: WorldConfig, airspace: Airspace, dt: float) -> MotionModel:
     """Build the motion model of the settings; the arguments are those of ``MotionModel``.
 
     Raises:
-        InputError: there is none, or one's own cannot be built.
+        InputError: there is none, or the given class cannot be built.
     """
     kind = config.motion.kind
     model = MOTION_MODELS.get(kind, "motion.kind")
     with naming_errors(f"motion.kind: {kind}") if ":" in kind else nullcontext():
         return model(config, airspace, dt)
-
-
-def check_model(model: MotionModel, kind: str, state: State) -> None:
-    """Try one step of a motion model of one's own.
-
-    Args:
-        model: built from ``motion.kind``.
-        kind: the setting.
-        state: of any number of worlds.
-
-    Raises:
-        InputError: a method raises an error, or returns something of another type, shape or dtype than it
-            must; a state keeps all of its shapes and dtypes.
-    """
-    if ":" not in kind:
-        return
-    name, state = f"motion.kind: {kind}", tree_map(torch.clone, state)
-    flag, goal = state.message_sent, state.goal.roll(1, -1)
-    with naming_errors(name):
-        _require_alike(f"{name}: ready", ready := model.ready(state), flag)
-        _require_alike(f"{name}: on_ground", on_ground := model.on_ground(state), flag)
-        _require_alike(f"{name}: reach", model.reach(state), state.battery)
-        _require_alike(f"{name}: battery_reach", model.battery_reach(state), state.battery)
-        valid = flag.unsqueeze(-1).repeat(1, 1, 2)
-        _require_alike(f"{name}: mask_busy", model.mask_busy(valid, ready.unsqueeze(-1), valid[0, 0]), valid)
-        flying = model.take_off(state, goal, ready, ready & (goal != state.goal))
-        _require_alike(f"{name}: take_off", flying, state)
-        moved = model.move(flying)
-        _require_alike(f"{name}: move", moved, state)
-        landed = model.on_ground(moved)
-        heard, here = (state.sent._replace(spotted=spotted) for spotted in (torch.ones_like(flag), landed))
-        key = f"{name}: latest_messages"
-        found = model.latest_messages(moved._replace(sent=heard), landed, here)
-        pair = isinstance(found, tuple) and len(found) == 2
-        checks.require(pair, key, f"a {type(found).__name__}", "is not a pair of flags and Messages")
-        _require_alike(key, found[0], flag)
-        _require_alike(key, found[1], state.sent)
-        problem = "still spots the source: let it send a message at its takeoff"
-        checks.require(not (found[1].spotted & ~landed).any(), key, "a UAV in flight", problem)
-        if (stop := model.new_stop(moved, on_ground, None)) is not None:
-            _require_alike(f"{name}: new_stop", stop, flag)
-
-
-def _require_alike(name: str, found: Any, like: Any) -> None:
-    """Require a tensor of the shape and dtype of another one, or such tensors in a named tuple's fields."""
-    if isinstance(like, Tensor):
-        is_tensor = isinstance(found, Tensor)
-        shown = f"{found.dtype} {list(found.shape)}" if is_tensor else f"a {type(found).__name__}"
-        alike = is_tensor and (found.dtype, found.shape) == (like.dtype, like.shape)
-        checks.require(alike, name, shown, f"is not a tensor of {like.dtype} {list(like.shape)}")
-        return
-    kind = type(like)
-    checks.require(isinstance(found, kind), name, f"a {type(found).__name__}", f"is not a {kind.__name__}")
-    for field, value, other in zip(kind._fields, found, like, strict=True):
-        _require_alike(f"{name}: {field}", value, other)
 
 
 @MOTION_MODELS.register("instant")

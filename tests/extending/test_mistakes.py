@@ -93,21 +93,9 @@ def test_a_law_without_its_braces_is_told_how_to_write_it():
         check({"delay": lambda written=written: DelayConfig(obs=written)}, message)
 
 
-WORLD = "[8, 3] = [initial conditions, UAVs]"
-
-
 @pytest.mark.parametrize(
     ("written", "message"),
     [
-        ("wrong:silent", "sensors: silent: a NoneType is not a tensor"),
-        ({"sensor": "wrong:silent", "name": "geiger"}, "sensors: geiger: a NoneType is not a tensor"),
-        ("wrong:number", "sensors: number: a float is not a tensor"),
-        (
-            "wrong:misnamed",
-            "sensors: misnamed: AttributeError: 'State' object has no attribute 'batery'"
-            + line("state.batery"),
-        ),
-        ("wrong:unending", "sensors: unending: [inf] is not finite"),
         (
             {"sensor": "wrong:unmarked", "half": 20},
             "sensors[0].half: 20 is no parameter of wrong:unmarked, which has none; parameters stand after "
@@ -179,28 +167,17 @@ def test_a_misspelt_feature_of_a_reward_term_names_the_term():
         RewardConfig(custom=terms)
 
 
-NO_LIST = "is not a list of damian.world.regions.region.Region"
-
-
 @pytest.mark.parametrize(
     ("mistake", "message"),
     [
         ("raise", "region.kind: wrong:park: KeyError: 'raise'" + line("return returned[config.options]")),
-        ("region", f"region.kind: wrong:park: a Region {NO_LIST}"),
-        ("polygon", f"region.kind: wrong:park: a Polygon {NO_LIST}"),
-        ("none", f"region.kind: wrong:park: a NoneType {NO_LIST}"),
-        ("nothing", f"region.kind: wrong:park: an empty list {NO_LIST}"),
-        ("polygons", f"region.kind: wrong:park: a list with a Polygon {NO_LIST}"),
-        ("points", "region.kind: wrong:park: polygon of park: a Point is not one of shapely's polygons"),
+        ("polygon", "region.kind: wrong:park: a Polygon is not a list of at least one Region"),
+        ("polygons", "region.kind: wrong:park: a list is not a list of at least one Region"),
         (
             "crossing",
-            "region.kind: wrong:park: polygon of park: Self-intersection[100 100] [m] makes it invalid: its "
-            "edges must not cross",
+            "region.kind: wrong:park: park: Self-intersection[100 100] [m]: edges must not cross",
         ),
-        (
-            "many",
-            "region.initial_conditions: 8 for 9 regions, but each needs an initial condition of its own",
-        ),
+        ("many", "region.initial_conditions: 8 for 9 regions: each needs at least one initial condition"),
     ],
 )
 def test_a_mistake_in_a_region_source_is_one_line(mistake, message):
@@ -216,19 +193,6 @@ def test_a_region_source_with_other_arguments_is_one_line():
     ("options", "message"),
     [
         ({}, "KeyError: 'mistake'" + line("self.mistake = config")),
-        ({"mistake": "float flag"}, "ready: torch.float32 [8, 3] is not a tensor of torch.bool [8, 3]"),
-        ({"mistake": "no UAVs"}, "on_ground: torch.bool [8] is not a tensor of torch.bool [8, 3]"),
-        ({"mistake": "none"}, "take_off: a NoneType is not a State"),
-        ({"mistake": "no flags"}, "latest_messages: a Messages is not a pair of flags and Messages"),
-        (
-            {"mistake": "no takeoff"},
-            "latest_messages: a UAV in flight still spots the source: let it send a message at its takeoff",
-        ),
-        (
-            {"mistake": "double"},
-            "move: elapsed: torch.float64 [8, 3] is not a tensor of torch.int64 [8, 3]",
-        ),
-        ({"mistake": "raise"}, "ValueError: Got unexpected field names: ['height']" + line("height=0")),
     ],
 )
 def test_a_mistake_in_a_motion_model_is_one_line(options, message):

@@ -8,7 +8,7 @@ import torch
 from helpers import fresh, one_uav
 from hypothesis import given
 from hypothesis import strategies as st
-from walks import DYNAMIC, dynamic_walks, in_double, n_stops, twin_position
+from walks import dynamic_walks, n_stops, twin_position
 
 from damian.envs.clocks import ClockConfig
 from damian.world.signal_source import SourceConfig, Walk, locate
@@ -62,12 +62,3 @@ def test_a_simulation_is_as_exact_after_many_steps_as_at_first():
         assert place[0].tolist() == pytest.approx(expected, abs=2e-2)
         moved += math.dist(expected, walk.stop[0, 0].tolist()) > 1
     assert moved > 1
-
-
-def test_a_source_returns_to_its_first_stop_without_a_jump():
-    walk = in_double(dynamic_walks(n=6, n_hotspots=2, min_wait=0.0, max_wait=1.0, **LOOP))
-    end = walk.depart[:, -1]
-    for tour in (1, 2, 1000):
-        places = [locate(walk, tour * end + offset, loops=True).position for offset in (-1e-3, 0.0, 1e-3)]
-        assert (places[1] - walk.stop[:, 0]).norm(dim=-1).max() < 1e-6
-        assert (places[0] - places[2]).norm(dim=-1).max() < 2e-3 * DYNAMIC.speed

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import pytest
 import torch
-from helpers import HERE, KEEPS_GOING, act, clock, fresh, go, one_uav, random_actions, square
+from helpers import KEEPS_GOING, act, clock, fresh, one_uav, random_actions, square
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -64,17 +64,6 @@ def test_a_flight_ends_after_exactly_its_duration_but_for_its_float_error(period
         )
         if most - least <= 1:  # so many steps that the float error of the duration is more than one
             assert least <= first_step(env, holds, most, vertical=vertical, cruise=cruise) <= most
-
-
-def test_a_thousand_steps_of_a_tenth_of_a_second_are_100_seconds():
-    env = fresh(one_uav(motion=MotionConfig("polynomial", sensing_time=100.0), clock=clock("0.1s")))
-    go(env, HERE)
-    state, ready = env.state, []
-    for _ in range(999):
-        ready.append(env.simulation.ready(state).item())
-        state = env.simulation.vehicles.move(state)
-    assert not any(ready)
-    assert env.simulation.ready(state).item()
 
 
 def test_flights_land_in_the_step_that_contains_the_end_of_their_duration():

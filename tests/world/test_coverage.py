@@ -132,21 +132,6 @@ def test_the_authors_areas_are_reproduced_within_one_percent_of_the_disc():
         np.testing.assert_allclose(got, expected, rtol=0, atol=0.01 * golden["disc_area"])
 
 
-def test_a_single_uav_covers_the_part_of_its_disc_inside_the_polygon():
-    polygon = shapely.box(0, -500, 500, 500)
-    places = [[[0.001, 0.0]], [[R, 300.0]], [[R / 2, -300.0]]]
-    half_in = 2 / 3 + math.sqrt(3) / (4 * math.pi)  # the disc without the segment beyond a chord at R / 2
-    np.testing.assert_allclose(share_at(polygon, places), [0.5, 1, half_in], atol=0.005)
-
-
-def test_a_hole_and_a_gap_between_parts_are_not_covered():
-    ring = Point(0, 0).buffer(400).difference(Point(0, 0).buffer(R, quad_segs=128))
-    assert share_at(ring, [[[0.0, 0.0]]]) == pytest.approx(0, abs=0.005)
-    parts = MultiPolygon([shapely.box(-300, -300, -R / 2, 300), shapely.box(R / 2, -300, 300, 300)])
-    places = [[[-R / 2 - 0.01, 0.0]]]
-    np.testing.assert_allclose(share_at(parts, places), exact_share(parts, places), atol=0.01)
-
-
 def test_samples_far_from_the_boundary_are_outside_as_often_as_a_test_of_each_finds():
     polygon = Polygon([(0, 0), (400, 0), (400, 300), (0, 300)], [[(150, 100), (250, 100), (200, 200)]])
     points = np.random.default_rng(0).uniform(-100, 450, (1200, 2))
@@ -163,19 +148,6 @@ def test_samples_far_from_the_boundary_are_outside_as_often_as_a_test_of_each_fi
 def test_bits_are_counted_as_python_counts_them(words):
     expected = [bin(w % 2**64).count("1") for w in words]
     assert coverage._bit_count(torch.tensor(words)).tolist() == expected
-
-
-@pytest.mark.parametrize("word", [0, -1, -(2**63), 2**63 - 1, 1, 0x5555555555555555])
-def test_bits_of_extreme_words_are_counted(word):
-    assert coverage._bit_count(torch.tensor(word)).item() == bin(word % 2**64).count("1")
-
-
-@pytest.mark.parametrize("count", range(1, 10))
-def test_or_of_rows_equals_numpys(count):
-    rng = np.random.default_rng(count)
-    table, rows = rng.integers(-(2**63), 2**63 - 1, (20, 3)), rng.integers(0, 20, (count, 5))
-    got = coverage._or_rows(torch.tensor(table), torch.tensor(rows))
-    assert got.tolist() == np.bitwise_or.reduce(table[rows], 0).tolist()
 
 
 @pytest.mark.parametrize(("n_uavs", "n_last"), [(1, 1), (1, 3), (2, 2), (3, 2), (5, 1)])
@@ -230,50 +202,6 @@ def test_only_worlds_that_have_changed_are_computed_again(square, monkeypatch):
     assert sizes == [1]
 
 
-def test_permuting_the_uavs_permutes_their_shares(square):
-    tables, _, points = square
-    ids, positions = at_random(points, (8, 4, 2))
-    share = covered_share(tables, ids, positions)
-    for order in itertools.permutations(range(4)):
-        permuted = covered_share(tables, ids[:, order], positions[:, order])
-        assert torch.equal(permuted, share[:, order])
-
-
-def test_uavs_more_than_two_radii_apart_cover_their_whole_discs():
-    open_sea = shapely.box(-1e5, -1e5, 1e5, 1e5)
-    apart = [[[0.0, 0.0]], [[2.01 * R, 0.0]], [[0.0, -2.01 * R]], [[-9e4, 9e4]]]
-    assert share_at(open_sea, apart).tolist() == [1, 1, 1, 1]
-
-
-def test_uavs_closer_than_two_radii_share_the_lens_between_them():
-    open_sea = shapely.box(-1e5, -1e5, 1e5, 1e5)
-    lens = 2 / 3 - math.sqrt(3) / (2 * math.pi)  # two unit discs, centres 1 apart, over pi
-    share = share_at(open_sea, [[[0.0, 0.0]], [[R * 0.6, R * 0.8]]])
-    np.testing.assert_allclose(share, [1 - lens] * 2, atol=0.01)
-
-
-@pytest.mark.parametrize("n_last", [1, 2, 3, 5])
-def test_holding_counts_the_footprint_once(n_last):
-    open_sea = shapely.box(-1e5, -1e5, 1e5, 1e5)
-    assert share_at(open_sea, np.full((1, n_last, 2), 17.3)) == pytest.approx(1 / n_last)
-
-
-def test_only_older_footprints_of_the_same_uav_are_subtracted():
-    left = shapely.box(-1e5, -1e5, 0, 1e5)  # half of ``newest`` and most of ``oldest`` lie inside
-    newest, oldest = [-0.001, 0.0], [-R / 2, 0.0]
-    forth, back = [[newest, oldest]], [[oldest, newest]]
-    forth_share, back_share = share_at(left, forth), share_at(left, back)
-    np.testing.assert_allclose(forth_share, exact_share(left, forth), atol=0.01)
-    np.testing.assert_allclose(back_share, exact_share(left, back), atol=0.01)
-
-
-def test_footprints_of_other_uavs_are_subtracted_at_the_same_index_only(square):
-    _, polygon, _ = square
-    here, there = [0.0, 0.0], [140.0, 0.0]
-    assert share_at(polygon, [[here, there], [there, here]]) == pytest.approx([1, 1])
-    assert share_at(polygon, [[here, there], [here, there]]) == pytest.approx([0, 0])
-
-
 def test_flat_ids_run_over_regions_and_padding_covers_nothing():
     regions = [shapely.box(-500, -500, 500, 500), shapely.box(-500, -500, 0, 500)]
     points = np.array([[[100.0, 0], [200.0, 0]], [[0.0, 0], [np.nan, np.nan]]])
@@ -281,14 +209,6 @@ def test_flat_ids_run_over_regions_and_padding_covers_nothing():
     ids, positions = torch.arange(4).view(4, 1, 1), torch.zeros(4, 1, 1, 2)
     share = covered_share(tables, ids, positions).squeeze(-1)
     np.testing.assert_allclose(share, [1, 1, 0.5, 0], atol=0.005)
-
-
-def test_shares_have_the_dtype_of_the_positions_also_after_tables_are_moved(square):
-    tables, _, points = square
-    ids, positions = at_random(points, (2, 3, 2))
-    share = covered_share(tables.to("cpu"), ids, positions.double())
-    assert share.dtype == torch.float64
-    np.testing.assert_allclose(share, covered_share(tables, ids, positions), atol=1e-6)
 
 
 def test_coverage_compiles_to_one_graph(square):

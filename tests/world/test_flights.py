@@ -182,23 +182,6 @@ def test_a_uav_in_flight_does_not_detect_the_source():
     assert env.state.motions.item() == 1  # a detection would have set it to 0
 
 
-def test_an_action_of_distance_0_holds_and_counts_as_a_motion():
-    env = fresh(one_uav())
-    place = env.state.goal.clone()
-    output = go(env, HERE, HERE, HERE)
-    assert env.state.goal.equal(place)
-    assert sent_messages(output).motions.item() == 3
-
-
-def test_a_uav_whose_target_lies_outside_the_region_holds():
-    env = fresh(one_uav())
-    place = env.state.goal.clone()
-    go(env, WEST)
-    assert env.state.goal.equal(place)
-    go(env, EAST)
-    assert not env.state.goal.equal(place)
-
-
 def test_motions_count_from_the_latest_detection():
     env = fresh(one_uav(source=SourceConfig(level_db=130.0, position=[160.0, 100.0])))
     counted = []
@@ -240,20 +223,6 @@ def test_masked_actions_hold_and_legal_actions_lead_to_their_nearest_point(energ
         masked, reached = masked + int((~legal).sum()), reached + int(moved.sum())
     assert masked > 100
     assert reached > 100
-
-
-def test_in_flight_exactly_one_action_is_legal_and_it_holds():
-    env = fresh(everything("polynomial"), num_worlds=16)
-    generator = torch.Generator().manual_seed(0)
-    waiting = 0
-    for _ in range(20):
-        output = act(env, random_actions(env, generator))
-        mask, ready = output["agents", "action_mask"], output["agents", "ready"]
-        assert (mask[~ready].sum(-1) == 1).all()
-        assert (mask[~ready].int().argmax(-1) == 0).all()
-        assert mask.any(-1).all()
-        waiting += int((~ready).sum())
-    assert waiting > 50
 
 
 def test_the_action_mask_is_absent_if_it_is_switched_off():

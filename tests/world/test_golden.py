@@ -73,23 +73,6 @@ def test_recorded_actions_lead_to_the_recorded_points(case, compared, reasons):
     assert counts == reasons
 
 
-@pytest.mark.parametrize(("case", "expected"), [(1, 103), (2, 271)])
-def test_a_uav_whose_nearest_point_is_its_own_holds(case, expected):
-    records = recorded(case, EPISODES, PERSISTENT, CUMULATIVE)
-    env = ready_env(usecase(case), len(records))
-    set_state(env, records, [transition.places for transition in records])
-    after = sent_messages(act(env, column(records, "actions")))
-    position = after.position + env.simulation.airspace.offset[0]
-    held = 0
-    for world, transition in enumerate(records):
-        for uav, place in enumerate(transition.places):
-            if reason_for_other_point(case, transition, uav) == "the UAV may hold":
-                ours = position[world, uav].tolist()
-                assert ours == pytest.approx(place, abs=TOLERANCE)
-                held += 1
-    assert held == expected
-
-
 @pytest.mark.parametrize(("case", "n_flags", "after_detection"), [(1, 168, 24), (2, 564, 181)])
 def test_recorded_points_give_the_recorded_detections_and_numbers_of_motions(case, n_flags, after_detection):
     records = recorded(case, EPISODES, PERSISTENT, CUMULATIVE)

@@ -97,37 +97,19 @@ def test_every_region_of_a_pool_must_contain_a_given_place():
         build(RegionConfig(pool=10), source=SourceConfig(position=[0.0, 190.0]))
 
 
-NOT_A_PLACE = "is not [x, y] in metres or {lat: ..., lon: ...} in degrees"
-NOT_DEGREES = "is not {lat: ..., lon: ...} in degrees, such as {lat: 53.1, lon: -4.5}"
-BOUNDS = "is not inside vertices region 0 (x 0 to 200 m, y 0 to 200 m)"
-
-
 @pytest.mark.parametrize(
-    ("place", "problem"),
+    "place",
     [
-        ([0.0], f": [0.0] {NOT_A_PLACE}"),
-        ("north", f": north {NOT_A_PLACE}"),
-        (["a", "b"], f": ['a', 'b'] {NOT_A_PLACE}"),
-        ([True, 1.0], f": [True, 1.0] {NOT_A_PLACE}"),
-        ([math.nan, 1.0], f": [nan, 1.0] {NOT_A_PLACE}"),
-        ([1.0, math.inf], f": [1.0, inf] {NOT_A_PLACE}"),
-        ({"lat": 1.0}, f": {{'lat': 1.0}} {NOT_DEGREES}"),
-        ({"lat": 1.0, "lng": 2.0}, f": {{'lat': 1.0, 'lng': 2.0}} {NOT_DEGREES}"),
-        ({"lat": 95.0, "lon": 0.0}, ".lat: 95.0 deg is not between -90 and 90 deg"),
-        ({"lat": 0.0, "lon": 200}, ".lon: 200 deg is not between -180 and 180 deg"),
-        ({"lat": math.nan, "lon": 0.0}, ".lat: nan is not a finite number"),
-        ({"lat": 0.0, "lon": "east"}, ".lon: east is not a finite number"),
-        ([1e9, 0.0], ": [1000000000.0, 0.0] is not within 2e+07 m of the origin"),
-        ([0.0, 100.0], f": [0.0, 100.0] m {BOUNDS}"),
-        (
-            {"lat": 53.1, "lon": -4.5},
-            ": {'lat': 53.1, 'lon': -4.5} has latitude and longitude, but vertices region 0 has no position "
-            "on Earth: give [x, y] in metres, or take a region from a FIR table or GeoJSON file",
-        ),
+        [0.0],
+        [math.nan, 1.0],
+        {"lat": 1.0, "lng": 2.0},
+        {"lat": 95.0, "lon": 0.0},
+        [0.0, 100.0],  # on the boundary
+        {"lat": 53.1, "lon": -4.5},  # of a region without a position on Earth
     ],
 )
 @pytest.mark.parametrize("key", ["region.start_positions", "source.position", "battery.charging_points"])
-def test_a_wrong_place_is_refused_with_one_line_that_names_it(key, place, problem):
+def test_a_wrong_place_is_refused_by_its_key(key, place):
     wrong = {
         "region.start_positions": lambda: build(SQUARE, start_positions=[[10.0, 10.0], [90.0, 90.0], place]),
         "source.position": lambda: build(SQUARE, source=SourceConfig(position=place)),
@@ -135,9 +117,8 @@ def test_a_wrong_place_is_refused_with_one_line_that_names_it(key, place, proble
             SQUARE, battery=BatteryConfig(enabled=True, charging_points=[[1, 9], place])
         ),
     }
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match=rf"^{key}\b"):
         wrong[key]()
-    assert str(error.value) == key + problem
 
 
 def test_a_place_in_a_hole_of_the_region_is_refused():
@@ -147,25 +128,6 @@ def test_a_place_in_a_hole_of_the_region_is_refused():
     assert str(error.value) == (
         "source.position: [0.0, 10.0] m is not inside park (x -100 to 100 m, y -100 to 100 m)"
     )
-
-
-def test_a_place_in_degrees_outside_the_region_is_shown_in_both_units(park):
-    with pytest.raises(InputError) as error:
-        build(park, source=SourceConfig(position={"lat": 45.003, "lon": 8.0015}))
-    assert str(error.value) == (
-        "source.position: {'lat': 45.003, 'lon': 8.0015} (at [0, 222.39] m) is not inside park (x -117.94 to "
-        "117.94 m, y -111.19 to 111.2 m)"
-    )
-
-
-@pytest.mark.parametrize("places", [5, "all", {"lat": 1.0, "lon": 2.0}])
-@pytest.mark.parametrize("key", ["region.start_positions", "battery.charging_points"])
-def test_places_that_are_no_list_are_refused(key, places):
-    with pytest.raises(InputError) as error:
-        RegionConfig(start_positions=places) if key[0] == "r" else BatteryConfig(
-            enabled=True, charging_points=places
-        )
-    assert str(error.value) == f"{key}: {places} is not a list of places such as [[0, 0], [100, 50]]"
 
 
 @pytest.mark.parametrize("second", [[10.0, 10.0], [10.5, 10.0]])
@@ -181,29 +143,11 @@ def test_two_start_positions_lead_to_one_landing_point_only_if_uavs_start_togeth
     assert goal[0, 0] == goal[0, 1] != goal[0, 2]
 
 
-def test_a_charging_point_is_listed_once():
-    with pytest.raises(InputError) as error:
-        build(
-            SQUARE,
-            battery=BatteryConfig(enabled=True, charging_points=[[10.0, 10.0], [50, 50], [50.0, 50.0]]),
-        )
-    assert (
-        str(error.value)
-        == "battery.charging_points: [50, 50] and [50.0, 50.0] are the same place: list each once"
-    )
-
-
 @pytest.mark.parametrize(
     ("settings", "value", "readers"),
     [
         ({"kind": "vertices", "vertices": CORNERS, "path": "a.csv"}, "path: a.csv", "fir or geojson"),
-        ({"kind": "geojson", "path": "a", "id": "B"}, "id: B", "fir"),
-        ({"kind": "fir", "path": "a", "id": "B", "where": "a:b"}, "where: a:b", "geojson"),
         ({"vertices": [[0, 0], [9, 9]]}, "vertices: [[0, 0], [9, 9]]", "vertices"),
-        ({"index": 0}, "index: 0", "geojson"),
-        ({"kind": "geojson", "path": "a", "min_area": 5.0}, "min_area: 5.0", "random"),
-        ({"kind": "geojson", "path": "a", "pool": 4}, "pool: 4", "random"),
-        ({"options": {"side": 3}}, "options: {'side': 3}", "a package.module:function of one's own"),
     ],
 )
 def test_a_setting_that_the_kind_of_region_does_not_read_is_refused(settings, value, readers):
@@ -216,12 +160,3 @@ def test_a_setting_that_the_kind_of_region_does_not_read_is_refused(settings, va
 def test_a_region_that_vanishes_once_rounded_is_refused():
     with pytest.raises(InputError, match=r"^tiny: .* once rounded to 1/65536 m: draw it larger"):
         centred(Region(shapely.Polygon([(0, 0), (1e-6, 0), (0, 1e-6)]), "tiny"))
-
-
-def test_a_lattice_whose_points_cannot_be_told_apart_is_refused():
-    with pytest.raises(InputError) as error:
-        RegionConfig(lattice_step=0.04, lattice_angle=7.0)
-    assert str(error.value) == (
-        "region.lattice_step: 0.04 m lays rows of landing points 0.00487477 m apart, but places are told "
-        "apart to 0.01 m"
-    )

@@ -44,10 +44,6 @@ def test_the_lattice_has_the_92_landing_points_of_each_use_case_in_order(case):
     assert distance == pytest.approx(scenario["max_distance_normaliser_m"], abs=1e-6)
 
 
-def test_there_are_nine_lattices_of_the_original_to_compare_with():
-    assert len(EXAMPLES) == 9
-
-
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_the_lattice_has_the_landing_points_of_the_original_for_other_polygons(example):
     n = None if example["n_landing_points"] == "all" else example["n_landing_points"]
@@ -113,28 +109,12 @@ def test_n_points_keeps_those_nearest_to_the_centroid_in_unchanged_order():
     np.testing.assert_array_equal(landing_lattice(L_SHAPE, 20, 45, len(points)), points)
 
 
-def test_shifting_a_symmetric_polygon_keeps_the_order_of_its_landing_points():
-    original = landing_lattice(SQUARE, 10, 90)
-    for shift in [(0.1, 0.7), (1e5 / 3, -2e4 / 7)]:
-        shifted = landing_lattice(shapely.affinity.translate(SQUARE, *shift), 10, 90)
-        np.testing.assert_allclose(shifted - shift, original, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("step", "degrees", "n", "message"),
     [
         (500, 45, None, "region.lattice_step: 500 m lays no landing point inside the polygon of 10000 m^2"),
         (30, 45, 50, "region.n_landing_points: 50 is more than the 12 inside the polygon: lower it, or"),
-        (30, 45, 0, "region.n_landing_points: 0"),
-        (0, 45, None, "lattice step: 0 m"),
-        (-3, 45, None, "lattice step: -3 m"),
-        (math.nan, 45, None, "lattice step: nan m"),
-        (1e300, 45, None, "lattice step: 1e+300 m"),
-        (1e-320, 45, None, "lattice step: 1e-320 m is not between"),
         (0.01, 45, None, "region.lattice_step: 0.01 m is too fine for a polygon of 100 m x 100 m"),
-        (30, 0, None, "lattice angle: 0 deg"),
-        (30, 91, None, "lattice angle: 91 deg"),
-        (30, 1e-300, None, "lattice angle: 1e-300 deg is not between"),
     ],
 )
 def test_an_impossible_lattice_raises_one_line(step, degrees, n, message):
@@ -175,27 +155,6 @@ def test_a_random_polygon_is_convex_and_has_an_area_between_the_limits(seed, max
     assert polygon.area == pytest.approx(polygon.convex_hull.area)
 
 
-def test_the_same_seed_gives_the_same_polygon():
-    polygons = [random_polygon(np.random.default_rng(seed), 1e5, 2e5) for seed in (3, 3, 4)]
-    assert polygons[0] == polygons[1] != polygons[2]
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "message"),
-    [
-        (0, 1, "min_area: 0 m^2"),
-        (-1, 1, "min_area: -1 m^2"),
-        (2, 1, "max_area: 1 m^2"),
-        (1, math.inf, "max_area: inf m^2"),
-        (math.nan, 1, "min_area: nan m^2"),
-    ],
-)
-def test_impossible_limits_of_the_area_are_refused(low, high, message):
-    with pytest.raises(InputError) as error:
-        random_polygon(np.random.default_rng(0), low, high)
-    assert str(error.value).startswith(message)
-
-
 # --- polygons from vertices ----------------------------------------------------------------------
 
 
@@ -208,20 +167,13 @@ def test_a_concave_polygon_stays_concave_whether_its_vertices_are_open_or_closed
 @pytest.mark.parametrize(
     ("vertices", "message"),
     [
-        ([], "not a list of [x, y]"),
         ([[0, 0], [1, 1]], "2 distinct points"),
-        ([[0, 0], [1, 1], [0, 0], [1, 1]], "2 distinct points"),
         ([[0, 0], [1, 1], [2, 2], [3, 3]], "no area"),
-        ([[0, 0], [0.1, 0.3], [0.7, 2.1]], "no area"),
         ([[0, 0], [1, 1], [1, 0], [0, 1]], "edges cross at [0.5, 0.5] m"),
-        ([[0, 0], [9, 9], [9, 0], [0, 5]], "edges cross"),
         ([[0, 0], [1, math.nan], [1, 0]], "vertex 1 [1.0, nan]"),
-        ([[0, 0], [1, 1], [math.inf, 0]], "vertex 2 [inf, 0.0]"),
         ([[0, 0], [1, 1], [1e300, 0]], "vertex 2 [1e+300, 0.0] m"),
-        ([[0, 0], [1, 1], [2]], "not a list of [x, y] numbers"),
         ([[0, 0], [1, 1], [2, "north"]], "not a list of [x, y] numbers"),
         ([[0, 0, 0], [1, 1, 0], [2, 0, 0]], "shape [3, 3]"),
-        ([0, 1, 2], "shape [3]"),
     ],
 )
 def test_vertices_that_form_no_polygon_raise_one_line(vertices, message):

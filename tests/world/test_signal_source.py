@@ -16,7 +16,6 @@ from walks import (
     USE_CASE,
     dynamic_walks,
     in_double,
-    leg_lengths,
     n_stops,
     twin_covered,
     twin_duration,
@@ -44,11 +43,6 @@ POLYGONS = {
     "turned sliver": TURNED_SLIVER,
     "two parts": TWO_PARTS,
 }
-
-
-def test_the_footprint_radius_equals_the_recorded_one():
-    assert footprint_radius(SourceConfig()) == pytest.approx(SCENARIO["footprint_radius_m"])
-    assert footprint_radius(SourceConfig()) == pytest.approx(56.23413252, abs=1e-8)
 
 
 def test_the_footprint_radius_follows_from_power_and_intensity():
@@ -152,17 +146,6 @@ def test_inner_points_fill_the_part_of_the_disc_inside_the_polygon():
     assert (inner[:, 0] > 30).float().mean().item() == pytest.approx(0.5, abs=0.05)
 
 
-def test_a_source_moves_around_its_hotspot_even_in_a_thin_polygon():
-    walk = in_double(dynamic_walks(SLIVER))
-    assert leg_lengths(walk).median() > 1e-4
-
-
-def test_a_walk_begins_at_the_configured_position():
-    walk = dynamic_walks(position=[51.5, 32.5])
-    assert walk.stop[:, 0].tolist() == [[51.5, 32.5]] * 8
-    assert (walk.stop[0, 1] != walk.stop[1, 1]).any()
-
-
 def test_waits_and_legs_alternate_without_gaps():
     walk = in_double(dynamic_walks(n=20))
     for w, n in enumerate(n_stops(walk).tolist()):
@@ -229,16 +212,6 @@ def test_a_position_equals_the_integrated_speed_profile(
         assert located.stop[w].item() == stop
 
 
-def test_a_triangular_leg_accelerates_for_half_its_length_and_then_decelerates():
-    stop = torch.tensor([[[0.0, 0.0], [0.0, 8.0]]])
-    speed, acceleration = torch.full((1, 2), 20.0), torch.full((1, 2), 2.0)
-    arrive, depart = torch.tensor([[0.0, 14.0]]), torch.tensor([[10.0, 20.0]])
-    walk = Walk(stop, arrive, depart, speed, acceleration, torch.ones(1, 2, dtype=torch.bool))
-    expected = {9.0: 0.0, 10.0: 0.0, 11.0: 1.0, 12.0: 4.0, 13.0: 7.0, 14.0: 8.0, 30.0: 8.0}
-    for time, y in expected.items():
-        assert locate(walk, torch.tensor([time])).position.tolist() == [[0.0, pytest.approx(y)]]
-
-
 def traced(walk, n):
     """Positions [n, W, 2] of whole walks at n equally spaced times, ``locate``'s result, times, spacing."""
     step = walk.depart[:, -1] * 1.05 / (n - 1)
@@ -261,17 +234,6 @@ def test_positions_are_continuous_and_never_exceed_the_largest_speed():
     assert moved.max() > 0.9 * DYNAMIC.local_speed * step.min()
 
 
-def test_a_source_stays_exactly_at_a_stop_while_it_waits():
-    walk = in_double(dynamic_walks(n=6))
-    for k in (0, 1, 5, 20):
-        for share in (0.0, 0.5, 1.0):
-            time = walk.arrive[:, k] + share * (walk.depart[:, k] - walk.arrive[:, k])
-            located = locate(walk, time)
-            assert located.position.tolist() == walk.stop[:, k].tolist()
-            assert located.stop.tolist() == [k] * 6
-            assert not located.finished.any()
-
-
 def test_a_walk_is_over_after_its_last_wait_and_the_source_stays_there():
     walk = dynamic_walks(n=20)
     end = walk.depart[:, -1]
@@ -282,13 +244,6 @@ def test_a_walk_is_over_after_its_last_wait_and_the_source_stays_there():
         assert located.finished.all()
         assert (located.position == walk.stop[:, -1]).all()
         assert (located.stop == n_stops(walk) - 1).all()
-
-
-def test_a_walk_around_one_hotspot_ends_too():
-    walk = dynamic_walks(n_hotspots=1, min_stops=1, max_stops=1)
-    assert walk.stop.shape == (8, 2, 2)
-    assert not locate(walk, torch.zeros(8)).finished.any()
-    assert locate(walk, torch.full((8,), 1000.0)).finished.all()
 
 
 def test_walks_contain_random_emission_only_if_it_is_per_stop():
@@ -318,52 +273,18 @@ def test_locate_compiles_to_one_graph(n_hotspots, loops):
 
 
 @pytest.mark.parametrize(
-    ("settings_", "message"),
+    "wrong",
     [
-        (
-            {"level_db": 100.0},
-            "source.level_db: 100.0 dB is not above microphone_db=105 dB: not heard even at 1 m",
-        ),
-        ({"microphone_db": -1.0}, "source.microphone_db: -1.0 dB is not at least 0 dB"),
-        ({"motion": "walk"}, "source.motion: walk is not one of static, dynamic"),
-        (
-            {"emission": "blinking"},
-            "source.emission: blinking is not one of constant, per_stop, per_step",
-        ),
-        (
-            {"emission": "per_stop"},
-            "source.emission: per_stop needs source.motion=dynamic: "
-            "a static source has one stop; take constant or per_step",
-        ),
-        (
-            {"emission_probability": 1.5},
-            "source.emission_probability: 1.5 is not between 0 and 1",
-        ),
-        (
-            {"position": [1.0, math.nan]},
-            "source.position: [1.0, nan] is not [x, y] in metres or {lat: ..., lon: ...} in degrees",
-        ),
-        ({"after_walk": "turn"}, "source.after_walk: turn is not one of loop, stop"),
-        (
-            {"after_walk": "stop"},
-            "source.after_walk: stop needs source.motion=dynamic: a static source does not walk",
-        ),
-        ({"n_hotspots": 0}, "source.n_hotspots: 0 is not between 1 and 1000"),
-        ({"min_stops": 0}, "source.min_stops: 0 is not at least 1"),
-        ({"max_stops": 2}, "source.max_stops: 2 is not between 3 and 1000"),
-        ({"local_distance": 0.0}, "source.local_distance: 0.0 m is not above 0 m"),
-        ({"speed": 0.0}, "source.speed: 0.0 m/s is not above 0 m/s"),
-        ({"local_speed": -1.7}, "source.local_speed: -1.7 m/s is not above 0 m/s"),
-        ({"acceleration": 0.0}, "source.acceleration: 0.0 m/s^2 is not above 0 m/s^2"),
-        (
-            {"local_acceleration": math.inf},
-            "source.local_acceleration: inf m/s^2 is not above 0 m/s^2",
-        ),
-        ({"min_wait": -1.0}, "source.min_wait: -1.0 s is not at least 0 s"),
-        ({"max_wait": 59.0}, "source.max_wait: 59.0 s is not at least 60 s"),
+        {"level_db": 100.0},  # below the microphone's
+        {"motion": "walk"},
+        {"emission": "per_stop"},  # of a static source
+        {"after_walk": "stop"},
+        {"emission_probability": 1.5},
+        {"max_stops": 2},
+        {"speed": 0.0},
+        {"max_wait": 59.0},
     ],
 )
-def test_a_wrong_source_setting_is_named_with_its_value_and_unit(settings_, message):
-    with pytest.raises(InputError) as error:
-        SourceConfig(**settings_)
-    assert str(error.value) == message
+def test_a_wrong_source_setting_is_refused_by_its_key(wrong):
+    with pytest.raises(InputError, match=f"^source.{next(iter(wrong))}: "):
+        SourceConfig(**wrong)

@@ -16,7 +16,6 @@ from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.motion import MotionConfig
-from damian.world.signal_source import SourceConfig
 
 SPOTTED = ("agents", "reward_terms", "spotted")
 
@@ -157,34 +156,3 @@ def test_a_uav_in_flight_neither_spots_nor_is_paid_nor_counts(
         assert output["success"].equal(enough)
         chose = env.simulation.ready(before)
         assert (env.state.motions == before.motions + chose)[flies].all()
-
-
-def test_a_flight_of_less_than_a_step_needs_no_message_at_its_takeoff():
-    motion = MotionConfig("polynomial", max_speed=1000.0, max_acceleration=1000.0)
-    env = fresh(flying(motion=motion, clock=ClockConfig("5s")), 8)
-    generator, moved = torch.Generator().manual_seed(0), 0
-    for _ in range(10):
-        before = env.state.goal
-        output = act(env, random_actions(env, generator))
-        assert output["agents", "message_sent"].all()
-        assert not sent_messages(output).in_flight.any()
-        moved += int((env.state.goal != before).sum())
-    assert moved > 30
-
-
-def test_a_uav_that_leaves_the_source_stops_spotting_it_at_once():
-    source = SourceConfig(level_db=130.0, position=[100.0, 100.0])
-    region = REGIONS["fixed"]
-    scenario = flying(agents=1, source=source, region=region, episode=KEEPS_GOING)
-    env = fresh(scenario, 64)
-    generator, left = torch.Generator().manual_seed(0), 0
-    for _ in range(30):
-        before = env.state
-        output = act(env, random_actions(env, generator))
-        message = sent_messages(output)
-        leaves = before.sent.spotted & message.in_flight & (message.time > before.sent.time)
-        assert not message.spotted[leaves].any()
-        assert message.detected_time[leaves].equal(before.sent.detected_time[leaves])
-        assert message.detected_position[leaves].equal(before.sent.position[leaves])
-        left += int(leaves.sum())
-    assert left > 2

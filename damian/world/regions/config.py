@@ -8,6 +8,7 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
+import shapely
 
 from damian.common import checks
 from damian.common.errors import naming_errors
@@ -16,7 +17,7 @@ from damian.world.regions.fir import read_fir
 from damian.world.regions.geojson import read_geojson
 from damian.world.regions.places import check_places
 from damian.world.regions.polygon import RESOLUTION, polygon_from_vertices, random_polygon
-from damian.world.regions.region import Region, centred, check_regions
+from damian.world.regions.region import Region, centred
 
 
 @dataclass
@@ -25,7 +26,7 @@ class RegionConfig:
 
     kind: str = "random"
     """Origin of the region: ``random``, ``vertices``, ``fir`` (Eurocontrol table), ``geojson``, or
-    ``package.module:function`` of one's own."""
+    ``package.module:function``."""
     min_area: float = 100_000.0
     """Smallest area of a random region [m^2]."""
     max_area: float = 200_000.0
@@ -58,7 +59,7 @@ class RegionConfig:
     """Whether all UAVs start on the same drawn landing point; given start positions may then share one."""
 
     options: Any = None
-    """Settings of a region source of one's own, as a mapping."""
+    """Settings of your own region source, as a mapping."""
 
     def __post_init__(self) -> None:
         checks.types("region", self)
@@ -88,7 +89,7 @@ class RegionConfig:
         """Read the region from its file or vertices, or draw ``pool`` random regions.
 
         Raises:
-            InputError: the file cannot be read, the vertices form no valid polygon, or a source of one's own
+            InputError: the file cannot be read, the vertices form no valid polygon, or the given function
                 raises an error or returns no list of regions with valid polygons.
         """
         source, name = REGION_SOURCES.get(self.kind, "region.kind"), f"region.kind: {self.kind}"
@@ -96,15 +97,23 @@ class RegionConfig:
             return [centred(region) for region in source(self, rng)]
         with naming_errors(name):
             found = source(self, rng)
-        check_regions(found, name)
-        most, problem = self.initial_conditions, "regions, but each needs an initial condition of its own"
+        listed = isinstance(found, list) and found and all(isinstance(each, Region) for each in found)
+        checks.require(
+            bool(listed), name, f"a {type(found).__name__}", "is not a list of at least one Region"
+        )
+        for region in found:
+            reason = shapely.is_valid_reason(region.polygon)
+            checks.require(
+                region.polygon.is_valid, f"{name}: {region.name}", reason, "[m]: edges must not cross"
+            )
+        most, problem = self.initial_conditions, "regions: each needs at least one initial condition"
         checks.require(len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem)
         return [centred(region) for region in found]
 
     def _refuse_unread(self) -> None:
         """Refuse settings of other kinds of regions, which this kind would ignore."""
         if ":" in self.kind:
-            return  # a source of one's own may read any of them
+            return  # such a function may read any of them
         for setting in fields(self):
             kinds = _READ_BY.get(setting.name, [self.kind])
             default = [] if setting.name == "vertices" else setting.default
@@ -125,13 +134,13 @@ _READ_BY = {
     "id": ["fir"],
     "index": ["geojson"],
     "where": ["geojson"],
-    "options": ["a package.module:function of one's own"],
+    "options": ["a package.module:function"],
 }
 """Settings that only some kinds of regions read, and these kinds."""
 
 
 RegionSource = Callable[[RegionConfig, np.random.Generator], list[Region]]
-"""From the settings and a random generator to the regions, of which each episode flies over one."""
+"""From the settings and a random generator to the regions; each episode flies over one of them."""
 
 
 def _not_a_source(found: Any) -> str | None:
@@ -139,7 +148,7 @@ def _not_a_source(found: Any) -> str | None:
 
 
 REGION_SOURCES = Registry[RegionSource]("region source", _not_a_source)
-"""Region sources by ``region.kind``; one's own as ``package.module:function``."""
+"""Region sources by ``region.kind``, or as ``package.module:function``."""
 
 
 @REGION_SOURCES.register("random")

@@ -1,4 +1,4 @@
-"""Reads Eurocontrol FIR tables (CSV); any fault raises one `InputError` that says where in the file it is."""
+"""Reads Eurocontrol FIR tables (CSV)."""
 
 import os
 from pathlib import Path
@@ -12,7 +12,6 @@ from damian.world.regions.region import Region, local_region
 _ID, _SEQUENCE = "Airspace ID", "Sequence Number"
 _LOWEST, _HIGHEST = "Min Flight Level", "Max Flight Level"
 _LATITUDE, _LONGITUDE = "Latitude", "Longitude"
-_COLUMNS = (_ID, _LOWEST, _HIGHEST, _SEQUENCE, _LATITUDE, _LONGITUDE)
 _BOUNDS = {
     _LATITUDE: (-90.0, 90.0, "deg"),
     _LONGITUDE: (-180.0, 180.0, "deg"),
@@ -33,59 +32,38 @@ def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
         InputError: the file cannot be read, its table is malformed, or the airspace is missing or invalid.
     """
     with named(path):
-        table = parse_table(read_text(Path(path)), _COLUMNS)
+        table = parse_table(read_text(Path(path)), [_ID, *_BOUNDS])
         rows = [row for row in table if row.cells[_ID] == airspace_id]
         if not rows:
             known_ids = {row.cells[_ID] for row in table}
             raise InputError(f"no {_ID} {show(airspace_id)}; {near(airspace_id, known_ids)}")
-        rows, levels = _in_sequence(rows), _levels(rows)
-        corners = [[_number(row, column) for column in (_LONGITUDE, _LATITUDE)] for row in rows]
-        return local_region([[np.array(corners)]], airspace_id, levels, airspace_id)
-
-
-def _in_sequence(rows: list[Row]) -> list[Row]:
-    """Sort the rows by their sequence numbers, which must be 0, 1, 2, ..."""
-    numbered = sorted((_number(row, _SEQUENCE), row) for row in rows)
-    for expected, (number, row) in enumerate(numbered):
-        if number == expected:
-            continue
-        problem = f"line {row.line}: {_SEQUENCE} {row.cells[_SEQUENCE]}"
-        if expected and number == numbered[expected - 1][0]:
-            raise InputError(f"{problem} is on line {numbered[expected - 1][1].line} too")
-        raise InputError(f"{problem} where {expected} is next; number the points 0, 1, 2, ...")
-    return [row for _, row in numbered]
-
-
-def _levels(rows: list[Row]) -> tuple[float, float]:
-    """Lowest and highest flight level, each of which must be the same in all rows."""
-    first = min(rows)
-    low, high = (_same_in_all_rows(rows, first, column) for column in (_LOWEST, _HIGHEST))
-    if low > high:
-        raise InputError(f"line {first.line}: {_LOWEST} {low:g} FL is above {_HIGHEST} {high:g} FL")
-    return low, high
-
-
-def _same_in_all_rows(rows: list[Row], first: Row, column: str) -> float:
-    level = _number(first, column)
-    for row in rows:
-        value = _number(row, column)
-        if value != level:
+        numbered = sorted((_number(row, _SEQUENCE), row) for row in rows)
+        for expected, (number, row) in enumerate(numbered):
+            if number != expected:
+                raise InputError(
+                    f"line {row.line}: {_SEQUENCE} {number:g} where {expected} is next; number the points "
+                    "0, 1, 2, ..."
+                )
+        levels = [(_number(row, _LOWEST), _number(row, _HIGHEST)) for row in rows]
+        low, high = levels[0]
+        if len({*levels}) > 1 or low > high:
             raise InputError(
-                f"line {row.line}: {column} {value:g} FL is not the {level:g} FL of line "
-                f"{first.line}; an airspace has one"
+                f"{show(airspace_id)}: {_LOWEST} and {_HIGHEST} are {low:g} and {high:g} FL in line "
+                f"{rows[0].line}; give the lowest and the highest one, the same in every line"
             )
-    return level
+        corners = [[_number(row, column) for column in (_LONGITUDE, _LATITUDE)] for _, row in numbered]
+        return local_region([[np.array(corners)]], airspace_id, (low, high), airspace_id)
 
 
 def _number(row: Row, column: str) -> float:
     """Read a cell as a number within its column's bounds."""
     text, (low, high, unit) = row.cells[column], _BOUNDS[column]
     try:
-        # float() alone would accept underscores and read 1_0 as 10.
-        value = float("_" if "_" in text else text)
+        value = float(text)
     except ValueError:
         raise InputError(f"line {row.line}: {column} {show(text)} is not a number") from None
     if not low <= value <= high:
-        written = f"{text[:40]} {unit}".strip()
-        raise InputError(f"line {row.line}: {column} {written} is not between {low:g} and {high:g} {unit}")
+        raise InputError(
+            f"line {row.line}: {column} {value:g} {unit} is not between {low:g} and {high:g} {unit}"
+        )
     return value

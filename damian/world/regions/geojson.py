@@ -1,4 +1,4 @@
-"""Reads one area of a GeoJSON file (RFC 7946); any fault raises one `InputError` that says where it is."""
+"""Reads one area of a GeoJSON file (RFC 7946)."""
 
 import json
 import os
@@ -13,8 +13,6 @@ from damian.world.regions.geodesy import Floats
 from damian.world.regions.region import Region, local_region
 
 _SHAPES = ("Polygon", "MultiPolygon")
-_BOUNDS = (("longitude", -180.0, 180.0), ("latitude", -90.0, 90.0))
-"""Bounds of the coordinates of a position [deg], in the order of GeoJSON."""
 
 
 class _Candidate(NamedTuple):
@@ -53,12 +51,8 @@ def read_geojson(path: str | os.PathLike[str], index: int | None = None, where: 
 def _parse_json(text: str) -> Any:
     try:
         return json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"line {error.lineno}: not JSON: {error.msg}") from None
-    except RecursionError:
-        raise InputError("JSON nested too deeply for a GeoJSON file") from None
-    except ValueError:  # Python's limit
-        raise InputError("not JSON: a number has too many digits") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"not JSON: {error}") from None
 
 
 def _candidates(document: Any) -> list[_Candidate]:
@@ -139,34 +133,31 @@ def _parts(chosen: _Candidate) -> list[list[Floats]]:
     coordinates = chosen.geometry.get("coordinates")
     if kind == "Polygon":
         return [_rings(place, coordinates)]
-    parts = _non_empty_list(place, coordinates)
-    return [_rings(f"{place}[{i}]", part) for i, part in enumerate(parts)]
+    return [_rings(f"{place}[{i}]", part) for i, part in enumerate(_non_empty_list(place, coordinates))]
 
 
 def _rings(place: str, rings: Any) -> list[Floats]:
-    rings = _non_empty_list(place, rings)
-    return [_ring(f"{place}[{i}]", ring) for i, ring in enumerate(rings)]
+    return [_ring(f"{place}[{i}]", ring) for i, ring in enumerate(_non_empty_list(place, rings))]
 
 
 def _ring(place: str, ring: Any) -> Floats:
-    positions = _non_empty_list(place, ring)
-    corners = [_position(f"{place}[{i}]", p) for i, p in enumerate(positions)]
-    if corners[0] != corners[-1]:
-        raise InputError(f"{place}: not closed: its last position is not its first {corners[0]}")
-    return np.array(corners, dtype=np.float64)
-
-
-def _position(place: str, position: Any) -> list[float]:
-    """Longitude and latitude of a position."""
-    if not isinstance(position, list) or len(position) < 2:
-        raise InputError(f"{place}: {show(position)} is not [longitude, latitude]")
-    for (name, low, high), value in zip(_BOUNDS, position, strict=False):
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (is_number and low <= value <= high):
-            raise InputError(
-                f"{place}: {name} {show(value)} is not a number between {low:g} and {high:g} deg"
-            )
-    return position[:2]
+    """A closed ring of positions without their heights, [V, 2] degrees."""
+    try:
+        corners = np.array([position[:2] for position in _non_empty_list(place, ring)], dtype=np.float64)
+    except (TypeError, ValueError, KeyError, OverflowError):
+        raise InputError(f"{place}: {show(ring)} is not a list of [longitude, latitude]") from None
+    if corners.ndim != 2 or corners.shape[1] != 2:
+        raise InputError(f"{place}: {show(ring)} is not a list of [longitude, latitude]")
+    outside = np.flatnonzero(~(np.abs(corners) <= [180, 90]).all(axis=1))
+    if len(outside):
+        first = outside[0]
+        raise InputError(
+            f"{place}[{first}]: {corners[first].tolist()} is not a longitude between -180 and 180 deg and a "
+            "latitude between -90 and 90 deg"
+        )
+    if (corners[0] != corners[-1]).any():
+        raise InputError(f"{place}: not closed: its last position is not its first {corners[0].tolist()}")
+    return corners
 
 
 def _non_empty_list(place: str, value: Any) -> list[Any]:

@@ -80,12 +80,7 @@ def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: fl
     The hull grows by one point at a time until its area reaches ``min_area_m2``. It lies in the disc, so its
     area cannot exceed ``max_area_m2``. If the two areas are so close that a thousand points do not suffice,
     the hull is scaled up to the mean of the two areas.
-
-    Raises:
-        InputError: unless 0 < min_area_m2 <= max_area_m2.
     """
-    checks.above("min_area", min_area_m2, 0.0, "m^2")
-    checks.in_range("max_area", max_area_m2, min_area_m2, unit="m^2")
     points = _disc(rng, max_area_m2, _MAX_POINTS)
     hull = _hull(points[:3])
     for point in points[3:]:
@@ -124,18 +119,14 @@ def landing_lattice(
         [L, 2] metres.
 
     Raises:
-        InputError: an invalid step, slant or number of points; no point, or fewer than ``n_points``, inside.
+        InputError: no point, or fewer than ``n_points``, inside.
     """
-    checks.above("lattice step", step_m, 0.0, "m")
-    checks.above("lattice angle", degrees, 0.0, "deg")
-    checks.in_range("lattice angle", degrees, 0.0, 90.0, "deg")
     lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
     shapely.prepare(polygon)
     inside = lattice[shapely.contains_xy(polygon, lattice)]
     problem = f"lays no landing point inside the polygon of {polygon.area:g} m^2; take a shorter one"
     checks.require(len(inside) > 0, "region.lattice_step", f"{step_m:g} m", problem)
     if n_points is not None:
-        checks.in_range("region.n_landing_points", n_points, 1)
         problem = f"is more than the {len(inside)} inside the polygon: lower it, or region.lattice_step"
         checks.require(
             n_points <= len(inside), "region.n_landing_points", n_points, f"{problem} ({step_m:g} m)"

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import shapely
@@ -66,35 +66,6 @@ def to_grid(metres: Floats) -> Floats:
     return np.round(metres * 65536) / 65536
 
 
-def check_regions(found: Any, name: str) -> None:
-    """Require a list of regions with valid polygons.
-
-    Args:
-        found: what a region source returned.
-        name: of the source, for errors.
-
-    Raises:
-        InputError: it is something else.
-    """
-    shown = f"a {type(found).__name__}"
-    if isinstance(found, list):
-        others = [type(each).__name__ for each in found if not isinstance(each, Region)]
-        shown = f"a list with a {others[0]}" if others else "" if found else "an empty list"
-    problem = "is not a list of damian.world.regions.region.Region"
-    checks.require(isinstance(found, list) and not shown, name, shown, problem)
-    for region in found:
-        polygon, name_of_region = region.polygon, f"{name}: polygon of {region.name}"
-        good = isinstance(polygon, Polygon | MultiPolygon)
-        checks.require(
-            good, name_of_region, f"a {type(polygon).__name__}", "is not one of shapely's polygons"
-        )
-        checks.require(not polygon.is_empty, name_of_region, "it", "is empty")
-        reason = shapely.is_valid_reason(polygon)
-        checks.require(
-            polygon.is_valid, name_of_region, reason, "[m] makes it invalid: its edges must not cross"
-        )
-
-
 def local_region(
     parts: Sequence[Sequence[Floats]],
     name: str,
@@ -146,5 +117,5 @@ def _made_valid(local: Polygon | MultiPolygon, source: str) -> Polygon | MultiPo
 
 def _unwrap_longitude(ring: Floats, lon_deg: float) -> Floats:
     """Shift each corner by whole turns of longitude to within 180 deg of ``lon_deg``."""
-    turns = np.round((lon_deg - ring[:, 0]) / 360)
-    return ring + np.column_stack([360 * turns, np.zeros_like(turns)])
+    whole_turns = np.round((lon_deg - ring[:, 0]) / 360)
+    return ring + np.column_stack([360 * whole_turns, np.zeros_like(whole_turns)])
