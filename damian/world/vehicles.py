@@ -285,10 +285,6 @@ def _charging_points(config: WorldConfig, airspace: Airspace) -> Tensor:
     charges = torch.zeros(n_regions, n_points, dtype=torch.bool)
     for index, region in enumerate(airspace.regions):
         local = torch.as_tensor(local_places("battery.charging_points", places, region))
-        for i, place in enumerate(local):
-            first = places[int((local == place).all(-1).nonzero()[0])]
-            problem = "are the same place: list each once"
-            checks.require(first is places[i], "battery.charging_points", f"{first} and {places[i]}", problem)
         regions = torch.full((len(local),), index)
         charges[index, nearest_points(airspace.cells, airspace.exact_points, regions, local, 1)] = True
     return charges.flatten()

@@ -8,12 +8,10 @@ import shapely
 from torch import Tensor
 
 from damian import ContextSampler, Law, MessageContext, feature, reward_term, sensor
-from damian.common.tensors import tree_where
 from damian.server.features import FeatureCache
 from damian.server.rewards import Counters
 from damian.world.airspace import Airspace
 from damian.world.config import WorldConfig
-from damian.world.messages import Messages
 from damian.world.regions.config import RegionConfig
 from damian.world.regions.region import Region
 from damian.world.simulation import Simulation
@@ -46,26 +44,6 @@ class Rush(Law):
 
     def undeclared(self, context: MessageContext) -> Tensor:
         return context.entries["position"][:, 0]
-
-
-@sensor()
-def silent(state: State, world: Simulation) -> Any:
-    return None
-
-
-@sensor()
-def number(state: State, world: Simulation) -> Any:
-    return 0.5
-
-
-@sensor()
-def misnamed(state: State, world: Simulation) -> Tensor:
-    return state.batery  # type: ignore[attr-defined]
-
-
-@sensor()
-def unending(state: State, world: Simulation) -> Tensor:
-    return state.battery / 0
 
 
 @sensor()
@@ -161,24 +139,3 @@ class Flight(PolynomialFlight):
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         super().__init__(config, airspace, dt)
         self.mistake = config.motion.options["mistake"]
-
-    def ready(self, state: State) -> Any:
-        return super().ready(state).float() if self.mistake == "float flag" else super().ready(state)
-
-    def on_ground(self, state: State) -> Any:
-        return super().on_ground(state)[:, 0] if self.mistake == "no UAVs" else super().on_ground(state)
-
-    def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> Any:
-        return None if self.mistake == "none" else super().take_off(state, goal, ready, departs)
-
-    def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> Any:
-        sends, sent = super().latest_messages(state, on_ground, messages)
-        if self.mistake == "no takeoff":
-            return on_ground, tree_where(on_ground, messages, state.sent)
-        return sent if self.mistake == "no flags" else (sends, sent)
-
-    def move(self, state: State) -> State:
-        moved = super().move(state)
-        if self.mistake == "raise":
-            return moved._replace(height=0)  # type: ignore[call-arg]
-        return moved._replace(elapsed=moved.elapsed.double()) if self.mistake == "double" else moved

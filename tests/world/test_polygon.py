@@ -170,7 +170,7 @@ def test_a_concave_polygon_stays_concave_whether_its_vertices_are_open_or_closed
         ([[0, 0], [1, 1]], "2 distinct points"),
         ([[0, 0], [1, 1], [2, 2], [3, 3]], "no area"),
         ([[0, 0], [1, 1], [1, 0], [0, 1]], "edges cross at [0.5, 0.5] m"),
-        ([[0, 0], [1, math.nan], [1, 0]], "vertex 1 [1.0, nan]"),
+        ([[0, 0], [1, math.nan], [1, 0]], "vertex 1 [1.0, nan] m is not within"),
         ([[0, 0], [1, 1], [1e300, 0]], "vertex 2 [1e+300, 0.0] m"),
         ([[0, 0], [1, 1], [2, "north"]], "not a list of [x, y] numbers"),
         ([[0, 0, 0], [1, 1, 0], [2, 0, 0]], "shape [3, 3]"),

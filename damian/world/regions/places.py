@@ -31,13 +31,10 @@ def check_place(key: str, place: Any) -> None:
         InputError: it is something else.
     """
     if not isinstance(place, Mapping):
-        good = isinstance(place, Sequence) and len(place) == 2 and all(map(_is_finite, place))
-        checks.require(good, key, place, "is not [x, y] in metres or {lat: ..., lon: ...} in degrees")
         return checks.place(key, place)
     good = set(place) == set(_DEGREES)
     checks.require(good, key, place, "is not {lat: ..., lon: ...} in degrees, such as {lat: 53.1, lon: -4.5}")
     for name, largest in _DEGREES.items():
-        checks.require(_is_finite(place[name]), f"{key}.{name}", place[name], "is not a finite number")
         checks.in_range(f"{key}.{name}", place[name], -largest, largest, "deg")
     return None
 
@@ -83,7 +80,3 @@ def _local(key: str, place: Any, region: Region) -> Floats:
             "[x, y] in metres, or take a region from a FIR table or GeoJSON file"
         )
     return np.stack(to_local(place["lat"], place["lon"], region.origin))
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))

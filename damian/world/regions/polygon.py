@@ -41,17 +41,22 @@ def polygon_from_vertices(vertices: ArrayLike, source: str) -> Polygon:
         InputError: not [V, 2] finite metres, fewer than three distinct points, crossing edges, or
             no area.
     """
-    corners = _corners(vertices, source)
-    far = np.flatnonzero(np.abs(corners).max(axis=1) > MAX_COORDINATE_M)
+    try:
+        corners = np.asarray(vertices, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{source}: vertices are not a list of [x, y] numbers") from None
+    if corners.ndim != 2 or corners.shape[1] != 2:
+        raise InputError(f"{source}: vertices of shape {list(corners.shape)} are not a list of [x, y]")
+    far = np.flatnonzero(~(np.abs(corners) <= MAX_COORDINATE_M).all(axis=1))
     if len(far):
         raise InputError(
-            f"{source}: vertex {far[0]} {corners[far[0]].tolist()} m is more than "
-            f"{MAX_COORDINATE_M:g} m from the origin; give local metres"
+            f"{source}: vertex {far[0]} {corners[far[0]].tolist()} m is not within {MAX_COORDINATE_M:g} m of "
+            "the origin; give local metres"
         )
     return polygon_from_rings([corners], source, "m")
 
 
-def polygon_from_rings(rings: Sequence[ArrayLike], source: str, unit: str) -> Polygon:
+def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polygon:
     """Build a polygon from its shell and holes; refuse any that is not valid.
 
     Args:
@@ -62,7 +67,7 @@ def polygon_from_rings(rings: Sequence[ArrayLike], source: str, unit: str) -> Po
     Raises:
         InputError: a ring without area, crossing edges, or a hole that is not inside the shell.
     """
-    shell, *holes = [_require_area(_corners(ring, source), source) for ring in rings]
+    shell, *holes = [_require_area(ring, source) for ring in rings]
     polygon = Polygon(shell, holes)
     if not polygon.is_valid:
         reason, _, place = shapely.is_valid_reason(polygon).rstrip("]").partition("[")
@@ -161,20 +166,6 @@ def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Gene
         if len(points) == n:
             return points
     raise InputError(f"polygon: {polygon.area:g} m^2 has no inside to draw {n} points from")
-
-
-def _corners(vertices: ArrayLike, source: str) -> Floats:
-    """Convert corners to an array [V, 2] of finite numbers."""
-    try:
-        corners = np.asarray(vertices, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{source}: vertices are not a list of [x, y] numbers") from None
-    if corners.ndim != 2 or corners.shape[1] != 2:
-        raise InputError(f"{source}: vertices of shape {list(corners.shape)} are not a list of [x, y]")
-    bad = np.flatnonzero(~np.isfinite(corners).all(axis=1))
-    if len(bad):
-        raise InputError(f"{source}: vertex {bad[0]} {corners[bad[0]].tolist()} is not two finite numbers")
-    return corners
 
 
 def _require_area(corners: Floats, source: str) -> Floats:
