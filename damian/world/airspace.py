@@ -19,6 +19,8 @@ from damian.world.regions.region import Region
 _ID_BITS = 24
 """Bits of a landing point's id below its distance; a message cannot number more points either."""
 _NEVER = torch.iinfo(torch.int64).max
+_MOST_CELLS = 2048
+"""Most columns, and rows, of the cells of a region."""
 _SLOTS = 2**18
 """Distances computed at once, which bounds the memory: a few arrays of 2 MB, to stay in a CPU's cache."""
 
@@ -26,11 +28,13 @@ _SLOTS = 2**18
 class Cells(NamedTuple):
     """The landing points that may be among the nearest ones of a place, by the square cell in which it lies.
 
-    Cells of R regions, C in all, lie side by side; those outside of the polygon have no points.
+    Cells of R regions, C in all, lie side by side; U of them are used, because they meet the polygon.
     """
 
     point: Tensor
-    """Ids of landing points within their region, W for each cell with -1 behind the last, [C, W] int32."""
+    """Ids of landing points within their region, W for each used cell, -1 behind the last, [U, W] int32."""
+    row: Tensor
+    """Row of each cell among these, [C] int32; 0 for cells that are not used."""
     first: Tensor
     """Index of the first cell of each region, [R]."""
     shape: Tensor
@@ -164,7 +168,7 @@ def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: in
         gather_rows(t, region) for t in (cells.corner, cells.side, cells.shape, cells.first)
     )
     column, row = ((target - corner) / side).long().clamp(min=0).minimum(shape - 1).unbind(-1)
-    point = gather_rows(cells.point, first + row * shape[:, 0] + column).long()
+    point = gather_rows(cells.point, gather_rows(cells.row, first + row * shape[:, 0] + column)).long()
     flat = point.clamp(min=0) + (region * points.shape[1]).unsqueeze(-1)
     east, north = (gather_rows(points.flatten(0, 1), flat) - target.unsqueeze(1)).unbind(-1)
     # Half a centimetre is rounded up: the small term is far above rounding errors.
@@ -185,33 +189,32 @@ def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], 
         polygons: of the regions.
         n: number of points.
     """
-    tables, shapes, corners, sides = [], [], [], []
+    tables, rows_of_cells, shapes, corners, sides = [], [], [], [], []
+    n_used = 0
     for lattice, polygon in zip(lattices, polygons, strict=True):
         west, south, east, north = polygon.bounds
-        side = math.sqrt(polygon.area / len(lattice))
+        # The second term bounds the number of cells of a long and narrow polygon.
+        side = max(math.sqrt(polygon.area / len(lattice)), max(east - west, north - south) / _MOST_CELLS)
         half = side * math.sqrt(0.5) + RESOLUTION
         columns, rows = (int(length / side) + 1 for length in (east - west, north - south))
         row, column = np.divmod(np.arange(columns * rows), columns)
         centre = np.stack([west + (column + 0.5) * side, south + (row + 0.5) * side], -1)
-        used = np.flatnonzero(shapely.dwithin(polygon, shapely.points(centre), half))
-        found, point = _within_reach(lattice, centre[used], min(n, len(lattice)), side, 2 * half)
-        slot = np.arange(len(found)) - np.searchsorted(found, found)
-        table = np.full((len(centre), slot.max() + 1), -1)
-        table[used[found], slot] = point
+        used = shapely.dwithin(polygon, shapely.points(centre), half)
+        cell, point = _within_reach(lattice, centre[used], min(n, len(lattice)), side, 2 * half)
+        slot = np.arange(len(cell)) - np.searchsorted(cell, cell)
+        table = np.full((used.sum(), slot.max() + 1), -1)
+        table[cell, slot] = point
         tables.append(table)
+        rows_of_cells.append(np.where(used, n_used + np.cumsum(used) - 1, 0))
+        n_used += len(table)
         shapes.append((columns, rows))
         corners.append((west, south))
         sides.append([side])
     widest = max(table.shape[1] for table in tables)
     padded = [np.pad(t, ((0, 0), (0, widest - t.shape[1])), constant_values=-1) for t in tables]
-    first = np.cumsum([0, *map(len, tables)])[:-1]
-    fields = (
-        np.concatenate(padded).astype(np.int32),
-        first,
-        np.array(shapes),
-        np.array(corners),
-        np.array(sides),
-    )
+    first = np.cumsum([0, *map(len, rows_of_cells)])[:-1]
+    ids, row_of_cell = (np.concatenate(parts).astype(np.int32) for parts in (padded, rows_of_cells))
+    fields = (ids, row_of_cell, first, np.array(shapes), np.array(corners), np.array(sides))
     return Cells(*map(torch.as_tensor, fields))
 
 
