@@ -13,7 +13,6 @@ from helpers import (
     KEEPS_GOING,
     MOTIONS,
     SQUARE,
-    WEST,
     act,
     both_kinds,
     both_motions,
@@ -125,21 +124,6 @@ def test_the_action_of_a_uav_that_is_not_ready_changes_nothing():
     assert waited > 100
 
 
-@pytest.mark.parametrize("sensing", [0.0, 2.5])
-def test_a_uav_is_ready_once_it_has_landed_and_sensed(sensing):
-    motion = MotionConfig("polynomial", sensing_time=sensing)
-    env = fresh(one_uav(motion=motion))
-    assert env.reset()["agents", "ready"].all()
-    outputs = [go(env, EAST)]
-    duration = flight(env)
-    assert duration > 15
-    outputs += [go(env, EAST) for _ in range(math.ceil(duration + sensing) - 1)]
-    for seconds, td in enumerate(outputs, start=1):
-        assert td["agents", "ready"].item() == (seconds >= duration + sensing)
-        assert td["agents", "message_sent"].item() == (seconds == 1 or seconds >= duration)
-    assert outputs[-1]["agents", "ready"].item()
-
-
 def test_a_uav_sends_a_message_at_its_takeoff_and_the_next_one_when_it_lands():
     env = fresh(one_uav(motion=FLYING))
     before = sent_messages(env.reset())
@@ -182,15 +166,6 @@ def test_a_uav_in_flight_does_not_detect_the_source():
     assert env.state.motions.item() == 1  # a detection would have set it to 0
 
 
-def test_motions_count_from_the_latest_detection():
-    env = fresh(one_uav(source=SourceConfig(level_db=130.0, position=[160.0, 100.0])))
-    counted = []
-    for action in (HERE, EAST, HERE, WEST, WEST, EAST):
-        message = sent_messages(go(env, action))
-        counted.append((message.spotted.item(), message.motions.item()))
-    assert counted == [(False, 1), (True, 2), (True, 1), (False, 1), (False, 2), (True, 3)]
-
-
 # Action masks.
 
 
@@ -223,11 +198,6 @@ def test_masked_actions_hold_and_legal_actions_lead_to_their_nearest_point(energ
         masked, reached = masked + int((~legal).sum()), reached + int(moved.sum())
     assert masked > 100
     assert reached > 100
-
-
-def test_the_action_mask_is_absent_if_it_is_switched_off():
-    assert "action_mask" not in UavEnv(usecase(2)).reset()["agents"]
-    assert "action_mask" in UavEnv(square()).reset()["agents"]
 
 
 @pytest.mark.parametrize("sensing_time", [0.0, 4.0])

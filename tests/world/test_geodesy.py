@@ -10,17 +10,9 @@ from damian.world.regions.geodesy import (
     area_centroid,
     to_latlon,
     to_local,
-    wrap_longitude,
 )
 
-ONE_DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 OFFSETS_M = st.floats(-35_000, 35_000)
-
-
-def test_paris_to_london_is_344_km_to_the_northwest():
-    x, y = to_local(51.5074, -0.1278, (48.8566, 2.3522))
-    assert np.hypot(x, y) == pytest.approx(343_556, abs=20)
-    assert np.degrees(np.arctan2(x, y)) % 360 == pytest.approx(330.0, abs=0.1)
 
 
 def test_distance_and_bearing_agree_with_vector_geometry_on_the_sphere():
@@ -51,28 +43,12 @@ def test_local_metres_within_50_km_survive_the_round_trip_over_degrees(lat, lon,
     np.testing.assert_allclose(to_local(*place, (lat, lon)), [x, y], atol=1e-6)
 
 
-@given(st.floats(-89, 89), st.floats(-179.999, 179.999), st.floats(-0.4, 0.4), st.floats(-0.4, 0.4))
-def test_degrees_survive_the_round_trip_over_local_metres(lat, lon, d_lat, d_lon):
-    place = lat + d_lat, float(wrap_longitude(lon + d_lon))
-    returned = to_latlon(*to_local(*place, (lat, lon)), (lat, lon))
-    assert returned[0] == pytest.approx(place[0], abs=1e-11)
-    error = float(wrap_longitude(returned[1] - place[1]))
-    assert error * np.cos(np.radians(place[0])) == pytest.approx(0, abs=1e-11)
-
-
 @given(st.floats(-60, 60), st.floats(1, 50_000))
 def test_a_place_east_of_the_antimeridian_has_a_wrapped_longitude_and_the_same_distance(lat, x):
     origin = (lat, 179.99999)
     place = to_latlon(x + 10, 0.0, origin)
     assert -180 <= place[1] < -179
     assert to_local(*place, origin)[0] == pytest.approx(x + 10, abs=1e-6)
-
-
-@given(st.floats(-1e4, 1e4))
-def test_a_wrapped_longitude_lies_in_one_turn_and_points_in_the_same_direction(lon):
-    wrapped = float(wrap_longitude(lon))
-    assert -180 <= wrapped < 180
-    assert np.cos(np.radians(wrapped - lon)) == pytest.approx(1, abs=1e-12)
 
 
 # --- the centroid of an area --------------------------------------------------------------------
@@ -137,10 +113,3 @@ def test_the_centroid_of_an_area_across_the_antimeridian_or_around_the_pole_is_i
     assert area_centroid([strait]) == pytest.approx((shifted[0], -180), abs=1e-9)
     cap = np.array([[0.0, 80], [90, 80], [180, 80], [270, 80], [360, 80]])
     assert area_centroid([cap])[0] == pytest.approx(90, abs=1e-6)
-
-
-def test_the_centroid_of_a_small_square_is_exact_to_a_millimetre():
-    lon, lat = np.array([[0.0, 0], [1e-4, 0], [1e-4, 1e-4], [0, 1e-4], [0, 0]]).T
-    ring = np.stack([7 + lon, 52 + lat], -1)
-    place = to_local(*area_centroid([ring]), (52.00005, 7.00005))
-    assert place == pytest.approx((0, 0), abs=1e-3)

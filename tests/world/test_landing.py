@@ -109,14 +109,18 @@ def some_points(rng, kind, n) -> np.ndarray:
 def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds, n):
     rng = np.random.default_rng(seed)
     lattices = [some_points(rng, kind, int(rng.integers(1, 40))) for kind in kinds]
-    polygons = [shapely.MultiPoint(points).buffer(rng.uniform(1, 500)) for points in lattices]
+    radii = rng.uniform(20, 500, len(kinds))
+    polygons = [shapely.MultiPoint(points).buffer(r) for points, r in zip(lattices, radii, strict=True)]
     region, target = rng.integers(len(kinds), size=12), np.empty((12, 2))
-    for i, (points, polygon) in enumerate((lattices[r], polygons[r]) for r in region):
-        angle = math.radians(45 * rng.integers(8))  # from a landing point, by a round distance
-        move = rng.choice([0.0, 15.0, 30.0, 45.005]) * np.array([math.sin(angle), math.cos(angle)])
+    for i, (points, radius) in enumerate((lattices[r], radii[r]) for r in region):
+        distance, angle = rng.uniform(0, 0.9 * radius), rng.uniform(0, 2 * math.pi)
+        if rng.random() < 0.5:  # round numbers, so that points may be equally near
+            distance, angle = (
+                min(rng.choice([0.0, 15.0, 30.0, 45.005]), distance),
+                math.pi / 4 * rng.integers(8),
+            )
+        move = distance * np.array([math.sin(angle), math.cos(angle)])
         target[i] = points[rng.integers(len(points))] + move
-        while rng.random() < 0.5 or not shapely.contains_xy(polygon, *target[i]):
-            target[i] = rng.uniform(*np.split(np.array(polygon.bounds), 2))
     most = max(map(len, lattices))
     padded = np.stack([np.pad(p, ((0, most - len(p)), (0, 0)), constant_values=np.inf) for p in lattices])
     n = min(n, most)

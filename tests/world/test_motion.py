@@ -166,19 +166,6 @@ def test_flights_equal_those_of_the_twin_at_dense_times(degree):
                 assert pose.cruised[b, n, k].item() == pytest.approx(cruised, abs=1e-9)
 
 
-def test_a_uav_whose_flight_is_over_stands_exactly_at_its_target():
-    origin, target = torch.tensor([[3.7, -8.1]]), torch.tensor([[-91.3, 77.7]])
-    level = torch.tensor([3.5])
-    times = phase_times(origin, target, level, MotionConfig())
-    for since_landing in (0.0, 0.5, 1000.0):
-        elapsed = 2 * times.vertical + times.cruise + since_landing
-        pose = fly(origin, target, level, elapsed, *times, 5)
-        assert pose.position[0, :2].tolist() == target[0].tolist()
-        assert pose.position[0, 2].item() == pytest.approx(0.0, abs=1e-6)
-        assert pose.position.dtype == torch.float32
-        assert pose.cruised.item() == pytest.approx(math.dist(origin[0], target[0]), rel=1e-6)
-
-
 def test_flights_compile_to_one_graph():
     motion = MotionConfig()
 

@@ -135,18 +135,6 @@ def test_each_kind_of_geojson_yields_its_only_area_with_and_without_a_byte_order
     assert sorted(_places(region).round(9).tolist()) == sorted(corners)
 
 
-def test_a_region_name_is_printable_and_one_line_for_any_text_in_the_file(tmp_path):
-    file = tmp_path / "odd.geojson"
-    file.write_text(json.dumps(_feature(_polygon(*SQUARE), name="north\n\ud800")))
-    assert read_geojson(file).name == r"north \ud800"
-
-
-def test_a_table_may_have_a_byte_order_mark_and_windows_line_endings(tmp_path):
-    file = tmp_path / "fir.csv"
-    file.write_bytes(b"\xef\xbb\xbf" + FIR.read_bytes().replace(b"\n", b"\r\n"))
-    assert read_fir(file, "North Bay") == read_fir(FIR, "North Bay")
-
-
 def test_parts_cut_at_the_antimeridian_are_united(tmp_path):
     west = [[179.9, 1], [180, 1], [180, 1.1], [179.9, 1.1], [179.9, 1]]
     east = [[-180, 1], [-179.9, 1], [-179.9, 1.1], [-180, 1.1], [-180, 1]]

@@ -17,13 +17,12 @@ from walks import (
     dynamic_walks,
     in_double,
     n_stops,
-    twin_covered,
     twin_duration,
     twin_position,
 )
 
 from damian.common.errors import InputError
-from damian.world.signal_source import SourceConfig, Walk, draw_walks, footprint_radius, leg_duration, locate
+from damian.world.signal_source import SourceConfig, draw_walks, footprint_radius, leg_duration, locate
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
 
@@ -58,14 +57,6 @@ def test_the_duration_of_a_leg_is_that_of_its_ramps_and_its_constant_speed(lengt
     values = (torch.tensor(x, dtype=torch.float64) for x in (length, speed, acceleration))
     expected = twin_duration(length, speed, acceleration)
     assert leg_duration(*values).item() == pytest.approx(expected, rel=1e-9, abs=1e-9)
-
-
-@given(length=st.floats(0.01, 2000), speed=st.floats(0.1, 50), acceleration=st.floats(0.05, 20))
-def test_a_leg_covers_its_length_in_its_duration_and_not_sooner(length, speed, acceleration):
-    values = [torch.tensor(x, dtype=torch.float64) for x in (length, speed, acceleration)]
-    duration = leg_duration(*values).item()
-    assert twin_covered(length, speed, acceleration, duration) == pytest.approx(length, rel=1e-3)
-    assert twin_covered(length, speed, acceleration, 0.9 * duration) < length * 0.99
 
 
 def recorded_legs():
@@ -136,16 +127,6 @@ def test_every_stop_is_inside_the_polygon_and_near_its_hotspot(name):
     assert hotspots == 20 * 10
 
 
-def test_inner_points_fill_the_part_of_the_disc_inside_the_polygon():
-    box = shapely.box(0, 0, 60, 60)
-    walk = dynamic_walks(box, n=400, n_hotspots=1, min_stops=7, position=[30.0, 0.5], local_distance=20.0)
-    inner = walk.stop[:, 1:].reshape(-1, 2)
-    distance = (inner - torch.tensor([30.0, 0.5])).norm(dim=1)
-    # Points are uniform in nearly a half disc, so half of them lie beyond 20 / sqrt(2) m.
-    assert (distance > 20 / math.sqrt(2)).float().mean().item() == pytest.approx(0.5, abs=0.05)
-    assert (inner[:, 0] > 30).float().mean().item() == pytest.approx(0.5, abs=0.05)
-
-
 def test_waits_and_legs_alternate_without_gaps():
     walk = in_double(dynamic_walks(n=20))
     for w, n in enumerate(n_stops(walk).tolist()):
@@ -210,28 +191,6 @@ def test_a_position_equals_the_integrated_speed_profile(
         position, stop = twin_position(walk, w, time[w].item())
         assert located.position[w].tolist() == pytest.approx(position, abs=2e-2)
         assert located.stop[w].item() == stop
-
-
-def traced(walk, n):
-    """Positions [n, W, 2] of whole walks at n equally spaced times, ``locate``'s result, times, spacing."""
-    step = walk.depart[:, -1] * 1.05 / (n - 1)
-    repeated = Walk(*(x.repeat(n, *[1] * (x.ndim - 1)) for x in walk))
-    times = torch.arange(n, dtype=torch.float64)[:, None] * step
-    located = locate(repeated, times.reshape(-1))
-    return located.position.reshape(n, -1, 2), located, times, step
-
-
-def test_positions_are_continuous_and_never_exceed_the_largest_speed():
-    walk = in_double(dynamic_walks(n=4, n_hotspots=3, min_wait=1.0, max_wait=10.0))
-    positions, located, times, step = traced(walk, 20_000)
-    moved = positions.diff(dim=0).norm(dim=-1)
-    stop = located.stop.reshape(times.shape)
-    allowed = walk.speed.gather(1, stop.T).T
-    # Arrival times are rounded to float32, so legs end slightly early or late.
-    slack = 5e-3
-    either = torch.maximum(allowed[1:], allowed[:-1])
-    assert (moved <= either * step + slack).all()
-    assert moved.max() > 0.9 * DYNAMIC.local_speed * step.min()
 
 
 def test_a_walk_is_over_after_its_last_wait_and_the_source_stays_there():

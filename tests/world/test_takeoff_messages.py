@@ -6,18 +6,13 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 from helpers import FLYING, KEEPS_GOING, REGIONS, act, fresh, random_actions, sent_messages, walking
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from damian.envs.clocks import ClockConfig
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.motion import MotionConfig
-
-SPOTTED = ("agents", "reward_terms", "spotted")
 
 
 def flying(**changed) -> ScenarioConfig:
@@ -123,36 +118,3 @@ def test_messages_and_rewards_equal_those_of_the_twin(sensing_time):
             spotting += sum(spots)
     assert begun > 100
     assert spotting > 10
-
-
-@given(
-    seed=st.integers(0, 10**6),
-    agents=st.integers(1, 4),
-    degree=st.sampled_from([3, 5, 7]),
-    speed=st.floats(2.0, 40.0),
-    sensing_time=st.sampled_from([0.0, 0.3, 7.0]),
-    period=st.sampled_from(["0.5s", "1s", "2s", "10s"]),
-    emission=st.sampled_from(["constant", "per_step", "per_stop"]),
-)
-@settings(max_examples=settings.default.max_examples // 20)
-def test_a_uav_in_flight_neither_spots_nor_is_paid_nor_counts(
-    *, seed, agents, degree, speed, sensing_time, period, emission
-):
-    motion = MotionConfig("polynomial", degree, speed, 5.0, sensing_time)
-    source = walking(level_db=145.0, emission=emission)
-    scenario = flying(agents=agents, motion=motion, source=source, clock=ClockConfig(period))
-    env = fresh(scenario, 4, seed=seed)
-    generator = torch.Generator().manual_seed(seed)
-    for _ in range(15):
-        before = env.state
-        output = act(env, random_actions(env, generator))
-        flies = ~env.simulation.vehicles.on_ground(env.state)
-        spotted = sent_messages(output).spotted
-        assert not spotted[flies].any()
-        assert (output[SPOTTED][flies] == 0).all()
-        paid = output[SPOTTED] + 0.5 * spotted.float().mean(-1, keepdim=True)
-        torch.testing.assert_close(output["agents", "reward"][..., 0], paid)
-        enough = (spotted & ~flies).sum(-1, keepdim=True) >= max(agents / 2, 1)
-        assert output["success"].equal(enough)
-        chose = env.simulation.ready(before)
-        assert (env.state.motions == before.motions + chose)[flies].all()

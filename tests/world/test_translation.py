@@ -97,13 +97,6 @@ def test_moving_the_region_and_all_places_changes_no_bit_of_a_rollout(vertices, 
     check_moved(vertices, offset, kind)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-@given(vertices=st.sampled_from([SQUARE, RAGGED]), east=OFFSET, north=OFFSET)
-def test_moving_by_any_offset_changes_no_bit_of_a_rollout(kind, vertices, east, north):
-    check_moved(vertices, (east, north), kind)
-
-
 @given(seed=st.integers(0, 2**32 - 1), east=OFFSET, north=OFFSET)
 def test_a_centred_region_does_not_depend_on_where_it_was(seed, east, north):
     corners = np.random.default_rng(seed).uniform(-300, 300, (7, 2)).round(3)
