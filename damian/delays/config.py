@@ -159,10 +159,10 @@ class LinkConfig:
         Raises:
             InputError: there is not one entry for each receiver and sender, or ``hears`` is not of bools.
         """
-        n = same_size({f"links.{name}": getattr(self, name) for name in ("delay", "loss", "hears")})
-        checks.require(
-            n in (None, n_agents), "links", f"{n} x {n}", f"is not {n_agents} x {n_agents}, for the UAVs"
-        )
+        for name in ("delay", "loss", "hears"):
+            n = same_size({f"links.{name}": getattr(self, name)})
+            should = f"is not {n_agents} x {n_agents}, a list for each receiver with an entry for each sender"
+            checks.require(n in (None, n_agents), f"links.{name}", f"{n} x {n}", should)
         hears = [] if self.hears is None else self.hears
         good = is_matrix(hears) and all(isinstance(each, bool) for row in hears for each in row)
         should = "is not a list of true and false for each receiver"

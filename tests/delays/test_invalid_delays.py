@@ -74,7 +74,7 @@ def test_an_invalid_delay_setting_raises_an_error_that_names_its_key(settings, e
         ({"kind": "ring"}, "links.kind: ring is not one of"),
         ({"delay": 3}, "links.delay: 3 means nothing with links=server"),
         ({"kind": "matrix", "range": 50.0, "hears": [[True]]}, "links.range: 50.0 does not go with links.he"),
-        ({"kind": "matrix", "delay": [[0, 1], [1, 0]]}, "links: 2 x 2 is not 3 x 3"),
+        ({"kind": "matrix", "delay": [[0, 1], [1, 0]]}, "links.delay: 2 x 2 is not 3 x 3"),
         ({"kind": "matrix", "loss": [[0, 0, 0], [0, 0, 2], [0, 0, 0]]}, "links.loss: 2 is not between 0 and"),
         ({"kind": "matrix", "hears": [[1, 1, 1]] * 3}, "links.hears: [[1, 1, 1], [1, 1, 1], [1, 1, 1]] is n"),
     ],

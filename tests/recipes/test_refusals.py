@@ -133,7 +133,7 @@ from damian.recipes.shared.stored_runs import save_config
             ["links=updown", "delay=paper", "backupdate=true", "recompute_actor=true"],
             "recompute_actor: True does not go with links=updown",
         ),
-        (["links=matrix", "links.hears=[[true]]"], "links.hears: it is not 3 lists"),
+        (["links=matrix", "links.hears=[[true]]"], "links.hears: 1 x 1 is not 3 x 3"),
         (["links.delay=3"], "links.delay: 3 means nothing with links=server"),
         (["settle=true", "backupdate=true", "delay.obs=32"], "settle: True needs more than 32 steps"),
         (["checkpoint=nowhere"], "checkpoint: nowhere"),

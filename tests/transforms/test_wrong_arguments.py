@@ -21,7 +21,6 @@ from damian.transforms import (
 
 NO_KEY = "is not a key such as 'observation' or ('agents', 'observation'), nor a list of keys"
 NO_SEED = "is not a whole number such as 0"
-NO_STEP = "is not the length of a step in seconds, such as 0.5"
 
 WRONG = {
     "out_keys: ['a'] are not 2 keys, as many as what is sent": lambda: ObservationDelay(
@@ -39,9 +38,9 @@ WRONG = {
     f"keys: ('agents', 3) {NO_KEY}": lambda: MessageHistory(1, [("agents", 3)]),  # type: ignore[arg-type,list-item]
     "dt: 0.0 s is not above 0 s": lambda: ObservationDelay("3s", dt=0.0),
     "dt: -1 s is not above 0 s": lambda: SampleAndHold("3s", dt=-1),
-    f"dt: '1s' {NO_STEP}": lambda: ActionDelay("3s", dt="1s"),  # type: ignore[arg-type]
-    f"dt: None {NO_STEP}": lambda: RewardDelay(Lag(1, "2s"), dt=None),  # type: ignore[arg-type]
-    f"dt: True {NO_STEP}": lambda: Channel("3s", dt=True),
+    "dt: 1s s is not above 0 s": lambda: ActionDelay("3s", dt="1s"),  # type: ignore[arg-type]
+    "dt: None s is not above 0 s": lambda: RewardDelay(Lag(1, "2s"), dt=None),  # type: ignore[arg-type]
+    "dt: True s is not above 0 s": lambda: Channel("3s", dt=True),
     f"ObservationDelay: seed: 'a' {NO_SEED}": lambda: ObservationDelay(1, seed="a"),  # type: ignore[arg-type]
     f"RewardDelay: seed: 1.5 {NO_SEED}": lambda: RewardDelay(1, seed=1.5),  # type: ignore[arg-type]
     f"Channel: seed: True {NO_SEED}": lambda: Channel(1, seed=True),
