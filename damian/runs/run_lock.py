@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -11,7 +11,7 @@ from damian.common.atomic_files import writing
 from damian.common.errors import InputError
 
 LOCK = ".lock"
-"""The file that is locked; it stays in the folder, since deleting it would let two runs in."""
+"""The file that is locked; a process that was killed leaves it in the folder, where it does no harm."""
 
 
 @contextmanager
@@ -30,15 +30,18 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
         yield
         return
     lock = FileLock(folder / LOCK, blocking=False, thread_local=False)
-    try:
-        with writing(folder):
+    with writing(folder):
+        try:
             lock.acquire()
-    except Timeout:
-        problem = "is in use by another run: wait for its end, or choose another folder"
-        raise InputError(f"{key}: {folder} {problem}") from None
+        except Timeout:
+            problem = "is in use by another run: wait for its end, or choose another folder"
+            raise InputError(f"{key}: {folder} {problem}") from None
     try:
         yield
     finally:
+        # While the lock is held: who opened this file before sees that it is gone, and makes a new one.
+        with suppress(OSError):  # Windows cannot delete an open file
+            (folder / LOCK).unlink()
         lock.release()
 
 

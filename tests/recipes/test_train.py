@@ -218,7 +218,7 @@ def test_a_damaged_run_folder_is_refused_in_one_line(run, capsys):
         (lambda f: (f / "config.yaml").write_text(""), "it has no agents, so it is not the whole"),
         (lambda f: (f / "config.yaml").unlink(), "damaged holds no config.yaml, so there is no run"),
         (lambda f: (f / "checkpoint.pt").write_text("{"), "checkpoint.pt: it is damaged"),
-        (lambda f: (f / "metrics.csv").write_text("x,y\n1,2\n"), "metrics.csv, line 1: no column frames"),
+        (lambda f: (f / "metrics.csv").write_text("x,y\n1,2\n"), "metrics.csv: it has no column frames"),
     ):
         folder = shutil.copytree(whole, whole.with_name("damaged"))
         damage(folder)
