@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.text import Annotation, Text
+from matplotlib.text import Annotation
 
 from damian.compare.comparison import (
     ALL_MESSAGES,
@@ -15,7 +15,6 @@ from damian.compare.comparison import (
     UNTRAINED,
     Arm,
     Comparison,
-    regime,
 )
 from damian.compare.figures import ARM_COLOURS, plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
@@ -27,18 +26,6 @@ ARMS = {
     "flown": Arm(naive=True, policy_of="best", regime="R0"),
     "aware": Arm(),
 }
-
-
-def test_the_regime_of_an_arm_follows_from_its_delays_unless_it_is_given():
-    arms = ARMS | {
-        "flown": Arm(naive=True, policy_of="best"),
-        "truth": Arm(regime="R1"),
-        "of truth": Arm(policy_of="truth"),
-        "given": Arm(policy_of="best", regime="R0"),
-    }
-    expected = {"best": "R3", "blind": "R0", "flown": "R2", "aware": "R0"}
-    expected |= {"truth": "R1", "of truth": "R1", "given": "R0"}
-    assert {name: regime(arms, name) for name in arms} == expected
 
 
 def row(task: str, delay: str, arm: str, seed: int, value: float, policy: str = TRAINED) -> dict:
@@ -81,13 +68,6 @@ def test_recovery_counts_from_the_stronger_naive_arm_by_means_over_seeds():
     assert compared["blind"]["J_norm"].value == 3 / 10
     for naive in ("blind", "flown"):
         assert compared[naive]["recovery"] is compared[naive]["improvement"] is UNKNOWN
-
-
-def test_the_probability_of_improvement_is_over_the_naive_arm_with_the_higher_mean():
-    scores = {"best": [9.0, 9, 9], "blind": [6.0, 0, 0], "flown": [5.0, 4, 3], "aware": [4.0, 6, 7]}
-    improvement = Comparison(rows_of("t", "late", scores), ARMS).compared("t", "late")["aware"]["improvement"]
-    assert improvement.value == (1.5 + 3 + 3) / 9  # against 5, 4, 3
-    assert 0 <= improvement.low < improvement.value < improvement.high <= 1
 
 
 def test_recovery_is_left_out_if_the_delay_costs_nothing():
@@ -228,15 +208,6 @@ def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     assert comparison.compared("t", "late")["aware"]["recovery"].value == pytest.approx((22 / 3 - 4) / 6)
 
 
-def test_the_share_of_a_script_that_may_win_nothing_has_no_end():
-    arms = ARMS | {"script": Arm(ceiling=True)}
-    rows = rows_of("t", "late", THREE)
-    rows += [row("t", "late", "script", seed, x, ALL_MESSAGES) for seed, x in enumerate((-4.0, 10.0, 12.0))]
-    share = Comparison(rows, arms).compared("t", "late")["aware"]["of_ceiling"]
-    assert share.value == pytest.approx((22 / 3) / 6)
-    assert np.isinf(share[1:]).all()  # one of 27 draws has the first seed only
-
-
 def test_arms_are_listed_where_no_arm_without_delay_ran(tmp_path):
     scores = {name: values for name, values in SCORES.items() if name in ("blind", "aware")}
     comparison = Comparison(rows_of("t", "late", scores), {name: ARMS[name] for name in scores})
@@ -258,23 +229,6 @@ def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
     assert "| 2 | 0.750 | 0.583 | 1.000 | - |" in first
     assert "| aware | 2 | 0.750 |" in overall
     assert "| aware | 4 | 36 | 0.04 |" in compute
-
-
-def test_figures_are_drawn_with_arms_that_train_nothing_and_runs_without_a_finished_episode(tmp_path):
-    comparison = Comparison(rows_of("t", "late", SCORES) + rows_of("u", "late", SCORES), ARMS)
-    curve = [
-        {"episodes": n, "perceived_return": n / 9, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
-        for n in range(5)
-    ]
-    unfinished = [dict.fromkeys(curve[0], np.nan) | {"episodes": 0.0}]
-    curves = {("t", "none", "best"): [curve, curve[1:]], ("t", "late", "blind"): [unfinished, unfinished]}
-    plot_curves(comparison, curves, {"perceived_steps": 1.0}, tmp_path / "curves.png")
-    plot_norms(comparison, tmp_path / "norms.png")
-    plot_delays(comparison, {"learning": ["blind", "aware"], "acting": ["aware"]}, tmp_path / "delays.png")
-    one = Comparison(rows_of("t", "late", SCORES), ARMS)
-    plot_curves(one, curves, {"perceived_steps": 1.0}, tmp_path / "one.png")
-    names = ("curves.png", "norms.png", "delays.png", "one.png")
-    assert all((tmp_path / name).stat().st_size > 10_000 for name in names)
 
 
 def drawn(monkeypatch, draw) -> Figure:
@@ -339,20 +293,6 @@ def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch
     path.write_text("of an earlier report")
     plot_curves(Comparison(unknown, ARMS), {}, {}, path)
     assert not path.exists()
-
-
-def test_the_legend_of_learning_curves_names_an_arm_that_ran_under_one_delay_only(monkeypatch, tmp_path):
-    rows = rows_of("t", "late", SCORES)
-    rows += [each for each in rows_of("t", "later", SCORES) if each["arm"] not in ("best", "flown")]
-    curve = [
-        {"episodes": n, "perceived_return": n / 9, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
-        for n in range(5)
-    ]
-    two = Comparison(rows + [each | {"task": "u"} for each in rows], ARMS)
-    curves = {("t", "none", "best"): [curve]}
-    figure = drawn(monkeypatch, lambda: plot_curves(two, curves, {}, tmp_path / "curves.png"))
-    texts = [text.get_text() for text in figure.axes[1].findobj(Text)]
-    assert {"best", "blind", "flown", "aware", RANDOM} <= {*texts}
 
 
 @pytest.mark.parametrize(("first", "drawn_over"), [(3, [3.0, 4.0]), (5, [])])

@@ -77,14 +77,6 @@ def same(one: ReplayBuffer, other: ReplayBuffer) -> None:
     assert other.storage.steps["agents"].batch_size == (ROWS, WORLDS, 2)
 
 
-def test_an_empty_memory_is_stored_and_loaded(tmp_path):
-    state = ReplayMemory(make_buffer(), tmp_path / "replay").state_dict()
-    buffer = make_buffer()
-    ReplayMemory(buffer, tmp_path / "replay").load_state_dict(state)
-    assert len(buffer) == 0
-    assert [*tmp_path.iterdir()] == []
-
-
 @pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_bytes(file.read_bytes()[:-1])])
 def test_a_missing_or_damaged_segment_is_refused_in_one_line(tmp_path, damage):
     buffer = make_buffer()

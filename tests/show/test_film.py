@@ -45,12 +45,6 @@ def test_a_footprint_is_stronger_while_its_uav_spots_the_source():
     assert np.abs(other - land).sum() < np.abs(after - land).sum()
 
 
-def test_the_source_is_filled_while_it_emits():
-    film = Film(flight(1, emits=np.array([False, True])))
-    assert colour_at(film, 0, 0.0, -120.0).min() > 0.9
-    assert colour_at(film, 1, 0.0, -120.0).max() < 0.3
-
-
 @pytest.mark.parametrize("view", ["2d", "3d"])
 def test_a_source_that_nobody_knows_is_neither_drawn_nor_explained(view):
     about = {"uavs": ["A", "B with a long name"]}
@@ -80,18 +74,6 @@ def test_the_belief_is_darker_in_more_probable_cells_of_the_region():
     film = Film(flight(0, cells=cells, belief=np.array([[0.1, 0.6, 0.3]])))
     brightness = [colour_at(film, 0, *cell).sum() for cell in cells]
     assert brightness[1] < brightness[2] < brightness[0] < colour_at(film, 0, 0.0, 150.0).sum()
-
-
-def test_messages_are_drawn_when_they_were_sent_and_arrive_and_the_future_is_pale():
-    sent, delay = np.zeros((5, 2), bool), np.zeros((5, 2), int)
-    sent[1, 0], delay[1, 0] = True, 2
-    sent[3, 1], delay[3, 1] = True, -1
-    film = Film(flight(4, sent=sent, delay=delay))
-    column, row = film.lanes.transData.transform((4.0, 0.0))
-    pictures = [film.frame(step) for step in (0, 4)]
-    early, late = (picture[round(len(picture) - 1 - row), round(column)] / 255.0 for picture in pictures)
-    assert early.sum() > late.sum()
-    assert np.abs(late - 1.0).max() > 0.3
 
 
 @pytest.mark.parametrize(
@@ -162,9 +144,3 @@ def test_the_pixels_are_in_the_specs():
     env = make_env(ScenarioConfig(), 1, seed=0, extras=EXTRAS)
     env.append_transform(FilmPixels(env.uav_env, view="3d"))
     check_env_specs(env)
-
-
-def test_several_worlds_cannot_be_filmed():
-    env = make_env(ScenarioConfig(), 2, extras=EXTRAS)
-    with pytest.raises(InputError, match="number of worlds: 2 is not 1"):
-        FilmPixels(env.uav_env)

@@ -102,14 +102,6 @@ def test_coverage_is_what_footprints_have_covered_of_the_region(episode):
         assert (shapely.contains_xy(covered, *points.T) == expected)[clear].mean() > 0.999
 
 
-def test_beliefs_are_cells_with_their_probability(episode):
-    cells = by_kind(feature_collection(episode, 10))["belief"]
-    likely = episode.likely_cells(10)
-    assert len(cells) == len(likely) > 3
-    shares = [cell["properties"]["probability"] for cell in cells]
-    np.testing.assert_allclose(shares, episode.belief[10, likely], atol=1e-5)
-
-
 def test_what_crosses_the_antimeridian_is_cut_there(episode):
     moved = replace(episode, origin=(-17.0, 179.9999))
     collection = feature_collection(moved, 10)
@@ -167,19 +159,6 @@ def flown_about_the_antimeridian(episode, longitude: float, metres: list[list[fl
     moved = replace(episode, origin=origin, position=position)
     track = by_kind(feature_collection(moved, len(path) - 1))["track"][0]
     return track, path, origin
-
-
-@pytest.mark.parametrize("longitude", [179.999, -179.999])
-@pytest.mark.parametrize("east", [300.0, -300.0, 0.0])
-def test_a_track_on_one_side_of_the_antimeridian_keeps_its_points_and_times(episode, longitude, east):
-    sign = np.sign(east) or -1.0
-    metres = [[east, 0], [east, 0], [east + 80 * sign, 0], [east, 0], [east + 9 * sign, 50], [east, 90]]
-    track, path, origin = flown_about_the_antimeridian(episode, longitude, metres)
-    assert track["geometry"]["type"] == "LineString"
-    np.testing.assert_allclose(local(track, origin), path, atol=0.02)
-    assert track["properties"]["times"] == episode.time[: len(path)].tolist()
-    degrees = shapely.get_coordinates(shape(track["geometry"]))
-    assert (np.abs(degrees[:, 0]) <= 180).all()
 
 
 @pytest.mark.parametrize("longitude", [179.999, -179.999])

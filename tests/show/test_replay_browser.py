@@ -229,12 +229,6 @@ def test_each_layer_can_be_seen_and_taken_away(opened, layer):
         assert states[0] == states[2] != states[1]
 
 
-def test_without_a_belief_its_layer_is_not_offered(opened):
-    with opened(late_flight(cells=None, belief=None)) as page:
-        assert not page.one("[data-layer=belief]").is_enabled()
-        assert page.one("[data-layer=covered]").get_attribute("aria-pressed") == "true"
-
-
 def coloured(picture, uav, tolerance=40):
     """Rows and columns of the pixels that have about the colour of a UAV."""
     colour = np.array([int(COLOURS[uav][i : i + 2], 16) for i in (1, 3, 5)])
@@ -328,26 +322,3 @@ def test_one_can_come_nearer_to_the_map_and_see_all_of_it_again(opened):
         page.actions().double_click(page.one(".view")).perform()
         page.settle()
         assert page.map() == picture
-
-
-def test_on_a_telephone_nothing_is_wider_than_the_screen(opened):
-    with opened(late_flight(2), late_flight(), width=390, height=844) as page:
-        for view in ("2d", "3d"):
-            page.one(f"[data-view='{view}']").click()
-            page.settle()
-            assert page.run("return document.documentElement.scrollWidth") <= 390
-        tops = [card.rect["y"] for card in page.all(".card")]
-        assert tops[1] > tops[0] + 300
-        sizes = [each.rect for each in page.all("button, select") if each.is_displayed()]
-        assert min(size["height"] for size in sizes) >= 40
-
-
-def test_dark_screens_get_a_dark_page(opened):
-    pictures = []
-    for dark in (False, True):
-        with opened(late_flight(), dark=dark) as page:
-            pictures.append(page.picture("body")[:600])
-            background = page.run("return getComputedStyle(document.body).backgroundColor")
-            assert (int(background.split("(")[1].split(",")[0]) < 60) == dark
-    assert pictures[0].mean() > 200
-    assert pictures[1].mean() < 80
