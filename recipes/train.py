@@ -37,8 +37,7 @@ from damian.compare.comparison import RANDOM, SCRIPT, TRAINED, UNTRAINED
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.keys import next_key
-from damian.learners.base import Learner, check_learner, check_numbers
-from damian.learners.finite import divergence
+from damian.learners.base import Learner, divergence
 from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.corrections import corrections_of
@@ -79,7 +78,9 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
     name = config.learner.name
     with own_code(name):
         learner = config.learner.make(env, config.learning_setup, buffer)
-        check_learner(learner, name)
+        has_actor = "actor" in learner.components()
+    should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
+    checks.require(has_actor, f"{name}: components", [*learner.components()], should)
     return learner
 
 
@@ -229,7 +230,7 @@ def update(
     progress.updates += 1
     try:
         with own_code(config.learner.name), using_threads(config.learning_threads):
-            losses = check_numbers(learner.learn(batch), config.learner.name)
+            losses = {name: float(number) for name, number in learner.learn(batch).items()}
     except (ValueError, RuntimeError):  # torch's distributions refuse a nan
         check_convergence(config, state, {})
         raise

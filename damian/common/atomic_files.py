@@ -28,7 +28,10 @@ def write_atomically(path: Path, content: bytes | str) -> None:
         except OSError:
             unfinished.unlink(missing_ok=True)
             raise
-        _sync_folder(path.parent)
+        if hasattr(os, "O_DIRECTORY"):  # Windows cannot open a folder, whose new name must last too
+            descriptor = os.open(path.parent, os.O_RDONLY)
+            os.fsync(descriptor)
+            os.close(descriptor)
 
 
 def remove_unfinished(folder: Path) -> None:
@@ -50,14 +53,3 @@ def writing(path: Path) -> Iterator[None]:
     except OSError as error:
         problem = error.strerror or str(error)
         raise RunError(f"{path}: it cannot be written: {problem}; what was stored before is intact") from None
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the new name of a file last, even if the machine stops."""
-    if not hasattr(os, "O_DIRECTORY"):  # Windows cannot open a folder
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -34,30 +34,22 @@ MEMORY_BYTES = 4_000_000_000
 """Most bytes that one part of an environment may allocate, as far as its settings tell."""
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-_SHOWN = 100
-"""Characters of a value that an error shows."""
+_KINDS = {bool: "true or false", list: "a list of places such as [[0, 0], [100, 50]]"}
 
 
 def require(condition: bool, key: str, value: Any, should: str) -> None:
     """Raise ``InputError("<key>: <value> <should>")`` unless the condition holds; a long value is cut."""
-    if condition:
-        return
-    text = str(value)
-    shown = text if len(text) <= _SHOWN else f"{text[: _SHOWN // 2]}...{text[-_SHOWN // 4 :]}"
-    raise InputError(f"{key}: {shown} {should}")
+    if not condition:
+        text = str(value)
+        raise InputError(f"{key}: {text if len(text) <= 100 else f'{text[:50]}...{text[-25:]}'} {should}")
 
 
-_KINDS = {
-    bool: "true or false",
-    list: "a list of places such as [[0, 0], [100, 50]]",
-}
+def convert_types(section: str, settings: Any) -> None:
+    """Convert the fields of a dataclass of settings, in place, to the types that they declare.
 
-
-def types(section: str, settings: Any) -> None:
-    """Require that the fields of a dataclass of settings have the types that they declare.
-
-    Arrays and numbers of NumPy and torch become plain ones, and numbers where a text is wanted (a time such
-    as 2) texts, in place. The other checks refuse what is no number or text, or not in their bounds.
+    Arrays and numbers of NumPy and torch become plain ones, and numbers become texts where a text is wanted
+    (a time such as 2). A value of another type is refused, if no other check refuses it: those of numbers
+    and names look at the type too.
 
     Args:
         section: of the settings, such as ``region``, for errors; empty for those of a whole scenario.
@@ -83,15 +75,17 @@ def _plain(value: Any) -> Any:
     return [_plain(each) for each in value] if type(value) in (list, tuple) else value
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def in_range(key: str, value: float, low: float, high: float | None = None, unit: str = "") -> None:
     """Require a number ``low <= value <= high``; without ``high``, the largest number of the unit."""
-    _require_bounds(key, value, low, *(() if high is None else (high,)))
     most = max(low, LARGEST.get(unit, HUGE)) if high is None else high
-    good = _is_number(value) and low <= value <= most
-    unit = f" {unit}" if unit else ""
     one_sided = high is None and not (_is_number(value) and most < value < math.inf)
     bounds = f"at least {low:g}" if one_sided else f"between {low:g} and {most:g}"
-    require(good, key, f"{value}{unit}", f"is not {bounds}{unit}")
+    good = _is_number(value) and low <= value <= most
+    require(good, key, f"{value} {unit}".strip(), f"is not {bounds} {unit}".strip())
 
 
 def whole(key: str, value: Any, low: int, high: float | None = None, unit: str = "") -> None:
@@ -103,10 +97,15 @@ def whole(key: str, value: Any, low: int, high: float | None = None, unit: str =
 
 def above(key: str, value: float, low: float, unit: str = "") -> None:
     """Require a number above ``low``, by ``TINY`` at least, up to the largest number of the unit."""
-    _require_bounds(key, value, low)
     good = _is_number(value) and low < value < math.inf
     require(good, key, f"{value} {unit}".strip(), f"is not above {low:g} {unit}".strip())
     in_range(key, value, low + TINY, max(low + TINY, LARGEST.get(unit, HUGE)), unit)
+
+
+def weight(key: str, value: float) -> None:
+    """Require a weight of a reward or a loss: a finite number that is not huge."""
+    require(_is_number(value) and math.isfinite(value), key, value, "is not a finite weight")
+    in_range(key, value, -1e6, 1e6)
 
 
 def seed(key: str, value: Any, low: int | None = None) -> None:
@@ -114,76 +113,6 @@ def seed(key: str, value: Any, low: int | None = None) -> None:
     good = isinstance(value, Integral) and not isinstance(value, bool)
     require(good, key, repr(value), "is not a whole number such as 0")
     require(low is None or int(value) >= low, key, value, f"is not at least {low}")
-
-
-def weight(key: str, value: float) -> None:
-    """Require a weight of a reward or a loss: a finite number that is not huge."""
-    good = _is_number(value) and math.isfinite(value)
-    require(good, key, value, "is not a finite weight")
-    in_range(key, value, -1e6, 1e6)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:
-    """Require a mapping without unknown keys, such as the options of a component of one's own.
-
-    Args:
-        key: of the setting, for errors.
-        given: the mapping, or None for an empty one.
-        known: the keys that it may have.
-
-    Returns:
-        The mapping.
-    """
-    known = list(known)
-    if given is None:
-        return {}
-    if not isinstance(given, Mapping):
-        raise InputError(f"{key}: {given} is not a mapping such as {{{known[0]}: 1}}")
-    for name, value in given.items():
-        require(name in known, f"{key}.{name}", value, f"is not one of its options: {', '.join(known)}")
-    return dict(given)
-
-
-def fits(key: str, value: Any, n_bytes: int, remedy: str) -> None:
-    """Require that what a setting makes an environment allocate fits into ``MEMORY_BYTES``."""
-    problem = f"needs {n_bytes / 1e9:.1f} GB of memory, more than {MEMORY_BYTES / 1e9:g} GB: {remedy}"
-    require(n_bytes <= MEMORY_BYTES, key, value, problem)
-
-
-def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:
-    """Require that the value is one of the choices."""
-    choices = list(choices)
-    names = ", ".join(map(str, choices))
-    problem = f"is not one of {names}" if choices else "is not known, because there is none"
-    require(value in choices, key, value, problem)
-
-
-def names(key: str, given: Any, known: Sequence[str]) -> frozenset[Any]:
-    """Require a collection of names, such as the extras of an environment, and none that is not known."""
-    should = f"is not a list of names such as ['{known[0]}']"
-    listed = isinstance(given, Iterable) and not isinstance(given, str | bytes | Mapping)
-    require(listed, key, repr(given), should)
-    found = list(given)
-    for name in found:
-        one_of(key, name, known)
-    return frozenset(found)
-
-
-def distinct(key: str, values: Sequence[Any]) -> None:
-    """Require that no value of a list appears twice."""
-    again = next((value for i, value in enumerate(values) if value in values[:i]), None)
-    require(again is None, key, again, "appears twice")
-
-
-def place(key: str, value: Any) -> None:
-    """Require a position ``[x, y]`` of two numbers [m] between ``-METRES`` and ``METRES``."""
-    good = isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value))
-    require(good and all(map(math.isfinite, value)), key, value, "is not [x, y] in metres")
-    require(all(abs(v) <= METRES for v in value), key, value, f"is not within {METRES:g} m of the origin")
 
 
 def seconds(key: str, value: str | float, zero: bool = False) -> float:
@@ -203,23 +132,64 @@ def seconds(key: str, value: str | float, zero: bool = False) -> float:
     return time
 
 
+def place(key: str, value: Any) -> None:
+    """Require a position ``[x, y]`` of two numbers [m] between ``-METRES`` and ``METRES``."""
+    good = isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value))
+    require(good and all(map(math.isfinite, value)), key, value, "is not [x, y] in metres")
+    require(all(abs(v) <= METRES for v in value), key, value, f"is not within {METRES:g} m of the origin")
+
+
+def one_of(key: str, value: Any, choices: Iterable[Any]) -> None:
+    """Require that the value is one of the choices."""
+    choices = list(choices)
+    names = ", ".join(map(str, choices))
+    problem = f"is not one of {names}" if choices else "is not known, because there is none"
+    require(value in choices, key, value, problem)
+
+
+def names(key: str, given: Any, known: Sequence[str]) -> frozenset[Any]:
+    """Require a collection of names, such as the extras of an environment, and none that is not known."""
+    listed = isinstance(given, Iterable) and not isinstance(given, str)
+    require(listed, key, repr(given), f"is not a list of names such as ['{known[0]}']")
+    for name in given:
+        one_of(key, name, known)
+    return frozenset(given)
+
+
+def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:
+    """Require a mapping without unknown keys, such as the options of your own component.
+
+    Args:
+        key: of the setting, for errors.
+        given: the mapping, or None for an empty one.
+        known: the keys that it may have.
+
+    Returns:
+        The mapping.
+    """
+    known = list(known)
+    given = {} if given is None else given
+    if not isinstance(given, Mapping):
+        raise InputError(f"{key}: {given} is not a mapping such as {{{known[0]}: 1}}")
+    for name, value in given.items():
+        require(name in known, f"{key}.{name}", value, f"is not one of its options: {', '.join(known)}")
+    return dict(given)
+
+
+def distinct(key: str, values: Sequence[Any]) -> None:
+    """Require that no value of a list appears twice."""
+    again = next((value for i, value in enumerate(values) if value in values[:i]), None)
+    require(again is None, key, again, "appears twice")
+
+
 def device(key: str, value: str) -> None:
     """Require ``cpu`` or a CUDA device of this machine."""
-    available = ["cpu"] + [f"cuda:{i}" for i in range(torch.cuda.device_count())]
-    available += ["cuda"] * (len(available) > 1)
+    n_gpus = torch.cuda.device_count()
+    available = ["cpu", *(f"cuda:{i}" for i in range(n_gpus)), *["cuda"] * bool(n_gpus)]
     require(value in available, key, value, f"is not one of the devices here: {', '.join(available)}")
 
 
-def integers(key: str, value: Any, shape: Sequence[int]) -> None:
-    """Require a tensor of integers of this shape."""
-    good = isinstance(value, torch.Tensor) and not (value.is_floating_point() or value.is_complex())
-    good = good and value.dtype != torch.bool and tuple(value.shape) == tuple(shape)
-    found = f"a tensor of {value.dtype}, {list(value.shape)}" if isinstance(value, torch.Tensor) else value
-    require(good, key, found, f"is not a tensor of integers of shape {list(shape)}, one for each world")
-
-
-def _require_bounds(key: str, value: Any, *bounds: Any) -> None:
-    """Require that the bounds with which a value is compared are numbers."""
-    for bound in bounds:
-        good = isinstance(bound, int | float)
-        require(good, key, value, f"cannot be compared with {bound!r}, which is not a number")
+def fits(key: str, value: Any, n_bytes: int, remedy: str) -> None:
+    """Require that what a setting makes an environment allocate fits into ``MEMORY_BYTES``."""
+    problem = f"needs {n_bytes / 1e9:.1f} GB of memory, more than {MEMORY_BYTES / 1e9:g} GB: {remedy}"
+    require(n_bytes <= MEMORY_BYTES, key, value, problem)

@@ -28,7 +28,7 @@ class RunError(RuntimeError):
 
 @contextmanager
 def naming_errors(name: str) -> Iterator[None]:
-    """Turn an error raised inside by a component of one's own into an ``InputError`` of one line.
+    """Turn an error raised inside by a component of a user's own into an ``InputError`` of one line.
 
     The line has the name, the error, and the file and line of the component. It is meant for the first call
     of a component, not for a step.
@@ -43,17 +43,23 @@ def naming_errors(name: str) -> Iterator[None]:
         yield
     except (InputError, RunError):
         raise
-    except Exception as error:  # a component of one's own can raise anything
+    except Exception as error:  # a user's own component can raise anything
         raise InputError(f"{name}: {described(error)}") from error
 
 
 def described(error: BaseException) -> str:
-    """An error on one line: its type, its message, and the deepest line of code that is one's own."""
+    """An error on one line: its type, its message, and the deepest line of the user's own code."""
     text = " ".join(str(error).split())
-    own = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_own(frame.filename)]
+    # Frames that belong neither to this package, nor to an installed one, nor to Python.
+    others = ("site-packages", "dist-packages", "<frozen", str(_PACKAGE), sysconfig.get_path("stdlib"))
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not any(other in frame.filename for other in others)]
     known = not own or isinstance(error, SyntaxError)  # its message has the place
     place = "" if known else f" ({Path(own[-1].filename).name}, line {own[-1].lineno})"
     return f"{type(error).__name__}{': ' if text else ''}{text}{place}"
+
+
+_PACKAGE = Path(__file__).parents[1]
 
 
 class Declared(dict[str, Any]):
@@ -70,14 +76,3 @@ class Declared(dict[str, Any]):
 
     def __missing__(self, name: object) -> NoReturn:
         raise InputError(self._problem.replace("NAME", str(name)))
-
-
-_OTHERS = [Path(__file__).parents[1], Path(sysconfig.get_path("stdlib"))]
-"""Folders of the package and of Python."""
-
-
-def _is_own(file: str) -> bool:
-    """Does a file belong neither to the package, nor to an installed one, nor to Python?"""
-    path = Path(file)
-    installed = {"site-packages", "dist-packages"} & {*path.parts}
-    return not installed and not file.startswith("<frozen") and not {*_OTHERS} & {*path.parents}

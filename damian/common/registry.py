@@ -1,11 +1,10 @@
-"""Components by name, or by the path of a class or function of one's own: ``package.module:Name``."""
+"""Components by name, or by the path of a class or function of a user's own: ``package.module:Name``."""
 
 import importlib
 import inspect
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from damian.common import checks
@@ -20,7 +19,7 @@ class Registry(Generic[T]):
 
     With ``LAWS = Registry[type[Law]]("law")``, ``@LAWS.register("uniform")`` adds a class and
     ``LAWS.get("uniform", key)`` returns it. ``LAWS.get("my_lab.delays:Satellite", key)`` imports a class that
-    is not registered, also from the current folder, so that a file of one's own needs no installation.
+    is not registered, also from the current folder, so that your own file needs no installation.
 
     Args:
         kind: what a component is called in errors, such as ``law``.
@@ -30,7 +29,6 @@ class Registry(Generic[T]):
     def __init__(self, kind: str, problem: Callable[[Any], str | None] = lambda _: None) -> None:
         self.kind, self._problem = kind, problem
         self._components: dict[str, T] = {}
-        self._imported: dict[str, T] = {}
 
     def register(self, name: str) -> Callable[[Component], Component]:
         """Decorator that adds a component under a name.
@@ -57,16 +55,14 @@ class Registry(Generic[T]):
         Raises:
             InputError: there is none.
         """
-        for components in (self._components, self._imported):
-            if isinstance(name, str) and name in components:
-                return components[name]
+        if isinstance(name, str) and name in self._components:
+            return self._components[name]
         if not isinstance(name, str) or ":" not in name:
             known = f"one of {', '.join(self._components)}, nor " if self._components else ""
             raise InputError(f"{key}: {name} is not {known}a path such as package.module:Name")
         component = _import_path(name, key)
         if problem := self._problem(component):
             raise InputError(f"{key}: {name} {problem}")
-        self._imported[name] = component
         return component
 
     def read(self, written: Any, key: str, entry: str) -> tuple[str, T, dict[str, Any]]:
@@ -134,52 +130,35 @@ def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], pat
     Raises:
         InputError: the function has no such parameter, or one without a default is not given.
     """
-    accepted = [*inspect.signature(function).parameters.values()]
-    known = {each.name: each for each in accepted if each.kind is inspect.Parameter.KEYWORD_ONLY}
-    unmarked = [each for each in accepted if each.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD]
-    unmarked = [str(each) for each in unmarked if each.default is not each.empty]
-    hint = f"; parameters stand after a *, as in (..., *, {', '.join(unmarked)})" if unmarked else ""
+    accepted = inspect.signature(function).parameters
+    known = {name: each for name, each in accepted.items() if each.kind is inspect.Parameter.KEYWORD_ONLY}
     for name, value in given.items():
-        problem = f"is no parameter of {path}, which has {', '.join(known) or 'none'}{hint}"
+        problem = f"is no parameter of {path}, which has {', '.join(known) or 'none'}"
         checks.require(name in known, f"{key}.{name}", value, problem)
     missing = [name for name, each in known.items() if each.default is each.empty and name not in given]
     checks.require(not missing, key, path, f"needs a value for {', '.join(missing)}")
 
 
 def _import_path(path: str, key: str) -> Any:
-    """The object at ``package.module:Name``.
+    """The object at ``package.module:Name``, also from a module of the current folder.
 
     Raises:
         InputError: the module cannot be imported, or has no such object.
     """
     module_name, _, name = path.partition(":")
+    folder = os.getcwd()
+    if folder not in sys.path:
+        sys.path.append(folder)  # it stays there: worker processes inherit it and import the module again
     try:
-        module = _module(module_name)
+        module = importlib.import_module(module_name)
     except InputError as error:
         raise InputError(f"{key}: {path}: {error}") from error
     except Exception as error:  # the module of a user can raise anything
-        missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        if missing and f"{module_name}.".startswith(f"{missing}."):
-            problem = f"{error}; {module_name} must be installed, on PYTHONPATH, or in {os.getcwd()}"
+        if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}."):
+            problem = f"{error}; {module_name} must be installed, on PYTHONPATH, or in {folder}"
         else:
             problem = f"importing it raised {described(error)}"
         raise InputError(f"{key}: {path}: {problem}") from error
     if not hasattr(module, name):
         raise InputError(f"{key}: {path}: the module {module_name} has no {name}")
     return getattr(module, name)
-
-
-def _module(name: str) -> Any:
-    """A module, also from the current folder, which stays on the path for worker processes if it has it."""
-    folder = os.getcwd()
-    if folder in sys.path:
-        return importlib.import_module(name)
-    sys.path.append(folder)
-    try:
-        module = importlib.import_module(name)
-    except BaseException:
-        sys.path.remove(folder)
-        raise
-    if Path(folder) not in Path(getattr(module, "__file__", None) or "/").parents:
-        sys.path.remove(folder)
-    return module

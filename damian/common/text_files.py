@@ -24,13 +24,10 @@ def read_text(file: Path) -> str:
     Raises:
         InputError: the file is missing, unreadable, too large, empty or not UTF-8.
     """
+    if not file.is_file():  # reading a pipe would wait for ever
+        raise InputError("is not a file" if file.exists() else "no such file")
     try:
-        if not file.exists():
-            raise InputError("no such file")
-        if not file.is_file():
-            raise InputError("is not a file")
-        size = file.stat().st_size
-        if size > MAX_BYTES:
+        if (size := file.stat().st_size) > MAX_BYTES:
             raise InputError(f"{size} bytes are more than the {MAX_BYTES} that are read")
         text = file.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -52,11 +49,7 @@ class Row(NamedTuple):
 
 
 def parse_table(text: str, columns: Iterable[str]) -> list[Row]:
-    """Parse a CSV table with a header; empty rows are left out.
-
-    Args:
-        text: the table.
-        columns: that it must have; it may have others.
+    """Parse a CSV table with a header, which must have these columns; empty rows are left out.
 
     Raises:
         InputError: a quote stays open, a column is missing or doubled, or a row has more or fewer cells than

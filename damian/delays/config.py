@@ -54,7 +54,7 @@ class DelayConfig:
     """Discount factor gamma of that sum (eq. 4)."""
 
     def __post_init__(self) -> None:
-        checks.types("delay", self)
+        checks.convert_types("delay", self)
         checks.in_range("delay.loss", self.loss, 0.0, 1.0)
         checks.one_of("delay.hold", self.hold, ("none", "max"))
         checks.one_of("delay.order", self.order, ORDERS)
@@ -135,7 +135,7 @@ class LinkConfig:
     """With ``matrix``: at most so many UAVs of a world send in a step; chance decides which."""
 
     def __post_init__(self) -> None:
-        checks.types("links", self)
+        checks.convert_types("links", self)
         checks.one_of("links.kind", self.kind, ("server", "updown", "matrix"))
         meant = {"server": [], "updown": ["delay", "loss"]}.get(self.kind)
         for field in fields(self)[1:]:

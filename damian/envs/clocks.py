@@ -35,30 +35,24 @@ class ClockConfig:
     """Discount per simulation step of the rewards within a step that ``skip`` makes longer."""
 
     def __post_init__(self) -> None:
-        checks.types("clock", self)
+        checks.convert_types("clock", self)
         fast, triggered = ("simulation", "agents", "server"), ("trigger", "shortest", "longest")
-        for slower, faster in itertools.permutations((*fast, "system"), 2):
-            if self._seconds(slower) >= self._seconds(faster) or faster == "simulation":
-                self._check_multiple(slower, faster)
         given = [name for name in triggered if getattr(self, name) is not None]
-        for name, faster in itertools.product(given, fast):
-            checks.seconds(f"clock.{name}", getattr(self, name))
-            self._check_multiple(name, faster)
+        pairs = [*itertools.permutations((*fast, "system"), 2), *itertools.product(given, fast)]
+        for slower, faster in pairs:
+            # Of two clocks, the slower one ticks only when the faster one does.
+            if slower in given or faster == "simulation" or self._seconds(slower) >= self._seconds(faster):
+                ratio = self._seconds(slower) / self._seconds(faster)
+                whole = math.isclose(ratio, max(round(ratio), 1), rel_tol=1e-9)
+                problem = f"is not a multiple of clock.{faster}={self._period(faster)}"
+                checks.require(whole, f"clock.{slower}", self._period(slower), problem)
         checks.in_range("clock.simulation", self.dt, 1e-3, 86_400, "s")  # a millisecond to a day
         checks.in_range("clock.skip_discount", self.skip_discount, 0.0, 1.0)
-        problem = "means nothing without clock.skip=true"
-        checks.require(
-            self.skip or self.skip_discount == 1, "clock.skip_discount", self.skip_discount, problem
-        )
-        problem = "means nothing without clock.trigger: the system clock is fixed"
-        unused = given[0] if given and self.trigger is None else None
-        checks.require(unused is None, f"clock.{unused}", getattr(self, unused or "trigger"), problem)
-
-    def _check_multiple(self, slow: str, fast: str) -> None:
-        ratio = self._seconds(slow) / self._seconds(fast)
-        whole = math.isclose(ratio, max(round(ratio), 1), rel_tol=1e-9)
-        problem = f"is not a multiple of clock.{fast}={self._period(fast)}"
-        checks.require(whole, f"clock.{slow}", self._period(slow), problem)
+        problem, discount = "means nothing without clock.skip=true", self.skip_discount
+        checks.require(self.skip or discount == 1, "clock.skip_discount", discount, problem)
+        for name in given:
+            problem = "means nothing without clock.trigger: the system clock is fixed"
+            checks.require(self.trigger is not None, f"clock.{name}", getattr(self, name), problem)
 
     def _period(self, name: str) -> str:
         return getattr(self, name) or self.simulation

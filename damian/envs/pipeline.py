@@ -1,4 +1,17 @@
-"""Builds a scenario's environment: the one place that decides the order of its delays, losses and clocks."""
+"""Builds a scenario's environment: the one place that decides the order of its delays, losses and clocks.
+
+What a step passes, in this order (a transform is there only if the scenario asks for it)::
+
+    policy -> action -> ActionDelay -> UavEnv: physics makes messages
+    UavEnv -> message -> ObservationDelay -> Belief, MessageHistory -> ServerNode: observations, rewards, ends
+                      -> Channel -> OnboardNode: observations from what other UAVs have sent directly
+    reward -> RewardDelay -> CumulativeReward
+    observation -> SampleAndHold (server) -> ObservationDelay (broadcast) -> SampleAndHold (agents)
+                -> ActionHistory -> policy
+    SkipUntilReady repeats all of it until a UAV can choose again
+
+Without a delayed message, a belief and a history of messages, ``UavEnv`` computes what ``ServerNode`` would.
+"""
 
 from collections.abc import Collection
 from functools import partial
@@ -9,7 +22,6 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
-from damian.common.text_files import show
 from damian.delays.config import CONTEXT_KEYS
 from damian.delays.laws import law_of, sampler_of
 from damian.envs.delayed_env import DelayedEnv
@@ -62,9 +74,8 @@ def make_env(
     extras = checks.names("extras", extras, ALL_EXTRAS)
     problem = "skips steps, but back-updating and evaluation need the messages of every step"
     checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
-    remote, linked = has_server_node(scenario), scenario.links.kind == "matrix"
-    dt = scenario.clock.dt
-    needed = {"message"} if remote or linked else set()
+    remote, dt = has_server_node(scenario), scenario.clock.dt
+    needed = {"message"} if remote or scenario.links.kind == "matrix" else set()
     needed |= {"position"} if scenario.delay.reads(dt) | scenario.links.reads(dt) else set()
     simulation = make_simulation(scenario, seed)
     server = make_server(scenario, simulation)
@@ -80,7 +91,7 @@ def make_env(
     )
     pipeline = DelayedEnv(env, make_transforms(scenario, server, extras))
     pipeline.set_seed(seed)
-    pipeline.reset()  # tries the laws, and whether the memory fits, so that a mistake is found here
+    pipeline.reset()  # allocates the memories of the transforms, and finds mistakes in a user's own law
     pipeline.set_seed(seed)
     return pipeline
 
@@ -103,60 +114,39 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
     delay, clock = scenario.delay, scenario.clock
     if not has_delay(scenario, "act") and clock.steps("agents") == 1:
         return []
-    law, hold = delay.law("act"), hold_action(scenario.actions)
     late = ActionDelay(
-        law,
+        delay.law("act"),
         keys.ACTION,
-        default=hold,
+        default=hold_action(scenario.actions),
         dt=clock.dt,
         sent_key="ready",
         valid_key=keys.ACTION_VALID,
         context_keys=CONTEXT_KEYS,
     )
-    late.memory_setting = "delay.act", show(delay.act)
     return [late]
 
 
 def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collection[str]) -> list[Transform]:
     """The message delay (paper, section 3.4), and the server node, which uses the arrived messages."""
-    output_messages, linked = "message" in extras, scenario.links.kind == "matrix"
+    output_messages, delayed = "message" in extras, has_message_delay(scenario)
+    remembers = server.grid is not None or scenario.delay.messages > 0
     transforms: list[Transform] = []
-    delayed, longest = has_message_delay(scenario), 0
-    read = server.grid is not None or scenario.delay.messages > 0
+    longest = 0
     if delayed:
-        uplink = uplink_transform(scenario, output_messages, reads_delay=read)
+        uplink = uplink_transform(scenario, output_messages, reads_delay=remembers)
         longest = uplink.sampler.longest
         transforms.append(uplink)
     transforms += remembering_transforms(scenario, server, longest, delayed)
+    dropped = []
+    if not output_messages:  # the server node drops what only it and the transforms before it read
+        written = [key for each in transforms for key in each.out_keys if key != keys.HISTORY]
+        sent = [] if scenario.links.kind == "matrix" else _SENT
+        dropped = [*sent, *written, *[keys.DELAY] * (delayed and remembers)]
     held = keys.RECEIVED if delayed else keys.MESSAGE
-    written = [*([] if linked else _SENT), *(key for each in transforms for key in each.out_keys)]
-    written = [key for key in written if key != keys.HISTORY]
-    if delayed and read:
-        written.append(keys.DELAY)
-    dropped = [] if output_messages else written
-    node = ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras)
-    return [*transforms, node]
-
-
-def remembering_transforms(
-    scenario: ScenarioConfig, server: Server, longest: int, delayed: bool
-) -> list[Transform]:
-    """What keeps messages of earlier steps: the belief, and the history of messages.
-
-    Args:
-        scenario: all settings.
-        server: server node.
-        longest: longest delay of a message [steps].
-        delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is delayed.
-    """
-    transforms: list[Transform] = []
-    if server.grid is not None:
-        belief = Belief(server, longest, delayed=delayed, own=scenario.observation.own)
-        belief.memory_setting = "delay.obs", show(scenario.delay.obs)
-        transforms.append(belief)
-    if scenario.delay.messages:
-        transforms.append(message_history(scenario, server, delayed))
-    return transforms
+    return [
+        *transforms,
+        ServerNode(server, held, dropped_keys=dropped, reward_terms="reward_terms" in extras),
+    ]
 
 
 def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_delay: bool) -> ObservationDelay:
@@ -168,7 +158,7 @@ def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_dela
         reads_delay: a later transform reads the delay.
     """
     delay = scenario.delay
-    uplink = ObservationDelay(
+    return ObservationDelay(
         delay.law("obs"),
         keys.MESSAGE,
         keys.RECEIVED,
@@ -180,24 +170,35 @@ def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_dela
         delay_key=keys.DELAY if output_messages or reads_delay else None,
         context_keys=CONTEXT_KEYS,
     )
-    uplink.memory_setting = "delay.obs", show(delay.obs)
-    return uplink
 
 
-def message_history(scenario: ScenarioConfig, server: Server, delayed: bool) -> MessageHistory:
-    """The messages of the latest steps, for the UAVs to learn a belief from them."""
-    history = MessageHistory(
-        scenario.delay.messages,
-        keys.MESSAGE,
-        keys.HISTORY,
-        delay_key=keys.DELAY if delayed else None,
-        sent_key=keys.MESSAGE_SENT,
-        encode=partial(scaled_messages, server),
-        group=True,
-        own=scenario.observation.own,
-    )
-    history.memory_setting = "delay.messages", scenario.delay.messages
-    return history
+def remembering_transforms(
+    scenario: ScenarioConfig, server: Server, longest: int, delayed: bool
+) -> list[Transform]:
+    """What keeps messages of earlier steps: the belief, and the history of messages to learn a belief from.
+
+    Args:
+        scenario: all settings.
+        server: server node.
+        longest: longest delay of a message [steps].
+        delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is delayed.
+    """
+    own, transforms = scenario.observation.own, list[Transform]()
+    if server.grid is not None:
+        transforms.append(Belief(server, longest, delayed=delayed, own=own))
+    if scenario.delay.messages:
+        history = MessageHistory(
+            scenario.delay.messages,
+            keys.MESSAGE,
+            keys.HISTORY,
+            delay_key=keys.DELAY if delayed else None,
+            sent_key=keys.MESSAGE_SENT,
+            encode=partial(scaled_messages, server),
+            group=True,
+            own=own,
+        )
+        transforms.append(history)
+    return transforms
 
 
 def scaled_messages(server: Server, rows: Tensor) -> Tensor:
@@ -230,7 +231,6 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         age_key=None,
         mask_key=None,
     )
-    channel.memory_setting = "links.delay", show(links.delay)
     dropped = [keys.LINKED, *([] if "message" in extras else _SENT)]
     return [channel, OnboardNode(server, dropped_keys=dropped)]
 
@@ -240,40 +240,43 @@ def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list
     delay, dt, reported = scenario.delay, scenario.clock.dt, "message" in extras
     transforms: list[Transform] = []
     if has_delay(scenario, "rew"):
-        law = delay.law("rew")
         # With a message delay the server computes in hindsight what was earned.
         earned_key = keys.EARNED_REWARD if reported and not has_message_delay(scenario) else None
         late = RewardDelay(
-            law,
+            delay.law("rew"),
             keys.REWARD,
             dt=dt,
             context_keys=CONTEXT_KEYS,
             delay_key=keys.REWARD_DELAY if reported else None,
             earned_key=earned_key,
         )
-        late.memory_setting = "delay.rew", show(delay.rew)
         transforms.append(late)
     if delay.reward_window > 1:
-        summed = CumulativeReward(delay.reward_window, delay.reward_discount, keys.REWARD)
-        summed.memory_setting = "delay.reward_window", delay.reward_window
-        transforms.append(summed)
+        transforms.append(CumulativeReward(delay.reward_window, delay.reward_discount, keys.REWARD))
     return transforms
 
 
 def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
-    """The clocks of server and UAVs (paper, section 3.6), and the UAVs' action history (section 3.3)."""
-    clock, n_actions = scenario.clock, scenario.delay.history
+    """Clocks of server and UAVs (paper, section 3.6), the broadcast, and the action history (section 3.3)."""
+    clock, links, n_actions = scenario.clock, scenario.links, scenario.delay.history
     transforms: list[Transform] = []
-    seen = [keys.OBSERVATION, *[keys.HISTORY] * bool(scenario.delay.messages)]
+    broadcast = [keys.OBSERVATION, *[keys.HISTORY] * bool(scenario.delay.messages)]
     if clock.steps("server") > 1:
-        observations = [*seen, keys.GLOBAL_OBSERVATION]
-        transforms.append(SampleAndHold(clock.steps("server"), observations))
-    if scenario.links.kind == "updown":
-        broadcast = sampler_of(scenario.links.delay, clock.dt, key="links.delay")
-        if scenario.links.loss or broadcast.constant_delay != 0:
-            transforms.append(downlink_transform(scenario))
+        transforms.append(SampleAndHold(clock.steps("server"), [*broadcast, keys.GLOBAL_OBSERVATION]))
+    updown, law = links.kind == "updown", links.delay
+    if updown and (links.loss or sampler_of(law, clock.dt, key="links.delay").constant_delay != 0):
+        downlink = ObservationDelay(
+            law_of(law, "links.delay"),
+            keys.OBSERVATION,
+            loss=links.loss,
+            order=scenario.delay.order,
+            dt=clock.dt,
+            age_key=None,
+            context_keys=CONTEXT_KEYS,
+        )
+        transforms.append(downlink)
     if clock.steps("agents") > 1:
-        transforms.append(SampleAndHold(clock.steps("agents"), seen, ready_key=keys.READY))
+        transforms.append(SampleAndHold(clock.steps("agents"), broadcast, ready_key=keys.READY))
     if n_actions:
         history = ActionHistory(
             n_actions,
@@ -286,25 +289,8 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
             # Features do not reflect a flight before it has ended, though a message is sent as it begins.
             reflected_after=1 if MOTION_MODELS.get(scenario.motion.kind, "motion.kind").instant else 2,
         )
-        history.memory_setting = "delay.history", n_actions
         transforms.append(history)
     return transforms
-
-
-def downlink_transform(scenario: ScenarioConfig) -> Transform:
-    """The delay of the server's broadcast to each UAV."""
-    links, dt = scenario.links, scenario.clock.dt
-    downlink = ObservationDelay(
-        law_of(links.delay, "links.delay"),
-        keys.OBSERVATION,
-        loss=links.loss,
-        order=scenario.delay.order,
-        dt=dt,
-        age_key=None,
-        context_keys=CONTEXT_KEYS,
-    )
-    downlink.memory_setting = "links.delay", show(links.delay)
-    return downlink
 
 
 def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:

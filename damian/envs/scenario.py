@@ -28,45 +28,29 @@ class ScenarioConfig(WorldConfig):
         super().__post_init__()
         self.delay.check(self.clock.dt)
         self.links.check(self.agents)
-        self._check_ends()
-        conflict = self.observation.own and self.clock.steps("server") > 1
+        own, belief, links = self.observation.own, self.observation.belief, self.links.kind
         problem = "does not go with clock.server: between two broadcasts no observation changes"
-        checks.require(not conflict, "observation.own", True, problem)
-        conflict = self.observation.own and self.links.kind == "updown"
+        checks.require(not own or self.clock.steps("server") == 1, "observation.own", True, problem)
         problem = "does not go with links=updown: the server has computed what a UAV receives"
-        checks.require(not conflict, "observation.own", True, problem)
-        self._check_belief()
-        messages, links = self.delay.messages, self.links.kind
+        checks.require(not own or links != "updown", "observation.own", True, problem)
+        problem = "does not go with links=matrix: no UAV computes a belief from what it hears directly"
+        checks.require(not belief or links != "matrix", "observation.belief", belief, problem)
+        problem = "needs discrete actions: it has a value for each of them"
+        fits = "belief_gain" not in belief or self.actions.kind == "discrete"
+        checks.require(fits, "observation.belief", belief, problem)
+        messages = self.delay.messages
         problem = f"does not go with links={links}: a UAV would get the messages that the server has received"
         checks.require(not messages or links == "server", "delay.messages", messages, problem)
         empty = self.agents == 1 and self.observation.critic == ["agent_distances"]
         problem = "is empty for a single UAV: add another feature"
         checks.require(not empty, "observation", "agent_distances", problem)
-
-    def _check_belief(self) -> None:
-        """Refuse beliefs that nothing computes."""
-        belief = self.observation.belief
-        problem = "does not go with links=matrix: no UAV computes a belief from what it hears directly"
-        checks.require(not (belief and self.links.kind == "matrix"), "observation.belief", belief, problem)
-        problem = "needs discrete actions: it has a value for each of them"
-        continuous = self.actions.kind == "continuous"
-        checks.require(not (continuous and "belief_gain" in belief), "observation.belief", belief, problem)
-
-    def _check_ends(self) -> None:
-        """Refuse end conditions of an episode that can never be met (paper, section 4.1)."""
-        checks.require(
-            self.episode.discharged_share is None or self.battery.enabled,
-            "episode.discharged_share",
-            self.episode.discharged_share,
-            "needs battery.enabled=true: the batteries stay full",
-        )
+        # Ends of an episode that can never be met (paper, section 4.1).
+        share = self.episode.discharged_share
+        problem = "needs battery.enabled=true: the batteries stay full"
+        checks.require(share is None or self.battery.enabled, "episode.discharged_share", share, problem)
         stops = self.source.motion == "dynamic" and self.source.after_walk == "stop"
-        checks.require(
-            not self.episode.end_with_source or stops,
-            "episode.end_with_source",
-            True,
-            "needs source.motion=dynamic and source.after_walk=stop: another source never ends its walk",
-        )
+        problem = "needs source.motion=dynamic and source.after_walk=stop: another source never ends its walk"
+        checks.require(not self.episode.end_with_source or stops, "episode.end_with_source", True, problem)
 
     @property
     def seeks_source(self) -> bool:

@@ -107,18 +107,10 @@ class UavEnv(EnvBase):
         self.action_columns = self.server.action_columns(features)
         """Columns of the actors' observations with a value for each action; None if there are none."""
         self._reset_outputs = self._outputs_at_reset(initial, features)
-        self._check_memory(num_worlds)
         self._make_specs(self._bounds(features))
         self.set_seed(seed)
         self._compiled: CompiledMethods | None = None
         self.to(torch.device(device))
-
-    def _check_memory(self, n_worlds: int) -> None:
-        """Refuse so many worlds that their state and the outputs of a step do not fit."""
-        tables = [*self.simulation.packed_initial, *self._reset_outputs.values()]
-        size = n_worlds * sum(table[0].nbytes for table in tables)
-        remedy = "take fewer of these worlds (worlds or eval_episodes of a program), or fewer UAVs"
-        checks.fits("num_worlds", n_worlds, size, remedy)
 
     def compile(self, **options: Any) -> "UavEnv":
         """Compile the computation of a step as one graph.
@@ -168,12 +160,12 @@ class UavEnv(EnvBase):
         Raises:
             InputError: it is that of another number of worlds or of another scenario.
         """
+        loaded = {}
         for name, own in self.worlds._asdict().items():
-            shape = list(state[name].shape)
-            should = f"is not {list(own.shape)}: load it into as many worlds of the same scenario"
+            shape, should = list(state[name].shape), f"is not {list(own.shape)}: load it into as many worlds"
             checks.require(shape == list(own.shape), f"UavEnv: shape of the loaded {name}", shape, should)
-        loaded = {name: state[name].to(own) for name, own in self.worlds._asdict().items()}
-        self.worlds = PackedState(**{name: table.clone() for name, table in loaded.items()})
+            loaded[name] = state[name].to(own, copy=True)
+        self.worlds = PackedState(**loaded)
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world its own random stream; the next reset begins its first episode.
@@ -187,7 +179,9 @@ class UavEnv(EnvBase):
         Raises:
             InputError: there is not one integer for each world.
         """
-        checks.integers("seeds", seeds, self.batch_size)
+        good = seeds.shape == self.batch_size and not seeds.is_floating_point()
+        should = f"are not {self.batch_size[0]} integers, one for each world"
+        checks.require(good, "seeds", f"{list(seeds.shape)} of {seeds.dtype}", should)
         seeds = seeds.to(self.device, torch.long)
         zero = torch.zeros_like(seeds)
         if "worlds" not in self.__dict__:
@@ -358,11 +352,9 @@ class UavEnv(EnvBase):
         else:
             action = Bounded(0.0, 1.0, shape=torch.Size((*agents, 2)), device=self.device)
         reward = Unbounded(torch.Size((*agents, 1)), device=self.device)
-        self.action_spec = Composite(
-            agents=Composite(action=action, shape=agents), shape=worlds, device=self.device
-        )
-        self.reward_spec = Composite(
-            agents=Composite(reward=reward, shape=agents), shape=worlds, device=self.device
+        of_agents = Composite(action=action, shape=agents), Composite(reward=reward, shape=agents)
+        self.action_spec, self.reward_spec = (
+            Composite(agents=each, shape=worlds, device=self.device) for each in of_agents
         )
         self.done_spec = self._specs_of(ends)
 

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 if TYPE_CHECKING:
+    from damian.interop.gym import UavGymEnv, UavVectorEnv
     from damian.interop.pettingzoo import UavParallelEnv
-    from damian.interop.single import UavGymEnv
-    from damian.interop.vector import UavVectorEnv
 
 __all__ = ["UavGymEnv", "UavParallelEnv", "UavVectorEnv"]
 
 TASKS = ("spotting", "tracking", "coverage", "energy", "mixed")
 """Scenarios of conf/scenario that are registered, each as ``damian/NAME-v0``."""
-_MODULES = {"UavGymEnv": "single", "UavParallelEnv": "pettingzoo", "UavVectorEnv": "vector"}
+_MODULES = {"UavGymEnv": "gym", "UavParallelEnv": "pettingzoo", "UavVectorEnv": "gym"}
 
 for _task in TASKS:
     gymnasium.register(

@@ -13,6 +13,7 @@ from torchrl.envs.utils import step_mdp
 
 from damian import keys
 from damian.common import checks
+from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
@@ -40,7 +41,7 @@ class Instant(NamedTuple):
 
 
 class Flight:
-    """The environment of a scenario, with its delays, stepped with NumPy arrays.
+    """The environment of a scenario, with its delays, stepped with NumPy arrays, after a ``reset``.
 
     Args:
         scenario: all settings, delays included.
@@ -52,6 +53,9 @@ class Flight:
     Raises:
         InputError: the scenario asks for something impossible, or a render mode or view is unknown.
     """
+
+    _now: TensorDictBase
+    """What the environment has output last, with which its next step begins; there after a reset."""
 
     def __init__(
         self,
@@ -65,7 +69,6 @@ class Flight:
             checks.one_of("render_mode", render_mode, RENDER_MODES)
         self.env = make_env(scenario, num_worlds, seed, extras=EXTRAS if render_mode else ())
         self.film = LiveFilm(self.env.uav_env, view) if render_mode else None
-        self._now: TensorDictBase | None = None
 
     def observation_space(self, agent: int) -> Box:
         """What an agent observes, [F]."""
@@ -97,8 +100,6 @@ class Flight:
         Returns:
             What the step outputs, and what the next step begins with.
         """
-        if self._now is None:
-            raise RuntimeError("call reset before step")
         self._now[keys.ACTION] = torch.as_tensor(action)
         if reset:
             stepped, self._now = self.env.step_and_maybe_reset(self._now)
@@ -116,8 +117,6 @@ class Flight:
 
     def state(self) -> Array:
         """What a central critic observes of the first world, from the messages at the server, [N G]."""
-        if self._now is None:
-            raise RuntimeError("call reset before state")
         return cast(Tensor, self._now[keys.GLOBAL_OBSERVATION])[0].flatten().numpy().copy()
 
     def state_space(self) -> Box:
@@ -147,34 +146,18 @@ def _instant(outputs: TensorDictBase) -> Instant:
 
 
 def actions_in(space: Space[Any], key: str, given: Any) -> Array:
-    """Actions as an array of the shape and type of a space; they may be of other types of the same kind.
-
-    Args:
-        space: what the actions must lie in.
-        key: of the error.
-        given: an array, or what NumPy makes one of: float64 for a space of float32, or any integers.
+    """Actions as an array of the type of a space; they may be of another type of the same kind.
 
     Raises:
-        InputError: they have another shape or kind (fractions where integers are asked for), or lie outside.
+        InputError: they do not lie in the space, or are fractions where integers are asked for.
     """
     try:
-        found = np.asarray(given)
-    except (TypeError, ValueError):  # such as a list of lists of several lengths
-        found = np.empty(0, object)
-    kind = np.dtype(space.dtype)
-    fits = found.shape == space.shape and np.can_cast(found.dtype, kind, "same_kind")
-    checks.require(fits and space.contains(found.astype(kind)), key, given, f"is not in {space}")
-    return found.astype(kind)
-
-
-def one_uav(scenario: ScenarioConfig) -> None:
-    """Refuse a scenario of several UAVs.
-
-    Raises:
-        InputError: a Gymnasium environment has one agent.
-    """
-    should = "is not 1: a Gymnasium environment has one agent; take damian.interop.UavParallelEnv"
-    checks.require(scenario.agents == 1, "agents", scenario.agents, should)
+        found = np.asarray(given).astype(space.dtype, casting="same_kind")
+    except (TypeError, ValueError):  # such as a text, or lists of several lengths
+        found = None
+    if found is None or not space.contains(found):
+        raise InputError(f"{key}: {given} is not in {space}")
+    return found
 
 
 def row(infos: dict[str, Array], world: int, agent: int) -> dict[str, Any]:

@@ -1,18 +1,19 @@
 """The interface of a learner: its settings, its actor, and its updates from collected batches."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 from tensordict import NestedKey, TensorDictBase
+from torch import nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor
 
 from damian import keys
 from damian.common import checks
-from damian.common.errors import InputError
 from damian.common.registry import Registry
-from damian.common.text_files import show
 from damian.learners.networks import ModelConfig, make_actor
 
 
@@ -93,7 +94,7 @@ READABLE = ("message", "state", "reward_terms", "privileged", "hindsight")
 class LearnerConfig:
     """Settings of a learner, which make it; those that all learners share.
 
-    A learner of one's own has a dataclass derived from this class, with fields for its own settings, that
+    A learner of your own has a dataclass derived from this class, with fields for its own settings, that
     implements ``make``. Whatever changes in the learner must be among its ``components``, or a resumed run
     loses it. The settings ``learner=package.module:Name learner.lr=1e-3`` choose it.
     """
@@ -117,10 +118,7 @@ class LearnerConfig:
         checks.in_range("learner.lr", self.lr, 0.0, 1.0)  # Adam moves a weight by up to this much at once
         checks.in_range("learner.gamma", self.gamma, 0.0, 1.0)
         checks.in_range("learner.steps", self.steps, 1, checks.STEPS)
-        key, reads = f"{type(self).__name__}.reads", self.reads
-        checks.require(isinstance(reads, tuple | list), key, reads, "is not a tuple such as ('message',)")
-        for name in reads:
-            checks.one_of(key, name, READABLE)
+        checks.names(f"{type(self).__name__}.reads", self.reads, READABLE)
 
     def check(self, setup: LearningSetup) -> None:
         """Check that this learner can learn in such a run.
@@ -151,42 +149,34 @@ class LearnerConfig:
 
 def _not_a_learner(found: Any) -> str | None:
     good = isinstance(found, type) and issubclass(found, LearnerConfig)
-    if good and "__dataclass_fields__" not in vars(found):
+    if good and "__dataclass_fields__" not in vars(found):  # its own settings would not be found
         return "is no dataclass: write @dataclass above the class"
-    if good and found.make is not LearnerConfig.make:
-        return None
-    return "is no dataclass derived from damian.LearnerConfig with a method make"
-
-
-def check_learner(learner: Any, name: str) -> None:
-    """Check that an object is a ``Learner``.
-
-    Raises:
-        InputError: it lacks a part, or its components lack the actor.
-    """
-    missing = [part for part in ("actor", "learn", "components") if not hasattr(learner, part)]
-    should = f"is no learner: it has no {', '.join(missing)} (damian.learners.base.Learner)"
-    checks.require(not missing, f"{name}: make returned", type(learner).__name__, should)
-    components = learner.components()
-    good = isinstance(components, dict) and components.get("actor") is learner.actor
-    should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
-    checks.require(good, f"{name}: components", show(components), should)
-
-
-def check_numbers(numbers: Any, name: str) -> dict[str, float]:
-    """The numbers that ``learn`` returns, as floats.
-
-    Raises:
-        InputError: they are not numbers by name.
-    """
-    good = isinstance(numbers, dict) and all(isinstance(key, str) for key in numbers)
-    should = "is not a dict of numbers by name, such as {'loss': 0.1}"
-    checks.require(good, f"{name}: learn returned", show(numbers), should)
-    try:
-        return {key: float(number) for key, number in numbers.items()}
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{name}: learn returned {show(numbers)}, which {should}") from error
+    return None if good else "is no dataclass derived from damian.LearnerConfig with a method make"
 
 
 LEARNERS = Registry[type[LearnerConfig]]("learner", _not_a_learner)
-"""Settings classes of learners, by name; one's own as ``package.module:Name``."""
+"""Settings classes of learners, by name; your own as ``package.module:Name``."""
+
+LARGEST_WEIGHT = 1e5
+"""Weights of useful networks are thousands of times smaller."""
+
+
+def divergence(components: Mapping[str, Any], numbers: Mapping[str, float]) -> str | None:
+    """Say which number shows that a learner has diverged; None if it has not.
+
+    A logged nan may only mean that nothing is known yet, as before SAC's warm-up; that of a loss has made the
+    weights nan as well.
+
+    Args:
+        components: of the learner, by name.
+        numbers: that the learner has logged, by name.
+    """
+    for name, number in numbers.items():
+        if math.isinf(number):
+            return f"{name} is {number}"
+    for name, component in components.items():
+        weights = [*component.parameters()] if isinstance(component, nn.Module) else []
+        largest = nn.utils.get_total_norm(weights, math.inf).item() if weights else 0.0
+        if not largest <= LARGEST_WEIGHT:  # true also for nan
+            return f"a weight of {name} is {largest:.3g}, not at most {LARGEST_WEIGHT:g}"
+    return None

@@ -84,8 +84,8 @@ class MappoConfig(LearnerConfig):
 
     def check(self, setup: LearningSetup) -> None:
         recurrent, shortest, longest = setup.model.recurrent, setup.shortest_period, setup.longest_delay
-        most_minibatches = setup.worlds if recurrent else setup.worlds * shortest
-        checks.in_range("learner.minibatches", self.minibatches, 1, most_minibatches)
+        samples = setup.worlds if recurrent else setup.worlds * shortest
+        checks.in_range("learner.minibatches", self.minibatches, 1, samples)
         should = f"needs more than {longest} steps (longest delay) per update (learner.steps), not {shortest}"
         checks.require(not setup.settle or longest < shortest, "settle", True, should)
         should = "does not go with model.rnn: hidden states are not recomputed from corrected observations"

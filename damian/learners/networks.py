@@ -18,7 +18,7 @@ from torchrl.modules.distributions import NormalParamExtractor
 from damian import keys
 from damian.common import checks
 from damian.learners.recurrent import AgentGRU
-from damian.learners.reward_scale import NormalizedValue, check_stored_values
+from damian.learners.reward_scale import NormalizedValue
 
 COMPILE_OPTIONS = {
     "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
@@ -61,12 +61,8 @@ class ModelConfig:
         checks.one_of("model.activation", self.activation, _ACTIVATIONS)
         checks.one_of("model.rnn", self.rnn, ["none", "gru"])
         checks.one_of("model.init", self.init, ["default", "orthogonal"])
-        checks.require(
-            not self.recurrent or bool(self.hidden),
-            "model.hidden",
-            [],
-            "needs at least one layer for model.rnn=gru",
-        )
+        should = "needs at least one layer for model.rnn=gru"
+        checks.require(not self.recurrent or bool(self.hidden), "model.hidden", [], should)
         checks.in_range("model.hidden (number of layers)", len(self.hidden), 0, 64)
         for width in self.hidden:
             checks.in_range("model.hidden", width, 1, 16384)
@@ -88,29 +84,27 @@ class ModelConfig:
     def gru(self, n_in: int, device: torch.device | None) -> AgentGRU:
         """Make all hidden layers for features [*, n_in]; the last one is recurrent."""
         *widths, n_hidden = self.hidden
-        if not widths:
-            return self.initialized(AgentGRU(nn.Identity(), n_in, n_hidden, device), 1.0)
-        encoder = self.hidden_layers(n_in, widths, device)
-        return self.initialized(AgentGRU(encoder, widths[-1], n_hidden, device), 1.0)
+        encoder = self.hidden_layers(n_in, widths, device) if widths else nn.Identity()
+        return self.initialized(AgentGRU(encoder, widths[-1] if widths else n_in, n_hidden, device), 1.0)
 
     def hidden_layers(self, n_in: int, widths: Sequence[int], device: torch.device | None) -> MLP:
         """Make layers of these widths, each with its activation, for features [*, n_in]."""
         *inner, n_out = widths
-        kind, active = _ACTIVATIONS[self.activation], True
-        return MLP(
-            n_in, n_out, num_cells=inner, activation_class=kind, activate_last_layer=active, device=device
-        )
+        kind = _ACTIVATIONS[self.activation]
+        options: dict[str, Any] = {"activation_class": kind, "activate_last_layer": True, "device": device}
+        return MLP(n_in, n_out, num_cells=inner, **options)
 
     def initialized(self, network: Network, gain: float) -> Network:
         """Initialise the weights as the setting ``init`` says, with ``gain`` in the last layer."""
-        if self.init == "orthogonal":
-            layers = [each for each in network.modules() if isinstance(each, nn.Linear | nn.GRUCell)]
-            for layer in layers:
-                for weights in layer.parameters():
-                    if weights.ndim == 1:
-                        nn.init.zeros_(weights)
-                    else:
-                        nn.init.orthogonal_(weights, gain if layer is layers[-1] else math.sqrt(2))
+        if self.init != "orthogonal":
+            return network
+        layers = [each for each in network.modules() if isinstance(each, nn.Linear | nn.GRUCell)]
+        for layer in layers:
+            for weights in layer.parameters():
+                if weights.ndim == 1:
+                    nn.init.zeros_(weights)
+                else:
+                    nn.init.orthogonal_(weights, gain if layer is layers[-1] else math.sqrt(2))
         return network
 
 
@@ -206,8 +200,11 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
     n_features = env.observation_spec[keys.OBSERVATION].shape[-1]
 
     def head(network: nn.Module, in_key: NestedKey) -> TensorDictModule:
-        if config.skip:
-            module: nn.Module = SkipConnection(network, action_columns(env, n_out))
+        if config.skip:  # the columns of the observation that have a probability for each action
+            columns = getattr(env, "action_columns", None)
+            should = "needs a probability for each discrete action: observation.belief=[belief_gain]"
+            checks.require(columns is not None, "model.skip", True, should)
+            module: nn.Module = SkipConnection(network, cast(slice, columns))
             return TensorDictModule(module, in_keys=[in_key, keys.OBSERVATION], out_keys=list(out_keys))
         normal = len(out_keys) == 2
         module = nn.Sequential(network, NormalParamExtractor()) if normal else network
@@ -218,19 +215,6 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
     linear = config.initialized(nn.Linear(config.hidden[-1], n_out, device=env.device), POLICY_GAIN)
     gru = config.gru(n_features, env.device)
     return TensorDictSequential([gru, head(linear, keys.HIDDEN)])  # type: ignore[list-item]
-
-
-def action_columns(env: EnvBase, n_actions: int) -> slice:
-    """The columns of the actor's observation that have a probability for each action.
-
-    Raises:
-        InputError: the environment has no attribute ``action_columns``, or none such.
-    """
-    columns = getattr(env, "action_columns", None)
-    good = isinstance(columns, slice) and columns.stop - columns.start == n_actions
-    should = "needs a feature with a probability for each discrete action: observation.belief=[belief_gain]"
-    checks.require(good, "model.skip", True, should)
-    return cast(slice, columns)
 
 
 class SkipConnection(nn.Module):
@@ -275,9 +259,7 @@ def make_critic(
         network = config.network(n_features, 1, env.device)
     if normalize:
         network = NormalizedValue(network, env.device)
-    critic = TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
-    critic.register_load_state_dict_pre_hook(check_stored_values)
-    return critic
+    return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])
 
 
 class SharedValue(nn.Module):

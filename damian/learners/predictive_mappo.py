@@ -1,22 +1,31 @@
-"""MAPPO whose actor has a belief head: it also learns to predict what arrives later."""
+"""A learnt belief: MAPPO whose actor predicts, from the messages that have arrived, what arrives later.
+
+Under delay a receiver holds a set of messages with ages, of its own and of others, and its own latest
+actions. The actor asks this set questions, by attention: one for each action that it might choose. From the
+answers it predicts what the messages will have said when that action has ended, once they have arrived, and
+chooses. It learns to predict from the replay buffer, in which the late messages have arrived.
+Nothing here depends on what the messages mean.
+"""
 
 from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import ProbabilisticActor, recurrent_mode
+from torchrl.modules.distributions import NormalParamExtractor
 
 from damian import keys
 from damian.common import checks
+from damian.common.tensors import expand_mask, gather_rows, next_true
 from damian.keys import next_key
 from damian.learners.base import LEARNERS, LearningSetup
-from damian.learners.belief_head import belief_head, ends_of_actions, make_belief_actor, prediction_loss
 from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig
-from damian.learners.networks import ModelConfig
+from damian.learners.networks import POLICY_GAIN, ModelConfig, with_distribution
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import arrived_by_now
 
@@ -54,18 +63,13 @@ class PredictiveMappoConfig(MappoConfig):
 
     def check(self, setup: LearningSetup) -> None:
         super().check(setup)
-        name, model = "learner=predictive_mappo", setup.model
-        checks.require(setup.backupdate, "learner", "predictive_mappo", _NEEDS)
-        checks.require(setup.action_delay is not None, "learner", "predictive_mappo", _CONSTANT)
-        for key, value, good in (
-            ("model.rnn", model.rnn, not model.recurrent),
-            ("model.skip", model.skip, not model.skip),
-            ("model.hidden", model.hidden, bool(model.hidden)),
-            ("recompute_actor", setup.recompute_actor, not setup.recompute_actor),
-        ):
-            checks.require(
-                good, key, value, f"does not go with {name}, whose actor has an encoder of its own"
-            )
+        model, should = setup.model, f"does not go with learner={self.name}, whose actor has its own encoder"
+        checks.require(setup.backupdate, "learner", self.name, _NEEDS)
+        checks.require(setup.action_delay is not None, "learner", self.name, _CONSTANT)
+        checks.require(not model.recurrent, "model.rnn", model.rnn, should)
+        checks.require(not model.skip, "model.skip", True, should)
+        checks.require(bool(model.hidden), "model.hidden", model.hidden, should)
+        checks.require(not setup.recompute_actor, "recompute_actor", True, should)
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         least = super().buffer_size(setup)
@@ -73,7 +77,7 @@ class PredictiveMappoConfig(MappoConfig):
 
     def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "PredictiveMappo":
         late = keys.DELAY in env.observation_spec.keys(True, True)  # rewards alone may be late
-        checks.require(late, "learner", "predictive_mappo", _NEEDS)
+        checks.require(late, "learner", self.name, _NEEDS)
         return PredictiveMappo(env, self, setup, buffer)
 
     def make_actor(self, env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
@@ -97,7 +101,7 @@ class PredictiveMappo(Mappo):
         self, env: EnvBase, config: PredictiveMappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None
     ) -> None:
         super().__init__(env, config, setup, buffer)
-        self.head = belief_head(self.actor)
+        self.head = next(each for each in self.actor.modules() if isinstance(each, BeliefHead))
         self.head_optimizer = torch.optim.Adam(self.head.parameters(), lr=config.prediction_lr, fused=True)
 
     def components(self) -> dict[str, Any]:
@@ -175,4 +179,281 @@ class PredictiveMappo(Mappo):
         after = (keys.READY, keys.DELAY, keys.GLOBAL_OBSERVATION)
         completed, delay, target = (cast(Tensor, steps[next_key(key)])[index] for key in after)
         arrived = arrived_by_now(delay, n_rows - 1 - end)
+        # An action whose flight the end of the episode has cut leads to nothing that could be predicted.
         return before, target, arrived & (ready & completed).unsqueeze(-1)
+
+
+# The actor.
+
+FLAGS = 3
+"""Columns of ``MessageHistory`` behind those of the message: whether it has arrived, its age, is it own."""
+CODE_SIZE = 8
+"""Size of the learnt code of a discrete action."""
+PREFERENCE_UNIT = 30.0
+"""Logits per unit of the learnt weights of predictions: weights move slowly, and a policy that relies on
+predictions needs large logits."""
+LARGEST = 5.0
+"""Largest magnitude of a normalised target, so that a number that hardly ever changes weighs no more."""
+FORGETTING = 0.99
+"""Share of the running statistics of the targets that an update keeps."""
+
+
+class MessageEncoder(nn.Module):
+    """Encodes an observation, a set of messages with ages, and a code of what is asked, by attention.
+
+    Each message is given as it is and relative to the newest known message of the first sender, which with
+    ``MessageHistory`` is the receiver itself. Queries follow from the observation and the code; keys and
+    values are an embedding of the messages. Messages that are not known have no influence.
+
+    Args:
+        n_features: number of features of the observation, F.
+        n_columns: number of columns of a row of the history, C.
+        n_code: size of a code, K.
+        config: the hidden layers follow the attention; the last one is the encoding.
+        heads: number of queries for a code.
+        width: size of the embedding of a message, E.
+        device: of the weights.
+    """
+
+    def __init__(
+        self,
+        n_features: int,
+        n_columns: int,
+        n_code: int,
+        config: ModelConfig,
+        heads: int,
+        width: int,
+        device: torch.device | None = None,
+    ) -> None:
+        super().__init__()
+        self.n_message, self.heads, self.width = n_columns - FLAGS, heads, width
+        n_known = n_features + self.n_message
+        self.embed = nn.Sequential(nn.Linear(n_columns + self.n_message, width, device=device), nn.ReLU())
+        self.queries = nn.Sequential(
+            nn.Linear(n_known + n_code, 2 * width, device=device),
+            nn.ReLU(),
+            nn.Linear(2 * width, heads * width, device=device),
+        )
+        self.layers = config.hidden_layers(heads * width + n_known + n_code, config.hidden, device)
+
+    def forward(self, observation: Tensor, history: Tensor, codes: Tensor) -> Tensor:
+        """Encode observations [*, F] and histories [*, L, C], for Q codes each [*, Q, K], into [*, Q, H]."""
+        if observation.dim() > 2:  # a compiler replaces attention in four dimensions by a slower kernel
+            batch = observation.shape[:-1]
+            rows = (part.flatten(0, len(batch) - 1) for part in (observation, history, codes))
+            return self(*rows).unflatten(0, batch)
+        message, known = history[..., : self.n_message], history[..., self.n_message]
+        newest = known.argmax(-1, keepdim=True).unsqueeze(-1)  # the first of the known ones
+        reference = message.gather(-2, newest.expand(*newest.shape[:-1], self.n_message))
+        relative = (message - reference) * known.unsqueeze(-1)
+        embedded = self.embed(torch.cat([history, relative], -1))  # [*, L, E]
+        context = torch.cat([observation.unsqueeze(-2), reference], -1)
+        first, *others = self.queries
+        asked = _apply(others, _linear_of_parts(first, context, codes))
+        queries = asked.unflatten(-1, (self.heads, self.width)).flatten(-3, -2)
+        scores = queries @ embedded.transpose(-1, -2) / self.width**0.5  # [*, Q heads, L]
+        shares = (scores + (known.unsqueeze(-2) - 1) * 1e8).softmax(-1)
+        found = (shares @ embedded).unflatten(-2, (-1, self.heads)).flatten(-2)
+        first, *others = self.layers
+        return _apply(others, _linear_of_parts(first, found, context, codes))
+
+
+def _linear_of_parts(layer: nn.Module, *parts: Tensor) -> Tensor:
+    """What a linear layer makes of features in several parts, [*, K] each, without copies of the ones that
+    are the same for all queries: their products are broadcast."""
+    weights = cast(nn.Linear, layer).weight.split([part.shape[-1] for part in parts], -1)
+    return sum((part @ w.T for part, w in zip(parts, weights, strict=True)), cast(nn.Linear, layer).bias)
+
+
+def _apply(layers: list[nn.Module], features: Tensor) -> Tensor:
+    for layer in layers:
+        features = layer(features)
+    return features
+
+
+class TargetScale(nn.Module):
+    """Running mean and standard deviation of each of G numbers, so that errors do not depend on their scales.
+
+    Args:
+        n_targets: how many numbers, G.
+        device: of the statistics.
+    """
+
+    moments: Tensor
+    """Running means of 1, the numbers and their squares, which begin with 0, [3, G]."""
+
+    def __init__(self, n_targets: int, device: torch.device | None = None) -> None:
+        super().__init__()
+        self.register_buffer("moments", torch.zeros(3, n_targets, dtype=torch.float64, device=device))
+
+    @torch.no_grad()
+    def update(self, target: Tensor, counts: Tensor) -> None:
+        """Add numbers [*, G] where they count, [*, 1] bool; nothing changes if none does."""
+        values = target.double().flatten(0, -2)
+        weight = counts.flatten(0, -2).double() / counts.sum().clamp(min=1)
+        new = torch.stack([torch.ones_like(values), values, values.square()])
+        kept = torch.where(counts.any(), FORGETTING, 1.0)
+        self.moments.mul_(kept).add_((1 - FORGETTING) * (new * weight).sum(1))
+
+    def normalize(self, target: Tensor) -> Tensor:
+        """Numbers [*, G] with mean 0 and standard deviation 1, within ``LARGEST``; 0 before any update."""
+        known, mean, square = self.moments / self.moments[0].clamp(min=1e-12)
+        deviation = (square - mean.square()).clamp(min=1e-8 * square + 1e-30).sqrt()
+        return ((target - mean) * known / deviation).clamp(-LARGEST, LARGEST).to(target.dtype)
+
+
+class BeliefHead(TensorDictModuleBase):
+    """Predicts what arrives later, for every discrete action, and encodes what is known for a policy.
+
+    The predictions tell, in units of their running standard deviation, what the G numbers of the targets will
+    have been when the action ends (after the step that executes it; with real flight times after the
+    landing), once the messages of that step have arrived. Code 0 asks what will have been whatever the
+    action; its encoding is for the policy.
+
+    While acting it writes ``("agents", "encoding")`` [*, H] and, with discrete actions,
+    ``("agents", "prediction")`` [*, A G]. In TorchRL's recurrent mode, which the losses of a policy switch
+    on, it does nothing: what the policy has read stays as it was, like an observation, so that learning to
+    predict never changes what a policy has done.
+
+    Args:
+        encoder: from observations, histories and codes to encodings [*, Q, H].
+        n_encoding: size of the encodings, H.
+        n_targets: number of numbers to predict, G.
+        n_actions: number of discrete actions, A; None if they are continuous, and codes of themselves.
+        n_code: size of a code, K.
+        device: of the weights.
+    """
+
+    def __init__(
+        self,
+        encoder: MessageEncoder,
+        n_encoding: int,
+        n_targets: int,
+        n_actions: int | None,
+        n_code: int,
+        device: torch.device | None = None,
+    ) -> None:
+        super().__init__()
+        self.encoder, self.n_actions = encoder, n_actions
+        self.codes = nn.Parameter(0.5 * torch.randn((n_actions or 0) + 1, n_code, device=device))
+        self.predictor = nn.Linear(n_encoding, n_targets, device=device)
+        self.norm = TargetScale(n_targets, device)
+        self.in_keys = [keys.OBSERVATION, keys.HISTORY]  # type: ignore[assignment]
+        written = [keys.ENCODING, *[keys.PREDICTION] * (n_actions is not None)]
+        self.out_keys = written  # type: ignore[assignment]
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if recurrent_mode():
+            return tensordict
+        observation, history = tensordict[keys.OBSERVATION], tensordict[keys.HISTORY]
+        codes = self.codes.expand(*observation.shape[:-1], -1, -1)
+        encodings = self.encoder(observation, history, codes)
+        tensordict.set(keys.ENCODING, encodings[..., 0, :])
+        if self.n_actions is not None:
+            tensordict.set(keys.PREDICTION, self.predictor(encodings[..., 1:, :]).flatten(-2))
+        return tensordict
+
+    def predict(self, observation: Tensor, history: Tensor, action: Tensor) -> Tensor:
+        """Normalised predictions, whatever the action and for this one, [*, 2, G].
+
+        Args:
+            observation: observations, [*, F].
+            history: messages with ages, [*, L, C].
+            action: actions, [*], or [*, K] if they are continuous.
+        """
+        code = action if self.n_actions is None else gather_rows(self.codes, action + 1)
+        codes = torch.stack([self.codes[0].expand_as(code), code], -2)
+        return self.predictor(self.encoder(observation, history, codes))
+
+
+class Preference(nn.Module):
+    """Logits from observations, encodings and what is predicted for each action, with learnt weights.
+
+    Args:
+        network: from observations and encodings [*, F + H] to logits [*, A].
+        n_targets: number of predicted numbers, G.
+        device: of the weights.
+    """
+
+    def __init__(self, network: nn.Module, n_targets: int, device: torch.device | None) -> None:
+        super().__init__()
+        self.network, self.weight = network, nn.Parameter(torch.zeros(n_targets, device=device))
+
+    def forward(self, observation: Tensor, encoding: Tensor, prediction: Tensor) -> Tensor:
+        """Logits [*, A] from observations [*, F], encodings [*, H] and predictions [*, A G]."""
+        logits = self.network(torch.cat([observation, encoding], -1))
+        return logits + PREFERENCE_UNIT * (prediction.unflatten(-1, (logits.shape[-1], -1)) @ self.weight)
+
+
+class NormalPolicy(nn.Module):
+    """Means and scales of continuous actions, [*, n] each, from observations and encodings.
+
+    Args:
+        network: from observations and encodings [*, F + H] to [*, 2 n].
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network, self.normal = network, NormalParamExtractor()
+
+    def forward(self, observation: Tensor, encoding: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and scales from observations [*, F] and encodings [*, H]."""
+        return self.normal(self.network(torch.cat([observation, encoding], -1)))
+
+
+def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int) -> ProbabilisticActor:
+    """Make the policy from observations and histories to ``("agents", "action")``.
+
+    Raises:
+        InputError: the environment has no history of messages.
+    """
+    known, device = env.observation_spec.keys(True, True), env.device
+    should = "reads no messages: set delay.messages, or add damian.MessageHistory to the environment"
+    checks.require(keys.HISTORY in known, "learner", "predictive_mappo", should)
+    observation, history = env.observation_spec[keys.OBSERVATION], env.observation_spec[keys.HISTORY]
+    n_targets, n_encoding = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1], config.hidden[-1]
+
+    def network(n_out: int, *out_keys: NestedKey) -> TensorDictSequential:
+        discrete = len(out_keys) == 1
+        n_actions, n_code = (n_out, CODE_SIZE) if discrete else (None, n_out // 2)
+        n_features = observation.shape[-1]
+        encoder = MessageEncoder(n_features, history.shape[-1], n_code, config, heads, width, device)
+        head = BeliefHead(encoder, n_encoding, n_targets, n_actions, n_code, device)
+        read = [keys.OBSERVATION, *head.out_keys]
+        policy = config.network(n_features + n_encoding, n_out, device, POLICY_GAIN)
+        module = Preference(policy, n_targets, device) if discrete else NormalPolicy(policy)
+        parts = [head, TensorDictModule(module, read, list(out_keys))]
+        return TensorDictSequential(parts)  # type: ignore[arg-type]
+
+    return with_distribution(env, network)
+
+
+def ends_of_actions(ready: Tensor, reset: Tensor, delay: int) -> Tensor:
+    """The last step of the action that is chosen in each of T steps.
+
+    Args:
+        ready: whether the UAV could choose after each step, [T, ...] bool.
+        reset: whether the episode was reset after each step, bool, broadcast to ``ready``.
+        delay: steps until an action is executed, d.
+
+    Returns:
+        index of the step, [T, ...]; T if it comes later, or if a reset came before the action was executed.
+    """
+    ends, n_steps = next_true(ready | reset), len(ready)
+    executed = torch.arange(n_steps, device=ready.device) + delay
+    ends = ends[executed.clamp(max=n_steps - 1)]
+    prevented = next_true(reset.expand_as(ready)) < expand_mask(executed, ready)
+    return ends.where(~prevented & expand_mask(executed < n_steps, ready), n_steps)
+
+
+def prediction_loss(predicted: Tensor, target: Tensor, counts: Tensor) -> Tensor:
+    """Mean square error of predictions, []; 0 if none counts.
+
+    Args:
+        predicted: normalised predictions, [*, G].
+        target: normalised numbers that later arrived, [*, G]; anything where they do not count.
+        counts: whether they have arrived, [*, 1] bool.
+    """
+    error = torch.where(counts, predicted - target, 0.0).square()
+    return error.sum() / counts.expand_as(error).sum().clamp(min=1)

@@ -10,7 +10,6 @@ from torchrl.modules import PopArtValueNorm, RunningValueNorm
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
-from damian.common import checks
 
 FORGETTING = 0.99
 """Share of the running statistics of values that an update keeps: they reflect about the last 100 updates."""
@@ -47,18 +46,6 @@ def update_value_scale(critic: TensorDictModule, targets: Tensor) -> None:
 def value_scale(critic: TensorDictModule) -> Tensor | float:
     """Running standard deviation of a critic's value targets, [1]; 1 if its values are not normalised."""
     return critic.module.norm.scale().float() if isinstance(critic.module, NormalizedValue) else 1.0
-
-
-def check_stored_values(critic: nn.Module, stored: dict[str, Any], *_: Any) -> None:
-    """Check that a stored critic has running statistics if, and only if, this one has.
-
-    Raises:
-        InputError: one of both has, so that its outputs mean something else.
-    """
-    here = isinstance(critic.module, NormalizedValue)
-    there = any(".norm." in name for name in stored)
-    should = f"does not go with a critic that was trained with {there}"
-    checks.require(here == there, "learner.normalize_value", here, should)
 
 
 class ReturnScale(nn.Module):

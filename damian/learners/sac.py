@@ -97,9 +97,7 @@ class SacConfig(LearnerConfig):
         return self.buffer_steps // setup.worlds * setup.worlds
 
     def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "Sac":
-        if buffer is None:
-            raise ValueError("buffer: SAC needs a replay buffer on a TimeStorage")
-        return Sac(env, self, setup, buffer)
+        return Sac(env, self, setup, cast(ReplayBuffer, buffer))
 
 
 class Sac:
@@ -257,29 +255,17 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
     for all states would exceed the largest possible entropy where few actions are legal.
     """
 
-    def __init__(
-        self,
-        actor: ProbabilisticActor,
-        critics: list[TensorDictModule],
-        n: int,
-        share: float,
-        **options: Any,
-    ) -> None:
-        zero: Any = 0.0  # ``forward`` adds the target itself
-        super().__init__(
-            actor,
-            cast(Any, critics),
-            action_space="categorical",
-            num_actions=n,
-            target_entropy=zero,
-            **options,
-        )
+    def __init__(self, actor: Any, critics: Any, n: int, share: float, **options: Any) -> None:
+        options |= {"target_entropy": 0.0}  # ``forward`` adds the target itself
+        super().__init__(actor, critics, action_space="categorical", num_actions=n, **options)
         self.share, self.n_actions = share, n
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of transitions [K], with a target entropy for each state.
 
-        TorchRL evaluates the critics twice on the same observations, for their own loss and for the actor's.
+        TorchRL evaluates the critics twice on the same observations, for their own loss and for the actor's;
+        to do it once, this reads private parts of TorchRL (``_compute_target``, ``_vmap_qnetworkN0`` and
+        ``_alpha``), as nothing else in the package does. A test compares the losses with TorchRL's own.
         """
         target = self._compute_target(tensordict)
         values = self._action_values(tensordict)

@@ -75,7 +75,7 @@ class ObservationConfig:
     """Number of each UAV's latest landing points whose footprints the coverage counts."""
 
     def __post_init__(self) -> None:
-        checks.types("observation", self)
+        checks.convert_types("observation", self)
         for scope in ("local", "global"):
             for name in getattr(self, f"{scope}_features"):
                 check_feature(f"observation.{scope}_features", name, scope)

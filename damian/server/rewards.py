@@ -182,7 +182,7 @@ class RewardConfig:
     any parameters of the term beside its weight, and a ``name`` if a term appears twice."""
 
     def __post_init__(self) -> None:
-        checks.types("reward", self)
+        checks.convert_types("reward", self)
         terms = [custom_term(written, f"reward.custom[{i}]") for i, written in enumerate(self.custom)]
         self._custom = {term.name: term for term in terms}
         taken = {*INDIVIDUAL, *SYSTEM} & {*self._custom}

@@ -28,7 +28,7 @@ class EpisodeConfig:
     """End the episode when the source has finished its walk and stops for good (``source.after_walk``)."""
 
     def __post_init__(self) -> None:
-        checks.types("episode", self)
+        checks.convert_types("episode", self)
         if self.max_steps is not None:
             checks.whole("episode.max_steps", self.max_steps, 1, checks.STEPS)
         for name in ("success_share", "discharged_share"):

@@ -39,7 +39,7 @@ class BatteryConfig:
     region.start_positions); UAVs charge at the landing point nearest each, or anywhere if not given."""
 
     def __post_init__(self) -> None:
-        checks.types("battery", self)
+        checks.convert_types("battery", self)
         checks.above("battery.engine_power_kw", self.engine_power_kw, 0.0, "kW")
         checks.above("battery.reference_speed", self.reference_speed, 0.0, "m/s")
         checks.in_range("battery.capacity_kwh", self.capacity_kwh, 1e-6, unit="kWh")

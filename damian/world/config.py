@@ -31,7 +31,7 @@ class WorldConfig:
     ``package.module:name``, or ``{sensor: package.module:name, ...}`` with parameters of the sensor."""
 
     def __post_init__(self) -> None:
-        checks.types("", self)
+        checks.convert_types("", self)
         checks.whole("agents", self.agents, 1, 1000)  # their distances grow with the square
         if self.motion.kind == "polynomial":  # others refuse them when they are built
             flight_levels(self.motion, self.agents)

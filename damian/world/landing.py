@@ -38,7 +38,7 @@ class ActionConfig:
     """Mask discrete actions without effect: target outside the region, battery too low, UAV in flight."""
 
     def __post_init__(self) -> None:
-        checks.types("actions", self)
+        checks.convert_types("actions", self)
         checks.one_of("actions.kind", self.kind, ["discrete", "continuous"])
         checks.require(len(self.distances) > 0, "actions.distances", self.distances, "is empty")
         checks.require(len(self.headings) > 0, "actions.headings", self.headings, "is empty")

@@ -46,7 +46,7 @@ class MotionConfig:
     """Settings of your own motion model, as a mapping."""
 
     def __post_init__(self) -> None:
-        checks.types("motion", self)
+        checks.convert_types("motion", self)
         if ":" not in str(self.kind):  # ``damian.world.vehicles`` imports it
             checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
             problem = f"mean nothing with motion.kind={self.kind}"

@@ -73,7 +73,7 @@ class SourceConfig:
         return 1.0 if self.emission == "constant" else self.emission_probability
 
     def __post_init__(self) -> None:
-        checks.types("source", self)
+        checks.convert_types("source", self)
         checks.in_range("source.microphone_db", self.microphone_db, 0.0, unit="dB")
         checks.in_range("source.level_db", self.level_db, -300.0, 300.0, "dB")
         checks.require(

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from damian.envs.scenario import ScenarioConfig
-from damian.interop.single import UavGymEnv
-from damian.interop.vector import UavVectorEnv
+from damian.interop.gym import UavGymEnv, UavVectorEnv
 
 from .launch import composed_config
 

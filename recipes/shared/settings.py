@@ -15,7 +15,6 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import has_delay, has_message_delay
 from damian.envs.scenario import ScenarioConfig
 from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
-from damian.learners.bpql import BpqlConfig  # noqa: F401 (registers the learner, and SacConfig)
 from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.predictive_mappo import PredictiveMappoConfig

@@ -1,5 +1,8 @@
-"""Checks that components of one's own use."""
+"""Checks of settings: one failed check of each kind, and what they convert."""
 
+from dataclasses import dataclass
+
+import numpy as np
 import pytest
 
 from damian.common import checks
@@ -9,27 +12,23 @@ from damian.common.errors import InputError
 @pytest.mark.parametrize(
     ("check", "message"),
     [
+        (lambda: checks.in_range("key", 7, 0, 5, "m"), "key: 7 m is not between 0 and 5 m"),
+        (lambda: checks.in_range("key", -1, 0), "key: -1 is not at least 0"),
+        (lambda: checks.in_range("key", 1e30, 0, unit="s"), "key: 1e+30 s is not between 0 and 1e+06 s"),
+        (lambda: checks.above("key", "3", 0.0, "m"), "key: 3 m is not above 0 m"),  # type: ignore[arg-type]
+        (lambda: checks.above("key", float("nan"), 0.0), "key: nan is not above 0"),
+        (lambda: checks.whole("key", 1.5, 1), "key: 1.5 is not a whole number"),
+        (lambda: checks.seconds("key", "soon"), "key: soon is not a time such as 2s, 0.5m or 1h"),
+        (lambda: checks.place("key", [3]), "key: [3] is not [x, y] in metres"),
+        (lambda: checks.one_of("key", "c", ["a", "b"]), "key: c is not one of a, b"),
+        (lambda: checks.names("key", "a", ["a"]), "key: 'a' is not a list of names such as ['a']"),
         (
-            lambda: checks.above("outer", 300.0, "50"),  # type: ignore[arg-type]
-            "outer: 300.0 cannot be compared with '50', which is not a number",
+            lambda: checks.known_keys("key", {"iner": 5}, ["inner"]),
+            "key.iner: 5 is not one of its options: inner",
         ),
-        (
-            lambda: checks.in_range("outer", 300.0, None, 5),  # type: ignore[arg-type]
-            "outer: 300.0 cannot be compared with None, which is not a number",
-        ),
-        (
-            lambda: checks.in_range("outer", 300.0, 0, "5"),  # type: ignore[arg-type]
-            "outer: 300.0 cannot be compared with '5', which is not a number",
-        ),
-        (lambda: checks.above("outer", "3", 0.0, "m"), "outer: 3 m is not above 0 m"),  # type: ignore[arg-type]
-        (
-            lambda: checks.known_keys("options", {"iner": 5}, ["inner"]),
-            "options.iner: 5 is not one of its options: inner",
-        ),
-        (
-            lambda: checks.known_keys("options", 5, ["inner"]),
-            "options: 5 is not a mapping such as {inner: 1}",
-        ),
+        (lambda: checks.known_keys("key", 5, ["inner"]), "key: 5 is not a mapping such as {inner: 1}"),
+        (lambda: checks.distinct("key", [1, 2, 1]), "key: 1 appears twice"),
+        (lambda: checks.device("key", "foo"), "key: foo is not one of the devices here: cpu"),
     ],
 )
 def test_a_failed_check_is_one_line(check, message):
@@ -38,6 +37,24 @@ def test_a_failed_check_is_one_line(check, message):
     assert str(error.value) == message
 
 
-def test_options_that_are_known_are_returned():
-    assert checks.known_keys("options", {"inner": 5}, ["inner", "outer"]) == {"inner": 5}
-    assert checks.known_keys("options", None, ["inner"]) == {}
+def test_what_is_right_passes_and_is_converted():
+    assert [checks.seconds("key", time) for time in ("2s", "0.5m", "1h", 0.2)] == [2.0, 30.0, 3600.0, 0.2]
+    assert checks.known_keys("key", {"inner": 5}, ["inner", "outer"]) == {"inner": 5}
+    assert checks.known_keys("key", None, ["inner"]) == {}
+
+
+@dataclass
+class Section:
+    """Settings of each kind of type."""
+
+    time: str = "1s"
+    places: list[float] | None = None
+    on: bool = True
+
+
+def test_numbers_and_arrays_become_the_types_that_the_fields_declare():
+    section = Section(2, np.array([1.0, 2.0]))  # type: ignore[arg-type]
+    checks.convert_types("section", section)
+    assert section == Section("2", [1.0, 2.0])
+    with pytest.raises(InputError, match=r"^section\.on: yes is not true or false$"):
+        checks.convert_types("section", Section(on="yes"))  # type: ignore[arg-type]

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 import torch
-from streams import check_independent, overlaps
+from streams import overlaps
 from torch.func import vmap
 
 from damian.common import counter_rng
@@ -44,12 +44,7 @@ def correlation(one, other):
     return torch.corrcoef(torch.stack([one, other]).double())[0, 1].item() * one.numel() ** 0.5
 
 
-COUNTERS = {
-    "small": torch.arange(N),
-    "large": torch.arange(N) + 2**40,
-    "powers of two": 1 << torch.arange(63),
-}
-KEYS = {"hashed": counter_rng.world_seeds(0, 8), "small": torch.arange(8), "close": 7919 * torch.arange(1, 9)}
+KEYS = {"hashed": counter_rng.world_seeds(0, 8), "small": torch.arange(8)}
 
 
 @pytest.mark.parametrize("keys", KEYS.values(), ids=KEYS)
@@ -69,16 +64,7 @@ def test_streams_are_uniform_beside_each_other_and_independent_at_every_shift(ke
     for one, other in itertools.combinations(draws, 2):
         for lag in (0, 1, 5, 100):
             assert abs(correlation(one[lag:], other[: N - lag])) < 5
-    across = counter_rng.uniform(torch.arange(N) if keys is KEYS["small"] else counter_rng.world_seeds(3, N))
     assert abs(chi_square(counter_rng.uniform(torch.arange(N), torch.tensor(17)))) < 5
-    assert keys is KEYS["small"] or abs(chi_square(across)) < 5
-
-
-@pytest.mark.parametrize("counters", COUNTERS.values(), ids=COUNTERS)
-def test_every_bit_of_a_draw_is_set_in_half_of_the_draws(counters):
-    draws = counter_rng.bits64(counter_rng.world_seeds(1, 50).unsqueeze(-1), counters).flatten()
-    share = torch.stack([(draws >> bit) & 1 for bit in range(64)]).double().mean(-1)
-    assert ((share - 0.5).abs() < 5 * 0.5 / draws.numel() ** 0.5).all()
 
 
 def test_a_changed_bit_of_key_or_counter_changes_half_of_the_bits():
@@ -97,17 +83,6 @@ def test_no_stream_is_a_section_of_another():
     assert overlaps(counter_rng.bits64(keys.unsqueeze(-1), torch.arange(500))) == 0
     shifted = torch.arange(4096) * 100  # what the check would find otherwise
     assert overlaps(counter_rng.bits64(torch.tensor(0), shifted.unsqueeze(-1) + torch.arange(500))) > 1000
-
-
-def test_the_check_of_streams_fails_for_shared_and_for_shifted_streams(monkeypatch):
-    keys = counter_rng.world_seeds(0, 6)
-    check_independent(keys)
-    with pytest.raises(AssertionError):
-        check_independent(keys[[0, 1, 2, 0]])
-    draw = counter_rng.bits64
-    monkeypatch.setattr(counter_rng, "bits64", lambda key, clock: draw(keys[:1], clock + 500 * key))
-    with pytest.raises(AssertionError):
-        check_independent(torch.arange(4))
 
 
 def test_neighbouring_seeds_give_different_keys_to_all_worlds():

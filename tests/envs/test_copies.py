@@ -4,13 +4,10 @@ import copy
 import pickle
 from functools import partial
 from multiprocessing.reduction import ForkingPickler
-from pathlib import Path
 
 import pytest
-import torch
 from delayed_envs import DELAYS, choices, delayed
 from helpers import all_same, check_equal, everything, play
-from torch import Tensor
 from torchrl.envs import EnvBase
 
 from damian.common import compiling
@@ -25,10 +22,6 @@ def sent(env: EnvBase) -> EnvBase:
 
 def pickled(env: EnvBase) -> EnvBase:
     return pickle.loads(pickle.dumps(env))
-
-
-def save_rollout(_: int, env: EnvBase, actions: list[Tensor], file: Path) -> None:
-    torch.save(play(env, actions), file)
 
 
 every_copy = pytest.mark.parametrize("copied", [copy.deepcopy, pickled, sent])
@@ -71,13 +64,3 @@ def test_an_environment_sent_to_a_worker_process_shares_no_memory(delays):
             after, td = each.step_and_maybe_reset(td.set(ACTION, action))
             outputs.append(after["next"])
     assert all_same(outputs[:12], outputs[12:])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [uav_env, partial(delayed, everything(**DELAYS["everything"]))])
-def test_a_spawned_worker_compiles_its_own_graphs(make, tmp_path):
-    env = make().compile(backend="eager")
-    play(env, choices(env, 3))
-    file = tmp_path / "outputs"
-    torch.multiprocessing.spawn(save_rollout, (env, choices(env, 6), file))  # type: ignore[attr-defined]
-    assert all_same(torch.load(file, weights_only=False), play(env, choices(env, 6)))

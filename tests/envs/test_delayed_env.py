@@ -1,20 +1,16 @@
 """``DelayedEnv``: what holds in a scenario with any delays, losses and clocks, eager and compiled."""
 
 from collections.abc import Sequence
-from functools import partial
-from typing import Any
 
 import pytest
 import torch
-from delayed_envs import DELAYS, PAPER, after_steps, choices, delayed, every_delay
+from delayed_envs import DELAYS, after_steps, choices, delayed, every_delay
 from helpers import KEEPS_GOING, all_same, both_kinds, both_motions, everything, play, square
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import (
     Compose,
     EnvBase,
-    GymEnv,
-    ParallelEnv,
     RewardSum,
     StepCounter,
     Transform,
@@ -22,18 +18,14 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
-from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import hold_action, make_env, make_transforms, server_transforms
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS, UavEnv
 from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED, REWARD
-from damian.server.termination import EpisodeConfig
 from damian.transforms import ActionDelay, CumulativeReward, RewardDelay, SampleAndHold
 from damian.world.landing import ActionConfig
-from damian.world.signal_source import SourceConfig
 
 # Without delays.
 
@@ -70,30 +62,6 @@ def test_with_delays_of_0_all_transforms_output_what_the_environment_without_the
     check_equals_undelayed(all_transforms(scenario, 8), scenario)
 
 
-@both_motions
-def test_the_server_node_ends_an_episode_with_the_walk_of_the_source(motion):
-    episode = EpisodeConfig(max_steps=None, end_with_source=True)
-    waits, after = {"min_wait": 0.5, "max_wait": 1.0}, "stop"
-    source = SourceConfig(motion="dynamic", n_hotspots=1, local_distance=5.0, after_walk=after, **waits)
-    scenario = everything(motion, source=source, episode=episode)
-    check_equals_undelayed(all_transforms(scenario, 4), scenario, 60)
-
-
-@both_motions
-def test_the_server_node_knows_the_length_of_a_step(motion):
-    scenario = everything(motion, clock=ClockConfig("0.1m"))
-    check_equals_undelayed(all_transforms(scenario, 4), scenario)
-
-
-@both_motions
-def test_a_random_law_whose_delays_are_all_0_changes_nothing(motion):
-    never = {"law": "burst", "good": 0, "bad": 0, "bad_loss": 0.0}
-    undelayed = everything(motion)
-    env = delayed(everything(motion, delay=DelayConfig(obs=never, act=never, rew=never)), 8)
-    assert isinstance(env, DelayedEnv)
-    check_equals_undelayed(env, undelayed)
-
-
 def test_without_any_delay_there_are_no_transforms():
     nothing = DelayConfig(obs="0s", act={"law": "uniform", "high": "7s", "low": "3s", "probability": 0.0})
     env = make_env(everything(delay=nothing), 4, extras=EXTRAS)
@@ -111,13 +79,6 @@ def test_without_any_delay_there_are_no_transforms():
 def test_the_specs_are_right_with_every_delay(delays, motion, kind):
     env = delayed(everything(motion, kind, **DELAYS[delays]), 2)
     check_env_specs(env, seed=0, break_when_any_done="both")
-
-
-@every_delay
-def test_without_extras_the_specs_are_right_and_no_message_is_output(delays):
-    env = make_env(everything(**DELAYS[delays]), 2)
-    check_env_specs(env, seed=0, break_when_any_done="both")
-    assert not {"message", "received", "age", "delay", "message_sent"} & set(env.reset()["agents"].keys())
 
 
 # Causality: nothing has an effect before it arrives.
@@ -225,14 +186,6 @@ def test_a_reset_of_some_worlds_changes_only_their_rows(delays, motion):
     assert not all_same([td[0] for td in some], [td[0] for td in none])
 
 
-def test_the_same_seed_draws_the_same_delays_and_another_seed_different_ones():
-    scenario = everything(**DELAYS["paper"])
-    rollouts = [play(env := delayed(scenario, seed=seed), choices(env, 20)) for seed in (1, 1, 2)]
-    assert all_same(rollouts[0], rollouts[1])
-    delays = [after_steps(rollout, ("agents", "delay")) for rollout in rollouts]
-    assert not delays[0].equal(delays[2])
-
-
 # Action delays and observation delays.
 
 
@@ -289,29 +242,7 @@ def test_a_step_of_all_transforms_at_once_equals_torchrls_one_by_one(motion, cha
     assert all_same(expected, play(graph, actions))
 
 
-def test_only_a_uav_env_compiles_with_its_transforms():
-    with pytest.raises(TypeError, match="needs a UavEnv as its base_env here, not GymEnv"):
-        DelayedEnv(GymEnv("Pendulum-v1"), RewardDelay(2)).compile()
-
-
 # Compiled environments.
-
-
-def compiled_env(**changed: Any) -> DelayedEnv:
-    """An environment compiled with the ``eager`` backend, which is quick to compile."""
-    return delayed(everything("instant", **changed)).compile(backend="eager")
-
-
-@pytest.mark.slow
-def test_a_transform_that_is_appended_later_is_compiled_too():
-    delay = DelayConfig(rew=1)
-    env, eager = compiled_env(delay=delay), delayed(everything("instant", delay=delay))
-    actions = choices(env, 10)
-    play(env, actions)
-    for each in (env, eager):
-        each.append_transform(CumulativeReward(3, 0.5, REWARD))
-        each.set_seed(3)
-    assert all_same(play(env, actions), play(eager, actions))
 
 
 @pytest.mark.parametrize("compiles", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -340,18 +271,3 @@ def test_random_actions_are_those_that_torchrl_draws(kind):
         assert drawn.batch_size == expected.batch_size
         assert drawn["agents"].batch_size == expected["agents"].batch_size
     assert all_same(expected, env.rand_action(step.clone()).set(ACTION, expected[ACTION]))
-
-
-def test_existing_environments_run_in_worker_processes():
-    envs = [make_env(square(delay=DelayConfig(obs=PAPER, act=1)), 2, seed=i) for i in range(2)]
-    makers = [partial(envs.__getitem__, i) for i in range(2)]
-    workers = ParallelEnv(2, makers, mp_start_method="fork")
-    assert workers.rollout(4).batch_size == (2, 2, 4)
-    workers.close()
-
-
-def test_a_state_dict_for_another_number_of_worlds_is_refused():
-    env, other = (delayed(square(delay=DelayConfig(act=2)), n) for n in (2, 5))
-    env.reset()
-    with pytest.raises(InputError, match=r"\[2, \d+\] is not \[5, \d+\]: load it into as many worlds"):
-        other.load_state_dict(env.state_dict())

@@ -156,22 +156,3 @@ def test_both_ways_give_the_same_rollout(name, monkeypatch):
         env = delayed(SCENARIOS[name])
         outputs.append(play(env, choices(env, 12)))
     assert all_same(*outputs)
-
-
-@pytest.mark.parametrize(
-    "work",
-    [
-        lambda x: x.sum().item(),
-        lambda x: x[x > 0],
-        lambda x: x.nonzero(),
-        lambda x: x.masked_select(x > 0),
-        lambda x: bool(x.any()),
-        lambda x: x.index_put((x > 0,), x[0]),
-        lambda x: torch.tensor([1.0, 2.0]),
-        lambda x: x.repeat_interleave(x.long()),
-    ],
-)
-def test_what_waits_is_found(work):
-    numbers = torch.ones(3)
-    with pytest.raises(AssertionError), NothingWaits():
-        work(numbers)

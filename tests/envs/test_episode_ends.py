@@ -5,20 +5,15 @@ import itertools
 import math
 
 import pytest
-import shapely
 import torch
 from helpers import (
     EAST,
-    FLYING,
     HERE,
     KEEPS_GOING,
     MOTIONS,
-    SQUARE,
     act,
-    both_kinds,
     both_motions,
     clock,
-    everything,
     flight,
     fresh,
     go,
@@ -29,19 +24,13 @@ from helpers import (
     walking,
 )
 
-from damian.common.errors import InputError
-from damian.envs.scenario import ScenarioConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
-from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
-from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
 FAR = [[390.0, 10.0]]
-CORNER = [[190.0, 10.0]]
-"""A charging point where no UAV of these tests lands."""
 
 # Ends of episodes.
 
@@ -69,26 +58,6 @@ def test_the_time_limit_truncates_and_does_not_terminate():
     assert not any(td["terminated"].item() or td["success"].item() for td in ends)
 
 
-def test_success_at_the_last_step_terminates_and_does_not_truncate():
-    source = SourceConfig(level_db=130.0, position=[160.0, 100.0])
-    episode = EpisodeConfig(max_steps=2, success_share=1.0)
-    env = fresh(one_uav(source=source, episode=episode))
-    output = go(env, HERE, EAST)
-    assert (output["success"] & output["terminated"] & ~output["truncated"]).item()
-
-
-def test_the_time_limit_can_count_from_the_latest_detection():
-    source = SourceConfig(level_db=130.0, position=[60.0, 100.0])
-    episode = EpisodeConfig(max_steps=3, since_detection=True)
-    env = fresh(one_uav(source=source, episode=episode))
-    assert not go(env, *[HERE] * 10)["done"].item()
-    assert not go(env, EAST, EAST)["done"].item()
-    assert go(env, HERE)["truncated"].item()
-    never_detected = fresh(one_uav(episode=episode))
-    assert not go(never_detected, HERE, HERE)["done"].item()
-    assert go(never_detected, HERE)["truncated"].item()
-
-
 @both_motions
 @pytest.mark.parametrize(
     ("level", "resolution", "empty"),
@@ -112,51 +81,6 @@ def test_a_battery_is_empty_at_the_observed_level_0_or_if_it_allows_only_holding
     assert output["done"].item() == empty
     assert output["agents", "reward"].item() == (-2.0 if empty else 0.0)
     assert (output["terminated"] & ~output["truncated"] & ~output["success"]).item() == empty
-
-
-@both_motions
-@both_kinds
-@pytest.mark.parametrize("agents", [1, 3])
-def test_a_landed_uav_is_empty_exactly_where_no_action_leads_to_another_point(motion, kind, agents):
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.02, resolution=1e-3, charging_points=CORNER)
-    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=40.0)
-    distances, headings = [0.0, 10.0, 20.0, 40.0, 60.0], [10.0 * n for n in range(36)]
-    if kind == "discrete" and agents > 1:  # the second nearest point to a target is often the nearer one
-        distances, headings = [0.0, 60.0], [0.0, 90.0, 180.0, 270.0]
-    actions = ActionConfig(kind=kind, distances=distances, headings=headings)
-    settings = {"region": region, "battery": battery, "motion": MOTIONS[motion], "actions": actions}
-    table = actions.table()
-    env = fresh(ScenarioConfig(agents=agents, episode=KEEPS_GOING, **settings), num_worlds=len(table))
-    moves = torch.arange(len(table)) if kind == "discrete" else table / torch.tensor([60.0, math.tau])
-    moves = torch.stack([moves] * agents, 1)  # all stand on one point, and the first one chooses first
-    generator, start = torch.Generator().manual_seed(0), env.state
-    seen = []
-    for level in torch.linspace(0.5, 40.0, 60).tolist():
-        goal = int(torch.randint(len(env.simulation.points), (), generator=generator))
-        points = torch.full_like(start.goal, goal)
-        state = start._replace(goal=points, battery=torch.full_like(start.battery, level))
-        expected = bool(env.simulation._empty(state, torch.ones_like(start.message_sent))[0, 0])
-        env.state = state
-        act(env, moves)
-        assert (env.state.goal == points)[:, 0].all().item() == expected
-        seen.append(expected)
-    assert 5 < sum(seen) < 55
-
-
-def test_batteries_fail_in_the_energy_task_and_a_uav_in_flight_does_not_count_for_want_of_reach():
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.005, resolution=1e-3, charging_points=CORNER)
-    episode = EpisodeConfig(max_steps=60, discharged_share=1.0)
-    for motion in ("instant", "polynomial"):
-        scenario = square(agents=2, battery=battery, motion=MOTIONS[motion], episode=episode)
-        env, generator = fresh(scenario, num_worlds=32), torch.Generator().manual_seed(0)
-        failed = torch.zeros(32, dtype=torch.bool)
-        for _ in range(60):
-            output = act(env, random_actions(env, generator))
-            empty = sent_messages(output).empty
-            assert not (empty & ~env.simulation.vehicles.on_ground(env.state)).any()
-            assert output["terminated"].squeeze(-1).equal(empty.all(-1))
-            failed |= output["terminated"].squeeze(-1)
-        assert failed.sum() > 8
 
 
 def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_configured():
@@ -186,20 +110,6 @@ def test_a_source_that_begins_its_walk_anew_is_heard_for_the_whole_episode(emiss
     share = torch.stack(heard).float()
     assert share[200:].mean().item() == pytest.approx(1.0 if emission == "constant" else 0.4, abs=0.03)
     assert (emission == "constant") == share.all()
-
-
-def test_the_end_of_a_walk_that_never_comes_cannot_end_an_episode():
-    message = "episode.end_with_source: True needs source.motion=dynamic and source.after_walk=stop: "
-    for source in (SourceConfig(), SourceConfig(motion="dynamic")):
-        with pytest.raises(InputError, match=f"^{message}"):
-            square(source=source, episode=EpisodeConfig(end_with_source=True))
-
-
-def test_a_persistent_task_never_ends():
-    env = fresh(everything(episode=KEEPS_GOING), num_worlds=4)
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(100):
-        assert not act(env, random_actions(env, generator))["done"].any()
 
 
 @pytest.mark.parametrize(("over_steps", "bonus"), [(False, 3.0), (True, 1.5)])
@@ -239,16 +149,6 @@ def test_the_battery_drain_of_a_flight_does_not_depend_on_the_length_of_a_step()
     assert drained == pytest.approx([cost] * 3, abs=1e-3)
 
 
-def test_an_instant_flight_drains_the_energy_of_its_distance():
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.5)
-    env = fresh(one_uav(battery=battery))
-    origin = env.simulation.points[env.state.goal.item()]
-    go(env, EAST)
-    length = torch.linalg.vector_norm(env.simulation.points[env.state.goal.item()] - origin)
-    cost = flight_drain(env.simulation.vehicles.vertical[0], length, battery).item()
-    assert env.state.battery.item() == pytest.approx(100 - cost, abs=1e-4)
-
-
 @both_motions
 def test_a_uav_does_not_fly_to_a_landing_point_beyond_the_reach_of_its_battery(motion):
     battery = BatteryConfig(enabled=True, capacity_kwh=0.5, charging_points=FAR)
@@ -265,21 +165,6 @@ def test_a_uav_does_not_fly_to_a_landing_point_beyond_the_reach_of_its_battery(m
         assert bool((env.state.goal != start.goal).item()) == flies
 
 
-@both_motions
-def test_a_uav_with_an_empty_battery_stays_until_it_has_charged(motion):
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.05, charging_power_kw=0.5)
-    env = fresh(one_uav(battery=battery, motion=MOTIONS[motion]))
-    start = env.state.goal.item()
-    env.state = env.state._replace(battery=torch.zeros(1, 1))
-    gain = charge_gain(torch.tensor(1.0), battery).item()
-    levels = []
-    while env.state.goal.item() == start:
-        levels.append(env.state.battery.item())
-        go(env, EAST)
-    assert len(levels) > 2
-    assert levels == pytest.approx([gain * n for n in range(len(levels))], abs=1e-3)
-
-
 def test_uavs_charge_only_at_charging_points():
     battery = BatteryConfig(enabled=True, capacity_kwh=0.5, charging_points=[[160.0, 100.0]])
     env = fresh(one_uav(battery=battery))
@@ -294,55 +179,4 @@ def test_uavs_charge_only_at_charging_points():
     assert env.state.battery.item() == pytest.approx(after_flight + gain)
 
 
-def test_a_uav_begins_to_charge_in_the_step_after_its_landing():
-    battery = BatteryConfig(enabled=True, capacity_kwh=0.1)
-    env = fresh(one_uav(battery=battery, motion=FLYING))
-    go(env, EAST)
-    origin, goal = (env.simulation.points[p.item()] for p in (env.state.origin, env.state.goal))
-    length = torch.linalg.vector_norm(goal - origin)
-    cost = flight_drain(env.state.vertical[0, 0], length, battery).item()
-    go(env, *[HERE] * (math.ceil(flight(env)) - 1))
-    assert env.simulation.vehicles.on_ground(env.state).all()
-    assert env.state.battery.item() == pytest.approx(100 - cost, abs=1e-3)
-    gain = charge_gain(torch.tensor(1.0), battery).item()
-    go(env, HERE)
-    assert env.state.battery.item() == pytest.approx(100 - cost + gain, abs=1e-3)
-
-
-def test_battery_levels_stay_between_0_and_100_percent():
-    env = fresh(everything(episode=KEEPS_GOING), num_worlds=32)
-    generator = torch.Generator().manual_seed(0)
-    lowest = 100.0
-    for _ in range(40):
-        act(env, random_actions(env, generator))
-        assert ((env.state.battery >= 0) & (env.state.battery <= 100)).all()
-        lowest = min(lowest, env.state.battery.min().item())
-    assert lowest < 95
-
-
 # The source.
-
-
-def test_an_intermittent_source_is_spotted_as_often_as_it_emits():
-    source = SourceConfig(
-        level_db=160.0, position=[100.0, 100.0], emission="per_step", emission_probability=0.3
-    )
-    env = fresh(square(source=source, episode=KEEPS_GOING), num_worlds=400)
-    spotted = torch.stack([sent_messages(act(env, torch.zeros(400, 3).long())).spotted for _ in range(25)])
-    assert spotted.any(-1).equal(spotted.all(-1))
-    assert spotted.float().mean().item() == pytest.approx(0.3, abs=0.02)
-    # Emissions differ between worlds and between steps.
-    assert 0 < spotted[0, :, 0].float().mean() < 1
-    assert 0 < spotted[:, 0, 0].float().mean() < 1
-
-
-def test_a_walking_source_moves_and_stays_inside_its_region():
-    env = fresh(everything(), num_worlds=16)
-    airspace = env.simulation.airspace
-    start = env.state.source.clone()
-    for _ in range(60):
-        act(env, torch.zeros(16, env.n_agents).long())
-        for place, region in zip(env.state.source, env.state.region, strict=True):
-            polygon = airspace.regions[region].polygon
-            assert polygon.distance(shapely.Point(place.tolist())) < 1e-3
-    assert (torch.linalg.vector_norm(env.state.source - start, dim=-1) > 1).all()

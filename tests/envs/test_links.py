@@ -3,15 +3,13 @@
 import pytest
 import torch
 from delayed_envs import choices
-from helpers import KEEPS_GOING, all_same, both_motions, everything, play, square
+from helpers import all_same, both_motions, everything, play, square
 from torchrl.envs.utils import check_env_specs
 
 from damian import keys
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import make_env
-from damian.server.features import ObservationConfig
-from damian.transforms import Channel, ObservationDelay
+from damian.transforms import ObservationDelay
 
 LATE = {"law": "uniform", "low": 1, "high": 4}
 EXTRAS = ["message", "reward_terms"]
@@ -59,16 +57,6 @@ def test_links_without_delay_show_what_the_server_shows_if_nothing_is_delayed(mo
     assert all_same(*outputs)
 
 
-@every_link
-def test_rewards_ends_and_the_critic_are_those_of_the_server(links):
-    _, expected = linked(kind="server")
-    _, found = linked(**links)
-    names = [keys.REWARD, keys.DONE, keys.GLOBAL_OBSERVATION, keys.RECEIVED]
-    assert all_same(*([td.select(*names, strict=False) for td in outputs] for outputs in (expected, found)))
-    pairs = zip(expected, found, strict=True)
-    assert any(not a[keys.OBSERVATION].equal(b[keys.OBSERVATION]) for a, b in pairs)
-
-
 @both_motions
 def test_updown_shows_the_observation_that_the_server_computed_some_steps_ago(motion):
     _, at_once = linked(motion, kind="server")
@@ -112,20 +100,6 @@ def test_on_board_each_uav_computes_what_the_server_would_from_the_messages_that
     assert n_old > 50
 
 
-def test_out_of_range_a_uav_knows_only_the_first_message():
-    links = LinkConfig("matrix", range=1e-3)
-    env = make_env(square(episode=KEEPS_GOING, links=links), 2, extras=EXTRAS)
-    onboard = env.transform[-1]
-    onboard.dropped_keys = []
-    td = env.reset()
-    first = td[keys.MESSAGE].clone()
-    for action in choices(env, 5):
-        td = env.step(td.set(keys.ACTION, action))["next"]
-        others = ~torch.eye(3, dtype=torch.bool)
-        apart = others & (td[keys.LINKED] == first.unsqueeze(1)).all(-1)
-        assert apart.equal(others.expand(2, 3, 3))
-
-
 @pytest.mark.parametrize("links", [LINKS["updown"], LINKS["range"]])
 @pytest.mark.slow
 def test_a_compiled_step_does_the_same(links):
@@ -135,33 +109,9 @@ def test_a_compiled_step_does_the_same(links):
     assert all_same(*(play(env, choices(env, 8)) for env in (eager, graph)))
 
 
-@pytest.mark.parametrize("links", [LINKS["updown"], LINKS["matrix"]])
-def test_merged_steps_show_the_same_at_decisions(links):
-    scenario = everything(
-        "polynomial",
-        agents=1,
-        delay=DelayConfig(obs=1),
-        links=LinkConfig(**links),
-        clock=ClockConfig(skip=True),
-    )
-    env = make_env(scenario, 8, seed=1)
-    td = env.rollout(8, break_when_any_done=False)
-    assert (td["next", keys.DURATION] > 1).any()
-    assert td["next", *keys.OBSERVATION].isfinite().all()
-
-
-def test_the_channel_sends_only_what_uavs_send():
-    env, _ = linked("polynomial", kind="matrix", delay=1)
-    (channel,) = (transform for transform in env.transform if isinstance(transform, Channel))
-    assert channel.sent_key == keys.MESSAGE_SENT
-
-
 WRONG = {
     "links.kind": {"kind": "mesh"},
-    "links.delay": {"delay": 3},
     "links.range": {"kind": "updown", "range": 5.0},
-    "links.limit": {"kind": "matrix", "limit": 0},
-    "links.loss": {"kind": "updown", "loss": 1.5},
     "links.hears": {"kind": "matrix", "hears": [[True, True], [True, True]]},
     "links.loss: a is not between 0 and 1": {"kind": "matrix", "loss": [[0, "a", 0]] * 3},
     "links.loss: 1.5 is not between 0 and 1": {"kind": "matrix", "loss": 1.5},
@@ -178,8 +128,3 @@ WRONG = {
 def test_wrong_links_are_refused_in_one_line(key, links):
     with pytest.raises(ValueError, match=key):
         make_env(square(links=LinkConfig(**links)))
-
-
-def test_own_messages_do_not_go_with_a_broadcast():
-    with pytest.raises(ValueError, match=r"observation.own: True does not go with links=updown"):
-        square(observation=ObservationConfig(own=True), links=LinkConfig("updown"))

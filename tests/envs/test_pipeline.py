@@ -13,7 +13,7 @@ from torch import Tensor
 from damian.delays.config import DelayConfig
 from damian.delays.laws import law_of
 from damian.envs.clocks import ClockConfig
-from damian.envs.pipeline import action_codes, hold_action, make_env
+from damian.envs.pipeline import action_codes, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED
@@ -54,15 +54,6 @@ def test_after_a_reset_the_server_holds_the_first_message_of_every_uav():
         assert not td[AGE].any()
         assert not td["agents", "delay"].any()
         assert not Messages.unpack(td[RECEIVED]).time.any()
-
-
-def test_if_every_message_is_lost_the_server_holds_the_first_one_for_the_whole_episode():
-    env = delayed(square(episode=KEEPS_GOING, delay=DelayConfig(loss=1.0)))
-    outputs = play(env, choices(env, 10))
-    for t, td in enumerate(outputs[1::2], 1):
-        assert td[RECEIVED].equal(outputs[0][MESSAGE])
-        assert (td[AGE] == t).all()
-        assert (td["agents", "delay"] == -1).all()
 
 
 SILENT = SourceConfig(emission="per_step", emission_probability=0.0)
@@ -166,18 +157,6 @@ def test_between_two_ticks_of_the_servers_clock_observations_do_not_change():
             assert td[GLOBAL_OBSERVATION].equal(before[GLOBAL_OBSERVATION])
         n_changes += (td[GLOBAL_OBSERVATION] != before[GLOBAL_OBSERVATION]).any().item()
     assert n_changes > 5
-
-
-def test_a_uav_observes_the_latest_broadcast_before_its_own_tick():
-    every_step, sampled = (
-        delayed(with_clocks(**clocks)) for clocks in ({}, {"agents": "4s", "server": "2s"})
-    )
-    holds = torch.full((4, 3), hold_action(every_step.scenario.actions))
-    all_outputs, outputs = play(every_step, lambda t: holds, 20), play(sampled, lambda t: holds, 20)
-    for t in range(21):
-        at_server_tick, at_agent_tick = all_outputs[2 * (t - t % 2)], all_outputs[2 * (t - t % 4)]
-        assert outputs[2 * t][GLOBAL_OBSERVATION].equal(at_server_tick[GLOBAL_OBSERVATION])
-        assert outputs[2 * t][OBSERVATION][..., :-4].equal(at_agent_tick[OBSERVATION][..., :-4])
 
 
 @pytest.mark.sample(2)

@@ -9,13 +9,10 @@ from sensor_cases import GLOBAL, LOCAL, SENSORS
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from damian.baselines.greedy import greedy_policy
-from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
-from damian.runs.metrics import evaluate
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
@@ -50,33 +47,6 @@ def test_a_feature_is_late_by_as_many_steps_as_the_messages(motion):
             expected = timely[max(step - LATE, 0)]["agents", key][..., columns]
             assert output["agents", key][..., columns].equal(expected), (step, key)
     assert not timely[-1]["agents", "observation"].equal(late[-1]["agents", "observation"])
-
-
-def test_a_uav_that_knows_its_own_messages_knows_its_own_reading_at_once():
-    timely, late = (fly(sensing(own=True, delay=DelayConfig(obs=obs))) for obs in (0, LATE))
-    for one, other in zip(timely, late, strict=True):
-        assert one["agents", "observation"].equal(other["agents", "observation"])
-    last = [output[-1]["agents", "global_observation"] for output in (timely, late)]
-    assert not last[0].equal(last[1])
-
-
-@pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs={"law": "uniform", "low": 1, "high": 4})])
-def test_a_scripted_policy_and_an_evaluation_do_the_same_with_sensors(delay):
-    """Both read trails or rewards of messages, which have readings behind them."""
-    plain = everything(delay=delay)
-    results = []
-    for scenario in (plain, replace(plain, sensors=SENSORS)):
-        env = make_env(scenario, 8, seed=3, extras=["message"])
-        torch.manual_seed(0)
-        results.append(evaluate(env, greedy_policy(env), 12))
-    assert results[0] == results[1]
-
-
-def test_an_evaluation_recomputes_rewards_that_depend_on_readings():
-    env = make_env(sensing(), 4, seed=3, extras=["message"])
-    result = evaluate(env, greedy_policy(env), 12)
-    assert result.return_ == pytest.approx(result.perceived_return)
-    assert result.return_ > 0
 
 
 @both_motions
@@ -130,54 +100,3 @@ def test_the_specs_have_the_range_of_every_feature(kind, changed):
         spec = env.observation_spec["agents", name]
         assert spec.low.equal(torch.tensor(low).expand(spec.shape).float()), name
         assert spec.high.equal(torch.tensor(high).expand(spec.shape).float()), name
-
-
-# Mistakes, found when the environment is built.
-
-
-def observing(feature: str) -> dict:
-    return {"observation": ObservationConfig(["spotted", feature], ["source_time"])}
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        (
-            observing("sensor_cases:single"),
-            "feature sensor_cases:single: shape [12, 3] is not [12, 3, 2]"
-            " = [initial conditions, UAVs, values], as width=2 asks for",
-        ),
-        (
-            observing("sensor_cases:unbatched"),
-            "feature sensor_cases:unbatched: shape [3] is not [12, 3]"
-            " = [initial conditions, UAVs], as width=1 asks for",
-        ),
-        (
-            {"observation": ObservationConfig(["spotted"], ["sensor_cases:flat"])},
-            "feature sensor_cases:flat: shape [12, 3] is not [12, 3, K]"
-            " = [initial conditions, UAVs, values], as width=None asks for",
-        ),
-        (
-            observing("sensor_cases:smelt"),
-            "sensors: odour, which a feature reads, is not one of gust, gap",
-        ),
-        (
-            observing("sensor_cases:smelt") | {"sensors": []},
-            "sensors: odour, which a feature reads, is missing: no sensor is given",
-        ),
-        (
-            {"sensors": ["sensor_cases:three"]},
-            "sensors: three: shape [12, 3] is not [12, 3, 3]"
-            " = [initial conditions, UAVs, values], as width=3 asks for",
-        ),
-        (
-            {"reward": RewardConfig(custom=[{"term": "sensor_cases:unsummed"}])},
-            "reward term unsummed: shape [12, 3, 2] is not [12, 3] = [initial conditions, UAVs]",
-        ),
-    ],
-)
-def test_a_mistake_is_one_line(changed, message):
-    scenario = everything(**({"sensors": SENSORS} | changed))
-    with pytest.raises(InputError) as error:
-        make_env(scenario)
-    assert str(error.value) == message

@@ -68,7 +68,7 @@ def test_a_state_of_other_worlds_is_refused_in_one_line_and_changes_nothing():
     other = built("paper", "instant", 4)
     other.reset()
     with pytest.raises(
-        InputError, match=r"shape of the loaded floats: \[4, \d+\] is not \[3, \d+\]: load it into"
+        InputError, match=r"shape of the loaded floats: \[4, \d+\] is not \[3, \d+\]: load it"
     ):
         env.load_state_dict(other.state_dict())
     assert all(a is b for a, b in zip(before, env.uav_env.worlds, strict=True))

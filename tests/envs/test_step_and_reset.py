@@ -96,22 +96,6 @@ def test_with_merged_steps_the_totals_are_those_of_decisions():
     assert all(same(outputs_of(one), outputs_of(other)) for one, other in zip(ours, torchrls, strict=True))
 
 
-def test_what_the_policy_has_written_stays():
-    env = counted(everything())
-    *_, following = steps_of(env, choices(env, 3))
-    assert "reward" not in following[AGENTS]
-    assert following["policy_note"].all()
-    assert set(following[AGENTS].keys()) >= {"logits", "action"}
-
-
-def test_other_transforms_after_ours_see_every_step():
-    env = counted(everything(delay=DelayConfig(obs=2)))
-    env.append_transform(RewardSum([REWARD], [(AGENTS, "sum")]))
-    rollout = env.rollout(STEPS, break_when_any_done=False)["next"]
-    assert rollout["done"].any()
-    assert torch.equal(rollout[AGENTS, "sum"], rollout[EPISODE_REWARD])
-
-
 @pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs=2, loss=0.1)])
 def test_remembered_coverage_is_that_of_the_messages(delay):
     env = delayed(everything("polynomial", delay=delay))

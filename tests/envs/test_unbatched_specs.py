@@ -48,10 +48,3 @@ def test_the_environment_has_every_spec_without_its_batch(motion, kind, extras):
 @pytest.mark.parametrize("delays", [{}, *DELAYS.values()], ids=["none", *DELAYS])
 def test_the_environment_with_delays_has_every_spec_without_its_batch(delays, extras):
     check_unbatched(make_env(square(**delays), N_WORLDS, extras=extras))
-
-
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_both_kinds_of_actions_with_delays_have_every_spec_without_its_batch(kind):
-    scenario = everything("polynomial", kind)
-    scenario.delay = DELAYS["everything"]["delay"]
-    check_unbatched(make_env(scenario, N_WORLDS, extras=ALL_EXTRAS))

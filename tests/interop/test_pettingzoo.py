@@ -38,13 +38,6 @@ def test_pettingzoos_checkers_find_nothing(task, actions, motion, delay, capsys)
     assert "Passed Parallel API test" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("delay", DELAYS)
-@pytest.mark.parametrize(("task", "actions", "motion"), [kind[:3] for kind in KINDS])
-def test_pettingzoos_checkers_find_nothing_in_any_combination(task, actions, motion, delay, capsys):
-    test_pettingzoos_checkers_find_nothing(task, actions, motion, delay, capsys)
-
-
 def test_the_environment_does_what_the_torchrl_environment_does():
     scenario = compose_scenario("delay=paper", "episode.max_steps=8")
     env, reference = UavParallelEnv(scenario, seed=3), make_env(scenario, 1, seed=3)
@@ -87,18 +80,5 @@ def test_a_picture_is_drawn():
 def test_what_a_user_can_get_wrong_is_said_in_one_line():
     env = made()
     env.reset()
-    with pytest.raises(InputError, match=r"actions: \['uav_0'\] lack one for uav_1"):
-        env.step({"uav_0": 0})
     with pytest.raises(InputError, match="action of uav_1: -1 is not in Discrete"):
         env.step({"uav_0": 0, "uav_1": -1, "uav_2": 0})
-
-
-def test_actions_may_be_of_any_type_of_the_same_kind():
-    env = made("actions=continuous", "agents=2")
-    env.reset(seed=0)
-    expected = env.step({name: np.array([0.25, 1.0], np.float32) for name in env.agents})[0]
-    env.reset(seed=0)
-    found = env.step({"uav_0": np.array([0.25, 1.0]), "uav_1": [0.25, 1]})[0]
-    assert all(np.array_equal(found[name], expected[name]) for name in expected)
-    with pytest.raises(InputError, match=r"action of uav_1: \[0\.5 1\.5\] is not in Box"):
-        env.step({"uav_0": np.array([0.25, 1.0]), "uav_1": np.array([0.5, 1.5])})

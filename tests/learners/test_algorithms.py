@@ -18,7 +18,6 @@ from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.recipes.shared.settings import LoggerConfig, TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer, train
-from damian.replay.backupdate import BackupdateStorage
 from damian.replay.time_storage import TimeStorage
 
 AWARE = {
@@ -90,13 +89,6 @@ def build_learner(name: str, aware: str = "backupdate", **changed) -> tuple[Mapp
     return make_learner(settings, env, replay_buffer(settings, env)), env
 
 
-@both_learners
-@pytest.mark.parametrize("settle", [False, True])
-def test_a_learner_waits_for_the_longest_delay_only_with_settle(name, settle):
-    learner, _ = build_learner(name, settle=settle)
-    assert learner.setup.settle_steps == (3 if settle else 0)
-
-
 @pytest.mark.parametrize("kind", [MappoConfig, SacConfig, BpqlConfig])
 def test_a_learner_trains_the_actor_that_evaluations_make(kind):
     class OwnActor(kind):
@@ -111,15 +103,6 @@ def test_a_learner_trains_the_actor_that_evaluations_make(kind):
     learner = OwnActor().make(env, settings.learning_setup, None if kind is MappoConfig else buffer)
     activations = {type(module) for module in learner.actor.modules()} & {torch.nn.ReLU, torch.nn.Tanh}
     assert activations == {torch.nn.ReLU}
-
-
-@both_learners
-def test_a_replay_buffer_corrects_its_steps_only_with_backupdating(name):
-    buffers = {aware: build_learner(name, aware)[0].buffer for aware in ("backupdate", "history")}
-    assert isinstance(buffers["backupdate"].storage, BackupdateStorage)
-    assert buffers["backupdate"].storage.longest == 3
-    plain = buffers["history"]
-    assert plain is None if name == "mappo" else not isinstance(plain.storage, BackupdateStorage)
 
 
 @both_learners
@@ -146,13 +129,3 @@ def test_a_learner_also_waits_for_late_rewards_and_its_replay_buffer_has_room_fo
     assert all(map(math.isfinite, losses.values()))
     naive, _ = build_learner(name, "history", delay=delay, clock=clock)
     assert naive.setup.longest_delay == obs
-
-
-@pytest.mark.parametrize("recompute", [False, True])
-def test_late_messages_correct_the_actors_observations_only_with_recompute_actor(recompute):
-    learner, env = build_learner("mappo", recompute_actor=recompute)
-    batch = env.rollout(12, learner.actor, break_when_any_done=False)
-    corrected = learner.backupdated_batch(batch)
-    assert corrected["agents", "backupdated"].any()
-    for key in ("observation", "action_log_prob"):
-        assert corrected["agents", key].equal(batch["agents", key]) is not recompute

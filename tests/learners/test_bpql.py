@@ -1,11 +1,8 @@
 """BPQL: critics read states that have arrived, and the actor what had arrived and its own actions since."""
 
-import math
-import sys
-
 import pytest
 import torch
-from helpers import both_kinds, check_refused, everything, learning
+from helpers import both_kinds, everything, learning
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
@@ -19,8 +16,6 @@ from damian.envs.pipeline import make_env
 from damian.learners.bpql import BpqlConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac
-from damian.recipes.shared.launch import launch
-from damian.recipes.train import main
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
@@ -81,25 +76,6 @@ def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_fr
     assert (torch.stack(late) - torch.stack(expected)).abs().max() > 0.1  # as collected, they were late
 
 
-@both_kinds
-def test_critics_read_the_state_only_and_the_actor_its_own_observation_only(kind):
-    learner, _, drawn = learnt(kind, steps=24)
-    other = drawn.copy()
-    other[keys.OBSERVATION] = torch.rand_like(drawn[keys.OBSERVATION])
-    values, others = (
-        learner.loss._vmap_qnetworkN0(batch.copy(), learner.loss.qvalue_network_params)[
-            "action_value" if kind == "discrete" else "state_action_value"
-        ]
-        for batch in (drawn, other)
-    )
-    assert values.equal(others)
-    other = drawn.copy()
-    other[keys.GLOBAL_OBSERVATION] = torch.rand_like(drawn[keys.GLOBAL_OBSERVATION])
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        actions = [learner.actor(batch.copy())[keys.ACTION] for batch in (drawn, other)]
-    assert actions[0].equal(actions[1])
-
-
 def test_the_losses_are_those_of_bpql():
     learner, _, drawn = learnt()
     batch, loss = drawn[:7], learner.loss
@@ -148,22 +124,3 @@ def test_bpql_waits_for_states_and_refuses_to_learn_without_back_updating():
         learning(SMALL, longest_delay=3, critic_key=keys.PRIVILEGED_OBSERVATION)
     )  # states that are true anyway
     config.check(learning(SMALL))  # nothing is late
-
-
-TINY = ["frames=200", "worlds=4", "learner.steps=16", "learner.warm_up=100", "learner.buffer_steps=1000"]
-TINY += ["learner.updates=1", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
-TINY += ["region.lattice_step=60", "episode.max_steps=12", "delay.obs=3"]
-
-
-@pytest.mark.parametrize("aware", [pytest.param("both", marks=pytest.mark.slow), "history"])
-def test_the_command_line_trains_with_bpql(tmp_path, monkeypatch, aware, capsys):
-    monkeypatch.chdir(tmp_path)
-    words = ["train.py", "learner=bpql", f"aware={aware}", *TINY, "hydra.run.dir=run"]
-    monkeypatch.setattr(sys, "argv", words)
-    if aware == "history":
-        check_refused(lambda: launch(main), "learner: bpql needs back-updating", capsys)
-        return
-    launch(main)
-    assert (tmp_path / "run" / "result.csv").is_file()
-    last = (tmp_path / "run" / "metrics.csv").read_text().splitlines()[-1]
-    assert all(math.isfinite(float(number)) for number in last.split(",") if number)

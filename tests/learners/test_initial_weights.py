@@ -8,7 +8,6 @@ from helpers import both_kinds, everything, learning
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
-from damian.common.errors import InputError
 from damian.envs.uav_env import UavEnv
 from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.learners.sac import Sac, SacConfig
@@ -65,8 +64,3 @@ def test_the_default_is_pytorchs():
     weights = ModelConfig(hidden=[16]).network(5, 3, None)[0].weight
     torch.manual_seed(0)
     assert weights.equal(nn.Linear(5, 16).weight)
-
-
-def test_another_kind_of_initial_weights_is_refused_in_one_line():
-    with pytest.raises(InputError, match=r"^model\.init: xavier is not one of default, orthogonal$"):
-        ModelConfig(init="xavier")

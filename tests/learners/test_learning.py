@@ -18,7 +18,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig, add_advantages, mappo_losses
+from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.corrections import corrections_of
@@ -73,17 +73,6 @@ def test_masked_policies_never_choose_an_illegal_action(make, motion):
     assert legal.all()
 
 
-def test_continuous_actions_lie_in_the_unit_square():
-    env = UavEnv(scenario(actions=ActionConfig(kind="continuous")), 32)
-    for policy in (make_actor(env, SMALL), random_policy(env)):
-        with set_exploration_type(ExplorationType.RANDOM):
-            action = env.rollout(5, policy)["agents", "action"]
-        assert action.shape[-1] == 2
-        assert action.min() >= 0
-        assert action.max() <= 1
-        assert action.std() > 0.1
-
-
 def collect(motion: str, kind: str):
     """A batch with episodes of 9 steps, terminated in every other world and truncated in the others."""
     config = scenario(
@@ -97,72 +86,6 @@ def collect(motion: str, kind: str):
     batch = env.rollout(24, actor, break_when_any_done=False)
     batch["next", "terminated"][::2] = batch["next", "done"][::2]
     return batch, critic
-
-
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_the_advantage_is_zero_where_a_uav_was_not_ready(kind):
-    batch, critic = collect("polynomial", kind)
-    add_advantages(batch, critic, MappoConfig())
-    ready = batch["agents", "ready"]
-    assert 0 < ready.float().mean() < 1
-    assert (batch["agents", "advantage"][~ready] == 0).all()
-    assert (batch["agents", "advantage"][ready] != 0).any()
-
-
-def losses_of(batch: TensorDictBase, actor, critic, config: MappoConfig) -> Tensor:
-    """The loss on all steps of a batch [B, T]."""
-    read = batch.select(*LOSS_KEYS, *critic.in_keys, strict=False).reshape(-1)
-    return mappo_losses(
-        dict(read.items(True, True)), actor, critic, config, torch.tensor(config.entropy_coeff)
-    )[0]
-
-
-@pytest.mark.parametrize(("kind", "mask"), [("discrete", True), ("discrete", False), ("continuous", True)])
-def test_steps_without_a_decision_train_the_critic_only(kind, mask):
-    config = scenario(actions=ActionConfig(kind=kind, mask=mask))
-    env = UavEnv(config, 4)
-    actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
-    networks = torch.nn.ModuleDict({"actor": actor, "critic": critic})
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        batch = env.rollout(6, actor, break_when_any_done=False)
-
-    def gradients(ready: bool) -> tuple[float, float]:
-        batch["agents", "ready"] = torch.full_like(batch["agents", "ready"], ready)
-        add_advantages(batch, critic, MappoConfig())
-        networks.zero_grad()
-        losses_of(batch, actor, critic, MappoConfig()).sum().backward()
-        grads = {n: p.grad.abs().sum().item() for n, p in networks.named_parameters() if p.grad is not None}
-        actors = sum(g for n, g in grads.items() if n.startswith("actor"))
-        return actors, sum(grads.values()) - actors
-
-    actor_gradient, critic_gradient = gradients(ready=True)
-    assert actor_gradient > 0
-    assert critic_gradient > 0
-    assert gradients(ready=False)[0] == 0
-    assert gradients(ready=False)[1] > 0
-
-
-def test_objective_and_entropy_are_means_over_decisions():
-    env = UavEnv(scenario(motion=MotionConfig(kind="polynomial")), 8)
-    actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        batch = env.rollout(12, actor, break_when_any_done=False)
-    add_advantages(batch, critic, MappoConfig())
-    ready = batch["agents", "ready"]
-    batch["agents", "advantage"] = torch.where(ready, 2.0, 5.0).unsqueeze(-1)
-    assert not ready.all()
-    objective, entropy_loss, _ = losses_of(batch, actor, critic, MappoConfig(entropy_coeff=0.1)).tolist()
-    assert objective == pytest.approx(-2, abs=1e-5)  # ratios of 1
-    entropy = actor.get_dist(batch).entropy()[ready].mean().item()
-    assert entropy_loss == pytest.approx(-0.1 * entropy, rel=1e-5)
-
-
-def test_advantages_are_scaled_over_decisions_only():
-    batch, critic = collect("polynomial", "discrete")
-    add_advantages(batch, critic, MappoConfig())
-    advantage = batch["agents", "advantage"][batch["agents", "ready"]]
-    assert advantage.mean().item() == pytest.approx(0, abs=1e-5)
-    assert advantage.std(correction=0).item() == pytest.approx(1, abs=1e-4)
 
 
 @both_motions
@@ -227,17 +150,6 @@ def test_a_flight_of_three_steps_earns_their_rewards_and_the_value_after_landing
     assert flight["agents", "value_target"].flatten().tolist() == targets
 
 
-def test_only_the_critic_observes_global_features_with_ctde():
-    config = scenario()
-    config.observation.ctde = True
-    env = UavEnv(config, 2)
-    assert env.observation_spec["agents", "observation"].shape[-1] == 1
-    assert env.observation_spec["agents", "global_observation"].shape[-1] == 4
-    config.observation.ctde = False
-    env = UavEnv(config, 2)
-    assert env.observation_spec["agents", "observation"].shape[-1] == 4
-
-
 # How back-updating changes the importance ratios of the first pass.
 
 ROUNDING = 1e-4
@@ -278,22 +190,6 @@ def test_with_backupdating_the_first_importance_ratios_are_one_as_actor_observat
     assert log_ratios(learner, corrected, behaviour).abs().max() < ROUNDING
 
 
-@both_kinds
-def test_recompute_actor_hides_that_the_actor_never_had_the_corrected_observations(kind):
-    learner, batch = collect_delayed(kind, recompute_actor=True)
-    corrected, behaviour = learner.backupdated_batch(batch), batch["agents", "action_log_prob"]
-    assert corrected["agents", "action"].equal(batch["agents", "action"])
-    differs = (corrected["agents", "observation"] != batch["agents", "observation"]).any(-1)
-    assert 0.1 < differs.float().mean() < 0.9
-    # The loss gets ratios of 1, as if the actor had chosen from the corrected observations.
-    assert log_ratios(learner, corrected, corrected["agents", "action_log_prob"]).abs().max() < ROUNDING
-    # Ratios to the probabilities with which the actor chose differ from 1 where observations were corrected.
-    true = log_ratios(learner, corrected, behaviour)
-    assert true.abs()[~differs].max() < ROUNDING
-    assert (true.abs()[differs] > ROUNDING).float().mean() > 0.95
-    assert (true.exp() - 1).abs()[differs].mean() > 0.01
-
-
 def test_an_observation_is_corrected_only_if_a_message_of_the_previous_step_was_late():
     learner, batch = collect_delayed("discrete", recompute_actor=True)
     corrected = learner.backupdated_batch(batch)
@@ -320,14 +216,3 @@ def test_with_settle_steps_are_learnt_from_later_and_then_as_if_without_delay():
     assert not learnt["next", "agents", "global_observation"].equal(
         settled["next", "agents", "global_observation"]
     )
-
-
-def test_the_share_of_backupdated_messages_is_reported_with_the_losses():
-    learner, batch = collect_delayed("discrete", recompute_actor=False)
-    share = learner.backupdated_batch(batch)["agents", "backupdated"].float().mean().item()
-    learner, batch = collect_delayed("discrete", recompute_actor=False)
-    losses = learner.learn(batch)
-    assert losses["backupdated"] == share
-    assert {"loss_objective", "loss_entropy", "loss_critic"} < set(losses)
-    learner.buffer = None
-    assert "backupdated" not in learner.learn(batch)

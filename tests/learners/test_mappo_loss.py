@@ -1,12 +1,11 @@
 """MAPPO's loss beside TorchRL's, its compiled form, its minibatches, and the values of its critics."""
 
 import copy
-import math
 from dataclasses import replace
 
 import pytest
 import torch
-from helpers import check_refused, everything, learning
+from helpers import everything, learning
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import StepCounter
@@ -19,8 +18,6 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.learners.mappo import (
     LOSS_KEYS,
-    LOSSES,
-    NUMBERS,
     Mappo,
     MappoConfig,
     add_advantages,
@@ -31,7 +28,6 @@ from damian.learners.mappo import (
 )
 from damian.learners.networks import COMPILE_OPTIONS, ModelConfig
 from damian.learners.recurrent import RECURRENT_KEYS, add_recurrent_state
-from damian.recipes import train
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
 
@@ -136,21 +132,6 @@ def test_the_losses_and_their_gradients_are_torchrls(case):
     assert (losses[0] != 0).all()
 
 
-def test_no_decision_gives_no_loss_of_the_actor_and_no_nan():
-    _, learner, batch = flown("discrete")
-    batch[keys.READY] = torch.zeros_like(batch[keys.READY])
-    losses = losses_of(learner, batch)
-    assert losses[:2].tolist() == [0.0, 0.0]
-    assert losses[2] > 0
-
-
-def test_a_ratio_may_be_clipped_down_to_zero():
-    _, learner, batch = flown("discrete")
-    widest = replace(CONFIG, clip_epsilon=1.0)
-    losses = losses_of(learner, batch, widest)
-    assert losses.isfinite().all()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["discrete", "unmasked", "continuous", "shared value", "normalised"])
 def test_the_compiled_losses_are_those_of_the_uncompiled_function_for_any_number_of_steps(case):
@@ -168,19 +149,6 @@ def test_the_compiled_losses_are_those_of_the_uncompiled_function_for_any_number
         gradients = [torch.autograd.grad(terms.sum(), learner.weights) for terms in (found, expected)]
         torch.testing.assert_close((found, numbers), (expected, expected_numbers), rtol=1e-4, atol=1e-6)
         torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_learner_compiles_on_demand_and_a_recurrent_one_never_does():
-    _, learner, batch = flown("discrete")
-    _, other, _ = flown("discrete", compile=True)
-    numbers = []
-    for each in (learner, other):
-        torch.manual_seed(0)
-        numbers.append(each.learn(batch.clone()))
-    assert numbers[1] == pytest.approx(numbers[0], rel=1e-4, abs=1e-6)
-    assert hasattr(other.losses, "_torchdynamo_orig_callable")
-    assert flown("recurrent", compile=True)[1].losses.__func__ is Mappo._losses
 
 
 @pytest.mark.parametrize("case", ["discrete", "recurrent"])
@@ -201,45 +169,6 @@ def test_every_pass_goes_once_over_all_steps_in_the_order_of_a_permutation(case)
             assert value.equal(samples[key][index]), key
 
 
-def test_the_numbers_are_means_over_all_minibatches():
-    _, learner, batch = flown("discrete")
-    learner.optimizer.param_groups[0]["lr"] = 0.0  # so that every minibatch sees the same networks
-    torch.manual_seed(0)
-    numbers = learner.optimize(batch)
-    torch.manual_seed(0)
-    parts = []
-    for entries in learner._minibatches(batch):
-        losses, further = learner._losses(entries, learner.entropy_coeff.value)
-        gradients = torch.autograd.grad(losses.sum(), learner.weights, materialize_grads=True)
-        norm = torch.cat([gradient.flatten() for gradient in gradients]).norm()
-        parts.append([*losses.tolist(), *further.tolist(), norm.item()])
-    expected = torch.tensor(parts, dtype=torch.double).mean(0).tolist()
-    names = (*LOSSES, *NUMBERS, "gradient_norm")
-    assert numbers == pytest.approx(dict(zip(names, expected, strict=True)), rel=1e-4)
-    assert numbers["gradient_norm"] > learner.config.max_grad_norm  # before it is scaled down
-
-
-@pytest.mark.parametrize("case", ["discrete", "continuous"])
-def test_divergence_clipping_and_entropy_are_means_over_decisions(case):
-    _, learner, batch = flown(case)
-    torch.manual_seed(0)  # the entropy of continuous actions is drawn
-    _, numbers = learner._losses(loss_entries(learner, batch), learner.entropy_coeff.value)
-    torch.manual_seed(0)
-    log_ratios, entropies = policy_terms(batch.copy(), learner.actor)
-    divergences, clipped, chosen = [], [], []
-    for place in batch[keys.READY].nonzero().tolist():
-        log_ratio = log_ratios[*place].item()
-        divergences.append(math.exp(log_ratio) - 1 - log_ratio)
-        clipped.append(abs(math.exp(log_ratio) - 1) > learner.config.clip_epsilon)
-        chosen.append(entropies[*place].item())
-    expected = [sum(each) / len(each) for each in (divergences, clipped, chosen)]
-    assert dict(zip(NUMBERS, numbers.tolist(), strict=True)) == pytest.approx(
-        dict(zip(("kl", "clip_fraction", "entropy"), expected, strict=True)), rel=1e-4
-    )
-    assert 0.2 < numbers[1] < 0.8
-    assert not numbers.requires_grad
-
-
 def test_the_explained_variance_is_1_for_exact_values_and_0_for_a_constant():
     _, _, batch = flown("discrete")
     target = batch[keys.VALUE_TARGET]
@@ -248,13 +177,6 @@ def test_the_explained_variance_is_1_for_exact_values_and_0_for_a_constant():
         assert explained_variance(batch).item() == pytest.approx(share, abs=1e-5)
     batch[keys.VALUE_TARGET] = torch.ones_like(target)
     assert explained_variance(batch).isnan()
-
-
-def test_an_update_logs_the_variance_that_the_values_of_the_batch_explained_before_it():
-    _, learner, batch = flown("discrete")
-    numbers = learner.learn(batch)
-    assert numbers["explained_variance"] == pytest.approx(explained_variance(batch).item())
-    assert list(numbers) == [*LOSSES, *NUMBERS, "gradient_norm", "explained_variance"]
 
 
 # Values.
@@ -292,44 +214,3 @@ def test_a_shared_value_is_one_for_all_uavs_from_the_observations_of_all_of_them
         assert (learner.critic(other)[keys.STATE_VALUE] != value).all()
     n_features = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1]
     assert learner.weights[len([*learner.actor.parameters()])].shape == (16, 3 * n_features)
-
-
-def test_a_shared_value_is_trained_towards_the_mean_target_of_the_uavs():
-    _, learner, batch = flown("shared value")
-    with torch.no_grad():
-        value = learner.critic(batch.copy())[keys.STATE_VALUE]
-    n_critic = len([*learner.critic.parameters()])
-    for mean, is_reached in ((0.0, True), (0.1, False)):
-        batch[keys.VALUE_TARGET] = value + mean + torch.tensor([-0.3, 0.1, 0.2]).unsqueeze(-1)
-        losses = losses_of(learner, batch)
-        _, gradients = with_gradients(learner, losses[2:])
-        assert all((gradient.abs() < 1e-6).all() for gradient in gradients[-n_critic:]) is is_reached
-
-
-def test_a_shared_value_goes_with_a_privileged_critic_backupdating_and_a_recurrent_actor(run):
-    words = ["model.shared_value=true", "critic=privileged", "delay.obs=2", "aware=both", "model=gru"]
-    tiny = ["worlds=4", "frames=128", "learner.steps=16", "learner.minibatches=2", "eval_episodes=2"]
-    region = ["region.lattice_step=60", "episode.max_steps=12", "model.hidden=[8]"]
-    folder = run(train, *words, *tiny, *region)
-    assert len((folder / "metrics.csv").read_text().splitlines()) == 3
-
-
-def test_sac_refuses_a_shared_value_in_one_line(run, capsys, tmp_path):
-    error = "model.shared_value: True is for learner=mappo only"
-    check_refused(lambda: run(train, "learner=sac", "model.shared_value=true"), error, capsys)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("case", ["discrete", "recurrent, continuous"])
-def test_an_older_checkpoint_of_the_optimiser_can_be_loaded(case):
-    """It numbers the weights as TorchRL's loss does, and was not fused."""
-    _, learner, batch = flown(case)
-    weights = [*MAPPOLoss(learner.actor, learner.critic).parameters()]
-    assert [id(weight) for weight in weights] == [id(weight) for weight in learner.weights]
-    older = torch.optim.Adam(weights, lr=1e-3)
-    losses = losses_of(learner, batch)
-    losses.sum().backward()
-    older.step()
-    learner.optimizer.load_state_dict(older.state_dict())
-    learner.learn(batch)
-    assert {int(state["step"]) for state in learner.optimizer.state.values()} == {1 + 4}

@@ -1,7 +1,6 @@
 """The learnt belief: its attention and loss beside slow twins, what it may know, and that it learns."""
 
-import copy
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
@@ -14,13 +13,17 @@ from damian import keys
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.keys import next_key
-from damian.learners.belief_head import MessageEncoder, TargetScale, prediction_loss
 from damian.learners.networks import ModelConfig
-from damian.learners.predictive_mappo import PredictiveMappo, PredictiveMappoConfig
+from damian.learners.predictive_mappo import (
+    MessageEncoder,
+    PredictiveMappo,
+    PredictiveMappoConfig,
+    TargetScale,
+    prediction_loss,
+)
 from damian.recipes.shared.settings import LoggerConfig, TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.replay.backupdate import BackupdateStorage
-from damian.replay.hindsight import arrived_by_now
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
@@ -94,19 +97,6 @@ def test_the_attention_is_that_of_a_loop_over_heads_and_known_messages():
                 torch.testing.assert_close(encoded[i, j, q], expected, atol=1e-5, rtol=1e-4)
 
 
-def test_messages_are_a_set_and_unknown_ones_have_no_influence():
-    encoder, (observation, history, codes) = example(6)
-    history[:, 0, 2] = 1.0
-    encoded = encoder(observation, history, codes)
-    shuffled = history[:, [0, 4, 2, 6, 1, 5, 3]]
-    torch.testing.assert_close(encoder(observation, shuffled, codes), encoded)
-    unknown = history[..., 2:3] == 0
-    assert unknown.any()
-    torch.testing.assert_close(
-        encoder(observation, torch.where(unknown, 0.0, history), codes), encoded, atol=1e-5, rtol=1e-4
-    )
-
-
 def test_the_loss_is_the_mean_over_what_counts_whatever_the_rest_is():
     torch.manual_seed(2)
     predicted, target, counts = torch.rand(5, 3, 2, 4), torch.rand(5, 3, 1, 4), torch.rand(5, 3, 1, 1) < 0.5
@@ -138,13 +128,6 @@ def test_the_scale_of_the_targets_does_not_matter_and_those_that_do_not_count_ar
     assert constant.normalize(torch.full((4, 1), 0.3)).abs().max() < 1e-3
 
 
-def test_what_has_arrived_by_now_is_counted_as_by_hand():
-    delay = torch.tensor([[[0], [2]], [[3], [-1]], [[1], [2]]])
-    since = torch.tensor([0, 2, 2])
-    expected = [[[True], [False]], [[False], [False]], [[True], [True]]]
-    assert arrived_by_now(delay, since).tolist() == expected
-
-
 def test_targets_use_nothing_that_has_not_arrived_by_now():
     learner, env, _ = build()
     learner.learn(collected(learner, env))
@@ -166,6 +149,19 @@ def test_targets_use_nothing_that_has_not_arrived_by_now():
     assert not before[2].all()
 
 
+def test_an_action_whose_flight_the_end_of_the_episode_cuts_is_no_target():
+    learner, env, _ = build(flights=True)
+    learner.learn(collected(learner, env))
+    steps = learner.storage.steps
+    # Every step is a decision and the end of an episode, and its message has arrived.
+    for key, value in ((keys.READY, True), (keys.RESET_AFTER, True), (next_key(keys.DELAY), 0)):
+        steps[key].fill_(value)
+    for completed in (True, False):
+        steps[next_key(keys.READY)].fill_(completed)
+        *_, counts = learner.sample(learner.last_steps())
+        assert counts.all() if completed else not counts.any()
+
+
 def ends_of_completed(storage: BackupdateStorage, act: int) -> dict[tuple[int, int, int], int]:
     """The last step of each completed action, for the step of its choice, world and UAV, by loops."""
     steps = storage.steps[storage.latest()]
@@ -183,7 +179,7 @@ def ends_of_completed(storage: BackupdateStorage, act: int) -> dict[tuple[int, i
 
 
 @pytest.mark.sample(2)
-@pytest.mark.parametrize(("flights", "act"), [(False, 0), (True, 0), (False, 2), (True, 2)])
+@pytest.mark.parametrize(("flights", "act"), [(False, 2), (True, 0), (True, 2)])
 def test_a_decision_counts_if_its_action_was_completed_and_the_last_message_of_it_has_arrived(flights, act):
     learner, env, _ = build(flights=flights, act=act, prediction_batch=3000)
     for _ in range(6):
@@ -233,29 +229,3 @@ def test_learning_to_predict_does_not_change_what_the_policy_has_done(kind):
     for _ in range(5):
         learner.learn_prediction(learner.last_steps())
     assert log_prob().equal(before)
-
-
-def test_a_learner_goes_on_from_its_components_as_if_it_had_not_stopped():
-    learner, env, config = build()
-    batches = [collected(learner, env) for _ in range(2)]
-    learner.learn(batches[0])
-    saved = {name: copy.deepcopy(part.state_dict()) for name, part in learner.components().items()}
-    other = cast(PredictiveMappo, make_learner(config, env, learner.buffer))
-    assert saved.keys() == other.components().keys()
-    for name, part in other.components().items():
-        part.load_state_dict(saved[name])
-    results = []
-    for each in (learner, other):
-        torch.manual_seed(6)
-        results.append([float(each.learn_prediction(each.last_steps())) for _ in range(3)])
-    assert results[0] == results[1]
-
-
-def test_an_actor_for_evaluations_predicts_as_the_learner_does():
-    learner, env, config = build()
-    learner.learn(collected(learner, env))
-    actor = config.learner.make_actor(env, config.model)
-    actor.load_state_dict(learner.actor.state_dict())
-    td = env.reset()
-    one, other = (policy(td.clone())[keys.PREDICTION] for policy in (actor, learner.actor))
-    assert one.equal(other)

@@ -7,12 +7,11 @@ from typing import Any
 import pytest
 import torch
 from helpers import everything, learning
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import PopArtValueNorm
 
 from damian import keys
 from damian.common.errors import InputError
@@ -127,14 +126,6 @@ def test_the_network_of_a_normalised_critic_learns_targets_of_mean_0_and_deviati
     assert value_scale(mappo(False)[0].critic) == 1.0
 
 
-def test_a_critic_without_rewards_stays_finite():
-    learner, env = mappo(True, normalize_advantage=False)
-    for batch in flights(env, learner.actor):
-        batch[REWARD] = torch.zeros_like(batch[REWARD])
-        learner.learn(batch)
-    assert all(weights.isfinite().all() for weights in learner.weights)
-
-
 def slow_returns(batches: list[TensorDictBase], gamma: float) -> list[float]:
     """Discounted sums of the rewards so far in each episode, world by world and step by step."""
     flight = torch.cat(batches, 1)
@@ -171,15 +162,6 @@ def test_rewards_are_divided_by_the_root_mean_square_of_discounted_returns_over_
     assert scale.value.item() == pytest.approx(expected.item(), rel=1e-4)
 
 
-def test_equal_returns_and_missing_ones_leave_rewards_finite():
-    for reward in (0.0, 3.0):
-        scale = ReturnScale(torch.zeros(2, 3, 1), 0.0)
-        rewards = torch.full((2, 4, 3, 1), reward)
-        done = torch.zeros(2, 4, 1, dtype=torch.bool)
-        scale.update(TensorDict({"next": {"agents": {"reward": rewards}, "done": done}}, [2, 4]))
-        assert (rewards / scale.value).amax().item() == pytest.approx(min(reward, 1.0))
-
-
 # Checkpoints.
 
 
@@ -203,22 +185,7 @@ def test_running_statistics_are_among_what_a_checkpoint_stores(make, tmp_path):
 @pytest.mark.parametrize("normalize", [True, False])
 def test_a_checkpoint_of_a_critic_with_other_values_is_refused_in_one_line(normalize, tmp_path):
     here, there = mappo(normalize)[0], mappo(not normalize)[0]
-    message = f"its critic does not fit this run: learner.normalize_value: {normalize} does not go with"
-    with pytest.raises(InputError, match=message) as refused:
+    with pytest.raises(InputError, match="its critic does not fit this run") as refused:
         restore(here.components(), stored(there), tmp_path, "resume")
     assert "\n" not in str(refused.value)
     restore(here.components(), stored(here), tmp_path, "resume")
-
-
-@pytest.mark.slow
-def test_changing_statistics_and_coefficients_do_not_compile_the_loss_again():
-    env = small_env()
-    torch.manual_seed(3)
-    config = MappoConfig(minibatches=2, normalize_value=True, entropy_coeff=0.1, entropy_coeff_end=0.0)
-    learner = Mappo(env, config, learning(ModelConfig(hidden=[8]), compile=True, frames=200))
-    first, *later = flights(env, learner.actor, 4)
-    learner.learn(first)
-    with torch._dynamo.config.patch(error_on_recompile=True):
-        for batch in later:
-            learner.learn(batch)
-    assert isinstance(learner.critic.module.norm, PopArtValueNorm)

@@ -9,23 +9,17 @@ from helpers import both_kinds, both_motions, everything, learning
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
-from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import DiscreteSACLoss
 
-from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import UavEnv
 from damian.keys import OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import NUMBERS, Sac, SacConfig
-from damian.replay.backupdate import BackupdateStorage
-from damian.replay.recompute import server_recompute
-from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
 from damian.server.termination import EpisodeConfig
 from damian.world.landing import ActionConfig
-from damian.world.messages import Messages
 
 SMALL = ModelConfig(hidden=[16])
 FAST = SacConfig(updates=2, batch_size=64, warm_up=0)
@@ -69,29 +63,6 @@ def test_nothing_is_learnt_before_the_warm_up():
     assert learner.loss.log_alpha.item() != before
 
 
-def test_the_target_of_a_decision_discounts_the_next_value_by_its_duration():
-    env = UavEnv(everything("polynomial", kind="discrete"), 8)
-    learner = learner_of(env, SacConfig(gamma=0.5, warm_up=0))
-    batch = fly(env, learner.actor, 60)
-    learner.buffer.extend(batch)
-    storage = learner.buffer.storage
-    steps, order = storage.steps, storage.latest()
-    ready, next_ready = (steps[key][order] for key in (("agents", "ready"), ("next", "agents", "ready")))
-    ends = (steps["next", key][order].squeeze(-1) for key in ("done", "terminated"))
-    decisions = find_decisions(ready, next_ready, *ends)
-    batch = transitions(steps, order, decisions, 0.5, learner.observed)
-    duration = batch["steps_to_next_obs"]
-    assert duration.max() > 5
-    target = learner.loss._compute_target(batch)
-    unrewarded = batch.clone()
-    unrewarded["next", "agents", "reward"].zero_()
-    one_step = unrewarded.clone()
-    one_step["steps_to_next_obs"] = torch.ones_like(duration)
-    next_value = learner.loss._compute_target(one_step) / 0.5
-    expected = batch["next", "agents", "reward"].squeeze(-1) + 0.5 ** duration.squeeze(-1) * next_value
-    assert torch.allclose(target, expected, atol=1e-5)
-
-
 def test_the_target_entropy_is_a_share_of_the_entropy_of_a_uniform_choice_among_legal_actions():
     env = UavEnv(everything(kind="discrete"), 8)
     learner = learner_of(env, SacConfig(target_entropy=0.5))
@@ -126,16 +97,6 @@ def test_the_discrete_losses_and_their_gradients_are_torchrls(mask):
         assert any((gradient != 0).any() for gradient in gradients[0]), name
 
 
-def test_an_update_evaluates_each_critic_once_on_the_same_observations():
-    learner = recording_learner()
-    evaluated = []
-    network = learner.loss.qvalue_network.module
-    hook = network.register_forward_hook(lambda *call: evaluated.append(len(call[1][0])))
-    learner.loss(learner.drawn[0])
-    hook.remove()
-    assert evaluated == [64] * 4  # two critics before and after each decision
-
-
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 1.0)])
 def test_the_target_entropy_of_continuous_actions_is_that_of_one_uav_within_its_bounds(low, high):
     env = UavEnv(everything(kind="continuous"), 4)
@@ -143,32 +104,6 @@ def test_the_target_entropy_of_continuous_actions_is_that_of_one_uav_within_its_
     bounds.low, bounds.high = torch.full_like(bounds.low, low), torch.full_like(bounds.high, high)
     target = learner_of(env).loss.target_entropy.item()
     assert target == pytest.approx(2 * (torch.tensor((high - low) / 2).log().item() - 1), abs=1e-6)
-
-
-def delayed_env():
-    delay = DelayConfig(obs={"law": "uniform", "low": 0, "high": 5}, history=2)
-    env = make_env(everything(delay=delay, episode=EpisodeConfig(max_steps=9)), 4, 1, extras=["message"])
-    env.append_transform(StepCounter())
-    return env
-
-
-def test_a_late_message_corrects_transitions_that_are_stored_already():
-    env = delayed_env()
-    recompute = server_recompute(env.server)
-    buffer = ReplayBuffer(storage=BackupdateStorage(60 * 4, recompute, longest=5))
-    learner = Sac(env, FAST, learning(SMALL, 5), buffer)
-    batch = fly(env, learner.actor, 40)
-    for part in batch.split(8, 1):
-        learner.learn(part)
-    storage = buffer.storage
-    stored = storage.steps[storage.latest()[:-5]].transpose(0, 1)
-    settled = batch[:, :-5]
-    sent, elapsed = settled["next", "agents", "message"], settled["next", "step_count"].squeeze(-1)
-    truth = env.server(Messages.unpack(sent), elapsed)
-    assert stored["next", "agents", "reward"].squeeze(-1).equal(truth.reward)
-    assert stored["next", "agents", "global_observation"].equal(truth.global_observation)
-    assert not stored["next", "agents", "reward"].equal(settled["next", "agents", "reward"])
-    assert stored["agents", "observation"].equal(settled["agents", "observation"])  # never corrected
 
 
 class RecordingSac(Sac):
@@ -274,37 +209,6 @@ def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_by_tau_t
     assert abs(moved) == pytest.approx(0.3, rel=1e-2)  # the temperature has its own rate
 
 
-@both_kinds
-def test_an_update_logs_the_entropy_and_the_norms_of_its_gradients(kind):
-    learner = recording_learner(UavEnv(everything(kind=kind), 4), lr=1e-9, alpha_lr=1e-9)
-    torch.manual_seed(0)
-    numbers = learner.update(learner.drawn[0])
-    for name, network in (("actor", "actor_network"), ("critic", "qvalue_network")):
-        of_network = [w for n, w in learner.loss.named_parameters() if n.startswith(f"{network}_params")]
-        norm = torch.cat([weight.grad.flatten() for weight in of_network]).norm()
-        torch.testing.assert_close(numbers[f"gradient_norm_{name}"], norm)
-    torch.manual_seed(0)
-    policy = learner.actor.get_dist(learner.drawn[0].copy())
-    drawn = policy.entropy() if kind == "discrete" else -policy.rsample_and_log_prob()[1]
-    tolerance = 1e-4 if kind == "discrete" else 0.5  # TorchRL draws other actions
-    assert numbers["entropy"].item() == pytest.approx(drawn.mean().item(), abs=tolerance)
-
-
-def test_an_update_clears_the_gradients_of_the_previous_one():
-    learner = recording_learner(lr=1e-9, alpha_lr=1e-9)
-    first = [weight.grad.clone() for weight in learner.loss.parameters()]
-    learner.update(learner.drawn[0])
-    for weight, gradient in zip(learner.loss.parameters(), first, strict=True):
-        torch.testing.assert_close(weight.grad, gradient)
-
-
-def test_nothing_is_learnt_before_any_step_has_settled():
-    env = delayed_env()
-    learner = learner_of(env, settle=10)
-    losses = [learner.learn(fly(env, learner.actor, 4))["loss_actor"] for _ in range(4)]
-    assert [math.isnan(loss) for loss in losses] == [True, True, False, False]
-
-
 def test_a_checkpoint_restores_the_networks_but_not_the_discount():
     env = UavEnv(everything(), 4)
     far, near = (learner_of(env, SacConfig(gamma=gamma)) for gamma in (0.99, 0.5))
@@ -313,18 +217,3 @@ def test_a_checkpoint_restores_the_networks_but_not_the_discount():
     near.loss.load_state_dict(learnt)
     assert far.loss.value_estimator.gamma.item() == pytest.approx(0.99)
     assert near.loss.value_estimator.gamma.item() == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-@pytest.mark.slow
-def test_sac_learns_which_actions_are_rewarded(kind):
-    """Actions to the east are rewarded at once and gamma is 0: a bandit without context."""
-    env = UavEnv(everything(kind=kind, actions=ActionConfig(kind=kind, mask=False)), 16)
-    learner = learner_of(env, SacConfig(updates=60, batch_size=128, gamma=0.0, warm_up=0, alpha_init=0.01))
-    for _ in range(4):
-        batch = fly(env, learner.actor, 16)
-        action = batch["agents", "action"]
-        east = action % 8 == 4 if kind == "discrete" else action[..., 1] < 0.25
-        batch["next", "agents", "reward"] = east.float().unsqueeze(-1)
-        learner.learn(batch)
-    assert east.float().mean() > 0.6

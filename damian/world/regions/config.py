@@ -62,7 +62,7 @@ class RegionConfig:
     """Settings of your own region source, as a mapping."""
 
     def __post_init__(self) -> None:
-        checks.types("region", self)
+        checks.convert_types("region", self)
         REGION_SOURCES.get(self.kind, "region.kind")
         checks.above("region.min_area", self.min_area, 0.0, "m^2")
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")

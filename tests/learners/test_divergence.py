@@ -1,0 +1,25 @@
+"""A learner has diverged if a weight is not finite or beyond all use, or a logged number is infinite."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from damian.learners.base import divergence
+
+
+def test_a_nan_counts_only_if_weights_are_wrong():
+    network = nn.Linear(2, 2)
+    components = {"actor": network, "optimizer": torch.optim.Adam(network.parameters()), "other": nn.ReLU()}
+    assert divergence(components, {"loss": 1.0, "not known yet": math.nan}) is None
+    assert divergence(components, {"a": 1.0, "b": -math.inf}) == "b is -inf"
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -2e5])
+def test_one_wrong_weight_is_enough(value):
+    network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
+    with torch.no_grad():
+        network[0].bias[1] = value
+    found = divergence({"actor": network}, {})
+    assert found == f"a weight of actor is {abs(value):.3g}, not at most 100000"
