@@ -25,15 +25,6 @@ SCHEMAS = {
     "advise": "damian.recipes.advise:AdviseConfig",
 }
 """Dataclass of all settings of a program, by the name of its file in conf/."""
-CHOICES = {
-    "LearnerConfig": [
-        "damian.learners.bpql:BpqlConfig",
-        "damian.learners.mappo:MappoConfig",
-        "damian.learners.predictive_mappo:PredictiveMappoConfig",
-        "damian.learners.sac:SacConfig",
-    ]
-}
-"""Dataclasses that stand for another one, as the settings choose."""
 
 
 @dataclass(frozen=True)
@@ -115,12 +106,27 @@ def _settings(module: str, name: str, path: str = "") -> dict[str, Setting]:
 
 def _below(module: str, key: str, kind: str) -> dict[str, Setting]:
     """The settings below a field: those of its dataclass, or of the dataclass that its dictionary holds."""
-    if kind in CHOICES:
-        return _any_of([path.split(":") for path in CHOICES[kind]], f"{key}.")
+    if kind == "LearnerConfig":
+        return _any_of(_learners(), f"{key}.")
     if each := re.fullmatch(r"dict\[str, (\w+)\]", kind):
         key, kind = f"{key}.NAME", each[1]
     found = _find(module, kind)
     return _settings(*found, f"{key}.") if found else {}
+
+
+def _learners() -> list[tuple[str, str]]:
+    """Module and class of the settings of every learner that registers itself; the settings choose one."""
+    files = sorted((Path(damian.__file__).parent / "learners").glob("*.py"))
+    return [
+        (f"damian.learners.{file.stem}", node.name)
+        for file in files
+        for node in ast.parse(file.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef) and "LEARNERS.register" in map(_called, node.decorator_list)
+    ]
+
+
+def _called(decorator: ast.expr) -> str:
+    return ast.unparse(decorator.func) if isinstance(decorator, ast.Call) else ""
 
 
 def _any_of(classes: Sequence[Sequence[str]], path: str) -> dict[str, Setting]:
