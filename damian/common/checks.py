@@ -151,9 +151,10 @@ def names(key: str, given: Any, known: Sequence[str]) -> frozenset[Any]:
     """Require a collection of names, such as the extras of an environment, and none that is not known."""
     listed = isinstance(given, Iterable) and not isinstance(given, str)
     require(listed, key, repr(given), f"is not a list of names such as ['{known[0]}']")
-    for name in given:
+    found = list(given)  # a generator can be read only once
+    for name in found:
         one_of(key, name, known)
-    return frozenset(given)
+    return frozenset(found)
 
 
 def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:

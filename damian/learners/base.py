@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import nn
 from torchrl.data import ReplayBuffer
@@ -161,6 +162,7 @@ LARGEST_WEIGHT = 1e5
 """Weights of useful networks are thousands of times smaller."""
 
 
+@torch.no_grad()
 def divergence(components: Mapping[str, Any], numbers: Mapping[str, float]) -> str | None:
     """Say which number shows that a learner has diverged; None if it has not.
 
@@ -175,8 +177,8 @@ def divergence(components: Mapping[str, Any], numbers: Mapping[str, float]) -> s
         if math.isinf(number):
             return f"{name} is {number}"
     for name, component in components.items():
-        weights = [*component.parameters()] if isinstance(component, nn.Module) else []
-        largest = nn.utils.get_total_norm(weights, math.inf).item() if weights else 0.0
+        weights = component.parameters() if isinstance(component, nn.Module) else []
+        largest = nn.utils.get_total_norm([each for each in weights if each.numel()], math.inf).item()
         if not largest <= LARGEST_WEIGHT:  # true also for nan
             return f"a weight of {name} is {largest:.3g}, not at most {LARGEST_WEIGHT:g}"
     return None
