@@ -46,7 +46,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
         delay=DelayConfig(messages=3), links=LinkConfig("updown")
     ),
     "observation: agent_distances is empty for a single UAV": lambda: square(
-        agents=1, observation=ObservationConfig(["agent_distances"], [])
+        agents=1, observation=ObservationConfig([], ["agent_distances"])
     ),
     "episode.discharged_share: 0.5 needs battery.enabled=true": lambda: square(
         episode=EpisodeConfig(discharged_share=0.5)
@@ -64,7 +64,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "seeds: [3] of torch.int64 are not 2 integers": lambda: make_env(square(), 2).seed_worlds(
         torch.arange(3)
     ),
-    "motion.min_level: 1": lambda: ScenarioConfig(
+    "motion.max_level: 2 m leaves room for 2 flight levels": lambda: ScenarioConfig(
         motion=MotionConfig("polynomial", min_level=1, max_level=2, level_separation=1)
     ),
 }
