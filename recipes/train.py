@@ -330,19 +330,19 @@ def report(
         env.set_seed(config.eval_seed)  # the same episodes for every policy
         return evaluate(env, policy, config.horizon, sample)
 
-    rows = {}
-    for name, policy in {UNTRAINED: untrained_actor(config, env), TRAINED: actor}.items():
+    random, rows = fly(random_policy(env)), {}
+    for name, policy in {TRAINED: actor, UNTRAINED: untrained_actor(config, env)}.items():
         if policy is not None:
-            rows |= {name: fly(policy), name + DETERMINISTIC: fly(policy, sample=False)}
+            rows = {name: fly(policy), name + DETERMINISTIC: fly(policy, sample=False)} | rows
     try:
         rows[SCRIPT] = fly(greedy_policy(env))
     except InputError as error:  # the region is too large for the script, but not for the networks
         print(f"no {SCRIPT}: {error}")
-    rows[RANDOM] = fly(random_policy(env))
+    rows[RANDOM] = random
     can_succeed, late = config.episode.success_share is not None, has_message_delay(config)
     table = save_results(rows, folder, can_succeed, late, MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
-    return rows[RANDOM]
+    return random
 
 
 def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
