@@ -18,6 +18,8 @@ BOOKING_CHUNK = 2**22
 _FEW_AGENTS = 4
 """Most UAVs of a world that book one after the other. In a compiled step with 3 UAVs this takes 0.2 times as
 long as rounds in which all of them ask; with 8 UAVs it takes 5 times as long, with 20 UAVs 50 times."""
+_POINTS_AT_ONCE = 1024
+"""Landing points whose actions are ranked together, which bounds the memory."""
 _EDGES_AT_ONCE = 2**18
 """Pairs of target and polygon edge compared at once, which bounds the memory: a few arrays of 2 MB."""
 
@@ -147,43 +149,43 @@ class Candidates:
             torch.zeros(*shape, self.n_candidates, dtype=torch.int32), torch.zeros(*shape, self.n_candidates)
         )
         counts = self.airspace.n_points.tolist()
-        for region, count in enumerate(tqdm(counts, desc="regions", delay=1, leave=False)):
-            ranked, within = self._rank_from(region, count, displacement(table[:, 0], table[:, 1]))
+        parts = [(r, own) for r, n in enumerate(counts) for own in torch.arange(n).split(_POINTS_AT_ONCE)]
+        for region, own in tqdm(parts, desc="landing points", delay=1, leave=False):
+            ranked, within = self._rank_from(region, own, displacement(table[:, 0], table[:, 1]))
             for table_of_all, part in zip(self.ranking, ranked, strict=True):
-                table_of_all[region, :count] = part.to(table_of_all.dtype)
-            self.distance[region, :count] = ranked.distance[..., 0].where(within, torch.inf)
+                table_of_all[region, own] = part.to(table_of_all.dtype)
+            self.distance[region, own] = ranked.distance[..., 0].where(within, torch.inf)
         self.ranking = Ranking(*(each.flatten(0, 2) for each in self.ranking))
         self.distance = self.distance.flatten(0, 1)
         holds = table[:, 0] == 0
         self.can_hold = bool(holds.any())
         self.hold = torch.arange(len(table)) == int(holds.int().argmax())
 
-    def _rank_from(self, region: int, count: int, move: Tensor) -> tuple[Ranking, Tensor]:
+    def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
         """Rank the landing points for flights within a region; a UAV holds if its target lies outside.
 
         Args:
             region: index of the region.
-            count: number of its landing points P, at each of which a UAV may stand.
+            own: landing points where UAVs stand, [P].
             move: displacements east and north, [A, 2] metres.
 
         Returns:
             Candidates, [P, A, K], and whether each target lies inside, [P, A].
         """
         polygon, points = self.airspace.regions[region].polygon, self.airspace.points[region]
-        target = self.airspace.exact_points[region, :count].unsqueeze(1) + move
+        target = self.airspace.exact_points[region, own].unsqueeze(1) + move
         shapely.prepare(polygon)
         within = torch.as_tensor(shapely.contains_xy(polygon, *target.numpy().transpose(2, 0, 1)))
-        own = torch.arange(count).unsqueeze(-1).expand_as(within)
         nearest = _nearest_or_own(
             self.airspace.cells,
             self.airspace.exact_points,
             torch.full((within.numel(),), region),
             target.flatten(0, 1),
-            own.flatten(),
+            own.repeat_interleave(len(move)),
             within.flatten(),
             self.n_candidates,
         ).view(*within.shape, -1)
-        offset = gather_rows(points, nearest) - points[:count, None, None]
+        offset = gather_rows(points, nearest) - points[own, None, None]
         return Ranking(nearest, torch.linalg.vector_norm(offset, dim=-1)), within
 
     def to(self, device: torch.device) -> "Candidates":
