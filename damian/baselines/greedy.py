@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from damian import keys
+from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
@@ -35,6 +36,9 @@ PROBABLE = 0.1
 WORTH = 0.3
 """A UAV does not fly where it detects the source with less than this share of the highest probability, but as
 near to the best landing point as it can."""
+MAX_PAIRS = 400_000_000
+"""Most pairs of landing points: the script weighs each of them against every other one of its region. A
+training leaves the script out of its results instead of running out of memory at its end."""
 
 
 def greedy_policy(env: DelayedEnv) -> TensorDictModule:
@@ -42,7 +46,13 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
 
     It is stateless and deterministic: equal messages give equal actions. It writes ``("agents", "action")``
     [B, N], or [B, N, 2] if actions are continuous. The environment must have ``message`` among its extras.
+
+    Raises:
+        InputError: there are more than ``MAX_PAIRS`` pairs of landing points.
     """
+    n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
+    shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
+    checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
     believes = keys.BELIEF in available and env.uav_env.scenario.seeks_source
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.baselines.random import random_policy
+from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -232,3 +233,9 @@ def test_with_any_number_of_uavs_the_policy_is_clearly_better_than_the_random_on
             env.set_seed(5)
             scores.append(evaluate(env, policy, 50).return_)
         assert scores[0] > 2 * scores[1]
+
+
+def test_a_region_with_too_many_landing_points_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setattr("damian.baselines.greedy.MAX_PAIRS", 100)
+    with pytest.raises(InputError, match=r"region.lattice_step: \d+ landing points are too many"):
+        greedy_policy(field())
