@@ -75,7 +75,7 @@ class Choice(NamedTuple):
     decisions: dict[int, Decision]
     """By the numbers of the UAVs."""
     action: Tensor
-    """Actions of all UAVs, of which those of these UAVs count, [1, N, ...]."""
+    """Actions of all UAVs; only those of these UAVs count, [1, N, ...]."""
     hidden: Tensor | None
     """Hidden states after the choice, [1, N, H]."""
 
@@ -376,7 +376,7 @@ class Fleet:
 
     @torch.no_grad()
     def ask_policy(self, choosing: Sequence[int]) -> tuple[Tensor, Tensor | None]:
-        """Actions of all UAVs, of which those that choose count, [1, N, ...]; hidden states, [1, N, H]."""
+        """Actions of all UAVs, [1, N, ...], where only those that choose count; hidden states, [1, N, H]."""
         read = self.observe(choosing)
         if self.drawn:
             with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):

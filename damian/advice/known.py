@@ -192,12 +192,12 @@ class UavLog:
             filled.point = filled.target = before.point
         if report.target is not None:
             filled.target = near(report.target)
-        filled.track = before.track if before else 0.0
-        if report.track is not None:
-            filled.track = math.radians(report.track) % (2 * math.pi)
-        filled.battery = before.battery if before else 100.0
-        if report.battery is not None:
-            filled.battery = report.battery
+        track, battery, readings = 0.0, 100.0, (0.0,) * self.n_readings
+        if before:
+            track, battery, readings = before.track, before.battery, before.readings
+        filled.track = track if report.track is None else math.radians(report.track) % (2 * math.pi)
+        filled.battery = battery if report.battery is None else report.battery
+        filled.readings = readings if report.readings is None else report.readings
         filled.spotted = report.source_spotted and not report.flies
         self._fill_detection(filled, before)
         filled.motions = 0 if before is None or before.spotted else before.motions
@@ -205,9 +205,6 @@ class UavLog:
         if report.motions is not None:
             filled.motions = report.motions
         filled.trail = self._trail(filled, before)
-        filled.readings = before.readings if before else (0.0,) * self.n_readings
-        if report.readings is not None:
-            filled.readings = report.readings
 
     def _fill_detection(self, filled: FilledReport, before: FilledReport | None) -> None:
         report = filled.report

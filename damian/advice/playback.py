@@ -120,7 +120,7 @@ def _read(
         raise InputError(f"{path}: the fleet never began: not every UAV has reported")
     _advance(fleet, view, fleet.clock, span, is_last=True)
     if not view.steps:
-        whole = f"the journal tells of 0 to {(fleet.step - fleet.first_step) * fleet.node.dt:g} s"
+        whole = f"the journal covers 0 to {(fleet.step - fleet.first_step) * fleet.node.dt:g} s"
         raise InputError(f"span: no step lies between {span[0]:g} and {span[1]:g} s: {whole}")
     return view, reports
 

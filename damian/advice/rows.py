@@ -297,11 +297,9 @@ def read_json(text: str | bytes, lines: bool = False) -> Rows:
     if lines:
         parts = [(f"line {n}", line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
         return _rows([(where, parsed_json(line, where)) for where, line in parts])
-    parsed = parsed_json(text, "JSON")
-    found = parsed["rows"] if isinstance(parsed, dict) and "rows" in parsed else parsed
-    return _rows(
-        [(f"row {n}", row) for n, row in enumerate(found if isinstance(found, list) else [found], 1)]
-    )
+    found = parsed_json(text, "JSON")
+    rows = found if isinstance(found, list) else [found]
+    return _rows([(f"row {n}", row) for n, row in enumerate(rows, 1)])
 
 
 def _rows(found: Sequence[tuple[str, Any]]) -> Rows:

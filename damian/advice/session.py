@@ -36,18 +36,10 @@ from damian.common.text_files import named, show
 from damian.runs.run_lock import is_folder, locked
 
 MAX_FLEETS = 1000
-_SERVICE = ("reports", "folder", "port", "host", "token", "uavs", "journal", "durable")
-_OUTCOME_IS_SAME = (
-    "policy",
-    "checkpoint",
-    "agents",
-    "device",
-    "frames",
-    "episodes",
-    "eval_episodes",
-    "hydra",
-)
-MAY_DIFFER = (*_SERVICE, *_OUTCOME_IS_SAME)
+MAY_DIFFER = {
+    *("reports", "folder", "port", "host", "token", "uavs", "journal", "durable"),
+    *("policy", "checkpoint", "agents", "device", "frames", "episodes", "eval_episodes", "hydra"),
+}
 """Settings that a journal and a service need not share: those that say how reports come in and where journals
 lie, those that are compared apart, and those on which no advice depends."""
 TOLERANCE = 0.01
@@ -328,23 +320,22 @@ def check_same(then: About, now: About) -> None:
     Raises:
         InputError: it is of others.
     """
-    remedy = "name another journal=FOLDER"
-    was, own = ({"policy": each.policy, "checkpoint": each.checkpoint} for each in (then, now))
-    if was != own:
-        raise InputError(f"it is of {was}, not of {own}: {remedy}")
-    was, own = _settings_of(then.overrides), _settings_of(now.overrides)
+    was, own = (
+        {**_settings_of(each), "policy": each.policy, "checkpoint": each.checkpoint} for each in (then, now)
+    )
     differ = [
         f"{key}: {was.get(key, 'not given')} then, {own.get(key, 'not given')} now"
         for key in {**was, **own}
         if was.get(key) != own.get(key)
     ]
     if differ:
-        raise InputError(f"it is of other settings: {'; '.join(differ)}: give the same, or {remedy}")
+        remedy = "give the same, or name another journal=FOLDER"
+        raise InputError(f"it is of other settings: {'; '.join(differ)}: {remedy}")
 
 
-def _settings_of(overrides: Sequence[str]) -> dict[str, str]:
+def _settings_of(about: About) -> dict[str, str | None]:
     """What overrides set, by key, without what may differ; the last one of a key counts."""
-    parts = [word.lstrip("+").partition("=") for word in overrides]
+    parts = [word.lstrip("+").partition("=") for word in about.overrides]
     return {key: value for key, _, value in parts if key.split(".")[0] not in MAY_DIFFER}
 
 
