@@ -33,7 +33,7 @@ from damian.advice.rows import (
 from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import named, show
-from damian.runs.run_lock import is_folder, locked
+from damian.runs.run_lock import LOCK, is_empty, is_folder, locked
 
 MAX_FLEETS = 1000
 MAY_DIFFER = {
@@ -271,7 +271,9 @@ class AdviceSession:
 
 def _remove_if_empty(folder: Path) -> None:
     with suppress(OSError):
-        folder.rmdir()
+        if is_empty(folder):
+            (folder / LOCK).unlink(missing_ok=True)
+            folder.rmdir()
 
 
 def replay(fleet: Fleet, line: Line) -> None:
