@@ -161,9 +161,7 @@ def test_a_span_is_a_part_of_the_flight(flown, told, scenario):
     assert not part.sent[0].any()
     assert np.array_equal(part.sent[1:], told.sent[first + 1 : last + 1])
     assert np.array_equal(part.delay[part.sent], told.delay[first : last + 1][part.sent])
-    with pytest.raises(
-        InputError, match="span: no step lies between 100 and 200 s: the journal covers 0 to"
-    ):
+    with pytest.raises(InputError, match="span: no step lies between 100 and 200 s: the journal covers 0 to"):
         episode_of(flown[1], fleet_of(names_of(3)), {}, (100.0, 200.0))
 
 
