@@ -202,7 +202,7 @@ def _curve_panel(
     task, delay, measure = content
     for name, arm in comparison.arms.items():
         run = (task, delay if arm.delayed else NOT_LATE, name)
-        style = look(comparison, name) | {"marker": "", "label": name}
+        style: dict[str, Any] = look(comparison, name) | {"marker": "", "label": name}
         if run in curves:
             place, mean, low, high = _band(curves[run], measure, progress)
             axis.plot(place, mean, linewidth=1.2, **style)
@@ -299,5 +299,5 @@ def _references(axis: Axes, comparison: Comparison, task: str) -> None:
     for label, style, values in lines:
         if values:
             level = fmean(values.values())
-            axis.axhline(level, **_LEVEL | {"linestyle": style})
+            axis.axhline(level, color="0.5", linestyle=style, linewidth=0.8)
             axis.annotate(label, (0.01, level), xycoords=("axes fraction", "data"), fontsize=6, va="bottom")

@@ -1,6 +1,7 @@
 """Figure of one flight: where the server believed the UAVs to be, beside where they truly were."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -61,12 +62,12 @@ def draw_map(axis: Axes, flight: Episode, step: int) -> None:
         axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
 
 
-def _lines(axis: Axes, flight: Episode, values: Floats) -> list:
+def _lines(axis: Axes, flight: Episode, values: Floats) -> list[Any]:
     """Draw a value of each UAV over time, [T + 1, N]; returns the lines."""
     lines = []
     for uav, shown in enumerate(frame_of(flight, 0).uavs):
-        style = {"color": shown.colour, "linestyle": _DASHES[uav // len(COLOURS) % len(_DASHES)]}
-        drawn = axis.step(flight.time, values[:, uav], where="post", linewidth=1.2, label=shown.name, **style)
-        lines += drawn
+        style: dict[str, Any] = {"color": shown.colour, "label": shown.name, "linewidth": 1.2}
+        dashes = _DASHES[uav // len(COLOURS) % len(_DASHES)]
+        lines += axis.step(flight.time, values[:, uav], linestyle=dashes, where="post", **style)
     axis.set_ylim(0, 1.1 * float(values.max()) or 1.0)
     return lines[: len(_DASHES) * len(COLOURS)]

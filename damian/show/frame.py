@@ -1,9 +1,9 @@
 """One instant of an episode, as every picture of it shows it: on the map, in space, and as GeoJSON."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from shapely.geometry.base import BaseGeometry
 
 from damian.common.plotting import COLOURS
 from damian.show.episode import Episode, Floats
@@ -41,8 +41,8 @@ class Frame:
     """Place of the source: east, north [m], [2]; None if nobody knows it."""
     emits: bool
     """Whether the source emits."""
-    cells: list[tuple[BaseGeometry, float]]
-    """Where the source may well be: areas in the region, with their probabilities."""
+    cells: list[tuple[Any, float]]
+    """Where the source may well be: polygons or several of them, with their probabilities."""
 
 
 def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:

@@ -184,6 +184,7 @@ def make_folder(file: Path) -> None:
         (lambda f: make_folder(f / "checkpoint.pt"), "checkpoint.pt: it cannot be read: Is a directory"),
         (lambda f: (f / "checkpoint.pt").unlink(), "checkpoint.pt: there is no such file"),
         (lambda f: (f / "config.yaml").write_text("agents: 3\n"), "config.yaml: it has no learner"),
+        (lambda f: (f / "run.json").write_text('{"damian": "0.4.0"}'), "resume: run: damian 0.4.0 wrote it"),
     ],
 )
 def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, message):
