@@ -36,18 +36,18 @@ test-browser: $(VENV)/browser
 	$(PY) -m pytest -m browser tests/show/test_replay_browser.py $(ARGS)
 
 bench: $(VENV)/bench
-	$(VENV)/bin/damian bench $(ARGS)
+	$(PY) examples/benchmarks/bench.py $(ARGS)
 
 # The service of damian advise over loopback.
 bench-advise: $(VENV)/test
-	$(PY) -m damian.recipes.bench_advise $(ARGS)
+	$(PY) examples/benchmarks/bench_advise.py $(ARGS)
 
 # The collectors of docs/scaling.md, in turns.
 bench-collectors: $(VENV)/slow
-	$(PY) -m damian.recipes.bench_collectors $(ARGS)
+	$(PY) examples/benchmarks/bench_collectors.py $(ARGS)
 
 bench-quick: $(VENV)/bench
-	$(VENV)/bin/damian bench --quick
+	$(PY) examples/benchmarks/bench.py --quick
 
 # Algorithms of BenchMARL, in an environment of its own: it asks for another TorchRL than ours. Fails if one learns nothing.
 BENCHMARL := build/benchmarl-venv

@@ -3,7 +3,8 @@
     damian advise checkpoint=runs/first reports=table.csv            (one table, one answer)
     damian advise checkpoint=runs/first folder=inbox "uavs=[A,B,C]"  (every table that comes into a folder)
     damian advise checkpoint=runs/first port=8000 journal=journals   (several fleets over HTTP)
-    damian advise region=llanbedr policy=greedy reports=table.csv    (the script)
+    damian advise region=llanbedr policy=script reports=table.csv    (the script)
+    damian advise fit=journals/north.jsonl                           (how late the links were, for trainings)
 
 Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
 docs/advise.md explains the columns of the reports, the answers, and what is guaranteed. The run folder gets
@@ -30,12 +31,14 @@ import hydra
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
+from damian.advice.fitting import fit, read_log, summary, trace_rows
 from damian.advice.fleet import Fleet, Waiting
 from damian.advice.node import Node, for_uavs, scenario_of_service
 from damian.advice.rows import read_file
 from damian.advice.session import AdviceSession, read_inbox, write_answer
 from damian.baselines.greedy import greedy_policy
 from damian.common import checks
+from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.runs.run_lock import is_folder, locked
@@ -56,17 +59,23 @@ FLEET = "main"
 class AdviseConfig(FlownPolicyConfig):
     """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
 
-    policies: ClassVar[tuple[str, ...]] = ("mode", "sampled", "greedy")
+    policies: ClassVar[tuple[str, ...]] = ("deterministic", "sampled", "script")
 
     policy: str | None = None
-    """``mode`` or ``sampled``: the policy of ``checkpoint``; ``greedy``: the script. If it is not given:
-    ``mode`` with a checkpoint, ``greedy`` without."""
+    """The policy of ``checkpoint``: its most likely actions (``deterministic``), or ``sampled`` ones; or the
+    ``script``. If it is not given: ``deterministic`` with a checkpoint, ``script`` without."""
     reports: str | None = None
     """Table of reports to answer once, CSV or JSON."""
     folder: str | None = None
     """Folder to watch for tables of reports; each is answered in ``advice.csv`` and ``advice.json`` there."""
     port: int | None = None
     """Port of the service over HTTP; 0: a free one."""
+    fit: str | None = None
+    """Journal, or table of reports with the column receive time: nothing is advised, and a trace law of its
+    delays is written into the run folder as ``trace.csv``."""
+    fit_dt: float | None = None
+    """Length of a step [s], with ``fit``: delays of the trace are whole steps, as the journal counts them;
+    without it they are times, which a simulation rounds up to whole steps."""
     host: str = "127.0.0.1"
     """Address that the service listens to: by default only programs of this machine reach it."""
     token: str | None = None
@@ -84,6 +93,8 @@ class AdviseConfig(FlownPolicyConfig):
         if self.port is not None:
             checks.whole("port", self.port, 0, 65535)
         check_token("token", self.token)
+        if self.fit_dt is not None:
+            checks.above("fit_dt", self.fit_dt, 0.0, "s")
 
     def check_source(self) -> None:
         """Require exactly one source of reports.
@@ -91,13 +102,15 @@ class AdviseConfig(FlownPolicyConfig):
         Raises:
             InputError: there is none, or more than one, or a journal is named that nothing would write.
         """
-        given = [name for name in ("reports", "folder", "port") if getattr(self, name) is not None]
+        given = [name for name in ("reports", "folder", "port", "fit") if getattr(self, name) is not None]
         if len(given) != 1:
             problem = f"{' and '.join(given)} are given" if given else "is missing"
-            raise InputError(f"reports: {problem}: give one of reports=FILE, folder=FOLDER, port=NUMBER")
-        if self.reports is not None:
+            raise InputError(
+                f"reports: {problem}: give one of reports=FILE, folder=FOLDER, port=NUMBER, fit=FILE"
+            )
+        if self.reports is not None or self.fit is not None:
             for name in ("journal", "durable"):
-                problem = "is for a service; a table that is answered once has no journal: leave it out"
+                problem = "is for a service or a folder, which alone have a journal: leave it out"
                 checks.require(not getattr(self, name), name, getattr(self, name), problem)
 
 
@@ -176,6 +189,16 @@ def answer_table(config: AdviseConfig, folder: Path) -> None:
     print(write_answer(folder, answer), end="")
 
 
+def fit_delays(config: AdviseConfig, folder: Path) -> None:
+    """Write the delays of a log of reports as a trace, with a row for each message, and print a summary."""
+    fitted = fit(read_log(Path(str(config.fit))))
+    save_config(without_token(config), folder)
+    trace = folder / "trace.csv"
+    write_atomically(trace, "\n".join(["delay", *trace_rows(fitted, config.fit_dt), ""]))
+    print(summary(fitted))
+    print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
+
+
 def note(config: AdviseConfig) -> None:
     """Say where the service knows less than the policy did in its training."""
     if config.observation.own and config.learnt:
@@ -185,6 +208,9 @@ def note(config: AdviseConfig) -> None:
 def advise(config: AdviseConfig, folder: Path) -> None:
     """Answer reports from where the settings say."""
     config.check_source()
+    if config.fit is not None:
+        fit_delays(config, folder)
+        return
     scenario_of_service(config.eval_scenario)
     note(config)
     if config.reports is not None:

@@ -21,21 +21,15 @@ from .shared.misspelt import check_words
 PROGRAMS = {
     "train": "train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one",
     "evaluate": "evaluate a trained policy, also in another scenario or under other delays",
-    "compare": "train and evaluate several arms with several seeds, and compare them with intervals",
-    "oracle": "evaluate a policy that knows some messages on time: which delay costs how much",
-    "ceiling": "fly a script with ever more known on time: what a delay leaves to be won",
+    "compare": "train and evaluate several methods with several seeds, and compare them with intervals",
     "tune": "search for better settings of a learner with Optuna",
-    "fly": "fly episodes and keep them as files, films, figures and pages: what is true, what is believed",
-    "replay": "make a page that plays stored episodes side by side, in any browser",
+    "fly": "fly episodes, and keep or replay them as files, films, figures and pages",
     "advise": "advise real UAVs: from what they report, where each should land next",
-    "fit-delays": "fit a trace law to the delays of real reports, to train with them",
-    "pendulum": "apply the delay transforms to another environment: SAC on Pendulum-v1",
-    "spread": "compare with a published table: MAPPO in simple_spread_v3 with late observations",
-    "bench": "measure the speed of environment and training beside VMAS",
+    "oracle": "fly a policy or the script with ever more known on time: which delay costs how much",
 }
 """What each program does, by its name; the program is the module of this name."""
 SETTINGS = {
-    **dict.fromkeys(("train", "evaluate", "oracle", "ceiling"), "train"),
+    **dict.fromkeys(("train", "evaluate", "oracle"), "train"),
     "compare": "compare",
     "fly": "fly",
     "tune": "tune",

@@ -17,11 +17,10 @@ any, from results.csv and curves.csv.
 """
 
 import re
-import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +46,8 @@ from damian.compare.figures import plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.envs.pipeline import has_message_delay
-from damian.runs.interrupt import exit_code
 
-from . import ceiling
+from . import oracle
 from .evaluate import fly, fly_untrained
 from .shared.command_line import command, typed_words, whole_laws
 from .shared.comparison_results import ROWS, Results, results_of, stored_results, write_csv
@@ -58,8 +56,7 @@ from .shared.experiment import Experiment
 from .shared.inheritance import check_policy_fits
 from .shared.known_settings import CONF
 from .shared.launch import checked, launch, reported, shown
-from .shared.launchers import LAUNCHERS, RayTasks, SlurmJobs
-from .shared.parallel import LOG, Launcher, Run, check_stored, perform_all
+from .shared.many_runs import LOG, RayTasks, Run, SlurmJobs, check_stored, perform_all, stop_code
 from .shared.settings import TrainConfig
 from .train import train
 
@@ -107,7 +104,7 @@ class CompareConfig:
         if self.seeds is not None:
             checks.whole("seeds", self.seeds, 1, 10_000)
         checks.whole("processes", self.processes, 1, 1024)
-        checks.one_of("launcher", self.launcher, LAUNCHERS)
+        checks.one_of("launcher", self.launcher, ("local", "ray", "slurm"))
         should = "means nothing without launcher=slurm"
         checks.require(self.slurm is None or self.launcher == "slurm", "slurm", self.slurm, should)
         mapping = self.slurm is None or isinstance(self.slurm, dict)
@@ -128,7 +125,7 @@ class CompareConfig:
                 sources = [
                     n
                     for n, a in self.chosen("arms").items()
-                    if a.policy_of is None and not (a.ceiling or a.untrained)
+                    if a.policy_of is None and not (a.oracle or a.untrained)
                 ]
                 checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, sources)
 
@@ -206,7 +203,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     """
     task, delay, name = folder.parts[-3:]
     arm, arms = config.experiment.arms[name], config.experiment.arms
-    flies_alone = arm.ceiling or arm.untrained
+    flies_alone = arm.oracle or arm.untrained
     source = arm.policy_of or (name if task != trained_in and not flies_alone else None)
     overrides = whole_laws(["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides])
     try:
@@ -214,14 +211,14 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         late = [] if arm.delayed else unseeded.late
         should = "delays this arm, with which others are compared: put delays under experiment.delays"
         checks.require(not late, ", ".join(late), "its value", should)
-        flies_script = arm.ceiling and unseeded.seeks_source and has_message_delay(unseeded)
+        flies_script = arm.oracle and unseeded.seeks_source and has_message_delay(unseeded)
         if flies_script:
-            ceiling.check(unseeded)
-        elif source is None and not arm.ceiling and not arm.untrained:
+            oracle.check(unseeded)
+        elif source is None and not arm.oracle and not arm.untrained:
             unseeded.check_learning()
     except COMPOSITION_ERRORS as error:
         raise InputError(f"{task}/{delay}/{name}: {one_line(error)}") from error
-    if arm.ceiling and not flies_script:
+    if arm.oracle and not flies_script:
         return  # nothing is won by finding the source, as the script does, or no message is late
     for seed in config.every_seed:
         seed_folder = f"seed_{seed}"
@@ -230,7 +227,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
             source_delay = delay if arms[source].delayed else NOT_LATE
             policy = folder.parents[2] / trained_in / source_delay / source / seed_folder
             seeded = replace(seeded, checkpoint=str(policy))
-        program = ceiling.fly if arm.ceiling else fly_untrained if arm.untrained else fly if source else train
+        program = oracle.fly if arm.oracle else fly_untrained if arm.untrained else fly if source else train
         yield Run(task, delay, name, seeded, folder / seed_folder, program, trains=program is train)
 
 
@@ -238,15 +235,6 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
 def _composed(*overrides: str) -> TrainConfig:
     """The settings of a training with these overrides."""
     return checked(compose("train", list(overrides)))
-
-
-def launcher_of(config: CompareConfig, folder: Path) -> Launcher | None:
-    """What carries out the runs of a comparison; None: processes of this machine."""
-    if config.launcher == "ray":
-        return partial(RayTasks, config.processes)
-    if config.launcher == "slurm":
-        return partial(SlurmJobs, config.processes, folder / "slurm", config.slurm or {})
-    return None
 
 
 def report(config: CompareConfig, results: Results, missing: Sequence[str], folder: Path) -> None:
@@ -285,7 +273,7 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
         "R2), 1 undelayed, not shown where "
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
         "one of the strongest naive arm, with its score interval; n compared: seeds that all of these have; "
-        "of ceiling: J over that of the script which knows all messages on time",
+        "of oracle: J over that of the script which knows all messages on time",
     ]
     if min(map(len, by_arm.values())) < SEEDS or episodes[0] < EPISODES:
         notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")
@@ -337,11 +325,16 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
         check_stored(run)
     try:
         if not config.report_only:
-            told, launcher = (POLICIES[config.policy], config.score), launcher_of(config, folder)
+            launcher = None
+            if config.launcher == "ray":
+                launcher = RayTasks(config.processes)
+            elif config.launcher == "slurm":
+                launcher = SlurmJobs(folder / "slurm", config.slurm or {})
+            told = POLICIES[config.policy], config.score
             failed = perform_all(runs, config.processes, told, launcher)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print("interrupted; run the same command again to continue", file=sys.stderr)
-        sys.exit(exit_code(signal.SIGINT))
+        sys.exit(stop_code(error))
     for run in failed:
         print(f"failed: {run.name}; see {run.folder / LOG}", file=sys.stderr)
     done = [run for run in runs if run.finished]

@@ -1,16 +1,18 @@
 """Fly episodes and keep each as file, film, figure or page: what is true, and what the server believes.
 
     damian fly checkpoint=runs/first
-    damian fly scenario=delaybench/tracking delay=paper aware=belief policy=greedy
+    damian fly scenario=delaybench/tracking delay=paper aware=belief policy=script
     damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
     damian fly journal=journals/north.jsonl "formats=[html,geojson]"
+    damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"
 
 Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
 The run folder gets config.yaml, and for each episode that is kept episode_N.json (docs/episodes.md explains
 it), the film episode_N.gif (and episode_N_3d.gif), and episode_N.png: a map, the positions over time, and the
 age of information; with keep=extremes they are called best, median and worst. "formats=[html]" makes
-episode_N.html, which plays the episode; damian replay makes such a page of several. With a journal of damian
-advise nothing is flown: the episode is the flight that it tells.
+episode_N.html, which plays the episode. With a journal of damian advise nothing is flown: the episode is the
+flight that it tells. Nor is it with ``replay``, which makes one page, replay.html, that plays stored episodes
+side by side: the same seed flown with and without a delay shows what the delay does.
 """
 
 from dataclasses import dataclass, field, fields
@@ -39,7 +41,7 @@ from damian.show.belief_figure import plot_beliefs
 from damian.show.episode import Episode, record
 from damian.show.film import VIEWS, check_gif, save_film
 from damian.show.geojson import origin_of, save_geojson
-from damian.show.replay_page import save_page
+from damian.show.replay_page import MOST, save_page
 
 from .evaluate import stored_actor
 from .shared.flown_policy import FlownPolicyConfig
@@ -58,13 +60,13 @@ FILMS = FORMATS[:2]
 class FlyConfig(FlownPolicyConfig):
     """All settings of ``damian fly``: those of ``damian train``, and what to fly and to keep."""
 
-    policies: ClassVar[tuple[str, ...]] = ("sampled", "mode", "greedy", "random")
+    policies: ClassVar[tuple[str, ...]] = ("sampled", "deterministic", "script", "random")
 
     eval_episodes: int = 1
     """Episodes to fly."""
     policy: str | None = None
-    """``sampled`` or ``mode``: the policy of ``checkpoint``; ``greedy``: the script; ``random``. If it is not
-    given: ``sampled`` with a checkpoint, ``greedy`` without."""
+    """The policy of ``checkpoint``: ``sampled`` actions, or its most likely ones (``deterministic``); the
+    ``script``; or ``random``. If it is not given: ``sampled`` with a checkpoint, ``script`` without."""
     keep: str = "all"
     """Which episodes to keep: ``all``, or the ``extremes``: the best, the median and the worst by return."""
     formats: list[str] = field(default_factory=lambda: ["gif", "png"])
@@ -77,20 +79,26 @@ class FlyConfig(FlownPolicyConfig):
     span: list[float] | None = None
     """First and last time of the journal to show, since every UAV had reported [s]; all if not given."""
 
+    replay: list[str] = field(default_factory=list)
+    """Files of stored episodes to play side by side in one page, instead of flying."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.journal is not None:
-            for key in ("checkpoint", "policy"):
+        sources = [name for name in ("journal", "replay") if getattr(self, name)]
+        checks.require(len(sources) < 2, "replay", self.replay, "does not go with journal: leave one out")
+        for source in sources:
+            for key, default in (
+                ("checkpoint", None),
+                ("policy", None),
+                ("eval_episodes", 1),
+                ("keep", "all"),
+            ):
                 given = getattr(self, key)
                 checks.require(
-                    given is None, key, given, "flies nothing beside journal: leave one of them out"
+                    given == default, key, given, f"means nothing with {source}, which flies nothing"
                 )
-            for key, default in (("eval_episodes", 1), ("keep", "all")):
-                given, should = (
-                    getattr(self, key),
-                    "chooses nothing: a journal tells one flight; leave it out",
-                )
-                checks.require(given == default, key, given, should)
+        if self.replay:
+            checks.in_range("replay", len(self.replay), 1, MOST, "episodes")
         if self.span is not None:
             good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal is not None
             checks.require(good, "span", self.span, "is not [FIRST, LAST], two times of a journal [s]")
@@ -114,9 +122,9 @@ def fly(config: FlyConfig) -> list[Episode]:
     if config.journal is not None:
         return [episode_of_journal(config)]
     env = make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, EXTRAS)
-    mode = ExplorationType.DETERMINISTIC if config.flown == "mode" else ExplorationType.RANDOM
+    likely = config.flown == "deterministic"
     policy = make_policy(config, env)
-    with set_exploration_type(mode):
+    with set_exploration_type(ExplorationType.DETERMINISTIC if likely else ExplorationType.RANDOM):
         rollout = env.rollout(config.horizon, policy, break_when_any_done=False)
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "seed": config.seed}
     return record(rollout, env.uav_env, {**about, "overrides": list(config.overrides)})
@@ -169,7 +177,7 @@ def make_policy(config: FlyConfig, env: DelayedEnv) -> TensorDictModuleBase:
         InputError: the checkpoint cannot be loaded, or the script does not suit the environment.
     """
     if not config.learnt:
-        return greedy_policy(env) if config.flown == "greedy" else random_policy(env)
+        return greedy_policy(env) if config.flown == "script" else random_policy(env)
     actor = stored_actor(config, env)
     add_recurrent_state(env, actor)
     return actor
@@ -211,6 +219,21 @@ def show(config: FlyConfig, folder: Path) -> None:
         print(summary(name, episode))
 
 
+def replay(config: FlyConfig, folder: Path) -> None:
+    """Make a page that plays stored episodes side by side, in any browser and without a network.
+
+    Raises:
+        InputError: a file is no episode, or has what a page cannot show.
+    """
+    episodes = [Episode.load(Path(file)) for file in config.replay]
+    page = folder / "replay.html"
+    try:
+        save_page(episodes, page)
+    except ValueError as error:  # a number that JSON cannot hold
+        raise InputError(f"replay: {error}") from error
+    print(f"page: {page} ({page.stat().st_size / 1e6:.2g} MB)")
+
+
 def summary(name: str, episode: Episode) -> str:
     """One line about an episode."""
     n_sent = max(int(episode.sent.sum()), 1)
@@ -230,7 +253,7 @@ def main(composed: DictConfig) -> None:
     config, folder = prepare(composed)
     if composed.journal is not None:
         config = with_settings_of_journal(config)  # type: ignore[arg-type]
-    perform(config, folder, show)  # type: ignore[arg-type]
+    perform(config, folder, replay if composed.replay else show)  # type: ignore[arg-type]
 
 
 def run() -> None:

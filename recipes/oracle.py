@@ -1,35 +1,48 @@
-"""Evaluate a trained policy under delay, with some messages known on time: which late messages cost how much.
+"""Fly a policy, or the script, with ever more known on time: which late messages cost how much.
 
     damian train scenario=tracking hydra.run.dir=runs/undelayed
     damian oracle checkpoint=runs/undelayed delay=paper
-    damian oracle checkpoint=runs/undelayed delay.obs=4 agents=5
+    damian oracle scenario=delaybench/tracking delay=paper
+    damian oracle -m scenario=delaybench/tracking delay.obs=2,4,8,16
 
-The policy acts on messages that have not arrived yet, so its results are a reference that no real system can
-reach (regime R3, docs/protocol.md). The overrides of the training run apply too, unless the command line
-gives others; a policy with a belief is refused. The run folder gets config.yaml, result.csv and result.md:
-one row for each set of messages that a UAV knows on time.
+With a checkpoint its policy flies, first as it must, then with some messages before they arrive (regime R3,
+docs/protocol.md). A policy with a belief is refused; the overrides of its training apply too.
+
+Without a checkpoint the script flies (``damian.baselines.greedy.Searcher``): each UAV goes where it most
+probably detects the source next, as the belief says, by the messages that have arrived at the server, by each
+UAV's own messages at once too (both R0), by all messages at once, and by the source's true place (both R3).
+With all messages on time it is a strong reference, and no proven limit: a policy that plans further ahead may
+win more. The run folder gets config.yaml, result.csv and result.md, with one row for what is known.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import hydra
 import torch
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
+from torch.nn.functional import one_hot
 from torchrl.envs import StepCounter
 
 from damian import keys
+from damian.baselines.greedy import greedy_policy
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.envs.pipeline import has_message_delay
-from damian.runs.metrics import evaluate
+from damian.compare.comparison import KNOWN_ON_TIME
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import has_message_delay, make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import save_results
 from damian.server.server import Server
+from damian.server.source_grid import SourceGrid
 from damian.world.messages import Messages
 
-from .evaluate import checkpoint_of, stored
+from .evaluate import stored
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
 from .shared.settings import TrainConfig
@@ -40,24 +53,45 @@ PLACE = ("position", "target", "track", "trail")
 """Fields of a message that a UAV can compute from its own past actions; its detections are not among them."""
 
 
-def foresee(config: TrainConfig, folder: Path) -> None:
-    """Evaluate the policy with ever more messages known on time, and fill the run folder."""
-    checkpoint_of(config)  # before the delays, because without it nothing can be compared
+def fly(config: TrainConfig, folder: Path) -> None:
+    """Evaluate the policy of ``config.checkpoint``, or else the script, and fill the run folder."""
+    check(config)
+    save_config(config, folder)
+    rows = policy_rows(config) if config.checkpoint else script_rows(config)
+    table = save_results(rows, folder, config.episode.success_share is not None, late=True)
+    print(f"\nwhat is known on time:\n\n{table}")
+
+
+def check(config: TrainConfig) -> None:
+    """Check that the rows can differ.
+
+    Raises:
+        InputError: no message is late, or the rows would not follow from what the server broadcasts.
+    """
     if not has_message_delay(config):
         raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
-    should = "is not supported: the rows replace what the server broadcasts; choose links=server"
+    should = "is not supported: the rows compare what the server can know; choose links=server"
     checks.require(config.links.kind == "server", "links", config.links.kind, should)
+    if not config.checkpoint:
+        if not config.seeks_source:
+            raise InputError(
+                "reward: nothing is won by finding the source, which is all that the script does"
+            )
+        return
     should = "is not supported: the rows replace what the server broadcasts at every step; leave it out"
     checks.require(config.clock.steps("server") == 1, "clock.server", config.clock.server, should)
-    follows = "what a UAV believes follows from more messages than the latest ones"
-    should = f"is not supported: {follows}; choose a policy that was trained without it"
-    for key, value in (
-        ("observation.belief", config.observation.belief),
-        ("delay.messages", config.delay.messages),
-    ):
-        checks.require(not value, key, value, should)
+    should = "is not supported: what a UAV believes follows from more messages than the latest ones"
+    belief, messages = config.observation.belief, config.delay.messages
+    checks.require(not belief, "observation.belief", belief, should)
+    checks.require(not messages, "delay.messages", messages, should)
+
+
+# A stored policy.
+
+
+def policy_rows(config: TrainConfig) -> dict[str, Evaluation]:
+    """Evaluations of the stored policy, in the same episodes, by what a UAV knows on time."""
     env, actor = stored(config)
-    save_config(config, folder)
     env.append_transform(StepCounter())
     own = torch.eye(config.agents, dtype=torch.bool, device=env.device)
     known_on_time = {
@@ -68,13 +102,12 @@ def foresee(config: TrainConfig, folder: Path) -> None:
         "everything": (own | ~own, ALL),
     }
     rows = {}
-    for name, (on_time, message_fields) in known_on_time.items():
-        env.set_seed(config.eval_seed)  # the same episodes for every row
-        observe = observe_with_timely_messages(env.server, on_time, message_fields)
+    for name, (on_time, fields) in known_on_time.items():
+        env.set_seed(config.eval_seed)
+        observe = observe_with_timely_messages(env.server, on_time, fields)
         policy = TensorDictSequential([observe, actor])  # type: ignore[list-item]
         rows[name] = evaluate(env, policy, config.horizon)
-    table = save_results(rows, folder, config.episode.success_share is not None, late=True)
-    print(f"\nwhat a UAV knows on time:\n\n{table}")
+    return rows
 
 
 def observe_with_timely_messages(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDictModule:
@@ -94,10 +127,55 @@ def observe_with_timely_messages(server: Server, on_time: Tensor, fields: Sequen
     return TensorDictModule(observe, in_keys=in_keys, out_keys=[keys.OBSERVATION])
 
 
+# The script.
+
+
+def script_rows(config: TrainConfig) -> dict[str, Evaluation]:
+    """Evaluations of the script, in the same episodes, by what is known on time."""
+    features = config.observation.belief or ["belief_moments"]
+    late, own = (
+        replace(config.eval_scenario, observation=replace(config.observation, own=knows, belief=features))
+        for knows in (False, True)
+    )
+    undelayed = replace(late, delay=replace(config.delay, obs=0, loss=0.0, hold="none"))
+    flights = (late, False), (own, False), (undelayed, False), (undelayed, True)
+    return {
+        known: _script(config, scenario, true_place)
+        for known, (scenario, true_place) in zip(KNOWN_ON_TIME, flights, strict=True)
+    }
+
+
+def _script(config: TrainConfig, scenario: ScenarioConfig, true_place: bool) -> Evaluation:
+    env = make_env(scenario, config.eval_episodes, config.eval_seed, config.device, ["message", "state"])
+    script: TensorDictModuleBase = greedy_policy(env)
+    if true_place:
+        script = TensorDictSequential([true_belief(env), script])  # type: ignore[list-item]
+    return evaluate(env, script, config.horizon)
+
+
+def true_belief(env: DelayedEnv) -> TensorDictModule:
+    """A module that replaces the server's belief by certainty about the source's cell.
+
+    Args:
+        env: its scenario observes a belief, and ``state`` is among its extras.
+    """
+    server = env.server
+    grid = cast(SourceGrid, server.grid)
+
+    def know(state: Tensor, message: Tensor) -> Tensor:
+        inside = grid.prior[server.region_of(server.messages(message))] > 0
+        distance = torch.cdist(state[..., -2:].to(grid.centres), grid.centres)
+        return one_hot(distance.where(inside, torch.inf).argmin(-1), distance.shape[-1]).to(distance)
+
+    return TensorDictModule(know, in_keys=[keys.STATE, keys.MESSAGE], out_keys=[keys.BELIEF])
+
+
 @hydra.main(version_base=None, config_path=CONF, config_name="train")
 @reported
 def main(composed: DictConfig) -> None:
-    perform(*prepare(composed), foresee)
+    if composed.resume is not None:
+        raise InputError("resume: nothing is trained; give the run folder as checkpoint")
+    perform(*prepare(composed), fly)
 
 
 def run() -> None:

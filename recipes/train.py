@@ -50,15 +50,13 @@ from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, plot_learning_curve, save_results
 from damian.runs.training_state import TrainingState, load_networks
 
-from .shared.collecting import collecting, collector_parts, ticks
+from .shared.collectors import WorkerLost, collecting, collector_parts, learning_env, ticks
 from .shared.inheritance import settings_by_key
 from .shared.known_settings import CONF
 from .shared.launch import interrupted, launch, perform, prepare, reported
-from .shared.learning_env import learning_env
 from .shared.settings import TrainConfig
 from .shared.stored_runs import run_folder, save_config, stored_config
 from .shared.training_film import film_policy
-from .shared.workers import WorkerLost
 
 MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
 of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most

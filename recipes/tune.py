@@ -38,14 +38,13 @@ from damian.common.csv_table import csv_table
 from damian.common.errors import InputError, RunError
 from damian.common.markdown import markdown_table
 from damian.compare.comparison import LESS_IS_BETTER, SCORES
-from damian.runs.interrupt import exit_code
 
 from .compare import POLICIES
 from .shared.command_line import command, typed_words
 from .shared.composition_errors import COMPOSITION_ERRORS, one_line
 from .shared.known_settings import CONF
 from .shared.launch import checked, launch, reported, shown
-from .shared.parallel import Run, perform_each
+from .shared.many_runs import Run, perform_each, stop_code
 from .shared.search_space import read_space
 from .shared.settings import TrainConfig, store_schema
 from .train import train
@@ -313,9 +312,9 @@ def main(composed: DictConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         search(config, overrides, folder)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print("interrupted; run the same command again to continue", file=sys.stderr)
-        sys.exit(exit_code(2))
+        sys.exit(stop_code(error))
     print(f"results: {folder}")
 
 

@@ -31,7 +31,6 @@ SHORTER = {
     "evaluate": FLIGHTS,
     "fly": [*FLIGHTS, "episode.max_steps=12"],
     "oracle": FLIGHTS,
-    "ceiling": FLIGHTS,
     "compare": ["seeds=1", "processes=1", OF_RUNS],
 }
 """Settings that make the commands of a program short; they replace those of the document."""

@@ -208,7 +208,7 @@ class Report(BaseModel):
         """
         said = self.model_fields_set
         if "received" in said and not file:
-            reads = "only damian advise reports=FILE and damian fit-delays read it"
+            reads = "only damian advise reports=FILE and damian advise fit=FILE read it"
             raise InputError(f"receive time: {reads}; the service looks at its own clock")
         has_time = "time" in said
         if "received" not in said:

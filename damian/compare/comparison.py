@@ -27,8 +27,13 @@ SCRIPTED = (RANDOM, SCRIPT)
 OF_ARM = (TRAINED, TRAINED_DETERMINISTIC, UNTRAINED, UNTRAINED_DETERMINISTIC)
 """Policies of an arm: its network after the training and before the first update."""
 ALL_MESSAGES = "all messages"
-CEILING = {"what has arrived": "R0", "its own messages": "R0", ALL_MESSAGES: "R3", "the source's place": "R3"}
-"""What is known on time in the rows of an information ceiling (``damian ceiling``), and their regimes."""
+KNOWN_ON_TIME = {
+    "what has arrived": "R0",
+    "its own messages": "R0",
+    ALL_MESSAGES: "R3",
+    "the source's place": "R3",
+}
+"""What the script of ``damian oracle`` knows on time in each row of its results, and the regimes."""
 HELD_OUT_MARK = "@"
 """Stands between a task and a change of it under which the task's policies fly untrained."""
 NOT_LATE = "none"
@@ -69,11 +74,11 @@ COMPARED = (
     Column("J_norm", "J_norm"),
     Column("recovery", "recovery"),
     Column("improvement", "P > naive"),
-    Column("of_ceiling", "of ceiling"),
+    Column("of_oracle", "of oracle"),
 )
 """What ``Comparison.compared`` finds of an arm: J_norm is 0 for the random policy, 1 for the undelayed arm;
 recovery is 0 for the strongest naive arm of the same track and 1 for the undelayed one; improvement: the
-probability that a run beats one of that naive arm; of_ceiling: the score over that of the script which knows
+probability that a run beats one of that naive arm; of_oracle: the score over that of the script which knows
 all messages on time, if an arm flies it."""
 MEASURES = tuple(column.name for column in MEASURED)
 SCORES = tuple(column.name for column in MEASURED if column.is_score)
@@ -99,8 +104,8 @@ class Arm:
     """Arm whose policies this one flies, without any training of its own; None: this arm trains."""
     untrained: bool = False
     """Whether the networks fly as they are before the first update, with their prior; nothing is trained."""
-    ceiling: bool = False
-    """Whether the script flies with ever more known on time (``damian ceiling``), and nothing is trained."""
+    oracle: bool = False
+    """Whether the script flies with ever more known on time (``damian oracle``), and nothing is trained."""
     tasks: list[str] | None = None
     """Tasks of the experiment that the arm does; all of them if not given."""
     regime: str = ""
@@ -209,14 +214,14 @@ class Comparison:
         return list({tuple(row[key] for key in keys): row for row in reversed(self.rows)}.values())[::-1]
 
     @property
-    def ceiling(self) -> str | None:
+    def oracle(self) -> str | None:
         """Name of the arm that flies the script with ever more known on time, if there is one."""
-        return next((name for name, arm in self.arms.items() if arm.ceiling), None)
+        return next((name for name, arm in self.arms.items() if arm.oracle), None)
 
     def present(self, task: str, delay: str) -> list[str]:
         """Arms with a policy of their own that have a finished run of a task under a delay."""
         found = {row["arm"] for row in self.rows if (row["task"], row["delay"]) == (task, delay)}
-        return [name for name, arm in self.arms.items() if name in found and not arm.ceiling]
+        return [name for name, arm in self.arms.items() if name in found and not arm.oracle]
 
     def values(self, task: str, delay: str, arm: str, policy: str, measure: str) -> dict[int, float]:
         """Values of a measure by seed; an untrained arm has none but those of its untrained network."""
@@ -252,12 +257,12 @@ class Comparison:
     def compared(self, task: str, delay: str) -> dict[str, Compared]:
         """Each delayed arm, over the seeds that it and all arms that it is compared with have finished."""
         scores = self.scores(task, delay)
-        ceiling = self.values(task, delay, self.ceiling or "", ALL_MESSAGES, self.score)
-        found = {name: self._compared(scores, ceiling, name) for name in list(scores)[2:]}
+        oracle = self.values(task, delay, self.oracle or "", ALL_MESSAGES, self.score)
+        found = {name: self._compared(scores, oracle, name) for name in list(scores)[2:]}
         return {name: result for name, result in found.items() if result.seeds}
 
     def _compared(
-        self, scores: Mapping[str, Mapping[int, float]], ceiling: Mapping[int, float], arm: str
+        self, scores: Mapping[str, Mapping[int, float]], oracle: Mapping[int, float], arm: str
     ) -> Compared:
         others = [name for name in list(scores)[2:] if track(self.arms, name) == track(self.arms, arm)]
         naive = [name for name in others if self.arms[name].naive]
@@ -270,7 +275,7 @@ class Comparison:
             probability = float(_improvement(array))
             found["improvement"] = Estimate(probability, *improvement_interval(probability, len(seeds)))
             found["recovery"] = _recovery(array)
-        return Compared(seeds, {**found, "of_ceiling": _ratio(scores[arm], ceiling)})
+        return Compared(seeds, {**found, "of_oracle": _ratio(scores[arm], oracle)})
 
     def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
         """Probability that a run of one delayed arm beats one of another, with its score interval, by names.
@@ -412,9 +417,9 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
                     # The script does not fly in every region.
                     if comparison.values(task, delay, arm, policy, comparison.score):
                         yield replace(_line(comparison, task, delay, arm, policy), arm=policy, regime="")
-            for known, information in CEILING.items():
-                if comparison.values(task, delay, comparison.ceiling or "", known, comparison.score):
-                    line = _line(comparison, task, delay, str(comparison.ceiling), known)
+            for known, information in KNOWN_ON_TIME.items():
+                if comparison.values(task, delay, comparison.oracle or "", known, comparison.score):
+                    line = _line(comparison, task, delay, str(comparison.oracle), known)
                     yield replace(line, regime=information)
 
 

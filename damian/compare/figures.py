@@ -100,7 +100,7 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
         return
     width = min(len(norms), _NORMS_IN_A_ROW)
     height = math.ceil(len(norms) / width)
-    arms = [name for name, arm in comparison.arms.items() if arm.delayed and not arm.ceiling]
+    arms = [name for name, arm in comparison.arms.items() if arm.delayed and not arm.oracle]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.0 * width + 1.2, 3.0 * height), layout="constrained")
         axes = figure.subplots(height, width, squeeze=False, sharey=True)
@@ -161,7 +161,7 @@ def look(comparison: Comparison, arm: str) -> dict[str, Any]:
     """Colour, line and marker of an arm, by its place among all arms of the comparison."""
     again, index = divmod(list(comparison.arms).index(arm), len(ARM_COLOURS))
     of_arm = comparison.arms[arm]
-    trains = of_arm.policy_of is None and not (of_arm.untrained or of_arm.ceiling)
+    trains = of_arm.policy_of is None and not (of_arm.untrained or of_arm.oracle)
     lines = _LINES if trains else _DOTTED
     return {
         "color": ARM_COLOURS[index],
@@ -244,11 +244,11 @@ def _known_norms(comparison: Comparison, task: str) -> dict[str, dict[int, Estim
 
 
 def _delay_column(column: Sequence[Axes], comparison: Comparison, task: str, arms: Sequence[str]) -> None:
-    """Draw the scores of arms over the delays of a task; below, their recovery or share of the ceiling."""
+    """Draw the scores of arms over the delays of a task; below, their recovery or share of the oracle's."""
     above, below = column
     delays = comparison.delays(task)
     has_naive = any(comparison.arms[arm].naive for arm in arms)
-    won = "recovery" if has_naive else "of_ceiling"
+    won = "recovery" if has_naive else "of_oracle"
     compared = [comparison.compared(task, delay) for delay in delays]
     for arm in arms:
         scores = [comparison.mean(task, delay, arm) for delay in delays]
@@ -293,8 +293,8 @@ def _references(axis: Axes, comparison: Comparison, task: str) -> None:
     undelayed = (task, NOT_LATE, comparison.undelayed)
     lines = [("undelayed", "--", comparison.values(*undelayed, comparison.policy, comparison.score))]
     lines.append((RANDOM, "--", comparison.values(*undelayed, RANDOM, comparison.score)))
-    for delay in comparison.delays(task)[:1] if comparison.ceiling else []:
-        found = comparison.values(task, delay, str(comparison.ceiling), ALL_MESSAGES, comparison.score)
+    for delay in comparison.delays(task)[:1] if comparison.oracle else []:
+        found = comparison.values(task, delay, str(comparison.oracle), ALL_MESSAGES, comparison.score)
         lines.append(("script, all messages on time", ":", found))
     for label, style, values in lines:
         if values:

@@ -1,6 +1,7 @@
 """BPQL: the actor observes what has arrived and its own actions since; critics learn from the true states.
 
-    python examples/transforms/late_critic.py        (some seconds; damian pendulum --arms bpql trains)
+    python examples/transforms/late_critic.py        (some seconds)
+    python examples/studies/pendulum.py --arms bpql     (a training)
 
 Kim et al. (2023): critics are needed in training only, and by then the state in which an action was chosen
 has arrived. They value it as without delay, Q(state, action), with the actor's action at what it observed.

@@ -20,7 +20,7 @@ from damian.runs.metrics_log import METRICS, read_metrics
 from damian.runs.run_record import read_record
 
 from .composition_errors import one_line
-from .parallel import Run
+from .many_runs import Run
 
 ROWS, CURVES = "results.csv", "curves.csv"
 WORDS = ("task", "delay", "arm", "regime", "policy")

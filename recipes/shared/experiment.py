@@ -70,13 +70,13 @@ class Experiment:
         for name, arm in self.arms.items():
             if arm.regime:
                 checks.one_of(f"experiment.arms.{name}.regime", arm.regime, ("R0", "R1", "R2", "R3"))
-            should = "trains nothing: it has no policy_of and no ceiling, and delayed is not false"
-            alone = arm.delayed and arm.policy_of is None and not arm.ceiling
+            should = "trains nothing: it has no policy_of and no oracle, and delayed is not false"
+            alone = arm.delayed and arm.policy_of is None and not arm.oracle
             checks.require(alone or not arm.untrained, f"experiment.arms.{name}", "untrained", should)
-            if arm.ceiling:
+            if arm.oracle:
                 should = "flies the script under delay: it has no policy_of, and delayed is not false"
                 good = arm.policy_of is None and arm.delayed
-                checks.require(good, f"experiment.arms.{name}", "ceiling", should)
+                checks.require(good, f"experiment.arms.{name}", "oracle", should)
             source = self.arms.get(arm.policy_of or "", arm)
             for task in self.tasks if arm.tasks is None else arm.tasks:
                 options = self.tasks if source.tasks is None else source.tasks

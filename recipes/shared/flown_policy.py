@@ -7,7 +7,7 @@ from damian.common import checks
 
 from .settings import TrainConfig
 
-STORED = ("sampled", "mode")
+STORED = ("sampled", "deterministic")
 
 
 @dataclass
@@ -33,7 +33,7 @@ class FlownPolicyConfig(TrainConfig):
     @property
     def flown(self) -> str:
         """The policy that flies, one of ``policies``."""
-        return self.policy or (self.policies[0] if self.checkpoint else "greedy")
+        return self.policy or (self.policies[0] if self.checkpoint else "script")
 
     @property
     def learnt(self) -> bool:

@@ -54,10 +54,10 @@ def test_steps_are_those_of_the_service(log):
 
 
 def test_a_law_reads_the_trace(log, tmp_path, capsys):
-    out = tmp_path / "trace.csv"
-    main(["fit-delays", str(log(table(True))), "--out", str(out), "--dt", "1"])
+    out = tmp_path / "run" / "trace.csv"
+    main(["advise", f"fit={log(table(True))}", "fit_dt=1", f"hydra.run.dir={out.parent}"])
     printed = capsys.readouterr().out.splitlines()
-    assert printed[-1].endswith(f'train with "delay.obs={{law: trace, path: {out}}}"')
+    assert f'train with "delay.obs={{law: trace, path: {out}}}"' in printed
     sampler = Trace(str(out)).sampler()
     assert sampler.longest == 4
     assert sampler.loses

@@ -195,14 +195,14 @@ def test_the_interval_of_a_share_lies_between_0_and_1_and_that_of_a_length_is_no
 
 
 def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
-    arms = ARMS | {"script": Arm(ceiling=True)}
+    arms = ARMS | {"script": Arm(oracle=True)}
     rows = rows_of("t", "late", THREE)
     for known, value in (("its own messages", 8.0), (ALL_MESSAGES, 10.0)):
         rows += [row("t", "late", "script", seed, value, known) for seed in range(3)]
     comparison = Comparison(rows, arms)
     compared = comparison.compared("t", "late")
     assert set(compared) == {"blind", "flown", "aware"}
-    assert compared["aware"]["of_ceiling"].value == pytest.approx((22 / 3) / 10)
+    assert compared["aware"]["of_oracle"].value == pytest.approx((22 / 3) / 10)
     script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
     assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
     assert comparison.compared("t", "late")["aware"]["recovery"].value == pytest.approx((22 / 3 - 4) / 6)
@@ -242,7 +242,7 @@ def drawn(monkeypatch, draw) -> Figure:
 def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other_one(monkeypatch, tmp_path):
     names = [f"arm {i}" for i in range(2 * len(ARM_COLOURS) - 2)]
     arms = {"best": Arm(delayed=False), "blind": Arm(naive=True)} | {name: Arm() for name in names}
-    arms |= {"unfinished": Arm(), "script": Arm(ceiling=True)}
+    arms |= {"unfinished": Arm(), "script": Arm(oracle=True)}
     scores = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3]} | {name: [6.0, 9, 7] for name in names}
     comparison = Comparison(rows_of("t", "late", scores), arms)
     panels = {"all": [*names, "unfinished", "left out"], "none": ["left out"]}

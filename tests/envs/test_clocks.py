@@ -14,7 +14,7 @@ from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.clocks import ClockConfig
 from damian.learners.schedule import SystemClock
-from damian.recipes.shared.collecting import spotting, ticks
+from damian.recipes.shared.collectors import spotting, ticks
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import learning_env
 from damian.server.termination import EpisodeConfig

@@ -17,7 +17,7 @@ from damian.envs.pipeline import make_env
 from damian.keys import HIDDEN, HIDDEN_BEFORE
 from damian.learners.mappo import Mappo, MappoConfig, policy_terms
 from damian.learners.networks import ModelConfig, make_actor
-from damian.recipes.shared.collecting import make_collector
+from damian.recipes.shared.collectors import make_collector
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.runs.metrics import evaluate

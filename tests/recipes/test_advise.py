@@ -33,7 +33,7 @@ B,NA,52.8133,-4.1264,0,NA,NA,NA,0.5,0
 C,NA,52.8154,-4.1311,1,180,NA,70,NA,NA
 """
 TOKEN = "a-token-of-the-service"
-SCRIPT = ["policy=greedy", "actions.distances=[0,30,60]", "region.initial_conditions=1"]
+SCRIPT = ["policy=script", "actions.distances=[0,30,60]", "region.initial_conditions=1"]
 
 
 @pytest.fixture
@@ -84,9 +84,12 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
 
 
 REFUSALS = [
-    (["policy=greedy"], "reports: is missing: give one of reports=FILE, folder=FOLDER, port=NUMBER"),
+    (
+        ["policy=script"],
+        "reports: is missing: give one of reports=FILE, folder=FOLDER, port=NUMBER, fit=FILE",
+    ),
     (["reports=table.csv", "port=0"], "reports: reports and port are given: give one of"),
-    (["policy=mode", "reports=table.csv"], "policy: mode needs checkpoint"),
+    (["policy=deterministic", "reports=table.csv"], "policy: deterministic needs checkpoint"),
     (["reports=nothing.csv"], "nothing.csv: no such file"),
     (["folder=nothing", "uavs=[A]"], "folder: nothing is not there"),
     (["folder=."], "uavs: []: List should have at least 1 item"),
@@ -140,7 +143,7 @@ def test_no_file_keeps_the_token_however_it_is_written(run, monkeypatch, word):
 
 def session_of(folder: Path) -> AdviceSession:
     region = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
-    return make_session(AdviseConfig(policy="greedy", region=region), folder)
+    return make_session(AdviseConfig(policy="script", region=region), folder)
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 from damian.advice.rows import read_file
 from damian.common.errors import InputError
 from damian.recipes import advise as advise_program
-from damian.recipes import bench, compare, evaluate, oracle, pendulum, spread, train
+from damian.recipes import compare, evaluate, oracle, train
 from damian.recipes import fly as fly_program
 from damian.recipes.command import main
 from damian.recipes.shared.settings import TrainConfig
@@ -52,17 +52,6 @@ VALID = {
     + "".join(
         f'{{"received":{i + 0.5},"reports":[{{"id":"A","time":{i}.0,"lat":53.1,"lon":-4.5}}]}}\n'
         for i in range(4)
-    ),
-    "seed0_naive.json": json.dumps(
-        {
-            "arm": "naive",
-            "seed": 0,
-            "steps": 20000,
-            "delay": 6,
-            "episodes": 20,
-            "hidden": 128,
-            "returns": {"6": -200.0},
-        }
     ),
     "episode.json": json.dumps(flight().document()),
 }
@@ -148,11 +137,6 @@ def answer(name, given_words, made=nothing):
             (evaluate, "report", nothing),
             (oracle, "evaluate", nothing),
             (compare, "perform_all", lambda *_: []),
-            (pendulum, "run_arm", nothing),
-            (pendulum, "table", nothing),
-            (spread, "run_arm", nothing),
-            (spread, "table", nothing),
-            (bench, "measure", nothing),
         ]
         for module, function, stand_in in cut_off:
             stack.enter_context(patch.object(module, function, stand_in))
@@ -251,24 +235,10 @@ def test_a_run_folder_of_any_content_is_refused_in_one_line(name, content):
     assert code == 2
 
 
-@examples(10, 1000)
-@given(contents("seed0_naive.json"))
-def test_a_stored_result_of_any_content_is_refused_in_one_line_or_read(content):
-    for name in ("pendulum", "spread"):
-        answer(name, ["--out", ".", "--seeds", "0"], write("seed0_naive.json", content))
-
-
 @examples(8, 1000)
 @given(contents("episode.json"))
 def test_an_episode_of_any_content_is_refused_in_one_line_or_shown(content):
-    answer("replay", ["episode.json"], write("episode.json", content))
-
-
-@examples(10, 1000)
-@given(st.sampled_from(LOGS).flatmap(lambda file: st.tuples(st.just(file), contents(file))))
-def test_a_log_of_any_content_is_refused_in_one_line_or_fitted(case):
-    file, content = case
-    answer("fit-delays", [file, "--out", "trace.csv"], write(file, content))
+    answer("fly", ["replay=[episode.json]", *SMALL], write("episode.json", content))
 
 
 @examples(20, 3000)
@@ -300,23 +270,6 @@ def test_any_words_end_a_comparison_in_one_line_or_start_it(given_words):
     few = ["experiment=usecase2", "tasks=[usecase2]", "arms=[undelayed]", "seeds=1"]
     with patch.object(compare, "report", nothing), patch.object(compare, "MARKDOWN", os.devnull):
         answer("compare", [*few, *given_words])
-
-
-@examples(15, 800)
-@given(
-    st.lists(
-        st.one_of(
-            st.sampled_from(
-                [f"--{name}" for name in ("seeds", "steps", "delay", "episodes", "hidden", "jobs", "x")]
-            ),
-            st.sampled_from([*NUMBERS, *WORDS, "0,1", "5000"]),
-            st.text(max_size=5),
-        ),
-        max_size=5,
-    )
-)
-def test_any_words_end_the_pendulum_in_one_line_or_start_it(given_words):
-    answer("pendulum", [*given_words, "--out", "run"])
 
 
 SWEEPS = [
@@ -357,18 +310,13 @@ def test_a_refused_sweep_leaves_no_folder(name, given_words):
     [
         ("fly", ["resume=x"], "resume: nothing is trained"),
         ("advise", ["resume=x"], "resume: nothing is trained"),
-        ("advise", ["policy=random"], "policy: random is not one of mode, sampled, greedy"),
+        ("advise", ["policy=random"], "policy: random is not one of deterministic, sampled, script"),
         ("advise", ["token=short"], "token: it is not a password"),
-        ("fit-delays", [], "the following arguments are required: log"),
-        ("fit-delays", ["nothing.csv"], "nothing.csv: no such file"),
-        ("fit-delays", ["nothing.jsonl"], "nothing.jsonl: it cannot be read"),
-        ("fit-delays", ["x", "--dt", "0"], "--dt: 0.0 s is not above 0 s"),
-        ("fit-delays", ["x", "--out", "/"], "--out: / is there already"),
-        ("ceiling", ["delay=paper", "checkpoint=x"], "checkpoint: the script flies"),
-        ("ceiling", ["delay=none"], "delay.obs: no message is late or lost"),
-        ("ceiling", ["scenario=coverage", "delay=paper"], "reward: nothing is won by finding the source"),
-        ("ceiling", ["links=matrix", "delay=paper"], "links: matrix is not supported"),
-        ("oracle", [], "checkpoint: it is missing"),
+        ("advise", ["fit=nothing.csv"], "nothing.csv: no such file"),
+        ("advise", ["fit=x", "fit_dt=0"], "fit_dt: 0.0 s is not above 0 s"),
+        ("oracle", ["delay=none"], "delay.obs: no message is late or lost"),
+        ("oracle", ["scenario=coverage", "delay=paper"], "reward: nothing is won by finding the source"),
+        ("oracle", ["links=matrix", "delay=paper"], "links: matrix is not supported"),
         ("evaluate", [], "checkpoint: it is missing"),
         (
             "compare",
@@ -380,13 +328,8 @@ def test_a_refused_sweep_leaves_no_folder(name, given_words):
             ["experiment=usecase2", "overrides=['++seed=3']"],
             "overrides: ++seed=3 cannot be the same",
         ),
-        ("bench", ["--foo"], "unrecognized arguments: --foo"),
-        ("pendulum", ["--seeds", "99999999999999999999"], "--seeds: 99999999999999999999 is not a list"),
-        ("pendulum", ["--hidden", "10000000"], "--hidden: 10000000 is not between 1 and 16384"),
-        ("pendulum", ["--out", "/dev/null/x"], "--out: /dev/null/x: Not a directory"),
-        ("pendulum", ["--out", "x" * 5000], "File name too long"),
-        ("replay", ["x.json"], "x.json: it is no episode of version 1 or 2: no such file"),
-        ("replay", [], "the following arguments are required: EPISODE.json"),
+        ("fly", ["replay=[x.json]"], "x.json: it is no episode of version 1 or 2: no such file"),
+        ("fly", ["replay=[x.json]", "journal=x"], "replay: ['x.json'] does not go with journal"),
         ("train", ["hydra.run.dir="], "hydra.run.dir: it is empty"),
         ("train", ["resume=" + "x" * 5000], "resume: "),
         ("train", ["checkpoint=" + "x" * 5000], "checkpoint: "),

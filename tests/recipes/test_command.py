@@ -74,11 +74,7 @@ def test_the_settings_read_from_the_source_are_those_of_the_dataclasses():
 
 def test_every_program_is_a_module_of_the_recipes_and_says_what_it_does(capsys):
     folder = Path(sys.modules["damian.recipes.command"].__file__).parent
-    helpers = {"__init__", "command", "bench_advise", "bench_arms", "bench_figure", "bench_timing"}
-    helpers |= {"bench_training", "bench_collectors"}
-    assert {name.replace("-", "_") for name in PROGRAMS} == {
-        path.stem for path in folder.glob("*.py")
-    } - helpers
+    assert {*PROGRAMS} == {path.stem for path in folder.glob("*.py")} - {"__init__", "command"}
     main([])
     printed = capsys.readouterr().out
     assert all(f"\n  {name} " in printed and what in printed for name, what in PROGRAMS.items())

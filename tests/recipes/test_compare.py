@@ -11,12 +11,12 @@ import pytest
 from helpers import check_refused
 from hydra import initialize_config_dir
 
-from damian.compare.comparison import CEILING, TRAINED, Arm
+from damian.compare.comparison import KNOWN_ON_TIME, TRAINED, Arm
 from damian.recipes.compare import CompareConfig, Experiment, main, plan
 from damian.recipes.evaluate import fly
 from damian.recipes.shared.known_settings import CONF
 from damian.recipes.shared.launch import launch
-from damian.recipes.shared.parallel import Run, perform_all
+from damian.recipes.shared.many_runs import Run, perform_all
 from damian.recipes.shared.settings import TrainConfig
 from damian.runs.run_lock import locked
 
@@ -314,7 +314,7 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
         ),
         (
             "tasks: {a: [scenario=tracking]}\ndelays: {up: [links=updown, delay.obs=2]}\n"
-            "arms: {undelayed: {delayed: false}, known: {ceiling: true}}",
+            "arms: {undelayed: {delayed: false}, known: {oracle: true}}",
             "a/up/known: links: updown is not supported",
         ),
     ],
@@ -334,14 +334,14 @@ def test_a_comparison_flies_policies_in_held_out_tasks_and_the_script_that_knows
         """tasks:
   follow: [scenario=delaybench/tracking]
 delays: {late: [delay.obs=2]}
-arms: {best: {delayed: false}, naive: {naive: true}, known: {ceiling: true}}
+arms: {best: {delayed: false}, naive: {naive: true}, known: {oracle: true}}
 held_out: {two: {overrides: [agents=2], tasks: [follow]}}
 """
     )
     words = ["--config-dir", "mine", "experiment=script", "seeds=1"]
     compare(*words, listed(*SMALL, "observation.belief_cell=100", "episode.max_steps=8"))
     text = (tmp_path / "runs/script/table.md").read_text()
-    for known, information in CEILING.items():
+    for known, information in KNOWN_ON_TIME.items():
         assert text.count(f"| known | {information} | {known} | 1 |") == 2
     assert "## follow@two, delay late\n\nPolicies of another task." in text
     results = tmp_path / "runs/script"
@@ -367,7 +367,7 @@ def test_runs_go_seed_by_seed_and_an_arm_does_its_tasks_only():
 
 
 def test_the_script_flies_only_where_messages_are_late():
-    arms = {"best": Arm(delayed=False), "known": Arm(ceiling=True)}
+    arms = {"best": Arm(delayed=False), "known": Arm(oracle=True)}
     delays = {"late": ["delay.obs=2"], "act": ["delay.act=2"]}
     experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms)
     with initialize_config_dir(CONF, version_base=None):

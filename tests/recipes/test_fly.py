@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from episodes import flight
 from helpers import check_refused
 from matplotlib.image import imread
 from PIL import Image
@@ -18,6 +19,7 @@ from damian.recipes.fly import kept, main
 from damian.recipes.shared.launch import launch
 from damian.recipes.train import main as train
 from damian.show.episode import Episode
+from damian.show.replay_page import page
 
 SHORT = ["policy=random", "formats=[]", "actions.distances=[0,30,60]", "episode.max_steps=60"]
 UNDELAYED = ["delay.obs=0", "delay.loss=0"]
@@ -77,17 +79,25 @@ def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run,
     words += ["actions.distances=[0,30,60]", "episode.max_steps=6", "delay.obs=2", "hydra.run.dir=trained"]
     monkeypatch.setattr(sys, "argv", ["train.py", *words])
     launch(train)
-    words = ["policy=mode", "checkpoint=trained", "eval_episodes=4", "keep=extremes", "episode.max_steps=6"]
+    words = [
+        "policy=deterministic",
+        "checkpoint=trained",
+        "eval_episodes=4",
+        "keep=extremes",
+        "episode.max_steps=6",
+    ]
     folder = run(*words, folder="flown")
     episodes = [Episode.load(folder / f"{name}.json") for name in ("worst", "median", "best")]
     assert all(episode.n_agents == 2 and episode.n_steps <= 6 for episode in episodes)
-    assert all(episode.about["policy"] == "mode" for episode in episodes)
+    assert all(episode.about["policy"] == "deterministic" for episode in episodes)
     returns = [episode.perceived_return for episode in episodes]
     assert returns == sorted(returns)
-    one = run("policy=mode", "checkpoint=trained", folder="one")  # not as many as the training evaluated
+    one = run(
+        "policy=deterministic", "checkpoint=trained", folder="one"
+    )  # not as many as the training evaluated
     assert [path.name for path in one.glob("episode_*.json")] == ["episode_0.json"]
     refusal = "flown/config.yaml: it holds no policy: the one of trained was flown there"
-    check_refused(lambda: run("policy=mode", "checkpoint=flown", folder="two"), refusal, capsys)
+    check_refused(lambda: run("policy=deterministic", "checkpoint=flown", folder="two"), refusal, capsys)
 
 
 def test_the_episodes_are_those_in_which_a_training_evaluates_its_policy(run, monkeypatch):
@@ -97,11 +107,11 @@ def test_the_episodes_are_those_in_which_a_training_evaluates_its_policy(run, mo
     launch(train)
     with Path("trained", "result.csv").open(newline="") as file:
         measured = {row["policy"]: float(row["perceived_return"]) for row in csv.DictReader(file)}
-    for policy, own in (("mode", ["checkpoint=trained"]), ("greedy", flown)):
+    for policy, own in (("deterministic", ["checkpoint=trained"]), ("script", flown)):
         words = [*own, f"policy={policy}", "eval_episodes=6", "episode.max_steps=20"]
         folder = run(*words, folder=policy)
         returns = [Episode.load(folder / f"episode_{i}.json").perceived_return for i in range(6)]
-        name = "trained, deterministic" if policy == "mode" else "script"
+        name = "trained, deterministic" if policy == "deterministic" else "script"
         assert np.mean(returns) == pytest.approx(measured[name], rel=1e-3)
     assert measured["script"] > 0
 
@@ -197,8 +207,8 @@ def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
         (["delay.obs=soon"], "delay.obs: soon is neither whole steps"),
         (["delay=sometimes"], "delay: sometimes is not one of burst, distance, lag, none, paper"),
         (["resume=runs/last"], "resume: nothing is trained; give the run folder as checkpoint"),
-        (["policy=best"], "policy: best is not one of sampled, mode, greedy, random"),
-        (["policy=mode"], "policy: mode needs checkpoint"),
+        (["policy=best"], "policy: best is not one of sampled, deterministic, script, random"),
+        (["policy=deterministic"], "policy: deterministic needs checkpoint"),
         (["keep=last"], "keep: last is not one of all, extremes"),
         (["views=[4d]"], "views: 4d is not one of 2d, 3d"),
         (
@@ -262,3 +272,45 @@ def test_a_real_region_of_any_shape_goes_from_file_to_film(run, tmp_path, kind):
 def unwrapped(polygons: list) -> list:
     """Polygons whose longitudes do not jump at the date line."""
     return [[[[lon % 360, lat] for lon, lat in ring] for ring in polygon] for polygon in polygons]
+
+
+# Pages of stored episodes.
+
+
+@pytest.fixture
+def replay(tmp_path, monkeypatch):
+    """Make a page of stored episodes; returns its run folder."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("undelayed.json", "late.json"):
+        flight(about={"overrides": [f"delay={name}"]}).save(tmp_path / name)
+
+    def run_recipe(*words: str) -> Path:
+        monkeypatch.setattr(sys, "argv", ["fly.py", *words, "hydra.run.dir=page"])
+        launch(main, "fly")
+        return tmp_path / "page"
+
+    return run_recipe
+
+
+def test_a_page_has_the_episodes_in_the_order_of_their_files(replay, capsys):
+    text = (replay("replay=[undelayed.json,late.json]") / "replay.html").read_text()
+    assert capsys.readouterr().out.startswith("page: page/replay.html (0.")
+    assert text.index('"title":"delay=undelayed.json"') < text.index('"title":"delay=late.json"')
+    assert len(text) < len(page([flight()])) + 10_000
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ({"about": {"seed": float("inf")}}, "not JSON compliant"),
+        ({"reward_terms": {"spotted": {}}}, "reward_terms"),
+        ({"time": "soon"}, "late.json: "),
+    ],
+)
+def test_a_damaged_episode_is_refused_in_one_line_and_leaves_no_page(
+    replay, tmp_path, capsys, damage, message
+):
+    held = json.loads((tmp_path / "late.json").read_text())
+    (tmp_path / "late.json").write_text(json.dumps({**held, **damage}))
+    check_refused(lambda: replay("replay=[late.json]"), message, capsys)
+    assert not (tmp_path / "page").exists()

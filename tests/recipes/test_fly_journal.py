@@ -14,7 +14,7 @@ from damian.recipes.fly import main
 from damian.recipes.shared.launch import launch
 from damian.show.episode import Episode
 
-WORDS = ["region=llanbedr", "delay=paper", "port=0", "policy=greedy", "agents=5", "token=x"]
+WORDS = ["region=llanbedr", "delay=paper", "port=0", "policy=script", "agents=5", "token=x"]
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def show(tmp_path, monkeypatch):
 def write_journal(path: Path) -> None:
     """Two UAVs that report their places for six seconds, the second one a second late."""
     journal = Journal(path)
-    about = About(policy="mode", checkpoint="runs/gone", overrides=[*WORDS, "checkpoint=runs/gone"])
+    about = About(policy="deterministic", checkpoint="runs/gone", overrides=[*WORDS, "checkpoint=runs/gone"])
     journal.append(Head(fleet="north", uavs=["A", "B"], about=about))
     for second in range(6):
         for uav, late in (("A", 0.2), ("B", 1.2)):
@@ -54,7 +54,7 @@ def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(show):
     assert (episode.n_agents, episode.names, episode.source) == (2, ["A", "B"], None)
     assert episode.age[:, 1].min() > 0 == episode.age[:-1, 0].max()
     about = dict(episode.about)
-    assert (about["policy"], about["checkpoint"], about["fleet"]) == ("mode", "runs/gone", "north")
+    assert (about["policy"], about["checkpoint"], about["fleet"]) == ("deterministic", "runs/gone", "north")
     assert about["began"] == "2023-11-14T22:13:21.000Z", "when both had reported"
     with Image.open(folder / "episode_0.gif") as film:
         assert film.n_frames == episode.n_steps + 1
@@ -86,10 +86,10 @@ def test_a_setting_that_is_given_replaces_that_of_the_advice(show):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["policy=greedy"], "policy: greedy flies nothing beside journal: leave one of them out"),
+        (["policy=script"], "policy: script means nothing with journal, which flies nothing"),
         (["checkpoint=run"], "checkpoint: run"),
-        (["eval_episodes=7"], "eval_episodes: 7 chooses nothing: a journal tells one flight; leave it out"),
-        (["keep=extremes"], "keep: extremes chooses nothing"),
+        (["eval_episodes=7"], "eval_episodes: 7 means nothing with journal"),
+        (["keep=extremes"], "keep: extremes means nothing with journal"),
         (["span=[3]"], "span: [3.0] is not [FIRST, LAST], two times of a journal [s]"),
         (["span=[90,99]"], "span: no step lies between 90 and 99 s: the journal covers 0 to 5 s"),
         (["journal=nothing.jsonl"], "nothing.jsonl: it cannot be read: No such file or directory"),

@@ -14,7 +14,7 @@ from damian.runs.run_lock import is_locked
 def test_a_worker_ends_with_a_comparison_that_was_killed(tmp_path):
     run = f"""import time
 from pathlib import Path
-from damian.recipes.shared.parallel import Run, perform_all
+from damian.recipes.shared.many_runs import Run, perform_all
 from damian.recipes.shared.settings import TrainConfig
 
 def wait(config, folder):

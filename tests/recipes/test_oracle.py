@@ -1,18 +1,25 @@
 """The oracle recipe: observations of UAVs that know some messages on time, and its table."""
 
+import csv
 import sys
+from itertools import pairwise
 
 import pytest
 import torch
 from helpers import both_motions, everything
 from torchrl.envs import StepCounter
 
+from damian import keys
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
 from damian.recipes import oracle, train
 from damian.recipes.shared.launch import composed_config, launch
+from damian.server.features import ObservationConfig
 from damian.world.messages import Messages
+from damian.world.regions.config import RegionConfig
+from damian.world.signal_source import SourceConfig
 
 TINY = ["frames=64", "worlds=4", "learner.steps=16", "eval_episodes=4", "model.hidden=[8]", "logger=csv"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
@@ -99,7 +106,7 @@ def foresee(tmp_path, monkeypatch):
 def test_the_table_has_a_row_for_each_set_of_messages_known_on_time(foresee, capsys):
     table = (foresee() / "result.md").read_text()
     rows, meaning = table.split("\n\n")
-    assert meaning.startswith("seen: as the server perceived it")
+    assert meaning.startswith("perceived: as far as the server knew")
     assert [line.split(" | ")[0][2:] for line in rows.splitlines()[2:]] == [
         "nothing",
         "where it is",
@@ -107,7 +114,7 @@ def test_the_table_has_a_row_for_each_set_of_messages_known_on_time(foresee, cap
         "the others' messages",
         "everything",
     ]
-    assert "what a UAV knows on time" in capsys.readouterr().out
+    assert "what is known on time" in capsys.readouterr().out
 
 
 @pytest.mark.sample(2)
@@ -133,4 +140,48 @@ def test_a_scenario_whose_observations_do_not_wait_for_the_server_is_refused(
 def test_a_policy_that_remembers_messages_is_refused(word, tmp_path):
     config = composed_config("delay.obs=2", "checkpoint=trained", word)
     with pytest.raises(InputError, match="follows from more messages than the latest ones"):
-        oracle.foresee(config, tmp_path)
+        oracle.fly(config, tmp_path)
+
+
+# The script.
+
+WORDS = ["scenario=delaybench/tracking", "observation.belief_cell=60", "eval_episodes=300"]
+WORDS += ["episode.max_steps=25", "delay.obs=6", "hydra.run.dir=script"]
+
+
+@pytest.fixture
+def returns(tmp_path, monkeypatch):
+    """The true return of every row of the recipe's table."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["damian oracle", *WORDS])
+    launch(oracle.main)
+    with (tmp_path / "script/result.csv").open(newline="") as file:
+        return {row["policy"]: float(row["return"]) for row in csv.DictReader(file)}
+
+
+def test_who_knows_more_on_time_wins_more(returns):
+    rows = ["what has arrived", "its own messages", "all messages", "the source's place"]
+    assert [*returns] == rows
+    for less, more in pairwise(rows):
+        assert returns[less] < returns[more], (less, more)
+
+
+def test_the_true_belief_is_certain_of_the_cell_with_the_nearest_centre():
+    scenario = ScenarioConfig(
+        region=RegionConfig(kind="random", pool=3, lattice_step=40),
+        source=SourceConfig(motion="dynamic"),
+        observation=ObservationConfig(belief=["belief_moments"]),
+    )
+    env = make_env(scenario, 12, seed=0, extras=["message", "state"])
+    steps = env.rollout(5, break_when_any_done=False)[:, -1]
+    grid = env.server.grid
+    belief = oracle.true_belief(env)(steps.clone())[keys.BELIEF]
+    assert torch.equal(belief.sum(-1), torch.ones(12))
+    region = env.server.region_of(env.server.messages(steps[keys.MESSAGE]))
+    for world in range(12):
+        cells = [k for k in range(belief.shape[-1]) if grid.prior[region[world], k] > 0]
+        east, north = steps[keys.STATE][world, -2:].tolist()
+        nearest = min(
+            cells, key=lambda k: (grid.centres[k, 0] - east) ** 2 + (grid.centres[k, 1] - north) ** 2
+        )
+        assert belief[world].argmax() == nearest

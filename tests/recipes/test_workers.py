@@ -21,12 +21,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
 from damian.common.errors import InputError
-from damian.recipes.shared.collecting import collecting
+from damian.recipes.shared.collectors import collecting, learning_env, worker_env, worker_seed
 from damian.recipes.shared.launch import composed_config
-from damian.recipes.shared.learning_env import learning_env
-from damian.recipes.shared.ray_workers import check_installed
+from damian.recipes.shared.ray_cluster import connected_ray
 from damian.recipes.shared.settings import TrainConfig
-from damian.recipes.shared.workers import worker_env, worker_seed
 from damian.recipes.train import make_learner, replay_buffer
 from damian.runs.metrics_log import MetricsLog
 
@@ -247,4 +245,4 @@ def test_a_run_that_lost_a_worker_and_was_resumed_equals_one_in_processes_that_l
 def test_a_missing_ray_is_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"collector: ray is not installed; pip install 'damian\[ray\]'"):
-        check_installed("collector")
+        connected_ray("collector", 2)

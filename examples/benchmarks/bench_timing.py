@@ -1,4 +1,4 @@
-"""How ``damian bench`` times environments: in turn, with episodes that end at different times.
+"""How ``bench.py`` times environments: in turn, with episodes that end at different times.
 
 If all worlds began together, most steps would be without a reset, and a rollout shorter than an episode would
 never reset at all. So before the measurement a few worlds at a time are reset until all have been.
@@ -32,15 +32,11 @@ class Measured(NamedTuple):
         return f"{self.lowest:.2f} to {self.highest:.2f}"
 
 
-Chunk = Callable[[], None]
-"""Takes a fixed number of steps; only calls of it are timed."""
-
-
-def in_turn(chunks: Mapping[str, Chunk], steps: int, repeats: int) -> dict[str, Measured]:
+def in_turn(chunks: Mapping[str, Callable[[], object]], steps: int, repeats: int) -> dict[str, Measured]:
     """Times of steps, where the chunks take turns, so that a busy machine slows all of them.
 
     Args:
-        chunks: by name, each of ``steps`` steps.
+        chunks: by name, each takes ``steps`` steps; only calls of it are timed.
         steps: number of steps of a chunk.
         repeats: number of measured turns.
     """

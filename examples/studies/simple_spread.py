@@ -15,7 +15,6 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEnv
 
 from damian import keys
-from damian.common import checks
 from damian.delays.laws import Law
 from damian.transforms import ActionHistory, MessageHistory, ObservationDelay
 
@@ -53,39 +52,30 @@ class SimpleSpread(EnvBase):
         worlds: number of worlds, B.
         agents: number of agents and of landmarks, N.
         local_ratio: weight of an agent's own reward; the common one has the rest.
-        device: where everything is computed.
-
-    Raises:
-        InputError: a number is out of its range.
 
     Examples:
         >>> env = SimpleSpread(64)
         >>> env.rollout(25)["next", "agents", "reward"].sum((1, 2, 3)).mean()  # about -79
     """
 
-    def __init__(
-        self, worlds: int, agents: int = 3, local_ratio: float = 0.5, device: torch.device | None = None
-    ) -> None:
-        checks.in_range("worlds", worlds, 1, 1_000_000)
-        checks.in_range("agents", agents, 2, 1000)
-        checks.in_range("local_ratio", local_ratio, 0.0, 1.0)
-        super().__init__(device=device, batch_size=torch.Size([worlds]))
+    def __init__(self, worlds: int, agents: int = 3, local_ratio: float = 0.5) -> None:
+        super().__init__(batch_size=torch.Size([worlds]))
         self.n_agents, self.local_ratio = agents, local_ratio
-        self.directions = torch.tensor(DIRECTIONS, device=device)
-        places = torch.arange(agents, device=device)
+        self.directions = torch.tensor(DIRECTIONS)
+        places = torch.arange(agents)
         self.others = places.expand(agents, -1)[places != places.unsqueeze(-1)].view(agents, -1)
-        self.generator = torch.Generator(self.device or "cpu")
+        self.generator = torch.Generator()
         self.generator.seed()
         self._make_specs(worlds, agents)
-        self.position, self.landmarks = (torch.zeros(worlds, agents, 2, device=device) for _ in range(2))
+        self.position, self.landmarks = (torch.zeros(worlds, agents, 2) for _ in range(2))
         self.velocity = torch.zeros_like(self.position)
-        self.steps = torch.zeros(worlds, 1, dtype=torch.long, device=device)
+        self.steps = torch.zeros(worlds, 1, dtype=torch.long)
 
     def _make_specs(self, worlds: int, n: int) -> None:
-        group, batch, device = torch.Size([worlds, n]), torch.Size([worlds]), self.device
+        group, batch = torch.Size([worlds, n]), torch.Size([worlds])
 
         def composite(entries: dict[str, Any], rows: torch.Size = batch) -> Composite:
-            return Composite(entries, shape=rows, device=device)
+            return Composite(entries, shape=rows)
 
         def numbers(width: int, rows: torch.Size = group) -> Unbounded:
             return Unbounded(torch.Size((*rows, width)))
@@ -107,7 +97,7 @@ class SimpleSpread(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones_like(self.steps, dtype=torch.bool)
-        drawn = torch.rand(2, *self.position.shape, generator=self.generator, device=self.device)
+        drawn = torch.rand(2, *self.position.shape, generator=self.generator)
         new, world = 2 * drawn - 1, mask.view(-1, 1, 1)
         self.position = torch.where(world, new[0], self.position)
         self.landmarks = torch.where(world, new[1], self.landmarks)
@@ -141,10 +131,10 @@ class SimpleSpread(EnvBase):
         ends = {keys.DONE: over, keys.TERMINATED: torch.zeros_like(over), keys.TRUNCATED: over.clone()}
         messages = seen.flatten(1, 2)
         groups = {
-            "agents": TensorDict(agents, [worlds, n], device=self.device),
-            "seen": TensorDict({"message": messages}, messages.shape[:2], device=self.device),
+            "agents": TensorDict(agents, [worlds, n]),
+            "seen": TensorDict({"message": messages}, messages.shape[:2]),
         }
-        return TensorDict({**groups, **ends}, self.batch_size, device=self.device)
+        return TensorDict({**groups, **ends}, self.batch_size)
 
 
 def contact_forces(position: Tensor) -> Tensor:

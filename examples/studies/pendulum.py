@@ -1,23 +1,22 @@
 """Apply the delay transforms to another environment: SAC on Gymnasium's Pendulum-v1 with late observations.
 
-    damian pendulum --jobs 2                  (half an hour on two free cores)
-    damian pendulum --arms history,bpql       (these arms only)
-    damian pendulum --seeds 0 --steps 10000 --delay 3 --out runs/pendulum3
+    python examples/studies/pendulum.py --jobs 2                  (half an hour on two free cores)
+    python examples/studies/pendulum.py --arms history bpql       (these arms only)
+    python examples/studies/pendulum.py --seeds 0 --steps 10000 --delay 3 --out runs/pendulum3
 
 Four arms are trained for each seed: undelayed; naive, whose observations are late; history, which also
 observes the agent's latest actions; and bpql, whose actor is that of history, but whose critics read only
 the state, once it has arrived (``BackupdateStorage``). The undelayed policy is also evaluated under several
-delays. The run folder (runs/pendulum, unless --out names another one) gets the table of mean returns as
-results.md and results.csv, and a JSON file for each arm and seed; an arm and seed that has its file is not
-trained again.
+delays. The folder gets the mean returns as results.md and results.csv, and a JSON file for each arm and seed.
 """
 
+import csv
 import statistics
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NamedTuple, cast
+from argparse import Namespace
+from typing import cast
 
 import torch
+from study import Results, carried_out, parser
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
@@ -37,9 +36,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from damian import keys
-from damian.common import checks
-from damian.common.atomic_files import write_atomically
-from damian.common.csv_table import csv_table
 from damian.common.markdown import markdown_table
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
@@ -50,17 +46,7 @@ from damian.replay.backupdate import BackupdateStorage
 from damian.replay.time_storage import TimeStorage
 from damian.transforms import ActionHistory, ObservationDelay
 
-from .shared.command_line import Parser, exits_with_one_line
-from .shared.outside_runs import (
-    add_options,
-    chosen_runs,
-    read_result,
-    run_all,
-    save_result,
-)
-
 ARMS = ("undelayed", "naive", "history", "bpql")
-AUGMENTED = ("history", "bpql")  # arms whose actor observes its latest actions
 DEPLOYED = {0: -145, 2: -153, 3: -324, 4: -757, 6: -777, 8: -977}
 REFERENCE = {("undelayed", d): r for d, r in DEPLOYED.items()}
 REFERENCE |= {("naive", 6): -1154, ("history", 6): -155, ("bpql", 6): -144}
@@ -72,19 +58,7 @@ EVALUATION_SEED = 1000  # of the initial conditions in every evaluation
 BATCH, LR, GAMMA, TAU = 256, 1e-3, 0.99, 0.005
 OBSERVED = (keys.OBSERVATION, keys.GLOBAL_OBSERVATION)  # of the actor, and the state for critics
 OUTPUTS = (*OBSERVED, "observation", "received", "age", "delay", "step_count", keys.REWARD)
-STORED = [*OBSERVED, "step_count", keys.ACTION]
-STORED += map(next_key, (*OUTPUTS, *keys.ENDS))
-
-
-class Run(NamedTuple):
-    """One arm with one seed."""
-
-    arm: str
-    seed: int
-    steps: int
-    delay: int
-    episodes: int
-    hidden: int
+STORED = [*OBSERVED, "step_count", keys.ACTION, *map(next_key, (*OUTPUTS, *keys.ENDS))]
 
 
 def make_env(delay: int, history: int, worlds: int | None = None) -> EnvBase:
@@ -123,25 +97,17 @@ def arrived_states(steps: TensorDictBase, observations: Tensor) -> dict[NestedKe
     return {next_key(keys.GLOBAL_OBSERVATION): observations}
 
 
-def make_learner(env: EnvBase, run: Run) -> Sac:
+def make_learner(env: EnvBase, arm: str, steps: int, delay: int, hidden: int) -> Sac:
     """The learner that also trains UAVs: SAC, or BPQL with a storage that learns of states as they arrive."""
-    kind = BpqlConfig if run.arm == "bpql" else SacConfig
+    kind = BpqlConfig if arm == "bpql" else SacConfig
     config = kind(lr=LR, alpha_lr=LR, gamma=GAMMA, tau=TAU, alpha_init=1.0)
-    model = ModelConfig(hidden=[run.hidden, run.hidden], activation="relu")
+    model = ModelConfig(hidden=[hidden, hidden], activation="relu")
     setup = LearningSetup(model, 1, 1, 1, critic_key=keys.OBSERVATION)
-    if run.arm != "bpql":
-        return config.make(env, setup, ReplayBuffer(storage=TimeStorage(run.steps)))
-    storage = BackupdateStorage(
-        run.steps,
-        arrived_states,
-        longest=run.delay,
-        env=env,
-        message_key="observation",
-        received_key="received",
-        delay_key="delay",
-        age_key="age",
-    )
-    setup = setup._replace(longest_delay=run.delay, critic_key=keys.GLOBAL_OBSERVATION)
+    if arm != "bpql":
+        return config.make(env, setup, ReplayBuffer(storage=TimeStorage(steps)))
+    names = {"message_key": "observation", "received_key": "received", "delay_key": "delay", "age_key": "age"}
+    storage = BackupdateStorage(steps, arrived_states, longest=delay, env=env, **names)
+    setup = setup._replace(longest_delay=delay, critic_key=keys.GLOBAL_OBSERVATION)
     return config.make(env, setup, ReplayBuffer(storage=storage))
 
 
@@ -149,7 +115,7 @@ def train(env: EnvBase, learner: Sac, steps: int, bar: tqdm) -> None:
     """Train for ``steps`` environment steps, with one update after each."""
     td = env.reset()
     for step in range(steps):
-        # Outside of such a context TorchRL's actor takes the mode of its distribution, and explores nothing.
+        # Outside of such a context TorchRL's actor takes the most likely action, and explores nothing.
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             td = env.rand_action(td) if step < RANDOM_STEPS else learner.actor(td)
             transition, td = env.step_and_maybe_reset(td)
@@ -171,7 +137,7 @@ def draw(learner: Sac) -> TensorDictBase:
 
 @torch.no_grad()
 def evaluate_under(delay: int, history: int, actor: nn.Module, episodes: int) -> float:
-    """Mean return of the policy's mode over episodes that have the same initial conditions at every call."""
+    """Mean return of the most likely actions, in episodes with the same initial conditions at every call."""
     env = make_env(delay, history, episodes)
     env.set_seed(EVALUATION_SEED)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -180,80 +146,48 @@ def evaluate_under(delay: int, history: int, actor: nn.Module, episodes: int) ->
     return rollout[next_key(keys.REWARD)].sum(1).mean().item()
 
 
-def run_arm(run: Run, folder: Path, place: int) -> None:
-    """Train, evaluate and write the result; ``place`` is the line of the progress bar."""
+def run_arm(arm: str, seed: int, args: Namespace) -> dict[str, float]:
+    """Train and evaluate an arm; returns its mean returns by the delay of the evaluation."""
     torch.set_num_threads(1)
-    torch.manual_seed(run.seed)
-    delay = 0 if run.arm == "undelayed" else run.delay
-    history = run.delay if run.arm in AUGMENTED else 0
+    torch.manual_seed(seed)
+    delay = 0 if arm == "undelayed" else args.delay
+    history = args.delay if arm in ("history", "bpql") else 0
     env = make_env(delay, history)
-    env.set_seed(run.seed)
-    learner = make_learner(env, run)
-    with tqdm(total=run.steps, desc=f"seed {run.seed} {run.arm}", position=place) as bar:
-        train(env, learner, run.steps, bar)
-    delays = sorted({*DEPLOYED, run.delay}) if run.arm == "undelayed" else [delay]
-    returns = {str(d): evaluate_under(d, history, learner.actor, run.episodes) for d in delays}
-    save_result(run, folder, returns)
+    env.set_seed(seed)
+    learner = make_learner(env, arm, args.steps, args.delay, args.hidden)
+    with tqdm(total=args.steps, desc=f"seed {seed} {arm}") as bar:
+        train(env, learner, args.steps, bar)
+    delays = sorted({*DEPLOYED, args.delay}) if arm == "undelayed" else [delay]
+    return {str(d): evaluate_under(d, history, learner.actor, args.episodes) for d in delays}
 
 
-def is_good(returns: Any) -> bool:
-    """Whether something can be mean returns by the delay of the evaluation."""
-    return isinstance(returns, dict) and all(isinstance(each, int | float) for each in returns.values())
-
-
-def table(runs: Sequence[Run], folder: Path) -> str:
+def table(results: Results, args: Namespace) -> str:
     """Write the results as results.csv and results.md; returns the latter's text."""
-    arms, seeds = (
-        list(dict.fromkeys(each)) for each in zip(*((run.arm, run.seed) for run in runs), strict=True)
-    )
-    rows = [["arm", "delay", "mean", *(f"seed {seed}" for seed in seeds), "reference"]]
-    for arm in arms:
-        results = [read_result(run, folder, is_good)["returns"] for run in runs if run.arm == arm]
-        for delay in results[0]:
-            values = [result[delay] for result in results]
+    rows = [["arm", "delay", "mean", *(f"seed {seed}" for seed in args.seeds), "reference"]]
+    for arm in args.arms:
+        found = [results[arm, seed] for seed in args.seeds]
+        for delay in found[0]:
+            values = [returns[delay] for returns in found]
             numbers = [f"{value:.0f}" for value in (statistics.mean(values), *values)]
             rows.append([arm, delay, *numbers, str(REFERENCE.get((arm, int(delay)), ""))])
-    write_atomically(folder / "results.csv", csv_table(rows))
-    title = f"# Pendulum-v1, SAC, {runs[0].steps} steps: return, mean of {runs[0].episodes} episodes"
+    with (args.out / "results.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    title = f"# Pendulum-v1, SAC, {args.steps} steps: return, mean of {args.episodes} episodes"
     text = f"{title}\n\n{markdown_table(rows[0], rows[1:])}\n"
-    write_atomically(folder / "results.md", text)
+    (args.out / "results.md").write_text(text)
     return text
 
 
-def parse(words: Sequence[str] | None) -> tuple[list[Run], Path, int]:
-    """The runs that the command line asks for, their folder, and the number of processes.
-
-    Raises:
-        InputError: an option is unknown, or its value is impossible.
-    """
-    parser = Parser(description="SAC on Pendulum-v1 with late observations.")
-    add_options(parser, ARMS, "runs/pendulum")
-    parser.add_argument("--steps", type=int, default=20_000, help="training steps of each arm")
-    parser.add_argument("--delay", type=int, default=6, help="delay of the observations [steps]")
-    parser.add_argument("--episodes", type=int, default=20, help="episodes of each evaluation")
-    parser.add_argument("--hidden", type=int, default=128, help="units in each of two hidden layers")
-    args = parser.parse_args(words)
-    checks.in_range("--steps", args.steps, RANDOM_STEPS + 1, 100_000_000)
-    checks.in_range("--delay", args.delay, 1, HORIZON, "steps")
-    for name, most in (("episodes", 10_000), ("hidden", 16_384)):
-        checks.in_range(f"--{name}", getattr(args, name), 1, most)
-    settings = args.steps, args.delay, args.episodes, args.hidden
-    runs = [Run(arm, seed, *settings) for arm, seed in chosen_runs(args, ARMS)]
-    return runs, args.out, args.jobs
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Train, evaluate and print the table; wrong input ends with one line on stderr and exit code 2."""
-    with exits_with_one_line():
-        runs, folder, jobs = parse(words)
-        run_all(runs, folder, jobs, run_arm, is_good)
-        print(f"{table(runs, folder)}\nresults: {folder}")
-
-
-def run() -> None:
-    """Run the program with the words of the command line."""
-    main()
+def main(words: list[str] | None = None) -> None:
+    """Train, evaluate and print the table."""
+    options = parser("SAC on Pendulum-v1 with late observations.", ARMS, "runs/pendulum")
+    options.add_argument("--steps", type=int, default=20_000, help="training steps of each arm")
+    options.add_argument("--delay", type=int, default=6, help="delay of the observations [steps]")
+    options.add_argument("--episodes", type=int, default=20, help="episodes of each evaluation")
+    options.add_argument("--hidden", type=int, default=128, help="units in each of two hidden layers")
+    args = options.parse_args(words)
+    print(table(carried_out(args, run_arm), args))
 
 
 if __name__ == "__main__":
-    run()
+    main()

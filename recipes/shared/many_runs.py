@@ -1,6 +1,7 @@
 """Carry out many runs, several at a time, each in its own folder with its output in log.txt.
 
-Finished runs are not repeated, and interrupted ones continue from their checkpoints.
+Finished runs are not repeated, and interrupted ones continue from their checkpoints. The runs are carried out
+in processes of this machine, as Ray tasks, or as Slurm jobs.
 """
 
 import csv
@@ -9,16 +10,23 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from functools import partial
+from importlib import import_module
 from itertools import islice
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from omegaconf import OmegaConf
@@ -34,15 +42,27 @@ from damian.runs.run_record import POLICY, read_record
 
 from .composition_errors import one_line
 from .launch import Program, perform
+from .ray_cluster import connected_ray
 from .settings import TrainConfig
 from .stored_runs import stored_config
 
 LOG = "log.txt"
+STOP_LIMIT = 120
+"""Seconds that interrupted Ray tasks have to write their checkpoints."""
 _SPAWN = multiprocessing.get_context("spawn")
 _stop = _SPAWN.Event()
 """Set after Ctrl-C: no further run begins. Worker processes share the event of the main process."""
 _idle = threading.Event()
 """Not set while this process carries out a run."""
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal has stopped the runs; its only argument is the exit code."""
+
+
+def stop_code(error: KeyboardInterrupt) -> int:
+    """The exit code of a program whose runs were stopped: 130 after Ctrl-C, 143 after SIGTERM."""
+    return error.args[0] if isinstance(error, Stopped) else exit_code(signal.SIGINT)
 
 
 @dataclass(frozen=True)
@@ -70,16 +90,11 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Has the run results, which belong to the finished policy that it flies, if it flies another's?"""
-        results = self.folder / RESULTS
-        if not results.exists() or self.policy is None:
-            return results.exists()
-        source = self.policy / RESULTS
-        flown, stored = read_record(self.folder).get(POLICY), digest(self.policy / CHECKPOINT)
-        if source.exists() and flown and stored:
-            return flown == stored
-        # An older damian did not record it. The times of copied files need not tell which was written first.
-        return source.exists() and source.stat().st_mtime_ns <= results.stat().st_mtime_ns
+        """Has the run results, and if it flies another's policy, are they of that policy as it is now?"""
+        if self.policy is None or not (self.folder / RESULTS).exists():
+            return (self.folder / RESULTS).exists()
+        same = read_record(self.folder).get(POLICY) == digest(self.policy / CHECKPOINT)
+        return same and (self.policy / RESULTS).exists()
 
     def score(self, policy: str, measure: str) -> float:
         """A measure of one policy in the results of a finished run, or of its first one."""
@@ -108,7 +123,7 @@ class Run:
 
 
 def check_stored(run: Run) -> None:
-    """Check that a run folder is empty or holds a run with the same settings; missing ones have defaults.
+    """Check that a run folder is empty or holds a run with the same settings.
 
     Raises:
         InputError: the stored settings differ or cannot be read.
@@ -145,12 +160,73 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, node
 
 
-Launcher = Callable[[], Executor]
-"""Makes what carries out runs elsewhere (``recipes/shared/launchers.py``), several at the same time."""
+# Where runs are carried out.
+
+
+class RayTasks:
+    """Carries out runs as Ray tasks with one CPU each (``connected_ray`` says where).
+
+    Args:
+        processes: number of tasks at the same time for which a Ray of this machine has room.
+
+    Raises:
+        InputError: Ray is not installed, or there is no cluster.
+    """
+
+    def __init__(self, processes: int) -> None:
+        self._ray, _ = connected_ray("launcher", processes)  # which ends with this program
+        self._tasks: list[Any] = []
+
+    def carry_out(self, run: Run) -> None:
+        """Carry out a run, and wait for its end."""
+        self._tasks.append(self._ray.remote(num_cpus=1, max_retries=0)(perform_run).remote(run))
+        self._ray.get(self._tasks[-1])
+
+    def cancel(self) -> None:
+        """Interrupt all runs as Ctrl-C, so that trainings write their checkpoints."""
+        for task in self._tasks:
+            self._ray.cancel(task)
+        self._ray.wait(self._tasks, num_returns=len(self._tasks), timeout=STOP_LIMIT)
+
+
+class SlurmJobs:
+    """Carries out runs as Slurm jobs, through submitit.
+
+    Args:
+        folder: gets the files of submitit; all machines must see it.
+        parameters: of submitit's executor; ``cluster: local`` starts processes of this machine instead.
+
+    Raises:
+        InputError: submitit is not installed, knows no such parameter, or finds no Slurm here.
+    """
+
+    def __init__(self, folder: Path, parameters: Mapping[str, Any]) -> None:
+        try:
+            submitit = import_module("submitit")
+        except ImportError:
+            problem = "submitit is not installed; pip install 'damian[cluster]'"
+            raise InputError(f"launcher: {problem}") from None
+        options = {"cpus_per_task": 1, "name": "damian", **parameters}
+        try:
+            self._executor = submitit.AutoExecutor(folder, cluster=options.pop("cluster", "slurm"))
+            self._executor.update_parameters(**options)
+        except (NameError, RuntimeError, TypeError, ValueError) as error:
+            raise InputError(f"slurm: {one_line(error)}") from error
+        self._jobs: list[Any] = []
+
+    def carry_out(self, run: Run) -> None:
+        """Carry out a run, and wait for its end."""
+        self._jobs.append(self._executor.submit(perform_run, run))
+        self._jobs[-1].result()
+
+    def cancel(self) -> None:
+        """Cancel all jobs with a signal at which trainings write their checkpoints."""
+        for job in self._jobs:
+            job.cancel()
 
 
 def perform_all(
-    runs: Sequence[Run], processes: int, told: tuple[str, str], launcher: Launcher | None = None
+    runs: Sequence[Run], processes: int, told: tuple[str, str], launcher: RayTasks | SlurmJobs | None = None
 ) -> list[Run]:
     """Carry out the runs that are not finished; returns those that failed.
 
@@ -176,7 +252,7 @@ def perform_all(
 
 
 def perform_each(
-    runs: Iterable[Run], processes: int, launcher: Launcher | None = None
+    runs: Iterable[Run], processes: int, launcher: RayTasks | SlurmJobs | None = None
 ) -> Iterator[tuple[Run, BaseException | None]]:
     """Carry out runs; yields each, when it has ended, with its error, or None.
 
@@ -189,50 +265,57 @@ def perform_each(
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
     """
     _stop.clear()
-    with _sigterm_as_ctrl_c():
-        if launcher is None and processes == 1:
-            yield from _in_turn(runs)
+    with _stopped_by_sigterm():
+        if launcher is not None:
+            yield from _in_pool(runs, processes, ThreadPoolExecutor(processes), launcher)
+        elif processes > 1:
+            yield from _in_pool(runs, processes, ProcessPoolExecutor(processes, _SPAWN, _begin, (_stop,)))
         else:
-            here = partial(ProcessPoolExecutor, processes, _SPAWN, _begin, (_stop,))
-            yield from _in_pool(runs, processes, launcher or here)
+            for run in runs:
+                try:
+                    perform_run(run)
+                except Exception as error:
+                    yield run, error
+                else:
+                    yield run, None
 
 
 @contextmanager
-def _sigterm_as_ctrl_c() -> Iterator[None]:
+def _stopped_by_sigterm() -> Iterator[None]:
     """Stop the runs inside at SIGTERM, which batch systems send, as at Ctrl-C."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    def stop(number: int, _: object) -> NoReturn:
+        raise Stopped(exit_code(number))
+
+    before = signal.signal(signal.SIGTERM, stop)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def _in_turn(runs: Iterable[Run]) -> Iterator[tuple[Run, BaseException | None]]:
-    """Carry out runs in this process, one after the other."""
-    for run in runs:
-        try:
-            _perform(run)
-        except Exception as error:
-            yield run, error
-        else:
-            yield run, None
-
-
 def _in_pool(
-    runs: Iterable[Run], processes: int, launcher: Launcher
+    runs: Iterable[Run], processes: int, pool: Executor, launcher: RayTasks | SlurmJobs | None = None
 ) -> Iterator[tuple[Run, BaseException | None]]:
-    """Carry out runs in worker processes."""
+    """Carry out runs with a pool: of worker processes, or of threads that wait for a launcher."""
+    carry_out = launcher.carry_out if launcher else perform_run
     waiting, futures = iter(runs), dict[Future[None], Run]()
-    with launcher() as pool:
+    with pool:
         try:
-            while futures := futures | _submit(pool, islice(waiting, processes - len(futures))):
+            while True:
+                for run in islice(waiting, processes - len(futures)):
+                    futures[_submitted(pool, carry_out, run)] = run
+                if not futures:
+                    return
                 for future in wait(futures, return_when=FIRST_COMPLETED).done:
                     error = future.exception()
-                    if isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the worker first
+                    if isinstance(error, KeyboardInterrupt):  # the signal reached the worker first
                         raise error
                     yield futures.pop(future), error
         except KeyboardInterrupt:
             _stop.set()
+            if launcher:
+                launcher.cancel()
             # Ctrl-C in a terminal reaches the workers, but a signal sent to this process alone does not.
             for worker in multiprocessing.active_children():
                 os.kill(worker.pid or 0, signal.SIGINT)
@@ -240,29 +323,25 @@ def _in_pool(
             raise
 
 
-def _submit(pool: Executor, runs: Iterable[Run]) -> dict[Future[None], Run]:
-    """Submit runs to workers that start with Ctrl-C ignored: only a training run handles it."""
+def _submitted(pool: Executor, carry_out: Any, run: Run) -> Future[None]:
+    """What becomes of a run; an error if a worker of the pool was killed before it could begin."""
+    # A worker begins with Ctrl-C ignored: only a training handles it, and not while modules are imported.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        return {_submitted(pool, run): run for run in runs}
+        return pool.submit(carry_out, run)
+    except BrokenExecutor as error:
+        broken: Future[None] = Future()
+        broken.set_exception(error)
+        return broken
     finally:
         signal.signal(signal.SIGINT, before)
 
 
-def _submitted(pool: Executor, run: Run) -> Future[None]:
-    """What becomes of a run; an error if a worker of the pool was killed before it could begin."""
-    try:
-        return pool.submit(_perform, run)
-    except BrokenProcessPool as error:
-        broken: Future[None] = Future()
-        broken.set_exception(error)
-        return broken
-
-
 def _begin(stop: Event) -> None:
     """Initialise a worker process: it shares the stop event of the main process."""
-    global _stop  # noqa: PLW0603 (the event cannot be passed to ``_perform`` with a run)
+    global _stop  # noqa: PLW0603 (the event cannot be passed to ``perform_run`` with a run)
     _stop = stop
+    _idle.set()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -279,7 +358,7 @@ def _end_with_parent() -> None:
         os._exit(exit_code(signal.SIGTERM))
 
 
-def _perform(run: Run) -> None:
+def perform_run(run: Run) -> None:
     """Carry out one run, resuming it if it has a checkpoint."""
     if _stop.is_set():
         raise KeyboardInterrupt
@@ -294,7 +373,7 @@ def _perform(run: Run) -> None:
                 config = replace(run.config, resume=str(run.folder)) if resumes else run.config
                 perform(config, run.folder, run.program)
         except SystemExit as interrupted:
-            raise KeyboardInterrupt from interrupted
+            raise Stopped(interrupted.code) from interrupted
         except (InputError, RunError) as error:
             print(f"error: {error}")
             raise

@@ -1,7 +1,7 @@
 """Measure ``damian advise`` over loopback: requests per second, and how long each takes.
 
-    python -m damian.recipes.bench_advise          (make bench-advise)
-    python -m damian.recipes.bench_advise --rate 500 --seconds 20 --fleets 5
+    python examples/benchmarks/bench_advise.py          (make bench-advise)
+    python examples/benchmarks/bench_advise.py --rate 500 --seconds 20 --fleets 5
 
 The service runs in a process of its own, on one core if the system lets it. Connections that stay open send
 the reports of 10 UAVs and a question for their advice, in turn; first at a fixed rate, then as fast as it
@@ -10,29 +10,28 @@ goes. Where other programs use the cores too, the processor time of a request te
 
 import http.client
 import json
-import math
 import os
 import subprocess
 import sys
 import tempfile
-import threading
 import time
+from argparse import ArgumentParser
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from damian.common import checks
 from damian.common.markdown import markdown_table
-
-from .shared.command_line import Parser, exits_with_one_line
 
 TOKEN = "a-token-for-the-bench"
 N_UAVS = 10
 CONNECTIONS = 4
 PLACE, SPREAD = (52.8128, -4.1288), 0.0015
 """Middle of the UAVs' places in the region of the bench, and their distance from each other [deg]."""
+HEADER = ("requests of 10 UAVs", "answered [1/s]", "p50 [ms]", "p99 [ms]", "longest [ms]", "CPU each [ms]")
+HEADER += ("status 200",)
 
 
 class Sample(NamedTuple):
@@ -116,20 +115,15 @@ def load(connections: Sequence[Connection], seconds: float, rate: float | None) 
             samples.append(Sample(due - first, done - due, status))
             due = due + period if rate else done
 
-    threads = [threading.Thread(target=work, args=(each, i)) for i, each in enumerate(connections)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(len(connections)) as pool:
+        list(pool.map(work, connections, range(len(connections))))
     return samples
 
 
 def processor_time(process: subprocess.Popen) -> float:
-    """Processor time that a process has used [s]; nan where the system does not tell."""
-    path = Path(f"/proc/{process.pid}/stat")
-    if not path.exists():
-        return math.nan
-    return sum(map(int, path.read_text().rpartition(")")[2].split()[11:13])) / os.sysconf("SC_CLK_TCK")
+    """Processor time that a process has used [s]."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
 def row(name: str, samples: Sequence[Sample], seconds: float, used: float) -> list[str]:
@@ -138,63 +132,40 @@ def row(name: str, samples: Sequence[Sample], seconds: float, used: float) -> li
     p50, p99 = np.quantile(took, [0.5, 0.99])
     good = sum(sample.status == 200 for sample in samples)
     answered = max([seconds, *(sample.due + sample.took for sample in samples)])
-    return [
-        name,
-        f"{len(samples) / answered:.0f}",
-        f"{p50:.1f}",
-        f"{p99:.1f}",
-        f"{took.max():.1f}",
-        f"{1000 * used / len(samples):.2f}",
-        f"{good} of {len(samples)}",
-    ]
+    times = [f"{p50:.1f}", f"{p99:.1f}", f"{took.max():.1f}", f"{1000 * used / len(samples):.2f}"]
+    return [name, f"{len(samples) / answered:.0f}", *times, f"{good} of {len(samples)}"]
 
 
-def main(words: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Measure and print the table."""
-    with exits_with_one_line():
-        parser = Parser(description="Speed of damian advise over loopback.")
-        parser.add_argument("--rate", type=float, default=500.0, help="requests per second")
-        parser.add_argument("--seconds", type=float, default=10.0, help="time of each measurement")
-        parser.add_argument("--fleets", type=int, default=4, help="number of fleets of 10 UAVs")
-        parser.add_argument("settings", nargs="*", help="settings of damian advise")
-        args = parser.parse_args(words)
-        checks.in_range("--rate", args.rate, 1, 1e5)
-        checks.in_range("--seconds", args.seconds, 0.1, 3600, "s")
-        checks.in_range("--fleets", args.fleets, 1, 100)
+    options = ArgumentParser(description="Speed of damian advise over loopback.")
+    options.add_argument("--rate", type=float, default=500.0, help="requests per second")
+    options.add_argument("--seconds", type=float, default=10.0, help="time of each measurement")
+    options.add_argument("--fleets", type=int, default=4, help="number of fleets of 10 UAVs")
+    options.add_argument(
+        "settings", nargs="*", default=["policy=script", "delay=paper"], help="of damian advise"
+    )
+    args = options.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        process, port = start(Path(folder), args.settings or ["policy=greedy", "delay=paper"])
+        process, port = start(Path(folder), args.settings)
         try:
-            connections = [
-                Connection(port, range(i % args.fleets, args.fleets, CONNECTIONS)) for i in range(CONNECTIONS)
-            ]
+            own = [range(i % args.fleets, args.fleets, CONNECTIONS) for i in range(CONNECTIONS)]
+            connections = [Connection(port, fleets) for fleets in own]
             uavs = {"uavs": [f"uav{i}" for i in range(N_UAVS)]}
             for fleet in range(args.fleets):  # the steps of real fleets do not begin all at once either
                 connections[0].request("PUT", f"/fleets/f{fleet}", uavs)
                 connections[0].request("POST", f"/fleets/f{fleet}/reports", reports(time.time(), 0))
                 time.sleep(1 / args.fleets)
             load(connections, 1.0, 50.0)  # warms up
-            times = [processor_time(process)]
-            rated = load(connections, args.seconds, args.rate)
-            times.append(processor_time(process))
-            fastest = load(connections, args.seconds, None)
-            times.append(processor_time(process))
+            rows = []
+            for name, rate in ((f"{args.rate:g} per second", args.rate), ("as fast as it goes", None)):
+                before = processor_time(process)
+                samples = load(connections, args.seconds, rate)
+                rows.append(row(name, samples, args.seconds, processor_time(process) - before))
         finally:
             process.terminate()
             process.wait()
-    head = [
-        "requests of 10 UAVs",
-        "answered [1/s]",
-        "p50 [ms]",
-        "p99 [ms]",
-        "longest [ms]",
-        "CPU each [ms]",
-        "status 200",
-    ]
-    rows = [
-        row(f"{args.rate:g} per second", rated, args.seconds, times[1] - times[0]),
-        row("as fast as it goes", fastest, args.seconds, times[2] - times[1]),
-    ]
-    print(markdown_table(head, rows))
+    print(markdown_table(HEADER, rows))
 
 
 if __name__ == "__main__":

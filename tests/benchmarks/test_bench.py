@@ -1,22 +1,18 @@
-"""The tables of ``damian bench``, with few worlds and steps."""
+"""The tables of examples/benchmarks, with few worlds and steps."""
 
+import importlib.util
+from dataclasses import replace
+
+import bench
+import bench_timing
+import bench_training
 import pytest
 import torch
+from bench import BARE, RIVAL, WHOLE, arms, believing, delayed, delays, fleet, rivals, scenarios
+from bench_timing import Measured, in_turn, staggered
+from bench_training import ARMS, HEADER, RIVALS, WIDTHS, Seconds, arm_config, rows, training
 
-from damian.recipes import bench, bench_timing
-from damian.recipes.bench_arms import (
-    BARE,
-    RIVAL,
-    WHOLE,
-    arms,
-    believing,
-    delayed,
-    delays,
-    fleet,
-    rivals,
-    scenarios,
-)
-from damian.recipes.bench_timing import Measured, in_turn, staggered
+from damian.envs.pipeline import has_message_delay
 
 TINY = bench.Sizes(
     worlds=4,
@@ -82,14 +78,46 @@ def test_the_cost_of_a_belief_has_a_row_for_each_kind():
 
 @pytest.mark.slow
 def test_growth_has_a_row_for_each_size(presets):
-    for part, sizes in (
-        (bench.growth_with_worlds, TINY.many_worlds),
-        (bench.growth_with_uavs, TINY.many_uavs),
-    ):
-        rows = part(presets, TINY).strip().splitlines()[4:]
+    for what, sizes in ("worlds", TINY.many_worlds), ("UAVs", TINY.many_uavs):
+        rows = bench.growth(presets, TINY, what, sizes).strip().splitlines()[4:]
         assert [int(row.split(" | ")[0].strip("| ")) for row in rows] == list(sizes)
 
 
 def test_a_hundred_uavs_have_room_to_fly(presets):
     env = delayed(fleet(presets["everything"], 100), {}, 1)
     assert env.rollout(2)["agents", "ready"].shape == torch.Size([1, 2, 100])
+
+
+# The training part.
+
+
+def test_arms_differ_in_delay_awareness_compiling_and_critic_only():
+    configs = [arm_config(words, [64, 64], worlds=8, steps=16) for words in ARMS]
+    assert [has_message_delay(config) for config in configs] == [False] * 3 + [True] * 2
+    assert [config.backupdates for config in configs] == [False] * 3 + [True] * 2
+    assert [config.compile for config in configs] == [False, True, True, False, True]
+    assert [config.model.shared_value for config in configs] == [False, False, True, False, True]
+    for config in configs:
+        assert (config.agents, config.worlds, config.update_steps) == (3, 8, 16)
+        assert config.model.hidden == [64, 64]
+        model = replace(config.model, shared_value=False)
+        assert (config.learner, model) == (configs[0].learner, configs[0].model)
+
+
+def test_rows_hold_the_share_of_backupdating_and_the_speed_relative_to_vmas():
+    ours, theirs = Seconds(0.3, 0.1, 0.6), Seconds(1.0, 0.0, 1.0)
+    assert rows({"ours": ours, bench_training.RIVAL: theirs}, frames=8000) == [
+        ("ours", "8,000", "300", "100", "600", "10.0%", "2.00"),
+        (bench_training.RIVAL, "4,000", "1000", "0", "1000", "0.0%", "1.00"),
+    ]
+    assert rows({"ours": ours}, frames=8000)[0][-1] == "-"  # without VMAS
+
+
+@pytest.mark.slow
+def test_every_arm_trains_and_has_a_row_for_each_width(monkeypatch):
+    rivals = RIVALS if importlib.util.find_spec("vmas") else ()
+    arms = [words for words in ARMS if "compile" not in words]
+    monkeypatch.setattr(bench_training, "ARMS", arms)
+    table = training(worlds=2, steps=8, repeats=1)
+    assert [row[0] for row in table] == [f"{width}: {name}" for width in WIDTHS for name in [*arms, *rivals]]
+    assert {len(row) for row in table} == {len(HEADER)}

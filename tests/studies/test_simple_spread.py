@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from simple_spread import HORIZON, KINEMATICS, SEEN, SimpleSpread
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from damian import keys
-from damian.common.errors import InputError
-from damian.recipes.shared.simple_spread import HORIZON, KINEMATICS, SEEN, SimpleSpread
 
 WORLDS = 12
 
@@ -118,12 +117,3 @@ def test_equal_seeds_begin_equal_episodes_in_the_square():
         assert places.abs().max() <= 1
         assert places.min() < -0.99
         assert places.max() > 0.99
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [((0,), "worlds: 0"), ((2, 1), "agents: 1"), ((2, 3, 1.5), "local_ratio: 1.5")],
-)
-def test_wrong_numbers_are_refused(arguments, message):
-    with pytest.raises(InputError, match=message):
-        SimpleSpread(*arguments)

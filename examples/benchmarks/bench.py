@@ -1,0 +1,323 @@
+"""Measure the speed of the environment and of training beside VMAS, the cost of delays, scaling, and memory.
+
+    python examples/benchmarks/bench.py            (make bench: a quarter of an hour)
+    python examples/benchmarks/bench.py --quick    (make bench-quick: a minute, the whole chain beside VMAS)
+
+Everything runs on one CPU thread. The measured environments take turns, episodes end at different times
+(``bench_timing.py``), and medians with the lowest and the highest time are reported. The tables are printed
+and written to runs/bench.md, with a figure in runs/bench.png.
+"""
+
+import importlib.util
+from argparse import ArgumentParser
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from bench_timing import Measured, collector_times, rollout_times
+from bench_training import HEADER, training, vmas_actor
+from matplotlib.figure import Figure
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.libs.vmas import VmasEnv
+from tqdm import tqdm
+
+from damian.common.markdown import markdown_table
+from damian.delays.config import DelayConfig
+from damian.envs.clocks import ClockConfig
+from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import make_env
+from damian.envs.scenario import ScenarioConfig
+from damian.envs.uav_env import EXTRAS, UavEnv
+from damian.learners.networks import ModelConfig, make_actor
+from damian.recipes.shared.launch import composed_config
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig
+from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
+from damian.server.termination import EpisodeConfig
+from damian.world.battery import BatteryConfig
+from damian.world.motion import MotionConfig
+
+RIVAL, LIMITED = "VMAS discovery, episodes never end", "VMAS discovery, episodes of 100 steps"
+BARE, WHOLE = "bare", "whole chain"
+NO_BELIEF = "no belief"
+
+Scenarios = dict[str, ScenarioConfig]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Numbers of worlds, UAVs, steps and repetitions of the measurements."""
+
+    worlds: int = 1024  # beside VMAS, in the cost of delays, and in the growth with UAVs
+    steps: int = 50  # of a rollout
+    batch: int = 10  # steps of a collector's batch
+    repeats: int = 7  # measured rollouts or batches of each environment, and iterations of each training
+    many_worlds: tuple[int, ...] = (1, 8, 64, 512, 1024, 4096, 16384)
+    many_uavs: tuple[int, ...] = (1, 3, 5, 10, 20, 50, 100)
+    growth_steps: int = 10  # of a rollout in the measurements of growth
+    modes: tuple[str, ...] = ("eager", "compiled")
+    training: tuple[int, int] = (256, 32)  # worlds and steps of a training batch
+
+
+def scenarios() -> Scenarios:
+    """The paper's use case 2 (section 5.2), and the same region with every feature, reward and model on."""
+    paper = composed_config("scenario=paper/usecase2")
+    full = replace(
+        paper,
+        region=replace(paper.region, start_positions=None, start_together=False, initial_conditions=1024),
+        motion=MotionConfig(kind="polynomial"),
+        battery=BatteryConfig(enabled=True),
+        actions=replace(paper.actions, mask=True),
+        observation=ObservationConfig(list(LOCAL), list(GLOBAL), ctde=True),
+        reward=RewardConfig(**dict.fromkeys((*INDIVIDUAL, *SYSTEM), 1.0)),
+        episode=EpisodeConfig(max_steps=100),
+    )
+    return {"use case 2": paper, "everything": full}
+
+
+def believing() -> Scenarios:
+    """The tracking task of delaybench without a belief, with the server's, and with that of each UAV too."""
+    plain = composed_config("scenario=delaybench/tracking")
+    features = {"belief": ["belief_gain", "belief_moments"]}
+    changes = {
+        NO_BELIEF: {},
+        "the server's belief": features,
+        "that of each UAV too": features | {"own": True},
+    }
+    return {
+        name: replace(plain, observation=replace(plain.observation, **changed))
+        for name, changed in changes.items()
+    }
+
+
+def fleet(scenario: ScenarioConfig, agents: int) -> ScenarioConfig:
+    """The scenario with another number of UAVs, which start at random ones of 372 landing points."""
+    start = {"start_positions": None, "start_together": False, "initial_conditions": 1024}
+    return replace(
+        scenario,
+        agents=agents,
+        region=replace(scenario.region, lattice_step=15.0, **start),
+        motion=replace(scenario.motion, max_level=30.0, level_separation=0.2),  # room for 100 flight levels
+    )
+
+
+def delays() -> dict[str, dict[str, Any]]:
+    """Changes to a scenario by name; "whole chain" is the paper's delay with an action history of four."""
+    paper = {"law": "uniform", "low": "3s", "high": "7s", "probability": 0.15}
+    everything = DelayConfig(obs=paper, act=1, rew=2, history=4, loss=0.1, reward_window=3)
+    slow = ClockConfig(agents="2s", server="4s")
+    return {
+        BARE: {},
+        "ObservationDelay, ServerNode": {"delay": DelayConfig(obs=paper)},
+        "ActionDelay": {"delay": DelayConfig(act=2)},
+        "RewardDelay": {"delay": DelayConfig(rew=2)},
+        "CumulativeReward": {"delay": DelayConfig(reward_window=3)},
+        "Clock (agents, server)": {"clock": slow},
+        "ActionHistory": {"delay": DelayConfig(history=4)},
+        WHOLE: {"delay": DelayConfig(obs=paper, history=4)},
+        "every transform": {"delay": everything, "clock": slow},
+    }
+
+
+def delayed(
+    scenario: ScenarioConfig, changes: dict[str, Any], worlds: int, mode: str = "eager"
+) -> DelayedEnv:
+    """An environment of a scenario with some changes, eager or compiled."""
+    env = make_env(replace(scenario, **changes), worlds)
+    return env.compile() if mode == "compiled" else env
+
+
+def arms(
+    presets: Scenarios, worlds: int, kinds: tuple[str, ...], modes: tuple[str, ...]
+) -> dict[str, EnvBase]:
+    """Environments of each scenario with each kind of delay, in each mode."""
+    return {
+        f"{name}, {kind}, {mode}": delayed(scenario, delays()[kind], worlds, mode)
+        for name, scenario in presets.items()
+        for kind in kinds
+        for mode in modes
+    }
+
+
+def rivals(worlds: int) -> dict[str, EnvBase]:
+    """VMAS's discovery task with three agents, without and with ends; nothing if VMAS is not installed."""
+    if not importlib.util.find_spec("vmas"):
+        print("VMAS is not installed, so there are no ratios: pip install -e '.[bench]'")
+        return {}
+    options = {"num_envs": worlds, "n_agents": 3, "device": "cpu", "continuous_actions": True}
+    return {
+        RIVAL: VmasEnv("discovery", **options),
+        LIMITED: VmasEnv("discovery", max_steps=100, **options),
+    }
+
+
+def policy_for(env: EnvBase) -> torch.nn.Module:
+    """A policy with two layers of 64 for an environment of ours, or of VMAS."""
+    if isinstance(env, DelayedEnv):
+        return make_actor(env, ModelConfig(hidden=[64, 64]))
+    return vmas_actor(env, 3, [64, 64])
+
+
+def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE, WHOLE)) -> str:
+    """Speed beside VMAS, through rollouts and collectors; the figure is written to runs/bench.png."""
+    envs = rivals(sizes.worlds) | arms(presets, sizes.worlds, kinds, sizes.modes)
+    rolled = rollout_times(envs, sizes.steps, sizes.repeats)
+    pairs = {name: (env, policy_for(env)) for name, env in envs.items()}
+    collected = collector_times(pairs, sizes.batch, sizes.repeats)
+    both = (rolled, collected)
+    plot_ratios({n: [float(ratio(t, t[n].median, "0")) for t in both] for n in envs}, Path("runs/bench.png"))
+    rows = []
+    for name in envs:
+        cells = [(f"{t[name].median:.2f}", t[name].spread, ratio(t, t[name].median)) for t in both]
+        rows.append((name, *cells[0], *cells[1], f"{rolled[name].first:.0f}" if "compiled" in name else ""))
+    title = f"{sizes.worlds} worlds, 3 UAVs, episodes end at different times; {sizes.repeats} repetitions"
+    header = ("ms/step", "lowest to highest", "times VMAS")
+    columns = (*(f"rollout: {name}" for name in header), *(f"collector: {name}" for name in header))
+    return table(title, ("environment", *columns, "compile [s]"), rows)
+
+
+def ratio(times: Mapping[str, Measured], ms: float, unknown: str = "-") -> str:
+    """How many times as fast as VMAS a step of ``ms`` milliseconds is."""
+    return f"{times[RIVAL].median / ms:.1f}" if RIVAL in times else unknown
+
+
+def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
+    """Time of a step with each kind of delay beside the bare environment, not compiled."""
+    rows = []
+    for name, scenario in presets.items():
+        envs = {kind: delayed(scenario, changes, sizes.worlds) for kind, changes in delays().items()}
+        times = rollout_times(envs, sizes.steps, sizes.repeats)
+        rows += [
+            (f"{name}: {kind}", f"{measured.median:.2f}", f"{measured.median / times[BARE].median:.2f}")
+            for kind, measured in times.items()
+        ]
+    title = f"What delays cost: {sizes.worlds} worlds, 3 UAVs, eager"
+    return table(title, ("environment", "ms/step", "times bare"), rows)
+
+
+def cost_of_belief(sizes: Sizes) -> str:
+    """Time of a step of a tracking task under the paper's delay, without and with a belief."""
+    envs = {
+        f"{name}, {mode}": delayed(scenario, delays()[WHOLE], sizes.worlds, mode)
+        for name, scenario in believing().items()
+        for mode in sizes.modes
+    }
+    times = rollout_times(envs, sizes.steps, sizes.repeats)
+    rows = []
+    for name, measured in times.items():
+        without = times[f"{NO_BELIEF}, {name.rpartition(', ')[2]}"].median
+        rows.append((name, f"{measured.median:.2f}", f"{measured.median / without:.2f}"))
+    title = f"What a belief costs: delaybench/tracking, {sizes.worlds} worlds, 3 UAVs, whole chain"
+    return table(title, ("environment", "ms/step", "times without"), rows)
+
+
+def growth(presets: Scenarios, sizes: Sizes, what: str, numbers: tuple[int, ...]) -> str:
+    """Time of a step for each number of worlds (with 3 UAVs) or of UAVs, whole chain, not compiled."""
+    rows = []
+    for number in tqdm(numbers, what):
+        worlds = number if what == "worlds" else sizes.worlds
+        flown = presets if what == "worlds" else {name: fleet(s, number) for name, s in presets.items()}
+        envs = {name: delayed(scenario, delays()[WHOLE], worlds) for name, scenario in flown.items()}
+        times = rollout_times(envs, sizes.growth_steps, sizes.repeats).values()
+        costs = [text for t in times for text in (f"{t.median:.2f}", f"{worlds / t.median * 1e3:,.0f}")]
+        rows.append((number, *costs))
+    fixed = "3 UAVs" if what == "worlds" else f"{sizes.worlds} worlds, starting anywhere"
+    header = [f"{name}: {cost}" for name in presets for cost in ("ms/step", "environment steps/s")]
+    return table(f"Growth with {what}: {fixed}, whole chain, eager", (what, *header), rows)
+
+
+def memory(presets: Scenarios) -> str:
+    """Bytes of the state and of a step's output for each world, and of the tables that all worlds share."""
+    rows = []
+    for name, scenario in presets.items():
+        env = UavEnv(scenario, 2, extras=EXTRAS)
+        bare = UavEnv(scenario, 2, extras=())
+        state = sum(x.nbytes for x in tensors(env.state)) // 2
+        outputs = [
+            sum(x.nbytes for x in tensors(e.rand_step(e.reset()).select("next").to_dict())) // 2
+            for e in (bare, env)
+        ]
+        shared = {x.data_ptr(): x.nbytes for x in tensors([vars(bare.simulation), vars(bare.server)])}
+        rows.append((name, state, *outputs, f"{sum(shared.values()) / 2**20:.1f} MiB"))
+    return table(
+        "Memory: bytes of a world with 3 UAVs",
+        ("scenario", "state", "output, bare", "output, all extras", "shared tables"),
+        rows,
+    )
+
+
+def training_speed(sizes: Sizes) -> str:
+    """Environment steps per second of training, and the time that each part of it takes."""
+    worlds, steps = sizes.training
+    title = f"Training: {worlds} worlds, 3 UAVs, {steps} steps; median of {sizes.repeats} iterations"
+    return table(title, HEADER, training(worlds, steps, sizes.repeats))
+
+
+def tensors(tree: Any) -> Iterator[Tensor]:
+    """Every tensor in nested containers and objects."""
+    if isinstance(tree, Tensor):
+        yield tree
+        return
+    if isinstance(tree, dict):
+        branches = tree.values()
+    elif isinstance(tree, list | tuple):
+        branches = tree
+    else:
+        branches = getattr(tree, "__dict__", {}).values()
+    for branch in branches:
+        yield from tensors(branch)
+
+
+def table(title: str, header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+    """A Markdown table under a heading."""
+    return f"## {title}\n\n{markdown_table(header, rows)}\n"
+
+
+def plot_ratios(ratios: Mapping[str, list[float]], path: Path) -> None:
+    """Draw a pair of bars for each environment: how many times as fast as VMAS it is."""
+    labels = ("in rollouts, random actions", "in a collector, with a policy")
+    figure = Figure(figsize=(8, 0.45 * len(ratios) + 1), layout="constrained")
+    axis = figure.subplots()
+    for shift, label, column in zip((0.2, -0.2), labels, zip(*ratios.values(), strict=True), strict=True):
+        bars = axis.barh([row + shift for row in range(len(ratios))], column, height=0.38, label=label)
+        axis.bar_label(bars, fmt="%.1f", padding=3)
+    axis.set_yticks(range(len(ratios)), list(ratios))
+    axis.invert_yaxis()
+    axis.axvline(1, color="0.4", linewidth=0.8)
+    axis.set(xlabel="times as fast as VMAS discovery")
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(loc="lower right", frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def measure(quick: bool) -> None:
+    """Measure everything or, if quick, the whole chain; print the tables and write them to runs/bench.md."""
+    torch.set_num_threads(1)
+    Path("runs").mkdir(exist_ok=True)
+    presets, sizes = scenarios(), Sizes()
+    report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]
+    parts = (
+        lambda: comparison(presets, sizes),
+        lambda: cost_of_delays(presets, sizes),
+        lambda: cost_of_belief(sizes),
+        lambda: growth(presets, sizes, "worlds", sizes.many_worlds),
+        lambda: growth(presets, sizes, "UAVs", sizes.many_uavs),
+        lambda: memory(presets),
+        lambda: training_speed(sizes),
+    )
+    if quick:
+        parts = (lambda: comparison(presets, replace(sizes, steps=25, repeats=3), (WHOLE,)),)
+    for part in parts:
+        report.append(part())
+        print(report[-1])
+    target = Path("runs/bench.md")
+    target.write_text("\n".join(report))
+    print(f"results: {target}, figure: {target.with_suffix('.png')}")
+
+
+if __name__ == "__main__":
+    options = ArgumentParser(description="Measure the speed of the environment and of training.")
+    options.add_argument("--quick", action="store_true", help="only the whole chain beside VMAS; a minute")
+    measure(options.parse_args().quick)

@@ -1,0 +1,169 @@
+"""Time of collecting, back-updating and optimising in a training iteration, beside TorchRL's MAPPO on VMAS.
+
+The training part of ``bench.py``. All arms have the same batch size, number of epochs and layer widths. They
+take turns, iteration by iteration, so that a busy machine slows all of them.
+"""
+
+import importlib.util
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, cast
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+from torchrl.envs.libs.vmas import VmasEnv
+from torchrl.modules import MultiAgentMLP, ProbabilisticActor, TanhNormal
+from torchrl.modules.distributions import NormalParamExtractor
+from torchrl.objectives.multiagent import MAPPOLoss
+from torchrl.objectives.utils import ValueEstimators
+from tqdm import tqdm
+
+from damian.learners.mappo import Mappo, MappoConfig, add_advantages
+from damian.learners.schedule import SystemClock
+from damian.recipes.shared.collectors import learning_env, make_collector, ticks
+from damian.recipes.shared.launch import composed_config
+from damian.recipes.shared.settings import TrainConfig
+from damian.recipes.train import make_learner, replay_buffer
+
+RIVAL = "TorchRL and VMAS: MAPPO, one value for all"
+RIVALS = {RIVAL: True, "TorchRL and VMAS: IPPO, a value for each": False}
+"""Is one value computed for all agents, as with our ``model.shared_value``?"""
+WIDTHS = {"2 x 64": [64, 64], "2 x 256": [256, 256]}
+"""Layer widths of all networks, by name."""
+UNDELAYED, AWARE = "scenario=paper/usecase2", "scenario=paper/usecase2 delay=paper aware=both"
+COMPILED, SHARED = "compile=true", "compile=true model.shared_value=true"
+ARMS = (UNDELAYED, f"{UNDELAYED} {COMPILED}", f"{UNDELAYED} {SHARED}", AWARE, f"{AWARE} {SHARED}")
+"""Overrides of ``damian train``, separated by spaces."""
+HEADER = ("training", "frames/s", "collecting [ms]", "back-updating [ms]", "optimising [ms]")
+HEADER += ("back-updating's share", "times TorchRL and VMAS")
+WARM_UP = 2  # iterations that do not count: the first compiles; back-updating has a full buffer after two
+
+
+class Seconds(NamedTuple):
+    """Times of the parts of one training iteration [s]."""
+
+    collecting: float
+    backupdating: float
+    optimising: float  # with the advantages
+
+
+def training(worlds: int, steps: int, repeats: int) -> list[tuple[str, ...]]:
+    """Rows under ``HEADER``: medians of ``repeats`` iterations of each arm, with batches [worlds, steps]."""
+    found = []
+    for width, hidden in WIDTHS.items():
+        arms = {words: damian(arm_config(words, hidden, worlds, steps)) for words in ARMS}
+        if importlib.util.find_spec("vmas"):
+            config = arm_config(UNDELAYED, hidden, worlds, steps)
+            arms |= {name: rival(config, together) for name, together in RIVALS.items()}
+        times: dict[str, list[Seconds]] = {name: [] for name in arms}
+        for _ in tqdm(range(WARM_UP + repeats), f"training, {width}", leave=False):
+            for name, iterations in arms.items():
+                times[name].append(next(iterations))
+        parts = {name: zip(*measured[WARM_UP:], strict=True) for name, measured in times.items()}
+        medians = {name: Seconds(*map(statistics.median, each)) for name, each in parts.items()}
+        found += [(f"{width}: {name}", *cells) for name, *cells in rows(medians, worlds * steps)]
+    return found
+
+
+def rows(medians: dict[str, Seconds], frames: int) -> list[tuple[str, ...]]:
+    """Rows under ``HEADER``, from median times of iterations with ``frames`` environment steps each."""
+    totals = {name: sum(parts) for name, parts in medians.items()}
+    return [
+        (
+            name,
+            f"{frames / totals[name]:,.0f}",
+            *(f"{1e3 * part:.0f}" for part in parts),
+            f"{parts.backupdating / totals[name]:.1%}",
+            f"{totals[RIVAL] / totals[name]:.2f}" if RIVAL in totals else "-",
+        )
+        for name, parts in medians.items()
+    ]
+
+
+def arm_config(words: str, hidden: Sequence[int], worlds: int, steps: int) -> TrainConfig:
+    """The configuration of an arm: overrides, layer widths, and B and T of a batch."""
+    batch = [f"worlds={worlds}", f"learner.steps={steps}", "learner.epochs=4", "learner.minibatches=4"]
+    return composed_config(*words.split(), f"model.hidden={list(hidden)}", *batch)
+
+
+def damian(config: TrainConfig) -> Iterator[Seconds]:
+    """Train as ``damian train`` does; yields the times of each iteration."""
+    env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
+    learner = cast(Mappo, make_learner(config, env, replay_buffer(config, env)))
+    collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
+    batches = ticks(collector, clock, env.server)
+    while True:
+        begin = time.perf_counter()
+        batch = next(batches)
+        collected = time.perf_counter()
+        batch = learner.backupdated_batch(batch)
+        backupdated = time.perf_counter()
+        add_advantages(batch, learner.critic, learner.config)
+        learner.optimize(batch)
+        yield Seconds(collected - begin, backupdated - collected, time.perf_counter() - backupdated)
+
+
+def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
+    """Train on VMAS's navigation with TorchRL's own networks, loss and buffer; yields times of iterations.
+
+    ``together``: compute one value for all agents (MAPPO) instead of one for each (IPPO).
+    """
+    worlds, steps, learner = config.worlds, config.update_steps, cast(MappoConfig, config.learner)
+    env = VmasEnv("navigation", worlds, n_agents=config.agents, max_steps=100, continuous_actions=True)
+    actor, observed = vmas_actor(env, config.agents, config.model.hidden), ("agents", "observation")
+    network = vmas_network(env, config.agents, config.model.hidden, 1, together)
+    critic = TensorDictModule(network, in_keys=[observed], out_keys=[("agents", "state_value")])
+    loss = MAPPOLoss(actor, critic, clip_epsilon=learner.clip_epsilon, entropy_coeff=learner.entropy_coeff)
+    loss.set_keys(reward=("agents", "reward"), value=("agents", "state_value"))
+    loss.make_value_estimator(ValueEstimators.MAGAE, gamma=learner.gamma, lmbda=learner.lmbda)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=learner.lr)
+    collector = Collector(env, actor, frames_per_batch=worlds * steps, total_frames=-1)
+    storage, size = LazyTensorStorage(worlds * steps), worlds * steps // learner.minibatches
+    memory = TensorDictReplayBuffer(storage=storage, sampler=SamplerWithoutReplacement(), batch_size=size)
+    batches = iter(collector)
+    while True:
+        begin = time.perf_counter()
+        batch = next(batches)
+        collected = time.perf_counter()
+        with torch.no_grad():
+            loss.value_estimator(batch)
+        memory.extend(batch.reshape(-1))
+        for _ in range(learner.epochs):
+            for minibatch in memory:
+                losses = loss(minibatch)
+                optimizer.zero_grad()
+                (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+                nn.utils.clip_grad_norm_(loss.parameters(), learner.max_grad_norm)
+                optimizer.step()
+        collector.update_policy_weights_()
+        yield Seconds(collected - begin, 0.0, time.perf_counter() - collected)
+
+
+def vmas_actor(env: EnvBase, agents: int, hidden: Sequence[int]) -> ProbabilisticActor:
+    """A policy with tanh-normal actions of each agent, from its own observation."""
+    n_out = 2 * env.full_action_spec_unbatched["agents", "action"].shape[-1]
+    network = nn.Sequential(vmas_network(env, agents, hidden, n_out, False), NormalParamExtractor())
+    normal = [("agents", "loc"), ("agents", "scale")]
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=[("agents", "observation")], out_keys=normal),
+        in_keys=normal,
+        out_keys=[("agents", "action")],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -1.0, "high": 1.0},
+        return_log_prob=True,
+        log_prob_key=("agents", "action_log_prob"),
+    )
+
+
+def vmas_network(
+    env: EnvBase, agents: int, hidden: Sequence[int], n_out: int, centralised: bool
+) -> MultiAgentMLP:
+    """One network for all agents."""
+    n_in = env.observation_spec["agents", "observation"].shape[-1]
+    options = {"share_params": True, "num_cells": list(hidden), "activation_class": nn.Tanh}
+    return MultiAgentMLP(n_in, n_out, agents, centralized=centralised, **options)
