@@ -6,24 +6,36 @@
 
 The overrides of the training run apply too, unless the command line gives others. The features of the actor's
 observation must stay the same. The run folder gets config.yaml, result.csv and result.md: success, steps and
-return of the trained policy beside the random and the greedy one.
+return of the trained policy beside the untrained one, the script and random actions.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import hydra
+import torch
 from omegaconf import DictConfig
 from torchrl.modules import ProbabilisticActor
 
-from damian.common.errors import InputError
+from damian.baselines.greedy import greedy_policy
+from damian.baselines.random import random_policy
+from damian.common.errors import InputError, naming_errors
+from damian.compare.comparison import RANDOM, SCRIPT, TRAINED, UNTRAINED
 from damian.envs.delayed_env import DelayedEnv
+from damian.envs.pipeline import has_message_delay, make_env
+from damian.runs.metrics import Evaluation, evaluate
+from damian.runs.run_folder import DETERMINISTIC, save_results
 from damian.runs.training_state import load_networks
 
 from .shared.known_settings import CONF
 from .shared.launch import launch, perform, prepare, reported
 from .shared.settings import TrainConfig
 from .shared.stored_runs import save_config
-from .train import make_eval_env, report
+
+MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
+of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
+likely one is taken. A policy without memory often needs chance to search: fly it as it returns more."""
+"""Lines under the table of an evaluation."""
 
 
 def fly(config: TrainConfig, folder: Path) -> None:
@@ -70,6 +82,60 @@ def checkpoint_of(config: TrainConfig) -> Path:
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
     return Path(config.checkpoint)
+
+
+def make_eval_env(config: TrainConfig) -> DelayedEnv:
+    """The environment of an evaluation, a world for each episode; its initial conditions are new."""
+    return make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, ["message"])
+
+
+def report(
+    config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module | None = None
+) -> Evaluation:
+    """Evaluate an actor beside an untrained one, the script and random actions; write and print the results.
+
+    Args:
+        config: settings of the evaluation.
+        folder: the run folder.
+        env: its environment, a world for each episode.
+        actor: the trained actor; None: only the others fly.
+
+    Returns:
+        The evaluation of the random policy in the same episodes.
+    """
+
+    def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
+        env.set_seed(config.eval_seed)  # the same episodes for every policy
+        return evaluate(env, policy, config.horizon, sample)
+
+    random, rows = fly(random_policy(env)), {}
+    for name, policy in {TRAINED: actor, UNTRAINED: untrained_actor(config, env)}.items():
+        if policy is not None:
+            rows = {name: fly(policy), name + DETERMINISTIC: fly(policy, sample=False)} | rows
+    try:
+        rows[SCRIPT] = fly(greedy_policy(env))
+    except InputError as error:  # the region is too large for the script, but not for the networks
+        print(f"no {SCRIPT}: {error}")
+    rows[RANDOM] = random
+    can_succeed, late = config.episode.success_share is not None, has_message_delay(config)
+    table = save_results(rows, folder, can_succeed, late, MEANING)
+    print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
+    return random
+
+
+def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
+    """The network of the actor, with its prior, as it is before the first update of a training.
+
+    Its weights are those with which a training of the same seed begins, unless that began with a checkpoint.
+    """
+    with torch.random.fork_rng(devices=[]), own_code(config.learner.name):
+        torch.manual_seed(config.seed)
+        return config.learner.make_actor(env, config.model)
+
+
+def own_code(learner: str) -> AbstractContextManager[None]:
+    """A context that names a learner of the user's own in errors; a built-in one keeps its traceback."""
+    return naming_errors(learner) if ":" in learner else nullcontext()
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

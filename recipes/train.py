@@ -1,4 +1,4 @@
-"""Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a greedy (scripted) one.
+"""Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one.
 
     damian train agents=3 scenario=spotting motion=polynomial seed=1
     damian train scenario=paper/usecase2 delay=paper aware=both
@@ -15,7 +15,7 @@ and the evaluation as result.csv and result.md (docs/runs.md).
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,14 +28,11 @@ from torchrl.data import ReplayBuffer
 from tqdm import tqdm
 
 from damian import keys
-from damian.baselines.greedy import greedy_policy
-from damian.baselines.random import random_policy
 from damian.common import checks
-from damian.common.errors import InputError, RunError, naming_errors
+from damian.common.errors import RunError
 from damian.common.threads import using_threads
-from damian.compare.comparison import RANDOM, SCRIPT, TRAINED, UNTRAINED
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import has_message_delay, make_env
+from damian.envs.pipeline import has_message_delay
 from damian.keys import next_key
 from damian.learners.base import Learner, divergence
 from damian.learners.schedule import SystemClock
@@ -45,11 +42,11 @@ from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.runs.interrupt import Interrupt
 from damian.runs.loggers import make_loggers
-from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.metrics_log import MetricsLog
-from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, plot_learning_curve, save_results
+from damian.runs.run_folder import CHECKPOINT, FIGURE, plot_learning_curve
 from damian.runs.training_state import TrainingState, load_networks
 
+from .evaluate import make_eval_env, own_code, report
 from .shared.collectors import WorkerLost, collecting, collector_parts, learning_env, ticks
 from .shared.inheritance import settings_by_key
 from .shared.known_settings import CONF
@@ -58,10 +55,44 @@ from .shared.settings import TrainConfig
 from .shared.stored_runs import run_folder, save_config, stored_config
 from .shared.training_film import film_policy
 
-MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
-of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
-likely one is taken. A policy without memory often needs chance to search: fly it as it returns more."""
-"""Lines under the table of an evaluation."""
+Watch = Callable[[int, dict[str, float]], None]
+"""Gets the environment steps so far and the numbers of each update; what it raises stops the training."""
+
+
+def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None:
+    """Train, evaluate, and fill the run folder.
+
+    Raises:
+        InputError: the settings do not allow training, or the checkpoint cannot be loaded.
+        RunError: the learner has diverged, or a file cannot be written.
+    """
+    config.check_learning()
+    env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
+    buffer = replay_buffer(config, env)
+    learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
+    with collecting(config, env, learner.actor) as collector:
+        state = TrainingState(folder, learner.components(), collector_parts(collector), clock, buffer)
+        begin(config, state)
+        print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
+        note_what_never_happens(config)
+        log = open_log(config, state)
+        with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
+            batches = ticks(collector, clock, env.server)
+            with saved_if_lost(state, log, interrupt):
+                for batch in batches if not enough(config, state) else ():
+                    numbers = update(config, learner, state, log, batch)
+                    if watch:
+                        watch(state.progress.frames, numbers)
+                    show(bar, config, state)
+                    if save_or_stop(config, state, log, interrupt):
+                        break
+    if interrupt.asked:
+        sys.exit(interrupted(folder, interrupt.asked))
+    random = report(config, folder, make_eval_env(config), learner.actor)
+    module, _, name = config.learner.name.partition(":")
+    title = f"{config.agents} UAVs, {name or module.upper()}"
+    plot_learning_curve(log.rows, random, folder / FIGURE, title)
+    print(f"learning curve: {folder / FIGURE}")
 
 
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
@@ -80,11 +111,6 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
     should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
     checks.require(has_actor, f"{name}: components", [*learner.components()], should)
     return learner
-
-
-def own_code(learner: str) -> AbstractContextManager[None]:
-    """A context that names a learner of the user's own in errors; a built-in one keeps its traceback."""
-    return naming_errors(learner) if ":" in learner else nullcontext()
 
 
 def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer:
@@ -113,91 +139,6 @@ def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer
     return ReplayBuffer(storage=storage)
 
 
-Watch = Callable[[int, dict[str, float]], None]
-"""Gets the environment steps so far and the numbers of each update; what it raises stops the training."""
-
-
-def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None:
-    """Train, evaluate, and fill the run folder.
-
-    Raises:
-        InputError: the settings do not allow training, or the checkpoint cannot be loaded.
-        RunError: the learner has diverged, or a file cannot be written.
-    """
-    config.check_learning()
-    env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
-    buffer = replay_buffer(config, env)
-    learner = make_learner(config, env, buffer)
-    with collecting(config, env, learner.actor) as collector:
-        state = TrainingState(folder, learner.components(), collector_parts(collector), clock, buffer)
-        begin(config, state)
-        print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
-        note_what_never_happens(config)
-        log = open_log(config, state)
-        with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
-            batches = ticks(collector, clock, env.server)
-            with saved_if_lost(state, log, interrupt):
-                for batch in batches if not enough(config, state) else ():
-                    numbers = update(config, learner, state, log, batch)
-                    if watch:
-                        watch(state.progress.frames, numbers)
-                    show(bar, config, state)
-                    if save_or_stop(config, state, log, interrupt):
-                        break
-    if interrupt.asked:
-        sys.exit(interrupted(folder, interrupt.asked))
-    random = report(config, folder, make_eval_env(config), learner.actor)
-    plot_learning_curve(log.rows, random, folder / FIGURE, f"{config.agents} UAVs, {learner_title(config)}")
-    print(f"learning curve: {folder / FIGURE}")
-
-
-def open_log(config: TrainConfig, state: TrainingState) -> MetricsLog:
-    """The files and loggers that get the numbers of each update."""
-    loggers, log_to = make_loggers(config.logger.custom, state.folder), config.logger
-    frames, settings = state.progress.frames, dict(settings_by_key(config))
-    return MetricsLog(state.folder, log_to.tensorboard, log_to.csv, frames, loggers, settings)
-
-
-def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> bool:
-    """Write a checkpoint after an update if one is due; returns whether the training ends here."""
-    finished, asked = enough(config, state), interrupt.asked is not None
-    due = finished or state.progress.updates % config.checkpoint_every == 0
-    if due or asked:
-        log.sync()
-        # Before the first episodes of all worlds can have ended, only the short ones have.
-        if due and state.progress.frames >= config.worlds * (config.episode.max_steps or 1):
-            state.save_best()
-        state.save()
-    return finished or asked
-
-
-@contextmanager
-def saved_if_lost(state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> Iterator[None]:
-    """If a worker is lost, write the checkpoint of the latest update, and say how to go on.
-
-    Raises:
-        RunError: a worker was lost; not if the run was asked to stop, as a batch system asks all processes.
-    """
-    try:
-        yield
-    except WorkerLost as error:
-        log.sync()
-        state.save()
-        if not interrupt.asked:
-            saved = f"{state.folder / CHECKPOINT} is of update {state.saved}, the latest"
-            raise RunError(f"{error}; {saved}; continue with resume={state.folder}") from error
-
-
-def note_what_never_happens(config: TrainConfig) -> None:
-    """Say which delays are so long that nothing arrives in an episode, and whether nothing is learnt."""
-    warm_up = getattr(config.learner, "warm_up", 0)
-    if warm_up > config.frames:
-        print(f"note: learner.warm_up: all {config.frames} steps are fewer than {warm_up}: nothing is learnt")
-    n_steps = config.episode.max_steps
-    for key in config.delay.settings_longer_than(n_steps, config.clock.dt) if n_steps else ():
-        print(f"note: {key} is at least as long as an episode of {n_steps} steps: nothing arrives in it")
-
-
 def begin(config: TrainConfig, state: TrainingState) -> None:
     """Load what the run continues or starts from, and write the files with which a run folder begins.
 
@@ -206,7 +147,8 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
     if config.resume:
         state.load()
     elif config.checkpoint:
-        names = ["actor", *["critic"] * same_learner(config)]
+        trained = stored_config(run_folder(Path(config.checkpoint)), "checkpoint").learner.name
+        names = ["actor", "critic"] if trained == config.learner.name else ["actor"]
         networks = {name: state.components[name] for name in names if name in state.components}
         load_networks(Path(config.checkpoint), "checkpoint", networks)
     if not config.resume:
@@ -257,18 +199,6 @@ def check_convergence(config: TrainConfig, state: TrainingState, losses: dict[st
         )
 
 
-def learner_title(config: TrainConfig) -> str:
-    """Name of the learner for titles: MAPPO, SAC, or the class of one's own."""
-    module, _, name = config.learner.name.partition(":")
-    return name or module.upper()
-
-
-def same_learner(config: TrainConfig) -> bool:
-    """Was ``config.checkpoint`` trained by the same learner, so that its critic can be loaded too?"""
-    folder = run_folder(Path(str(config.checkpoint)))
-    return stored_config(folder, "checkpoint").learner.name == config.learner.name
-
-
 def progress_bar(config: TrainConfig, state: TrainingState) -> tqdm:
     """A progress bar that counts episodes if ``config.episodes`` limits the run, else environment steps."""
     if config.episodes:
@@ -304,53 +234,51 @@ def distributions(batch: TensorDictBase) -> dict[str, NDArray[Any]]:
     return {name: values.flatten().float().cpu().numpy() for name, values in found.items()}
 
 
-def make_eval_env(config: TrainConfig) -> DelayedEnv:
-    """The environment of an evaluation, a world for each episode; its initial conditions are new."""
-    return make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, ["message"])
+def open_log(config: TrainConfig, state: TrainingState) -> MetricsLog:
+    """The files and loggers that get the numbers of each update."""
+    loggers, log_to = make_loggers(config.logger.custom, state.folder), config.logger
+    frames, settings = state.progress.frames, dict(settings_by_key(config))
+    return MetricsLog(state.folder, log_to.tensorboard, log_to.csv, frames, loggers, settings)
 
 
-def report(
-    config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module | None = None
-) -> Evaluation:
-    """Evaluate an actor beside an untrained one, the script and random actions; write and print the results.
+def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> bool:
+    """Write a checkpoint after an update if one is due; returns whether the training ends here."""
+    finished, asked = enough(config, state), interrupt.asked is not None
+    due = finished or state.progress.updates % config.checkpoint_every == 0
+    if due or asked:
+        log.sync()
+        # Before the first episodes of all worlds can have ended, only the short ones have.
+        if due and state.progress.frames >= config.worlds * (config.episode.max_steps or 1):
+            state.save_best()
+        state.save()
+    return finished or asked
 
-    Args:
-        config: settings of the evaluation.
-        folder: the run folder.
-        env: its environment, a world for each episode.
-        actor: the trained actor; None: only the others fly.
 
-    Returns:
-        The evaluation of the random policy in the same episodes.
+@contextmanager
+def saved_if_lost(state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> Iterator[None]:
+    """If a worker is lost, write the checkpoint of the latest update, and say how to go on.
+
+    Raises:
+        RunError: a worker was lost; not if the run was asked to stop, as a batch system asks all processes.
     """
-
-    def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
-        env.set_seed(config.eval_seed)  # the same episodes for every policy
-        return evaluate(env, policy, config.horizon, sample)
-
-    random, rows = fly(random_policy(env)), {}
-    for name, policy in {TRAINED: actor, UNTRAINED: untrained_actor(config, env)}.items():
-        if policy is not None:
-            rows = {name: fly(policy), name + DETERMINISTIC: fly(policy, sample=False)} | rows
     try:
-        rows[SCRIPT] = fly(greedy_policy(env))
-    except InputError as error:  # the region is too large for the script, but not for the networks
-        print(f"no {SCRIPT}: {error}")
-    rows[RANDOM] = random
-    can_succeed, late = config.episode.success_share is not None, has_message_delay(config)
-    table = save_results(rows, folder, can_succeed, late, MEANING)
-    print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
-    return random
+        yield
+    except WorkerLost as error:
+        log.sync()
+        state.save()
+        if not interrupt.asked:
+            saved = f"{state.folder / CHECKPOINT} is of update {state.saved}, the latest"
+            raise RunError(f"{error}; {saved}; continue with resume={state.folder}") from error
 
 
-def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
-    """The network of the actor, with its prior, as it is before the first update of a training.
-
-    Its weights are those with which a training of the same seed begins, unless that began with a checkpoint.
-    """
-    with torch.random.fork_rng(devices=[]), own_code(config.learner.name):
-        torch.manual_seed(config.seed)
-        return config.learner.make_actor(env, config.model)
+def note_what_never_happens(config: TrainConfig) -> None:
+    """Say which delays are so long that nothing arrives in an episode, and whether nothing is learnt."""
+    warm_up = getattr(config.learner, "warm_up", 0)
+    if warm_up > config.frames:
+        print(f"note: learner.warm_up: all {config.frames} steps are fewer than {warm_up}: nothing is learnt")
+    n_steps = config.episode.max_steps
+    for key in config.delay.settings_longer_than(n_steps, config.clock.dt) if n_steps else ():
+        print(f"note: {key} is at least as long as an episode of {n_steps} steps: nothing arrives in it")
 
 
 @hydra.main(version_base=None, config_path=CONF, config_name="train")

@@ -53,9 +53,12 @@ try:
     import optuna
     from optuna.trial import FrozenTrial, Trial, TrialState
     from optuna.visualization import matplotlib as figures
+    from sqlalchemy.exc import SQLAlchemyError
 except ImportError as error:
     raise InputError("damian tune: optuna is not installed; pip install optuna") from error
 
+NAME = "damian"
+"""Of the search in Optuna's storage."""
 STORAGE, TRIALS, TABLE = "search.db", "trials.csv", "table.md"
 FOLDER, CHOSEN, OVERRIDES = "folder", "chosen", "overrides"
 """What is stored with a trial: its folder, and the settings that it varies; with a search: its overrides."""
@@ -124,16 +127,23 @@ class Search:
     def __init__(self, config: TuneConfig, overrides: list[str], folder: Path) -> None:
         self.config, self.overrides, self.folder = config, overrides, folder
         self.space = read_space(config.search)
-        self.storage = f"sqlite:///{(folder / STORAGE).resolve()}"
+        self.storage = f"sqlite:///{(folder / STORAGE).resolve()}"  # Optuna opens it anew in each process
         median = optuna.pruners.MedianPruner(WARM_UP, n_warmup_steps=config.frames // 4)
         self.pruner = median if config.prune else optuna.pruners.NopPruner()
-        self.study = optuna.create_study(
-            study_name="damian",
-            storage=self.storage,
-            pruner=self.pruner,
-            direction="maximize" if config.sign > 0 else "minimize",
-            load_if_exists=True,
-        )
+        direction = "maximize" if config.sign > 0 else "minimize"
+        try:
+            self.study = optuna.create_study(
+                study_name=NAME,
+                storage=self.storage,
+                pruner=self.pruner,
+                direction=direction,
+                load_if_exists=True,
+            )
+        except (SQLAlchemyError, RuntimeError) as error:
+            problem = (
+                f"it does not hold a search ({type(error).__name__}); delete it, or choose another folder"
+            )
+            raise InputError(f"{folder / STORAGE}: {problem}") from error
         # A sampler with the same seed would draw the trials again that the study has already.
         self.study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(self.study.trials))
         stored, asked = self.study.user_attrs.get(OVERRIDES), [*overrides, f"search={config.search}"]
@@ -162,7 +172,7 @@ class Search:
             chosen = {key: values.suggest(trial, key) for key, values in self.space.items()}
             trial.set_user_attr(CHOSEN, chosen)
             try:
-                run = self.run(folder, self.words(chosen), trial._trial_id)
+                run = self.run(folder, self.words(chosen), trial.number)
             except InputError as error:
                 print(f"failed: {error}", file=sys.stderr)
                 self.study.tell(trial, state=TrialState.FAIL)
@@ -175,15 +185,15 @@ class Search:
         others = [word for word in self.overrides if word.partition("=")[0].lstrip("+") not in chosen]
         return [*others, *(f"{key}={value}" for key, value in chosen.items())]
 
-    def run(self, name: str, overrides: list[str], trial: int) -> Run:
-        """The training of a trial."""
+    def run(self, name: str, overrides: list[str], number: int) -> Run:
+        """The training of the trial with a number."""
         words = ["logger=csv", "threads=1", *overrides]
         try:
             config = checked(compose("train", words))
         except COMPOSITION_ERRORS as error:
             raise InputError(f"{name}: {one_line(error)}") from error
         config.overrides = words
-        program = functools.partial(train_watched, storage=self.storage, trial=trial, pruner=self.pruner)
+        program = functools.partial(train_watched, storage=self.storage, number=number, pruner=self.pruner)
         return Run("tune", "", "", config, self.folder / name, program)
 
     def tell(self, run: Run, error: BaseException | None) -> float | None:
@@ -205,18 +215,20 @@ class Search:
 
 
 def train_watched(
-    config: TrainConfig, folder: Path, storage: str, trial: int, pruner: optuna.pruners.BasePruner
+    config: TrainConfig, folder: Path, storage: str, number: int, pruner: optuna.pruners.BasePruner
 ) -> None:
     """Train for a trial, and stop when it is pruned.
 
     Args:
         config: settings of the training.
         folder: its run folder.
-        storage: Optuna's storage.
-        trial: the trial's id in it.
+        storage: address of Optuna's storage.
+        number: of the trial.
         pruner: decides whether to stop.
     """
-    study = optuna.load_study(study_name="damian", storage=storage, pruner=pruner)
+    opened = optuna.storages.RDBStorage(storage)
+    study = optuna.load_study(study_name=NAME, storage=opened, pruner=pruner)
+    trial = opened.get_trial_id_from_study_id_trial_number(opened.get_study_id_from_name(NAME), number)
     watched, sign = Trial(study, trial), 1 if study.direction == optuna.study.StudyDirection.MAXIMIZE else -1
 
     def watch(frames: int, numbers: dict[str, float]) -> None:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from damian.envs.pipeline import make_env
 from damian.learners.networks import ModelConfig, make_actor, make_critic
+from damian.recipes import evaluate
 from damian.recipes import train as train_recipe
 from damian.recipes.shared.launch import composed_config, seed_generators
 from damian.recipes.shared.settings import TrainConfig
@@ -322,7 +323,7 @@ def test_the_untrained_actor_of_an_evaluation_is_that_of_the_training_before_its
     with pytest.raises(Stop):  # the checkpoint is of before the first update
         train_recipe.train(config, tmp_path, stop)
     seed_generators(99)  # as in another process
-    actor = train_recipe.untrained_actor(config, train_recipe.make_eval_env(config)).state_dict()
+    actor = evaluate.untrained_actor(config, train_recipe.make_eval_env(config)).state_dict()
     first = weights(tmp_path, "actor")
     assert {f"actor.{name}" for name in actor} == first.keys()
     assert all(weight.equal(first[f"actor.{name}"]) for name, weight in actor.items())

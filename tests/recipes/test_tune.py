@@ -198,3 +198,9 @@ def test_what_a_user_can_get_wrong_is_refused_in_one_line(search, words, message
 def test_a_folder_with_another_search_is_refused(search, capsys):
     search("trials=1")
     check_refused(lambda: search("trials=1", "agents=2"), "choose another folder with hydra.run.dir", capsys)
+
+
+def test_a_storage_that_is_damaged_is_refused_in_one_line(search, tmp_path, capsys):
+    (tmp_path / "found").mkdir()
+    (tmp_path / "found" / "search.db").write_bytes(b"SQLite format 3\0 and then nonsense" * 100)
+    check_refused(lambda: search("trials=1"), "search.db: it does not hold a search", capsys)
