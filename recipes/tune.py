@@ -16,11 +16,12 @@ other seeds (damian compare).
 """
 
 import functools
+import json
 import math
 import shlex
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -42,15 +43,21 @@ from damian.compare.comparison import LESS_IS_BETTER, SCORES
 from .compare import POLICIES
 from .shared.command_line import command, typed_words
 from .shared.composition_errors import COMPOSITION_ERRORS, one_line
-from .shared.known_settings import CONF
+from .shared.known_settings import CONF, known_settings
 from .shared.launch import checked, launch, reported, shown
 from .shared.many_runs import Run, perform_each, stop_code
-from .shared.search_space import read_space
+from .shared.misspelt import no_such_key
 from .shared.settings import TrainConfig, store_schema
 from .train import train
 
 try:
     import optuna
+    from optuna.distributions import (
+        BaseDistribution,
+        CategoricalDistribution,
+        FloatDistribution,
+        IntDistribution,
+    )
     from optuna.trial import FrozenTrial, Trial, TrialState
     from optuna.visualization import matplotlib as figures
     from sqlalchemy.exc import SQLAlchemyError
@@ -64,6 +71,8 @@ FOLDER, CHOSEN, OVERRIDES = "folder", "chosen", "overrides"
 """What is stored with a trial: its folder, and the settings that it varies; with a search: its overrides."""
 SHOWN = 10
 """Trials in the table."""
+WORDS = ({"choices"}, {"low", "high"}, {"low", "high", "log"}, {"low", "high", "step"})
+"""Words with which the values of a setting can be written."""
 WARM_UP = 5
 """Trials before one may be pruned."""
 
@@ -110,6 +119,54 @@ class TuneConfig(TrainConfig):
 OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields(TrainConfig)}
 """Settings that a training does not have."""
 store_schema("tune_schema", TuneConfig)
+
+
+def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, BaseDistribution]:
+    """The values of each setting that a search varies, by its dotted key.
+
+    Args:
+        search: nested as the settings are; each as ``{low: 1, high: 8}``, with ``log: true`` or ``step``, or
+            as ``{choices: [...]}``.
+        path: what stands before the keys, within.
+
+    Raises:
+        InputError: a setting does not exist, or its values are not written so.
+    """
+    space = {}
+    for name, written in search.items():
+        key = f"{path}{name}"
+        should = "is neither {low: ..., high: ...}, with log or step, nor {choices: [...]}"
+        checks.require(isinstance(written, Mapping), f"search.{key}", written, should)
+        if not {*written} & {"low", "high", "choices"}:
+            space |= read_space(written, f"{key}.")
+            continue
+        if key not in known_settings("train"):
+            raise InputError(f"search: {no_such_key(key, 'train')}")
+        checks.require({*written} in WORDS, f"search.{key}", written, should)
+        space[key] = _distribution(key, **written)
+    if not space and not path:
+        raise InputError("search: it is empty: name a setting, such as search.learner.lr")
+    return space
+
+
+def _distribution(key: str, choices: Any = (), log: Any = False, **values: Any) -> BaseDistribution:
+    """The values of a setting, for Optuna; choices are as they are written on a command line."""
+    whole = all(isinstance(value, int) for value in values.values())
+    checks.require(isinstance(log, bool), f"search.{key}.log", log, "is not true or false")
+    try:
+        if not values:
+            checks.require(
+                isinstance(choices, list), f"search.{key}.choices", choices, "is no list of values"
+            )
+            return CategoricalDistribution([json.dumps(each, separators=(",", ":")) for each in choices])
+        return (IntDistribution if whole else FloatDistribution)(log=log, **values)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"search.{key}: {one_line(error)}") from error
+
+
+def _word(value: Any) -> str:
+    """A value of a trial, as it is written on a command line."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 class Search:
@@ -166,10 +223,10 @@ class Search:
     def runs(self) -> Iterator[Run]:
         """The trainings that are still to be done, each asked for when the ones before have been told."""
         for _ in range(self.config.trials - self.n_finished):
-            trial = self.study.ask()
+            trial = self.study.ask(self.space)
             folder = trial.user_attrs.get(FOLDER) or f"trial_{trial.number}"
             trial.set_user_attr(FOLDER, folder)
-            chosen = {key: values.suggest(trial, key) for key, values in self.space.items()}
+            chosen = {key: _word(trial.params[key]) for key in self.space}
             trial.set_user_attr(CHOSEN, chosen)
             try:
                 run = self.run(folder, self.words(chosen), trial.number)

@@ -2,8 +2,10 @@
 
 import csv
 import json
+import os
 import re
 import shlex
+import signal
 import sys
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from damian.recipes.compare import CompareConfig, Experiment, main, plan
 from damian.recipes.evaluate import fly
 from damian.recipes.shared.known_settings import CONF
 from damian.recipes.shared.launch import launch
-from damian.recipes.shared.many_runs import Run, perform_all
+from damian.recipes.shared.many_runs import Run, perform_all, perform_each, stop_code
 from damian.recipes.shared.settings import TrainConfig
 from damian.runs.run_lock import locked
 
@@ -194,6 +196,18 @@ def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compar
     assert re.search("checkpoint is .*paper/unaware/seed_8 in this stored run", capsys.readouterr().err)
 
 
+def end_by_sigterm(*_: object) -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_sigterm_stops_the_runs_with_an_exit_code_of_its_own(tmp_path):
+    runs = [Run("t", "d", name, TrainConfig(), tmp_path / name, end_by_sigterm) for name in "ab"]
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        list(perform_each(runs, 1))
+    assert stop_code(stopped.value) == 143
+    assert not (tmp_path / "b").exists()
+
+
 def test_an_unfinished_policy_is_not_flown(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     source = tmp_path / "none/undelayed/seed_8"
@@ -237,41 +251,18 @@ def test_ray_tasks_and_slurm_jobs_give_the_same_results_as_this_process(compare,
     ("overrides", "message"),
     [
         ([listed("framess=3")], "usecase2/none/undelayed: framess: no such key; did you mean frames?"),
-        ([listed("delay=papers")], "delay: papers is not one of burst, distance, lag, none, paper"),
         ([listed("agents=two")], "agents: Value 'two'"),
-        ([listed("delay.loss=0.1", "source.position=[1,2,3]")], "source.position: [1, 2, 3] is not"),
-        (["overrides=[seed=3]"], "a value with = in it needs quotes"),
         ([listed("seed=3")], "overrides: seed=3 cannot be the same for every run"),
         (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
-        (["arms=[undelayed,awake]"], "arms: awake is not one of undelayed, unaware, deployed, history"),
         (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
         (["seedz=3"], "seedz: no such key; did you mean seeds?"),
-        (["+seedz=3"], "seedz: no such key; did you mean seeds?"),
         (["seeds=0"], "seeds: 0 is not between 1 and"),
-        (["processes=none"], "processes"),
-        (["launcher=cloud"], "launcher: cloud is not one of local, ray, slurm"),
         (["slurm={cluster: local}"], "slurm: {'cluster': 'local'} means nothing without launcher=slurm"),
-        (["launcher=slurm", "slurm=cpu"], "slurm: cpu is no mapping such as {slurm_partition: cpu}"),
         (["score=age"], "score: age is not one of return, "),
-        (["policy=best"], "policy: best is not one of sampled, deterministic"),
-        (["experiment.arms.both.regime=R7"], "experiment.arms.both.regime: R7 is not one of R0, "),
-        (
-            ["experiment.arms.both.delayed=false"],
-            "experiment.arms: ['undelayed', 'both'] are not delayed",
-        ),
-        (["+experiment.delays.none=[]"], "experiment.delays: none cannot name a folder"),
+        (["experiment.arms.both.delayed=false"], "experiment.arms: ['undelayed', 'both'] are not delayed"),
         (["report_only=true"], "experiment: no run of it is finished in"),
-        (
-            ["+agents=3"],
-            "agents: it is a setting of the runs; all of them get it by \"overrides=['agents=",
-        ),
-        (["overrides=agents"], "overrides: it is a list: [agents]"),
-        (["arms=unaware"], "arms: it is a list: [unaware]"),
         (["arms=[]"], "arms: [] names none: leave it out, for all of them"),
-        (
-            ["overrides=['delay.obs=3','delay.rew=1']"],
-            "usecase2/none/undelayed: delay.obs, delay.rew: its value delays this arm",
-        ),
+        (["overrides=['delay.obs=3']"], "usecase2/none/undelayed: delay.obs: its value delays this arm"),
     ],
 )
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
@@ -281,27 +272,14 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.sample(6)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("tasks: {spotting: []}", "experiment.arms: it is missing or empty"),
-        ("arms: {undelayed: {delayed: false}}", "experiment.tasks: it is missing or empty"),
-        (
-            "tasks: {spotting: []}\narms: {undelayed: {delayed: false, overrides: agents=2}}",
-            "experiment.arms.undelayed.overrides: it is a list: [...]",
-        ),
-        (
-            "tasks: {spotting: agents=2}\narms: {undelayed: {delayed: false}}",
-            "experiment.tasks.spotting: it is a list",
-        ),
         (
             "tasks: {spotting: []}\narms: {undelayed: {delayed: false, polcy_of: x}}",
             "experiment.arms.undelayed.polcy_of: no such key",
-        ),
-        (
-            "tasks: {spotting: []}\narms: {undelayed: {delayed: false}, naive: {naive: true}}",
-            "experiment.arms: ['naive'] run under no delay: name some under experiment.delays",
         ),
         (
             "tasks: {spotting: []}\ndelays: {late: [delay.obs=2]}\narms: {undelayed: {delayed: false}, "
@@ -373,23 +351,6 @@ def test_the_script_flies_only_where_messages_are_late():
     with initialize_config_dir(CONF, version_base=None):
         runs = plan(CompareConfig(experiment, seeds=1), Path("runs"))
     assert [run.name for run in runs] == ["a/none/best/seed_0", "a/late/known/seed_0"]
-
-
-@pytest.mark.slow
-def test_a_run_with_a_damaged_file_is_refused_and_not_left_out_of_the_report(compare, capsys):
-    words = ["experiment=usecase2", "seeds=1", "arms=[undelayed]", listed(*SMALL)]
-    run = compare(*words) / "usecase2" / "none" / "undelayed" / "seed_8"
-    for file, text, message in (
-        ("result.csv", "", "it does not hold the results of a run (no episodes); delete the folder"),
-        ("result.csv", "policy,episodes\nx,3\n", "it does not hold the results of a run (no success_rate)"),
-        ("metrics.csv", "frames,episodes\n8,1\n", "metrics.csv, line 1: no column perceived_return"),
-    ):
-        whole = (run / file).read_text()
-        (run / file).write_text(text)
-        capsys.readouterr()
-        check_refused(lambda: compare(*words, "report_only=true"), message, capsys)
-        (run / file).write_text(whole)
-    compare(*words, "report_only=true")
 
 
 @pytest.mark.parametrize("name", [path.stem for path in sorted((Path(CONF) / "experiment").iterdir())])

@@ -124,12 +124,6 @@ def test_the_extremes_are_the_worst_the_median_and_the_best_episode(flown):
     assert list(kept(episodes, "all")) == [f"episode_{number}" for number in range(5)]
 
 
-def test_an_episode_has_an_instant_for_the_reset_and_one_for_each_step(flown):
-    episode = flown("agents=2", "episode.max_steps=7", "clock.simulation=2s")
-    assert episode.time.tolist() == [2.0 * step for step in range(8)]
-    assert episode.position.shape == (8, 2, 3)
-
-
 @pytest.mark.sample(4)
 @pytest.mark.parametrize("motion", [[], FLYING])
 @pytest.mark.parametrize("order", ["generation", "arrival"])
@@ -187,37 +181,19 @@ def test_if_every_message_is_lost_none_arrives_and_only_sent_messages_count_as_l
     assert "mean age 30.50 s, messages late 0.0%, lost 100.0%" in printed_line(capsys)
 
 
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_flight_and_another_one_another(run):
-    one, same, other = (
-        run(*BADLY, f"seed={seed}", folder=folder) for seed, folder in ((0, "one"), (0, "same"), (1, "other"))
-    )
-    one, same, other = (Episode.load(folder / "episode_0.json") for folder in (one, same, other))
-    assert np.array_equal(one.position, same.position)
-    assert not np.array_equal(one.position, other.position)
-
-
 @pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["delai=burst"], "delai"),
         (["delay.los=0.1"], "delay.los: no such key; did you mean delay.loss?"),
-        (["+delay.foo=3"], "delay.foo: no such key"),
-        (["delay.obs=soon"], "delay.obs: soon is neither whole steps"),
-        (["delay=sometimes"], "delay: sometimes is not one of burst, distance, lag, none, paper"),
         (["resume=runs/last"], "resume: nothing is trained; give the run folder as checkpoint"),
         (["policy=best"], "policy: best is not one of sampled, deterministic, script, random"),
         (["policy=deterministic"], "policy: deterministic needs checkpoint"),
-        (["keep=last"], "keep: last is not one of all, extremes"),
-        (["views=[4d]"], "views: 4d is not one of 2d, 3d"),
         (
             ["views=[]", "formats=[gif]"],
             "views: [] names no view for the films that formats=['gif'] asks for",
         ),
-        (["formats=[avi]"], "formats: avi is not one of gif, mp4, png, html, geojson"),
         (["formats=[geojson]", "region=usecase"], "geojson: its region has no latitude and longitude"),
-        (["region.id=Nope"], "Nope"),
     ],
 )
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(run, capsys, tmp_path, overrides, message):

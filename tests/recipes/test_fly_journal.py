@@ -87,13 +87,10 @@ def test_a_setting_that_is_given_replaces_that_of_the_advice(show):
     ("overrides", "message"),
     [
         (["policy=script"], "policy: script means nothing with journal, which flies nothing"),
-        (["checkpoint=run"], "checkpoint: run"),
         (["eval_episodes=7"], "eval_episodes: 7 means nothing with journal"),
-        (["keep=extremes"], "keep: extremes means nothing with journal"),
         (["span=[3]"], "span: [3.0] is not [FIRST, LAST], two times of a journal [s]"),
         (["span=[90,99]"], "span: no step lies between 90 and 99 s: the journal covers 0 to 5 s"),
         (["journal=nothing.jsonl"], "nothing.jsonl: it cannot be read: No such file or directory"),
-        (["journal=null", "span=[1,2]"], "span: [1.0, 2.0] is not [FIRST, LAST], two times of a journal [s]"),
         (["region=usecase"], "lat, lon"),
     ],
 )

@@ -3,15 +3,10 @@
 import csv
 import json
 import shlex
-import shutil
-import subprocess
-import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import check_refused
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -61,15 +56,10 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
         [],
         ["scenario=tracking", "motion=polynomial", "agents=2"],
         ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
-        ["scenario=energy", "motion=polynomial", "observation.ctde=true"],
         ["scenario=mixed", "logger=csv", "agents=1"],
-        ["scenario=spotting", "reward=tracking", "region=usecase", "actions=continuous"],
         ["delay.obs=3", "delay.act=2", "delay.rew=1", "delay.history=4", "delay.loss=0.1"],
-        ["delay=paper", "aware=both", "motion=polynomial"],
         ["delay=burst", "aware=backupdate", "scenario=mixed", "delay.order=arrival"],
         ["delay=paper", "delay.obs.high=9s", "clock.agents=2s", "clock.server=4s", "clock.system=16s"],
-        ["aware=backupdate"],
-        ["delay=paper", "aware=backupdate", "clock.server=2s", "delay.rew=3", "delay.reward_window=3"],
         ["learner=bpql", "learner.warm_up=64", "learner.updates=1", "delay=paper", "aware=belief"],
         ["learner=sac", "delay.rew=3", "aware=backupdate", "settle=true", "clock.server=2s"],
     ],
@@ -162,14 +152,6 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
 
 
 @pytest.mark.slow
-def test_one_learner_starts_from_the_policy_of_the_other(run):
-    first = run(*TINY, folder="first")
-    second = run(*TINY, f"checkpoint={first}", *SAC, "learner.lr=1e-9", folder="second")
-    one, other = (weights(folder, "actor") for folder in (first, second))
-    assert all(torch.allclose(other[name], one[name], atol=1e-6) for name in one)
-
-
-@pytest.mark.slow
 def test_a_run_can_be_resumed_without_the_folder_of_the_policy_that_it_started_from(run):
     first = run(*TINY, folder="first")
     second = run(*TINY, f"checkpoint={first}", folder="second")
@@ -184,15 +166,6 @@ def test_every_policy_is_evaluated_in_the_same_episodes(run):
     with (folder / "result.csv").open(newline="") as file:
         _, one, *others = [row[1:] for row in csv.reader(file)]
     assert others == [one] * 5
-
-
-@pytest.mark.slow
-def test_rows_after_the_checkpoint_are_dropped_when_a_run_is_resumed(run):
-    folder = run(*TINY, "learner.steps=16", folder="first")
-    with (folder / "metrics.csv").open("a") as file:
-        file.write(",".join(["99999"] + ["0"] * (len(metrics(folder)[0]) - 1)) + "\n")
-    run(f"resume={folder}", "frames=384", folder="second")
-    assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0, 384.0]
 
 
 @both_learners
@@ -211,22 +184,6 @@ def test_resuming_a_finished_run_trains_no_further(run, capsys, learner):
     assert resumed["resumed"][0]["command"] == f"damian train resume={folder} frames=100 hydra.run.dir=second"
 
 
-def test_a_damaged_run_folder_is_refused_in_one_line(run, capsys):
-    whole = run(*TINY, folder="whole")
-    for damage, message in (
-        (lambda f: (f / "config.yaml").write_text("a: [1"), "config.yaml: "),
-        (lambda f: (f / "config.yaml").write_text("- 1"), "config.yaml: "),
-        (lambda f: (f / "config.yaml").write_text(""), "it has no agents, so it is not the whole"),
-        (lambda f: (f / "config.yaml").unlink(), "damaged holds no config.yaml, so there is no run"),
-        (lambda f: (f / "checkpoint.pt").write_text("{"), "checkpoint.pt: it is damaged"),
-        (lambda f: (f / "metrics.csv").write_text("x,y\n1,2\n"), "metrics.csv: it has no column frames"),
-    ):
-        folder = shutil.copytree(whole, whole.with_name("damaged"))
-        damage(folder)
-        check_refused(partial(run, "resume=damaged", "frames=512", folder="second"), message, capsys)
-        shutil.rmtree(folder)
-
-
 def test_a_folder_that_holds_a_run_is_not_overwritten(run, capsys):
     folder = run(*TINY)
     before = (folder / "metrics.csv").read_text()
@@ -234,11 +191,6 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(run, capsys):
         run(*TINY, "seed=1")
     assert "holds a run already" in capsys.readouterr().err
     assert (folder / "metrics.csv").read_text() == before
-
-
-def test_each_reward_term_has_a_column_in_the_metrics(run):
-    rows = metrics(run(*TINY, "reward=tracking", "scenario=spotting"))
-    assert {"reward/spotting_agents", "reward/source_distance", "reward/source_time"} <= set(rows[0])
 
 
 @pytest.mark.slow
@@ -360,11 +312,3 @@ def test_where_nothing_is_won_by_the_source_a_belief_is_left_out(spotted, succes
     )
     assert bool(config.observation.belief) is config.model.skip is kept
     assert config.observation.own
-
-
-@pytest.mark.slow
-def test_a_notebook_that_imports_damian_keeps_its_own_figures():
-    code = "import matplotlib; matplotlib.use('svg'); import damian; damian.compose_scenario()\n"
-    code += "import damian.show.film, damian.recipes.train; print(matplotlib.get_backend())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "svg"
