@@ -7,9 +7,8 @@ import bench
 import bench_timing
 import bench_training
 import pytest
-import torch
-from bench import BARE, RIVAL, WHOLE, arms, believing, delayed, delays, fleet, rivals, scenarios
-from bench_timing import Measured, in_turn, staggered
+from bench import BARE, RIVAL, WHOLE, arms, delays, rivals, scenarios
+from bench_timing import Measured, in_turn
 from bench_training import ARMS, HEADER, RIVALS, WIDTHS, Seconds, arm_config, rows, training
 
 from damian.envs.pipeline import has_message_delay
@@ -41,12 +40,6 @@ def test_chunks_take_turns_and_have_their_own_median_and_spread(monkeypatch):
     assert times == {"slow": Measured(3, 2, 6), "fast": Measured(1, 1, 1)}
 
 
-def test_worlds_end_their_episodes_at_different_times(presets):
-    env = delayed(presets["everything"], delays()[WHOLE], 10)
-    staggered(env, groups=5)
-    assert env.uav_env.state.steps.tolist() == [4, 3, 2, 1, 0] * 2
-
-
 def test_every_environment_of_the_delay_table_is_measured(presets):
     text = bench.cost_of_delays({"everything": presets["everything"]}, TINY)
     assert [f"everything: {kind} " in text for kind in delays()] == [True] * len(delays())
@@ -70,22 +63,10 @@ def test_speed_is_given_relative_to_vmas():
 
 
 @pytest.mark.slow
-def test_the_cost_of_a_belief_has_a_row_for_each_kind():
-    rows = bench.cost_of_belief(TINY).strip().splitlines()[4:]
-    assert len(rows) == len(believing()) * len(TINY.modes)
-    assert rows[0].endswith("| 1.00 |")
-
-
-@pytest.mark.slow
 def test_growth_has_a_row_for_each_size(presets):
     for what, sizes in ("worlds", TINY.many_worlds), ("UAVs", TINY.many_uavs):
         rows = bench.growth(presets, TINY, what, sizes).strip().splitlines()[4:]
         assert [int(row.split(" | ")[0].strip("| ")) for row in rows] == list(sizes)
-
-
-def test_a_hundred_uavs_have_room_to_fly(presets):
-    env = delayed(fleet(presets["everything"], 100), {}, 1)
-    assert env.rollout(2)["agents", "ready"].shape == torch.Size([1, 2, 100])
 
 
 # The training part.

@@ -1,18 +1,15 @@
 """The evaluation recipe, run by its command line: a trained policy with other UAVs, regions and delays."""
 
 import csv
-import json
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 from helpers import check_refused
 from omegaconf import OmegaConf
 
-import damian
 from damian.common.errors import InputError
 from damian.compare.comparison import OF_ARM
 from damian.recipes import evaluate, train
@@ -125,39 +122,6 @@ def test_a_policy_keeps_its_action_history_under_another_delay_and_the_changes_a
     assert "\nnote: delay.history: in the training a UAV's history held only " in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_a_policy_keeps_its_history_of_messages_under_another_delay(fly):
-    words = ["delay.messages=2", "backupdate=true", "learner.prediction_steps=1"]
-    first = fly("learner=predictive_mappo", *words, of=None, folder="first", program=train)
-    config = OmegaConf.load(fly("delay=paper", of=first) / "config.yaml")
-    assert (config.delay.messages, config.delay.obs.law) == (2, "uniform")
-
-
-def test_the_folder_records_versions_machine_commit_and_wall_time(fly, capsys):
-    folder = fly()
-    record = json.loads((folder / "run.json").read_text())
-    assert record["damian"] == damian.__version__
-    assert record["packages"]["torch"] == torch.__version__
-    assert record["wall_time_s"] > 0
-    assert record["machine"]["cores"] >= 1
-    assert len(record["commit"].partition("+")[0]) == 40
-    assert capsys.readouterr().out.strip().splitlines()[-1] == "results: flown"
-    assert str(Path(damian.__file__).parent) not in (folder / "config.yaml").read_text()
-
-
-def test_a_resumed_run_is_evaluated_with_its_own_overrides(fly, trained, tmp_path, monkeypatch):
-    resumed = shutil.copytree(trained, tmp_path / "resumed")
-    monkeypatch.setattr(sys, "argv", ["train.py", f"resume={resumed}", "frames=96"])
-    launch(train.main)
-    assert OmegaConf.load(fly(of=resumed) / "config.yaml").delay.obs == 1
-
-
-def test_the_same_seed_gives_the_same_results_and_another_one_others(fly):
-    one, same, other = fly(folder="one"), fly(folder="same"), fly("seed=4", folder="other")
-    assert results(one) == results(same)
-    assert results(one) != results(other)
-
-
 @pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("overrides", "message"),
@@ -189,26 +153,6 @@ def test_what_a_policy_needs_to_fly_is_named(word, message):
     check_policy_fits(trained, trained)
 
 
-@pytest.mark.parametrize(
-    ("features", "word", "message"),
-    [
-        (
-            "coverage",
-            "observation.global_features=[mean_distance]",
-            r"observation\.global_features: the policy",
-        ),
-        ("agent_distances", "agents=5", "agents: the policy was trained with 3, so it cannot fly with 5"),
-    ],
-)
-def test_what_a_learnt_belief_predicts_is_named_though_the_actor_does_not_observe_it(features, word, message):
-    words = ["observation.ctde=true", f"observation.global_features=[{features}]"]
-    trained, other = (composed_config(*words, *more) for more in ([], [word]))
-    check_policy_fits(other, trained)
-    predicting = composed_config(*words, "learner=predictive_mappo")
-    with pytest.raises(InputError, match=message):
-        check_policy_fits(composed_config(*words, "learner=predictive_mappo", word), predicting)
-
-
 NEWER, ALL = "only actions newer than its message that the server holds", "all of its latest actions"
 
 
@@ -227,10 +171,6 @@ def test_what_a_history_holds_now_is_said_if_it_is_something_else(trained, flown
     note_what_a_history_holds(composed_config(*words, flown), composed_config(*words))
     note = f"note: delay.history: in the training a UAV's history {line}\n"
     assert capsys.readouterr().out == (note if line else "")
-
-
-def test_a_policy_flies_with_any_number_of_uavs_if_it_observes_no_distance_to_each():
-    check_policy_fits(composed_config("agents=5"), composed_config("agents=3"))
 
 
 @pytest.mark.parametrize(

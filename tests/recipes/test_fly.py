@@ -22,7 +22,6 @@ from damian.show.episode import Episode
 from damian.show.replay_page import page
 
 SHORT = ["policy=random", "formats=[]", "actions.distances=[0,30,60]", "episode.max_steps=60"]
-UNDELAYED = ["delay.obs=0", "delay.loss=0"]
 FLYING = ["motion=polynomial", "clock.simulation=1s"]
 BADLY = ["delay=none", "delay.obs={law: uniform, low: 0, high: 5}", "delay.loss=0.3"]
 """Messages overtake each other and are lost, so that a short flight covers every case."""
@@ -133,32 +132,6 @@ def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(flown,
     generated = step - episode.age.astype(int)
     assert episode.age.max() > 3
     assert (episode.believed == episode.true[generated, uav]).all()
-
-
-@pytest.mark.parametrize("motion", [[], FLYING])
-def test_without_delay_and_loss_the_server_holds_the_latest_message(flown, capsys, motion):
-    episode = flown(*UNDELAYED, *motion)
-    assert (episode.believed == episode.true)[episode.arrived].all()
-    assert (episode.age == 0)[episode.arrived].all()
-    assert episode.arrived.all() == (motion == [])
-    assert not episode.lost.any()
-    assert "messages late 0.0%, lost 0.0%" in printed_line(capsys)
-
-
-def test_under_a_constant_delay_the_belief_is_the_truth_that_many_steps_ago(flown, capsys):
-    episode = flown("delay.obs=3s", "clock.simulation=0.5s", "episode.max_steps=20")
-    age = np.minimum(episode.time, 3.0)
-    assert (episode.age == age[:, None]).all()
-    assert (episode.believed[6:] == episode.true[:-6]).all()
-    assert episode.arrived[:, 0].tolist() == [True] + [False] * 6 + [True] * 14
-    assert f"mean age {age[1:].mean():.2f} s, messages late 100.0%, lost 0.0%" in printed_line(capsys)
-
-
-def test_the_age_of_a_belief_grows_unless_a_message_arrives(flown):
-    episode = flown(*BADLY, "clock.simulation=0.1s")
-    quiet = ~episode.arrived[1:]
-    assert (np.diff(episode.age, axis=0)[quiet].round(9) == 0.1).all()
-    assert 0 < quiet.mean() < 1
 
 
 def test_a_lost_message_is_never_believed(flown, capsys):

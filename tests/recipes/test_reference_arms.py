@@ -1,7 +1,6 @@
 """Reference arms: messages held back to a constant delay (``delay.hold``), and a privileged critic."""
 
 import math
-import sys
 from typing import Any
 
 import pytest
@@ -14,7 +13,6 @@ from helpers import (
     all_same,
     both_kinds,
     both_motions,
-    check_refused,
     everything,
     go,
     one_uav,
@@ -39,9 +37,8 @@ from damian.keys import GLOBAL_OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig, make_critic
 from damian.learners.sac import Sac, SacConfig
-from damian.recipes.shared.launch import launch
 from damian.recipes.shared.settings import TrainConfig
-from damian.recipes.train import learning_env, main, make_learner, replay_buffer
+from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.server.features import ObservationConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
@@ -81,13 +78,6 @@ def test_held_messages_arrive_as_with_a_constant_delay(law, motion):
     obs, longest = LAWS[law]
     held = rollout_of(everything(motion, delay=DelayConfig(obs=obs, hold="max", history=2)))
     assert all_same(held, rollout_of(everything(motion, delay=DelayConfig(obs=longest, history=2))))
-
-
-def test_held_messages_have_the_age_of_the_longest_delay_once_that_has_passed():
-    outputs = rollout_of(everything(delay=DelayConfig(obs=PAPER, hold="max"), episode=KEEPS_GOING))
-    ages = torch.stack([td["agents", "age"] for td in outputs[1::2]])
-    expected = torch.arange(1, len(ages) + 1).clamp(max=7)
-    assert ages.equal(expected.view(-1, 1, 1, 1).expand_as(ages).float())
 
 
 @pytest.mark.parametrize("law", ["uniform", "burst", "trace"])
@@ -163,23 +153,12 @@ def test_a_belief_in_the_privileged_observation_is_that_the_source_is_where_it_i
         assert ((way - to_source).abs() <= cell / 2 / (200 * math.sqrt(2)) + 1e-6).all()
 
 
-def test_the_vector_to_a_source_far_beyond_the_region_is_clamped():
-    assert step_with_source_at([9000.0, -9000.0])[PRIVILEGED][0, 0, -2:].tolist() == [1.0, -1.0]
-
-
 @pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs=PAPER)], ids=["undelayed", "late"])
 def test_privileged_observations_change_no_other_output(delay):
     scenario = everything(delay=delay)
     with_it, without = rollout_of(scenario, (*EXTRAS, "privileged")), rollout_of(scenario)
     assert all(PRIVILEGED in td.keys(True, True) for td in with_it)
     assert all_same([td.exclude(PRIVILEGED) for td in with_it], without)
-
-
-@pytest.mark.slow
-def test_held_messages_and_privileged_observations_compile():
-    scenario = square(delay=DelayConfig(obs=BURST, hold="max"))
-    env = make_env(scenario, 4, extras=["message", "privileged"]).compile(backend="eager")
-    assert all_same(play(env, actions_for(env, 15)), rollout_of(scenario, ("message", "privileged"), 15))
 
 
 # The privileged critic.
@@ -230,16 +209,6 @@ def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(conf
     assert actions[0].equal(actions[1])
 
 
-@pytest.mark.parametrize("critic", ["server", "privileged"])
-def test_the_critic_observes_what_the_settings_choose(critic):
-    learner, env = learner_of(settings(critic=critic))
-    expected = {"server": GLOBAL_OBSERVATION, "privileged": PRIVILEGED}[critic]
-    assert learner.critic.in_keys == [expected]
-    sac, _ = learner_of(settings(critic=critic, learner=SacConfig()))
-    assert expected in sac.loss.qvalue_network.in_keys
-    assert (PRIVILEGED in env.observation_spec.keys(True, True)) == (critic == "privileged")
-
-
 def test_back_updating_does_not_change_the_privileged_observation():
     learner, env = learner_of(settings(backupdate=True))
     batch = env.rollout(12, learner.actor, break_when_any_done=False)
@@ -252,51 +221,3 @@ def test_back_updating_does_not_change_the_privileged_observation():
         assert corrected[key].equal(batch[key])
     losses = learner.learn(env.rollout(12, learner.actor, break_when_any_done=False))
     assert all(math.isfinite(loss) for loss in losses.values())
-
-
-# On the command line.
-
-TINY = ["frames=200", "worlds=4", "learner.steps=16", "eval_episodes=2", "model.hidden=[8]", "logger=csv"]
-TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
-SAC = ["learner=sac", "learner.warm_up=100", "learner.buffer_steps=1000", "learner.updates=1"]
-
-
-@pytest.fixture
-def train(tmp_path, monkeypatch):
-    """Run the recipe in an empty folder; returns its run folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*overrides: str):
-        monkeypatch.setattr(sys, "argv", ["train.py", *TINY, *overrides, "hydra.run.dir=run"])
-        launch(main)
-        return tmp_path / "run"
-
-    return run
-
-
-HELD = ["delay.hold=max", "aware=both", "settle=true"]
-ARMS = [
-    ["critic=privileged"],
-    *(pytest.param(arm, marks=pytest.mark.slow) for arm in (["critic=privileged", *SAC], HELD)),
-]
-
-
-@pytest.mark.parametrize("overrides", ARMS, ids=["privileged", "privileged sac", "held"])
-def test_a_reference_arm_is_trained_and_evaluated(train, overrides):
-    folder = train("scenario=delaybench/tracking", "delay=paper", *overrides)
-    assert (folder / "result.csv").is_file()
-    assert (folder / "learning_curve.png").is_file()
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("delay.hold=longest", "delay.hold: longest is not one of none, max"),
-        ("delay.hold=max", "delay.hold: max means nothing without delayed messages (delay.obs)"),
-        ("delay.order=arrival", "delay.order: arrival means nothing without delayed messages (delay.obs)"),
-        ("critic=oracle", "critic: oracle is not one of server, privileged"),
-    ],
-)
-def test_impossible_settings_of_a_reference_arm_are_refused(train, override, message, capsys, tmp_path):
-    check_refused(lambda: train(override), message, capsys)
-    assert not (tmp_path / "run").exists()

@@ -13,16 +13,13 @@ from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch import Tensor
 
 from damian.envs.pipeline import make_env
-from damian.learners.networks import ModelConfig, make_actor, make_critic
+from damian.learners.networks import make_actor, make_critic
 from damian.recipes import evaluate
 from damian.recipes import train as train_recipe
 from damian.recipes.shared.launch import composed_config, seed_generators
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.shared.stored_runs import stored_config
 from damian.runs.training_state import load_networks
-from damian.server.features import ObservationConfig
-from damian.server.rewards import RewardConfig
-from damian.server.termination import EpisodeConfig
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
@@ -129,16 +126,6 @@ def test_a_resumed_run_appends_to_its_own_metrics(run, learner):
     assert not (folder.parent / "second").exists()
 
 
-@pytest.mark.slow
-def test_a_resumed_run_continues_with_the_period_of_its_triggered_clock(run):
-    quiet = ["source.level_db=106", "learner.steps=4", "clock.trigger=2s", "clock.longest=10s"]
-    folder = run(*TINY, *quiet, "frames=80", "delay.obs=2", "backupdate=true", folder="first")
-    assert [row["frames"] / 8 for row in metrics(folder)] == [4, 4 + 6]
-    run(f"resume={folder}", "frames=300", folder="second")
-    frames = [row["frames"] / 8 for row in metrics(folder)]
-    assert frames == [4, 4 + 6, 4 + 6 + 8, 4 + 6 + 8 + 10, 4 + 6 + 8 + 10 + 10]
-
-
 def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
     first = run(*TINY, "agents=2", folder="first")
     still = run(f"checkpoint={first}", "learner.lr=1e-9", "seed=1", folder="still")
@@ -149,15 +136,6 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
     assert not all(torch.allclose(other[name], trained[name], atol=1e-3) for name in trained)
     assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # frames count from 0 again
     assert OmegaConf.load(still / "config.yaml").agents == 2
-
-
-@pytest.mark.slow
-def test_a_run_can_be_resumed_without_the_folder_of_the_policy_that_it_started_from(run):
-    first = run(*TINY, folder="first")
-    second = run(*TINY, f"checkpoint={first}", folder="second")
-    first.rename(first.with_name("moved"))
-    run(f"resume={second}", "frames=384", folder="third")
-    assert [row["frames"] for row in metrics(second)] == [128.0, 256.0, 384.0]
 
 
 def test_every_policy_is_evaluated_in_the_same_episodes(run):
@@ -191,35 +169,6 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(run, capsys):
         run(*TINY, "seed=1")
     assert "holds a run already" in capsys.readouterr().err
     assert (folder / "metrics.csv").read_text() == before
-
-
-@pytest.mark.slow
-def test_training_continues_after_a_batch_without_any_decision(run):
-    folder = run(
-        "agents=1",
-        "worlds=1",
-        "frames=60",
-        "learner.steps=4",
-        "learner.minibatches=1",
-        "motion=polynomial",
-        "motion.max_speed=5",
-        "clock.simulation=1s",
-        "eval_episodes=2",
-        "model.hidden=[8]",
-    )
-    assert len(metrics(folder)) == 15
-
-
-@pytest.mark.slow
-def test_delays_and_back_updating_change_the_losses(run):
-    slow = ["delay.obs=4", "scenario=tracking"]
-    naive, aware, undelayed = (
-        metrics(run(*TINY, *overrides, folder=name))
-        for name, overrides in (("a", slow), ("b", [*slow, "backupdate=true"]), ("c", ["scenario=tracking"]))
-    )
-    assert naive[0]["perceived_return"] == pytest.approx(aware[0]["perceived_return"], nan_ok=True)
-    assert naive[0]["loss_critic"] != aware[0]["loss_critic"]
-    assert naive[-1]["loss_critic"] != undelayed[-1]["loss_critic"]
 
 
 def test_a_sweep_fills_one_folder_per_run(run, tmp_path):
@@ -289,26 +238,3 @@ def test_the_use_cases_are_learnt_in_500_episodes_by_most_seeds(run, case):
     rows = [(folder / "result.md").read_text().splitlines()[3].split("|") for folder in runs]
     assert sorted(float(row[2]) for row in rows)[1] >= 0.97
     assert sorted(float(row[3]) for row in rows)[1] <= 1.2
-
-
-@pytest.mark.slow
-def test_training_on_the_real_region_clearly_beats_random(run):
-    folder = run()
-    rows = [line.split("|") for line in (folder / "result.md").read_text().splitlines()[2:]]
-    trained, random = float(rows[1][2]), float(rows[3][2])
-    assert trained >= 0.8
-    assert random <= 0.1
-
-
-@pytest.mark.parametrize(
-    ("spotted", "success", "kept"), [(0.0, None, False), (0.0, 0.5, True), (1.0, None, True)]
-)
-def test_where_nothing_is_won_by_the_source_a_belief_is_left_out(spotted, success, kept):
-    config = TrainConfig(
-        reward=RewardConfig(coverage=1.0, spotted=spotted),
-        episode=EpisodeConfig(success_share=success),
-        observation=ObservationConfig(own=True, belief=["belief_gain"]),
-        model=ModelConfig(skip=True),
-    )
-    assert bool(config.observation.belief) is config.model.skip is kept
-    assert config.observation.own

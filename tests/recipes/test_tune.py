@@ -75,16 +75,6 @@ def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys
 
 
 @pytest.mark.slow
-def test_the_best_of_scores_that_count_steps_is_the_least(search, capsys, monkeypatch):
-    scores = iter([5.0, 3.0])
-    monkeypatch.setattr(tune.Run, "score", lambda *_: next(scores))
-    folder = search("trials=2", "score=steps", "episode.max_steps=4")
-    best = rows(folder / "trials.csv")[1]
-    assert best["steps"] == "3"
-    assert f"learner.lr={best['learner.lr']}" in capsys.readouterr().out.split("The best:")[1]
-
-
-@pytest.mark.slow
 def test_a_killed_search_goes_on_with_the_trial_that_it_was_training(search):
     folder = search("trials=1")
     with killed_after(1):
@@ -192,12 +182,6 @@ def test_every_learner_has_a_space(capsys):
 )
 def test_what_a_user_can_get_wrong_is_refused_in_one_line(search, words, message, capsys):
     check_refused(lambda: search(*words), message, capsys)
-
-
-@pytest.mark.slow
-def test_a_folder_with_another_search_is_refused(search, capsys):
-    search("trials=1")
-    check_refused(lambda: search("trials=1", "agents=2"), "choose another folder with hydra.run.dir", capsys)
 
 
 def test_a_storage_that_is_damaged_is_refused_in_one_line(search, tmp_path, capsys):

@@ -104,16 +104,3 @@ def test_a_reset_of_some_worlds_leaves_the_others_alone():
         assert not new[::2].equal(old[::2])
     assert (env.velocity[::2] == 0).all()
     assert (env.steps[::2] == 0).all()
-
-
-def test_equal_seeds_begin_equal_episodes_in_the_square():
-    env = SimpleSpread(1000)
-    env.set_seed(5)
-    first = env.reset()[keys.OBSERVATION]
-    env.set_seed(5)
-    assert env.reset()[keys.OBSERVATION].equal(first)
-    assert not env.reset()[keys.OBSERVATION].equal(first)
-    for places in (env.position, env.landmarks):
-        assert places.abs().max() <= 1
-        assert places.min() < -0.99
-        assert places.max() > 0.99

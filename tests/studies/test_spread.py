@@ -6,14 +6,13 @@ import json
 import pytest
 import spread
 import torch
-from simple_spread import AGES, DELAYS, DIRECTIONS, HELD, HORIZON, KINEMATICS, SEEN, late_spread
+from simple_spread import AGES, DELAYS, DIRECTIONS, HELD, HORIZON, KINEMATICS, SEEN
 from spread import ARMS, EVALUATED, LATE, LATEST, TRAINED, main, make_env, make_learner
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from damian import keys
-from damian.delays.laws import Constant
 from damian.learners.networks import ModelConfig
 
 WORLDS = 3
@@ -90,17 +89,6 @@ def test_the_learnt_belief_reads_every_block_of_the_latest_steps_that_has_arrive
                     assert row[:2].equal(place)
                     assert row[2:7].equal(torch.eye(5)[block % 5])
                     assert row[7] == came
-
-
-@pytest.mark.parametrize("delay", [0, 3, 12])
-def test_with_a_constant_delay_agents_see_what_was_so_many_steps_ago(delay):
-    env = late_spread(WORLDS, Constant(delay), LATEST)
-    env.set_seed(0)
-    steps = env.rollout(HORIZON).transpose(0, 1)
-    for t in range(HORIZON):
-        assert steps[HELD][t].equal(steps[SEEN][max(t - delay, 0)])
-        seen = steps[HELD][t].view(WORLDS, 3, 10)
-        assert steps[keys.OBSERVATION][t, ..., :14].equal(torch.cat([steps[KINEMATICS][t], seen], -1))
 
 
 @pytest.mark.parametrize("arm", [name for name, arm in ARMS.items() if arm])
