@@ -31,7 +31,8 @@ from damian.show.episode import COLUMNS
 ROOT = Path(damian.__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "RESULTS.md", "CHANGELOG.md")]
 DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
-FILES = [*DOCUMENTS, *(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.py")]
+FILES = [file for file in DOCUMENTS if file.name != "CHANGELOG.md"]  # which names commands of older versions
+FILES += [*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "examples").rglob("*.py")]
 FILES += sorted((ROOT / "recipes").glob("*.py"))
 NEVER = 9
 """A delay that ends after the documents' example."""
