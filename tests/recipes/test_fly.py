@@ -252,7 +252,7 @@ def test_a_page_has_the_episodes_in_the_order_of_their_files(replay, capsys):
     ("damage", "message"),
     [
         ({"about": {"seed": float("inf")}}, "not JSON compliant"),
-        ({"reward_terms": {"spotted": {}}}, "reward_terms"),
+        ({"reward_terms": {"spotted": {}}}, "late.json: "),
         ({"time": "soon"}, "late.json: "),
     ],
 )

@@ -9,7 +9,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -32,6 +35,7 @@ from damian.recipes.shared.launch import composed_config
 from damian.recipes.shared.ray_cluster import connected_ray
 from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import make_learner, replay_buffer
+from damian.runs.checkpoint import plain
 
 TWO = ["collector=process", "workers=2"]
 LATE = ["delay=paper", "aware=both", "delay.rew=2"]
@@ -140,10 +144,11 @@ def test_what_a_checkpoint_reads_of_torchrls_collector_is_there():
     config = settings()
     with collecting(config, learning_env(config), actor_of(config)) as collector:
         next(iter(collector))
-        parts = collector_parts(collector)
-        state = parts["collector"].state_dict()
-        assert state["step"].batch_size == collector.env.batch_size
-        parts["collector"].load_state_dict(state)
+        step = collector_parts(collector)["collector"]
+        stored = plain(step.state_dict())
+        assert {*stored} == {"step", "trajectories"}
+        step.load_state_dict(stored)
+        assert next(iter(collector)).shape == (config.worlds, config.learner.steps)
 
 
 def test_each_worker_is_a_plain_collector_with_a_seed_of_its_own(forked):
@@ -237,3 +242,17 @@ def test_a_missing_ray_is_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"collector: ray is not installed; pip install 'damian\[ray\]'"):
         connected_ray("collector", 2)
+
+
+def test_a_ray_that_does_not_start_is_one_line(monkeypatch):
+    def fail(**_: Any) -> None:
+        raise OSError("no memory to share")
+
+    ray = ModuleType("ray")
+    ray.__spec__ = ModuleSpec("ray", None)
+    monkeypatch.setattr(ray, "is_initialized", lambda: False, raising=False)
+    monkeypatch.setattr(ray, "init", fail, raising=False)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    with pytest.raises(InputError, match="launcher: Ray does not start on this machine: no memory to share"):
+        connected_ray("launcher", 2)
