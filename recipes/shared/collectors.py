@@ -144,7 +144,8 @@ class WorkerCollector(Collector):
 
     def take_weights(self, weights: bytes) -> None:
         """Act with the weights of the learner's actor from now on."""
-        for own, new in zip(self.policy.state_dict().values(), unpacked(weights), strict=True):
+        actor = cast(torch.nn.Module, self.policy)
+        for own, new in zip(actor.state_dict().values(), unpacked(weights), strict=True):
             own.copy_(new)
 
     def dump(self) -> bytes:
@@ -217,7 +218,8 @@ class Workers:
     """
 
     def __init__(self, config: TrainConfig, actor: torch.nn.Module, frames: int) -> None:
-        self._actor, self._ray, self._connected = actor, None, False
+        self._actor, self._connected = actor, False
+        self._ray: Any = None
         skeleton = copy.deepcopy(actor).to("meta")
         makers = [partial(worker_env, config, skeleton, worker) for worker in range(config.workers)]
         options = {"frames_per_batch": frames, "collector_class": cast(Any, WorkerCollector)}
@@ -298,7 +300,7 @@ class Workers:
         with using_threads(torch.get_num_threads()):
             self._collector.shutdown()
         if self._connected:
-            self._ray.shutdown()  # type: ignore[union-attr]
+            self._ray.shutdown()
 
     def _on_all(self, method: str, arguments: list[tuple] | None = None) -> list[Any]:
         with self._naming_lost():
@@ -319,7 +321,7 @@ class Workers:
 
     def _lost_actor(self, error: Exception) -> tuple[int, str] | None:
         """Id of the process of a Ray actor whose end is an error, and how it ended."""
-        if not isinstance(error, self._ray.exceptions.RayActorError):  # type: ignore[union-attr]
+        if not isinstance(error, self._ray.exceptions.RayActorError):
             return None
         process, how = (re.search(pattern, str(error)) for pattern in (r"pid: (\d+)", r"exit type: (\w+)"))
         return (int(process[1]), f"Ray says {how[1] if how else 'that it has died'}") if process else None
