@@ -254,6 +254,7 @@ class Workers:
             remote_configs={"num_cpus": 1, "scheduling_strategy": places},
             **options,
         )
+        collector.update_policy_weights_(self._actor)  # before, the workers' actors have no tensors to fill
         random.setstate(state)
         return collector
 
