@@ -38,8 +38,8 @@ from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import save_results
+from damian.server.belief import SourceGrid
 from damian.server.server import Server
-from damian.server.source_grid import SourceGrid
 from damian.world.messages import Messages
 
 from .evaluate import stored
