@@ -99,7 +99,7 @@ REFUSALS = [
     (["port=0", "token=short"], "token: it is not a password of at least 16"),
     (["port=0", "host=999.1.1.1"], "port: 999.1.1.1:0 cannot be used"),
     (["resume=run"], "resume: nothing is trained"),
-    (["reports=table.csv", "journal=kept"], "journal: kept is for a service; a table that is answered once"),
+    (["reports=table.csv", "journal=kept"], "journal: kept is for a service or a folder"),
     (["folder=.", "uavs=[A]", "journal=../{folder}"], "journal: ../{folder} is the folder of the tables too"),
 ]
 
