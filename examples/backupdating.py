@@ -80,7 +80,6 @@ def main() -> tuple[TensorDictBase, Tensor]:
         max_size=BATCHES * BATCH_STEPS * WORLDS,
         recompute=recompute,
         longest=7,  # steps
-        env=env,  # to check the keys and recompute at once
         message_key="message",
         received_key="received",
         delay_key="delay",

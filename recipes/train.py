@@ -36,8 +36,7 @@ from damian.envs.pipeline import has_message_delay
 from damian.keys import next_key
 from damian.learners.base import Learner, divergence
 from damian.learners.schedule import SystemClock
-from damian.replay.backupdate import BackupdateStorage
-from damian.replay.corrections import corrections_of
+from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.runs.interrupt import Interrupt

@@ -47,7 +47,8 @@ class DelayLine:
 
     The memory:
 
-    - ``clock``: number of steps so far, and ``slot``: the slot of the current step, [M] each;
+    - ``clock``: number of steps so far, and ``place``: the place of the current slot of each sender among
+      all slots of all senders (slot times M, plus the sender's number), [M] each;
     - ``streams``: random stream of each sender, [M], and ``channel``: state of its channel, [M, ...];
     - ``reset_at``: clock at the sender's latest reset, [M], and ``generated_at``: clock at which the held
       message was generated, [M];
@@ -67,6 +68,7 @@ class DelayLine:
         self.sampler, self._gradients = sampler, gradients
         self._hold_last_generated = order == "generation"
         certainly_arrives = bool((sampler.chances[:, -1] < 1e-10).all())  # draws have 32 bits
+        self._always_longest = sampler.constant_delay == sampler.longest
         self._may_lose = not (certainly_arrives and type(sampler).forward is Sampler.forward)
 
     def init_memory(self, values: list[Tensor], streams: Tensor) -> Memory:
@@ -74,7 +76,7 @@ class DelayLine:
         n_rows, zero = self.sampler.lost + 1, torch.zeros_like(streams)
         memory = {
             "clock": zero,
-            "slot": zero.clone(),
+            "place": torch.arange(len(streams), device=streams.device),
             "streams": streams,
             "channel": self.sampler.initial_state(streams),
             "reset_at": zero.clone(),
@@ -86,11 +88,6 @@ class DelayLine:
             memory[f"slots_{i}"] = value.new_zeros(n_rows, *value.shape)
             memory[f"held_{i}"] = value.clone()
         return memory
-
-    def n_bytes(self, n_senders: int, size: int) -> int:
-        """Size of the memory for so many senders and messages of ``size`` bytes, about [bytes]."""
-        n_rows = self.sampler.lost + 1
-        return n_senders * (n_rows * (8 + size) + size + 7 * 8)  # 7 tensors have a number for each sender
 
     def row_dims(self, n_values: int) -> dict[str, int]:
         """The dimension of the senders in the buffers in which it is not the first."""
@@ -126,14 +123,17 @@ class DelayLine:
         """
         clock, generated_at = memory["clock"] + 1, memory["generated_at"]
         n_slots, n_senders = self.sampler.lost, len(generated_at)
-        slot_now = advance_slot(memory["slot"], 1, n_slots)
+        n_places = n_slots * n_senders
+        row_now = advance_slot(memory["place"], n_senders, n_places)
         delay, channel = self.sampler(memory["streams"], clock, memory["channel"], context)
+        if self._always_longest:  # K - 1 steps ahead in a ring of K slots is the slot of the step before
+            row_sent = memory["place"]
+        else:
+            row_sent = advance_slot(row_now, delay * n_senders, n_places)
         if sent is not None:
             delay = torch.where(sent, delay, self.sampler.lost)
-        arrival = advance_slot(slot_now, delay, n_slots)
         if sent is not None or self._may_lose:
-            arrival = torch.where(delay < n_slots, arrival, n_slots)
-        row_sent, row_now = (slot * n_senders + memory["senders"] for slot in (arrival, slot_now))
+            row_sent = torch.where(delay < n_slots, row_sent, n_places + memory["senders"])
         stamps = memory["stamps"].view(-1)
         stamp = stamps.index_copy_(0, row_sent, clock).index_select(0, row_now)
         if self._hold_last_generated:
@@ -142,7 +142,7 @@ class DelayLine:
             generated_after = torch.maximum(memory["reset_at"], clock - n_slots)
         fresh = stamp > generated_after
         generated_at = torch.where(fresh, stamp, generated_at)
-        memory = memory | {"clock": clock, "slot": slot_now, "channel": channel, "generated_at": generated_at}
+        memory = memory | {"clock": clock, "place": row_now, "channel": channel, "generated_at": generated_at}
         held = []
         for i, value in enumerate(values):
             slots, old = memory[f"slots_{i}"], memory[f"held_{i}"]
@@ -158,9 +158,8 @@ class DelayLine:
 
 
 def advance_slot(slot: Tensor, steps: Tensor | int, n_slots: int) -> Tensor:
-    """Slot that is ``steps`` < ``n_slots`` later in the ring; a modulo would cost a division per element."""
-    later = slot + steps
-    return torch.where(later < n_slots, later, later - n_slots)
+    """Slot that is ``steps`` later in the ring."""
+    return (slot + steps) % n_slots
 
 
 def slot_rows(slot: Tensor) -> Tensor:
@@ -212,10 +211,6 @@ class BroadcastLine:
             memory[f"contents_{i}"] = content.new_zeros(self._n_slots, *content.shape)
             memory[f"held_{i}"] = content.new_zeros(len(sender), *content.shape[1:])
         return memory
-
-    def n_bytes(self, n_senders: int, n_links: int, size: int) -> int:
-        """Size of the memory for so many senders, links and messages of ``size`` bytes, about [bytes]."""
-        return self.line.n_bytes(n_links, 0) + n_links * (8 + size) + n_senders * (8 + self._n_slots * size)
 
     def reset(self, memory: Memory, mask: Tensor) -> Memory:
         """Where the mask [L] is true, discard the messages that are held or in transit."""

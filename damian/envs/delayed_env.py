@@ -15,8 +15,7 @@ from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask, tree_where
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
-from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import Entries, Memory, drop_keys, select_entries
+from damian.transforms.base import Entries, Memory, StatefulTransform, act, begin, observe, select_entries
 from damian.world.state import PackedState
 
 _BASE = "base_env."
@@ -168,16 +167,11 @@ class DelayedEnv(TransformedEnv):
         If there is a mask ``stepped`` [B], only its worlds send messages and actions: the others will make
         this step later, and what is in transit is written in place.
         """
-        (stateful, _), memories = self._split_transforms(), list(memories)
+        stateful, _ = self._split_transforms()
         mask: Entries = {} if stepped is None else {keys.STEPPED: stepped}
-        for i, transform in reversed(list(enumerate(stateful))):
-            memories[i], changed = transform.on_action(memories[i], entries | mask)
-            entries = entries | changed
+        memories, entries = act(stateful, memories, entries | mask)
         worlds, outputs = self.uav_env.step_fn(worlds, entries[keys.ACTION], entries.get(keys.ACTION_VALID))
-        for i, transform in enumerate(stateful):
-            memories[i], changed = transform.on_step(memories[i], outputs | mask)
-            outputs = drop_keys(outputs | changed, transform.dropped_keys)
-        return worlds, memories, outputs
+        return worlds, *observe(stateful, memories, outputs, mask)
 
     def _further_step(
         self,
@@ -220,13 +214,9 @@ class DelayedEnv(TransformedEnv):
         self, worlds: PackedState, memories: list[Memory], mask: Tensor
     ) -> tuple[PackedState, list[Memory], Outputs]:
         """Reset the worlds of the mask [B, 1] and the leading stateful transforms; a pure function."""
-        (stateful, _), memories = self._split_transforms(), list(memories)
+        stateful, _ = self._split_transforms()
         worlds, outputs = self.uav_env.reset_fn(worlds, mask.view(-1))
-        for i, transform in enumerate(stateful):
-            rows = transform.expand_worlds(mask)
-            memories[i], changed = transform.on_reset(memories[i], outputs, rows)
-            outputs = drop_keys(outputs | changed, transform.dropped_keys)
-        return worlds, memories, outputs
+        return worlds, *begin(stateful, memories, outputs, mask)
 
     @torch.no_grad()
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
@@ -273,7 +263,7 @@ class DelayedEnv(TransformedEnv):
         )
         stateful, others = transforms[:n], transforms[n:]
         if _may_skip(stateful):
-            n = next((i for i, t in enumerate(stateful) if t.after_skipping), len(stateful))
+            n = next((i for i, t in enumerate(stateful) if t.sees_merged_steps_only), len(stateful))
             stateful, others = stateful[:n], [*stateful[n:], *others]
         return stateful, others
 

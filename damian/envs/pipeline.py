@@ -31,6 +31,7 @@ from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
+    Belief,
     Channel,
     CumulativeReward,
     MessageHistory,
@@ -39,9 +40,8 @@ from damian.transforms import (
     SampleAndHold,
     ServerNode,
 )
-from damian.transforms.belief import Belief
-from damian.transforms.onboard_node import OnboardNode
-from damian.transforms.skip_until_ready import SkipUntilReady
+from damian.transforms.hold import SkipUntilReady
+from damian.transforms.server_node import OnboardNode
 from damian.world.landing import ActionConfig, displacement
 from damian.world.vehicles import MOTION_MODELS
 
@@ -91,7 +91,7 @@ def make_env(
     )
     pipeline = DelayedEnv(env, make_transforms(scenario, server, extras))
     pipeline.set_seed(seed)
-    pipeline.reset()  # allocates the memories of the transforms, and finds mistakes in a user's own law
+    pipeline.reset()  # allocates the memories of the transforms, and finds entries that are missing
     pipeline.set_seed(seed)
     return pipeline
 

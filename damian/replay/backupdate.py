@@ -1,32 +1,68 @@
 """A replay-buffer storage that corrects stored steps as late messages arrive (paper, section 3.4)."""
 
-from collections.abc import Sequence
-from typing import Any, cast
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import Transform
 
 from damian import keys
 from damian.common import checks
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.keys import next_key
-from damian.replay.corrections import Correction, CreditLateRewards
 from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
-from damian.replay.step_keys import (
-    ENDS,
-    Recompute,
-    StepKeys,
-    check_entries,
-    check_messages,
-    check_returned,
-    check_steps,
-    example_steps,
-)
 from damian.replay.time_storage import TimeStorage
-from damian.transforms.entries import Entries
+from damian.transforms.base import Correction, Entries, StatefulTransform, leaf_transforms, sibling_key
+
+Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
+"""Function from steps [T, B], and the newest message that the receiver can hold after each step, [T, B, M] or
+[T, B, N, M], to entries after the steps, by key, such as ``{("next", "reward"): reward}``.
+
+Each entry has the shape and dtype of the stored one. ``("next", "done")``, ``("next", "terminated")`` and
+``("next", "truncated")`` [T, B, 1] are all among them, or none of them: then the stored ends stay.
+"""
+
+ENDS = tuple(map(next_key, keys.ENDS))
+"""Keys of the flags that end an episode after a step."""
+
+
+class StepKeys(NamedTuple):
+    """Keys of the entries that the storage reads and writes; all but ``step_count`` are under ``"next"``."""
+
+    message: NestedKey
+    received: NestedKey
+    delay: NestedKey
+    age: NestedKey
+    step_count: NestedKey
+    hindsight: NestedKey | None
+
+    @property
+    def backupdated(self) -> NestedKey:
+        """The flag beside ``delay`` that the storage adds, but not under ``"next"``."""
+        return cast(NestedKey, sibling_key(self.delay, "backupdated"))
+
+    @property
+    def hindsight_age(self) -> NestedKey:
+        """The age of the messages of ``hindsight``, which the storage adds, but not under ``"next"``."""
+        return cast(NestedKey, sibling_key(self.delay, "hindsight_age"))
+
+
+def corrections_of(transform: Transform, recomputed: Collection[NestedKey]) -> list[Correction]:
+    """The corrections that follow from the transforms of an environment, in their order.
+
+    Args:
+        transform: a transform, or a ``Compose`` of several (``env.transform``).
+        recomputed: keys of the entries that ``recompute`` returns, without ``"next"``, and of the rewards.
+
+    Raises:
+        InputError: a transform does not write what its correction reads, or its clocks are staggered.
+    """
+    leaves = [leaf for leaf in leaf_transforms(transform) if isinstance(leaf, StatefulTransform)]
+    found = (leaf.hindsight(recomputed) for leaf in leaves)
+    return [correction for correction in found if correction is not None]
 
 
 class BackupdateStorage(TimeStorage):
@@ -56,8 +92,6 @@ class BackupdateStorage(TimeStorage):
         longest: longest delay of a message or of a reward [steps].
         corrections: for what transforms after the receiver do to these entries, in their order: late rewards,
             sums of rewards, slow clocks (``corrections_of``).
-        env: environment of the steps, with its transforms: its specs and what ``recompute`` returns for two
-            steps of zeros are checked at once. If not given, the first steps that are written are checked.
         message_key: the message sent in each step; its entry, and the next three, are under ``"next"``.
         received_key: the message that the receiver held after the step.
         delay_key: delay of the message sent in the step [steps], -1 if it never arrives.
@@ -70,8 +104,7 @@ class BackupdateStorage(TimeStorage):
         options: of ``LazyTensorStorage``.
 
     Raises:
-        InputError: there is nothing to correct; or with ``env``: its steps lack an entry, or ``recompute``
-            returns something else than it should.
+        InputError: there is nothing to correct.
     """
 
     def __init__(
@@ -81,7 +114,6 @@ class BackupdateStorage(TimeStorage):
         longest: int,
         *,
         corrections: Sequence[Correction] = (),
-        env: EnvBase | None = None,
         message_key: NestedKey = keys.MESSAGE,
         received_key: NestedKey = keys.RECEIVED,
         delay_key: NestedKey = keys.DELAY,
@@ -93,12 +125,12 @@ class BackupdateStorage(TimeStorage):
         checks.whole("longest", longest, 0, unit="steps")
         super().__init__(max_size, **options)
         self.recompute, self.longest, self.corrections = recompute, longest, list(corrections)
-        self._late_rewards = [found for found in corrections if isinstance(found, CreditLateRewards)]
+        self._late_rewards = next((found for found in corrections if found.paid), None)
         if recompute is None:
-            should = "needs corrections that credit late rewards, and goes without hindsight_key"
-            good = bool(self._late_rewards) and hindsight_key is None
-            checks.require(good, "recompute", None, should)
-            delay_key = self._late_rewards[0].delay_key
+            if self._late_rewards is None or hindsight_key is not None:
+                should = "needs corrections that credit late rewards, and goes without hindsight_key"
+                raise InputError(f"recompute: None {should}")
+            delay_key = cast(NestedKey, self._late_rewards.delay_key)
         self.step_keys = StepKeys(
             unravel_key(message_key),
             unravel_key(received_key),
@@ -107,9 +139,7 @@ class BackupdateStorage(TimeStorage):
             unravel_key(step_count_key),
             None if hindsight_key is None else unravel_key(hindsight_key),
         )
-        self._checked, self._n_worlds = False, 0
-        if env is not None:
-            self._check_once(example_steps(env))
+        self._n_worlds: int | None = None
 
     @property
     def lookback(self) -> int:
@@ -129,41 +159,49 @@ class BackupdateStorage(TimeStorage):
             raise InputError(f"steps: a batch of shape {list(data.shape)} is not [T, B]")
         should = "joins steps before they are corrected: leave it out, and join the steps that are read"
         checks.require("steps_to_next_obs" not in data, "transform", "MultiStepTransform", should)
-        self._check_once(data[:2])
-        self._check_times(data)
+        self._check(data)
         super().set(cursor, self._with_added_entries(data), set_cursor=set_cursor)
         self.backupdate(len(data) + self.longest)
 
-    def _check_once(self, steps: TensorDictBase) -> None:
-        """Check the entries of a few steps, and what ``recompute`` returns for them, if not done before."""
-        if self._checked:
-            return
-        steps, entries = steps if self.device == "auto" else steps.to(self.device), {}
-        check_steps(steps, self.step_keys)
-        for late in self._late_rewards:
-            late.delay(steps)  # raises an error if there is none
+    def _check(self, data: TensorDictBase) -> None:
+        """Require that steps [T, B] have the entries that the storage reads, and fit into it."""
+        names, late, worlds = self.step_keys, self._late_rewards, tuple(data.shape)
+        needed = [("step_count_key", names.step_count, (*worlds, 1), "StepCounter()")]
+        needed += [("done", ENDS[0], (*worlds, 1), "every environment")]
+        delays = [("reward", late.delay_key)] if late and late.delay_key else []
         if self.recompute is not None:
-            check_messages(steps, self.step_keys)
-            held = steps[next_key(self.step_keys.received)]
-            entries = self.recompute(self._with_added_entries(steps), held)
-            check_returned(entries, steps, self.step_keys)
-        check_entries(self._correct(entries, self._with_added_entries(steps)), steps)
-        self._checked, self._n_worlds = True, steps.shape[1]
-
-    def _check_times(self, data: TensorDictBase) -> None:
-        needs, n_worlds = len(data) + 2 * self.longest + self.lookback, data.shape[1]
-        if n_worlds != self._n_worlds:
+            message = next_key(names.message)
+            checks.require(message in data.keys(True), "message_key", message, "is not in the steps")
+            size = tuple(data.get(message).shape)
+            writer = f"ObservationDelay(delay, {names.message!r}, {names.received!r}, delay_key=...)"
+            needed += [("received_key", next_key(names.received), size, writer)]
+            needed += [("delay_key", next_key(names.delay), (*size[:-1], 1), writer)]
+            needed += [("age_key", next_key(names.age), (*size[:-1], 1), writer)]
+            delays.append(("message", names.delay))
+        for name, key, size, writer in needed:
+            shape = tuple(data.get(key).shape) if key in data.keys(True) else None
+            found = "is not in the steps" if shape is None else f"has the shape {shape}, not {size}"
+            checks.require(shape == size, name, key, f"{found}: {writer} writes it")
+        if names.hindsight is not None:
+            key = next_key(names.hindsight)
+            checks.require(
+                key not in data.keys(True), "hindsight_key", key, "is an entry of the steps already"
+            )
+        n_worlds = self._n_worlds = data.shape[1] if self._n_worlds is None else self._n_worlds
+        if data.shape[1] != n_worlds:
             raise InputError(
-                f"steps: a batch of shape {list(data.shape)} is not one of {self._n_worlds} worlds: give "
+                f"steps: a batch of shape {list(data.shape)} is not one of {n_worlds} worlds: give "
                 f"ReplayBuffer.extend [B, T], as collectors and rollouts return it"
             )
+        needs = len(data) + 2 * self.longest + self.lookback
         if self.max_size < needs * n_worlds:
             raise InputError(
                 f"max_size: {self.max_size} is too little for batches of {len(data)} steps and delays of "
                 f"up to {self.longest} steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}"
             )
-        delays = [] if self.recompute is None else [("message", self.step_keys.delay)]
-        for name, key in [*delays, *(("reward", late.delay_key) for late in self._late_rewards)]:
+        for name, key in delays:
+            should = "is not in the steps: RewardDelay(delay_key=...) writes it"
+            checks.require(next_key(key) in data.keys(True), "delay_key", next_key(key), should)
             longest = int(data[next_key(key)].max())
             if longest > self.longest:
                 raise InputError(f"longest: a {name} takes {longest} steps, more than {self.longest} steps")
@@ -200,7 +238,7 @@ class BackupdateStorage(TimeStorage):
         should = "belong to no step: none is stored yet, so extend the replay buffer first"
         checks.require(len(self) > 0, "receive", f"{len(steps_ago)} messages", should)
         oldest, newest = int(steps_ago.max()), int(steps_ago.min())
-        reach = min(self.longest, cast(int, self._len_along_dim0) - 1)
+        reach = min(self.longest, self.n_steps - 1)
         if newest < 0 or oldest > reach:
             raise InputError(f"steps_ago: {newest} to {oldest} is not between 0 and {reach} steps")
         sent, delay = (self.steps[next_key(key)] for key in (self.step_keys.message, self.step_keys.delay))
@@ -219,10 +257,8 @@ class BackupdateStorage(TimeStorage):
         # Earlier steps too, whose messages may be the newest ones of the steps to correct.
         index = self.latest(n_steps + self.longest + self.lookback)
         rows = index[-n_steps:]
-        recomputed = self.recomputed(self._storage[index], len(index) - len(rows))
-        for key, value in recomputed.items():
-            self._storage.get(key)[rows] = value[-len(rows) :]
-        self._bump_mutation_revision()
+        recomputed = self.recomputed(cast(TensorDictBase, self.steps[index]), len(index) - len(rows))
+        self.overwrite(rows, {key: value[-len(rows) :] for key, value in recomputed.items()})
 
     def recomputed(self, steps: TensorDictBase, n_right: int = 0) -> dict[NestedKey, Tensor]:
         """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step.
@@ -252,7 +288,8 @@ class BackupdateStorage(TimeStorage):
         names = self.step_keys
         delay = steps[next_key(names.delay)]
         if self.recompute is None:
-            paid = self._late_rewards[0].paid(steps, steps[names.step_count].squeeze(-1))
+            late = cast(Correction, self._late_rewards)
+            paid = cast(Callable[..., Tensor], late.paid)(steps, steps[names.step_count].squeeze(-1))
             return {}, {names.backupdated: paid & (delay > 0)}
         held, age = steps[next_key(names.received)], steps[next_key(names.age)].long()
         log = MessageLog(steps[next_key(names.message)], delay.squeeze(-1), held, age.squeeze(-1))
@@ -272,9 +309,21 @@ class BackupdateStorage(TimeStorage):
     def _correct(self, entries: Entries, steps: TensorDictBase) -> Entries:
         """Apply the corrections to what ``recompute`` returned for steps [T, B]."""
         entries = {unravel_key(key): value for key, value in entries.items()}
+        recorded, n_ends = set(map(next_key, self.step_keys[:4])), sum(key in entries for key in ENDS)
+        checks.require(
+            n_ends in (0, len(ENDS)), "recompute", ENDS, "are returned in part: return all or none"
+        )
         count = steps[self.step_keys.step_count].squeeze(-1)
         for correction in self.corrections:
-            entries = correction(entries, steps, count)
+            entries = correction.correct(entries, steps, count)
+        for key, value in entries.items():
+            stored = steps.get(key, None)
+            should = "is not an entry after the steps of the same shape and dtype"
+            same = stored is not None and (value.shape, value.dtype) == (stored.shape, stored.dtype)
+            checks.require(same and key[0] == "next", "recompute", key, should)
+            checks.require(
+                key not in recorded, "recompute", key, "records what was known then, and must stay"
+            )
         return entries
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from damian.common.tensors import expand_mask, next_true
+from damian.common.tensors import expand_mask
 
 
 class MessageLog(NamedTuple):
@@ -58,22 +58,6 @@ def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:
         since: steps since each was sent, one for each delay or the first dimensions of them, [K, ...].
     """
     return (delay >= 0) & (delay <= expand_mask(since, delay))
-
-
-def paid_by_now(delay: Tensor, begins: Tensor, reset_after: Tensor) -> Tensor:
-    """Whether the reward earned at each step has been paid by the last step (``RewardDelay``), [T, *] bool.
-
-    The last step before a reset pays what is still in transit, if the environment was done there.
-
-    Args:
-        delay: delay of the reward earned at each step [steps], [T, *].
-        begins: whether this step is the first after a reset, [T, *].
-        reset_after: whether the environment was done with this step, [T, *].
-    """
-    steps = _steps(delay)
-    none_later = torch.full_like(steps[:1], len(steps))
-    last = torch.cat([next_true(begins)[1:], none_later]) - 1
-    return (steps + delay <= last) | reset_after.expand_as(steps).gather(0, last)
 
 
 def episode_starts(begins: Tensor) -> Tensor:

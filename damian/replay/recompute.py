@@ -6,8 +6,8 @@ from torch import Tensor
 
 from damian import keys
 from damian.keys import next_key
+from damian.replay.backupdate import Recompute
 from damian.replay.hindsight import arrived_by_now
-from damian.replay.step_keys import Recompute
 from damian.server.belief import likelihood, predict, repeated, report_rows, weigh
 from damian.server.server import Server
 

@@ -1,11 +1,12 @@
 """A replay-buffer storage that keeps steps in order of time."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
@@ -31,9 +32,22 @@ class TimeStorage(LazyTensorStorage):
         """All stored steps, [T, B], as a ring: ``latest`` gives their order in time."""
         return cast(TensorDictBase, self._storage)
 
+    # Private names of TorchRL are used in this file only; ``test_time_storage.py`` shows if they break.
+
+    @property
+    def n_steps(self) -> int:
+        """Number of stored steps, T."""
+        return cast(int, self._len_along_dim0 or 0)
+
+    def overwrite(self, index: Tensor, entries: Mapping[NestedKey, Tensor]) -> None:
+        """Replace entries of the steps at these indices [K] by values [K, B, ...], by key."""
+        for key, value in entries.items():
+            self.steps.get(key)[index] = value
+        self._bump_mutation_revision()
+
     def latest(self, n_steps: int | None = None) -> Tensor:
         """Indices of the latest ``n_steps`` steps (all if not given) in order of time, [min(n_steps, T)]."""
-        stored = cast(int, self._len_along_dim0 or 0)
+        stored = self.n_steps
         n_steps = stored if n_steps is None else min(n_steps, stored)
         last = self._last or 0  # nothing is stored if there is none
         return torch.arange(last - n_steps + 1, last + 1, device=self.device) % max(stored, 1)

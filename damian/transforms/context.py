@@ -8,10 +8,9 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 
 from damian.common import checks, counter_rng
-from damian.common.errors import Declared, naming_errors
-from damian.delays.laws import Law, law_name
+from damian.delays.laws import Law
 from damian.delays.samplers import MessageContext, Sampler
-from damian.transforms.entries import Entries, Memory, as_rows, select_entries, sibling_key
+from damian.transforms.base import Entries, Memory, as_rows, require_keys, sibling_key
 
 
 class ContextReader:
@@ -48,11 +47,11 @@ class ContextReader:
             should = f"has no key for {name}, which the law {type(law).__name__} reads"
             checks.require(name in known, "context_keys", known, should)
             self.keys[name] = cast(NestedKey, sibling_key(beside, unravel_key(known[name])))
-        self._name, self._sampler, self._dt = f"law {law_name(law)}", sampler, dt
+        self._sees_context, self._dt = sampler.sees_context, dt
         self._since_clock = 0 if before_step else 1
 
     def init_memory(self, memory: Memory, tensordict: TensorDictBase, rows: torch.Size) -> Memory:
-        """Add what the contexts need to the memory, and try the law once.
+        """Add what the contexts need to the memory.
 
         Args:
             memory: of the transform, M rows.
@@ -60,20 +59,17 @@ class ContextReader:
             rows: shape of the rows.
 
         Raises:
-            InputError: an entry is missing or has another shape, or the law does not return M delays.
+            InputError: an entry is missing, or has no part for each row.
         """
-        if not self._sampler.sees_context:
+        if not self._sees_context:
             return memory
-        streams = memory["streams"]
+        for name, key in self.keys.items():
+            require_keys(f"context_keys.{name}", [key], tensordict)
+            shape = tuple(tensordict.get(key).shape)
+            should = f"has shape {shape}, but messages are sent by rows of shape {tuple(rows)}"
+            checks.require(shape[: len(rows)] == tuple(rows), f"context_keys.{name}", key, should)
         n_agents = rows.numel() // tensordict.batch_size.numel()
-        memory = memory | {"agents": torch.arange(n_agents, device=streams.device)}
-        context = self.read(memory, select_entries(tensordict, list(self.keys.values())), None, rows)
-        if context is not None:
-            problem = f"{self._name}: the context has no entry NAME: the sampler declares those that it has, "
-            entries = Declared(context.entries, f"{problem}reads={list(self.keys)}")
-            with naming_errors(self._name):
-                self._sampler(streams, memory["clock"], memory["channel"], context._replace(entries=entries))
-        return memory
+        return memory | {"agents": torch.arange(n_agents, device=memory["streams"].device)}
 
     def read(
         self, memory: Memory, entries: Entries, sent: Tensor | None, rows: torch.Size
@@ -86,7 +82,7 @@ class ContextReader:
             sent: mask of the messages that are really sent, [M] bool; all of them if not given.
             rows: shape of the rows.
         """
-        if not self._sampler.sees_context:
+        if not self._sees_context:
             return None
         agents, streams, clock = memory["agents"], memory["streams"], memory["clock"]
         n_sending = torch.full_like(streams, len(agents))
@@ -100,13 +96,5 @@ class ContextReader:
             time=(clock + self._since_clock - memory["reset_at"]) * self._dt,
             uniform=counter_rng.uniform(streams, clock + 1),
             dt=self._dt,
-            entries={name: self._entry(entries, key, name, rows) for name, key in self.keys.items()},
+            entries={name: as_rows(entries[key], rows) for name, key in self.keys.items()},
         )
-
-    def _entry(self, entries: Entries, key: NestedKey, name: str, rows: torch.Size) -> Tensor:
-        """An entry as [M, ...]."""
-        checks.require(key in entries, f"context_keys.{name}", key, "is missing from the TensorDict")
-        shape = tuple(entries[key].shape)
-        should = f"has shape {shape}, but messages are sent by rows of shape {tuple(rows)}"
-        checks.require(shape[: len(rows)] == tuple(rows), f"context_keys.{name}", key, should)
-        return as_rows(entries[key], rows)

@@ -11,12 +11,9 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from damian.common import checks
 from damian.common.errors import InputError
-from damian.common.text_files import show
 from damian.keys import ENDS, last_part
-from damian.transforms.action_specs import ActionTransform
-from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import require_keys
-from damian.transforms.order import leaf_transforms
+from damian.transforms.action import ActionTransform
+from damian.transforms.base import StatefulTransform, leaf_transforms, require_keys
 
 _TRAJECTORY = ("collector", "traj_ids")
 """Key under which TorchRL's collectors store the number of each step's episode."""
@@ -60,9 +57,11 @@ def delay_trajectories(
         >>> late = delay_trajectories(steps, ObservationDelay(Uniform(1, 4), seed=0))
         >>> late["next", "age"]  # steps since each observation was generated
     """
-    _check_data(data)
-    should = "is not a transform, such as ObservationDelay(2), or a Compose(...) of several"
-    checks.require(isinstance(transform, Transform), "transform", show(transform), should)
+    if not data.batch_size.numel() or not data.dim() or ("next", "done") not in data.keys(True):
+        raise InputError(
+            'data: it has no steps with ("next", "done"): give steps as TorchRL stores them, [*, T]'
+        )
+    checks.require("time" not in data.names[:-1], "data", f"dimensions {data.names}", "must have time last")
     leaves = leaf_transforms(transform)
     for leaf in leaves:
         _check_transform(leaf)
@@ -131,18 +130,6 @@ class _Playback(EnvBase):
 # The stored steps.
 
 
-def _check_data(data: TensorDictBase) -> None:
-    """Require steps [*, T], time last, with their ends."""
-    is_steps = isinstance(data, TensorDictBase) and data.dim() > 0 and ("next", "done") in data.keys(True)
-    if not is_steps:
-        raise InputError('data: it has no ("next", "done"): give steps as TorchRL stores them, [*, T]')
-    checks.require(data.batch_size.numel() > 0, "data", f"shape {list(data.batch_size)}", "has no steps")
-    shape, done = tuple(data.batch_size), tuple(data.get(("next", "done")).shape)
-    checks.require(done == (*shape, 1), "data", f'("next", "done") of shape {done}', f"is not {(*shape, 1)}")
-    names = list(data.names)
-    checks.require("time" not in names[:-1], "data", f"dimensions {names}", "must have time last")
-
-
 def _find_starts(data: TensorDictBase, start_key: NestedKey | None) -> Tensor:
     """Mask of the first steps of episodes, [*, T] bool."""
     before, after = cast(TensorDictBase, data[..., :-1]), cast(TensorDictBase, data[..., 1:])
@@ -192,7 +179,7 @@ def _check_transform(transform: Transform) -> None:
             f"the stored ones; {remedy}"
         )
     skips = type(transform).skipped_worlds is not StatefulTransform.skipped_worlds
-    if skips or any(last_part(key) in ENDS for key in [*usage.creates, *usage.overwrites]):
+    if skips or any(last_part(key) in ENDS for key in transform.out_keys):
         raise InputError(
             f"transform: {name} changes how long steps or episodes last, but stored steps are over; {remedy}"
         )
@@ -211,12 +198,9 @@ def _read_action_specs(
             raise InputError(f"action_spec: it is needed for the range of {key}: pass env.full_action_spec")
         spec: Any = action_spec[key] if isinstance(action_spec, Composite) else action_spec
         action = step.get(key)
-        per_world = action.shape[n_batch:]
-        n_worlds = len(spec.shape) - len(per_world)
-        fits = n_worlds >= 0 and spec.shape[n_worlds:] == per_world
-        fits = fits and spec.dtype.is_floating_point == action.is_floating_point()
-        should = f"does not fit the stored {action.dtype} actions of shape {tuple(per_world)}"
-        checks.require(fits, "action_spec", f"{type(spec).__name__} of shape {tuple(spec.shape)}", should)
+        n_worlds = len(spec.shape) - len(
+            action.shape[n_batch:]
+        )  # leading dimensions, which the data may lack
         specs[key] = spec[(0,) * n_worlds].expand(action.shape) if n_worlds else spec.expand(action.shape)
     return specs
 

@@ -106,7 +106,7 @@ def make_learner(env: EnvBase, arm: str, steps: int, delay: int, hidden: int) ->
     if arm != "bpql":
         return config.make(env, setup, ReplayBuffer(storage=TimeStorage(steps)))
     names = {"message_key": "observation", "received_key": "received", "delay_key": "delay", "age_key": "age"}
-    storage = BackupdateStorage(steps, arrived_states, longest=delay, env=env, **names)
+    storage = BackupdateStorage(steps, arrived_states, longest=delay, **names)
     setup = setup._replace(longest_delay=delay, critic_key=keys.GLOBAL_OBSERVATION)
     return config.make(env, setup, ReplayBuffer(storage=storage))
 

@@ -109,7 +109,7 @@ def make_learner(env: EnvBase, arm: Arm, frames: int) -> Mappo:
     if size is None:
         return config.make(env, setup, None)
     names = {"message_key": SEEN, "received_key": HELD, "delay_key": DELAYS, "age_key": AGES}
-    storage = BackupdateStorage(size, recompute, LATEST, env=env, **names)
+    storage = BackupdateStorage(size, recompute, LATEST, **names)
     return config.make(env, setup, ReplayBuffer(storage=storage))
 
 

@@ -37,7 +37,7 @@ def recompute(steps: TensorDictBase, arrived: Tensor) -> dict[tuple[str, str], T
 
 
 names = {"message_key": "observation", "received_key": "received", "delay_key": "delay", "age_key": "age"}
-storage = BackupdateStorage(STEPS, recompute, longest=DELAY, env=env, **names)
+storage = BackupdateStorage(STEPS, recompute, longest=DELAY, **names)
 buffer = ReplayBuffer(storage=storage)
 
 

@@ -36,7 +36,7 @@ from damian.learners.schedule import SystemClock
 from damian.runs.checkpoint import plain
 from damian.runs.training_state import CarriedStep, RandomState
 from damian.server.server import Server
-from damian.transforms.episode_totals import EpisodeTotals
+from damian.transforms.reward import EpisodeTotals
 
 from .launch import seed_generators
 from .ray_cluster import connected_ray

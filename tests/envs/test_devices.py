@@ -18,8 +18,7 @@ from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import Outputs
-from damian.transforms.base import StatefulTransform
-from damian.transforms.entries import Entries, Memory
+from damian.transforms.base import Entries, Memory, StatefulTransform
 from damian.world.state import PackedState
 
 LATE = DelayConfig(obs={"law": "geometric", "mean": 2}, rew={"law": "uniform", "low": 0, "high": 30})

@@ -14,7 +14,7 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.keys import AGENTS, EPISODE_REWARD, GLOBAL_OBSERVATION, REWARD
-from damian.transforms.episode_totals import EpisodeTotals
+from damian.transforms.reward import EpisodeTotals
 
 STEPS = 20
 

@@ -20,8 +20,7 @@ from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.learners.mappo import Mappo, MappoConfig, add_advantages
 from damian.learners.networks import ModelConfig, make_actor, make_critic
-from damian.replay.backupdate import BackupdateStorage
-from damian.replay.corrections import corrections_of
+from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import server_recompute
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig

@@ -5,10 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import everything, random_actions, square
-from sensor_cases import GLOBAL, LOCAL, SENSORS
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import SamplerWithoutReplacement, SliceSampler, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 
 from damian import keys
@@ -16,12 +15,9 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
-from damian.replay.backupdate import BackupdateStorage
-from damian.replay.corrections import corrections_of
+from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
 from damian.replay.recompute import server_recompute
-from damian.server.features import ObservationConfig
-from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.messages import Messages
 
@@ -172,22 +168,6 @@ def test_back_updated_steps_equal_undelayed_ones_once_every_message_has_arrived(
     check_corrected(corrected, expected)
 
 
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
-def test_back_updated_steps_know_late_readings(motion):
-    observation = ObservationConfig(["spotted", *LOCAL], ["source_time", *GLOBAL])
-    reward = RewardConfig(custom=[{"term": "sensor_cases:calm"}])
-    sections = {"observation": observation, "reward": reward, "sensors": SENSORS}
-    scenario = everything(motion, episode=PERSISTENT, **sections)
-    undelayed = rollout(scenario, 39).transpose(0, 1)[: 39 - LONGEST]
-    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 39)
-    replay = buffer(scenario, 64)
-    for part in delayed.split(13, 1):
-        replay.extend(part)
-    key = ("next", "agents", "global_observation")
-    assert not delayed.transpose(0, 1)[: 39 - LONGEST][key].equal(undelayed[key])
-    check_corrected(in_order(replay, 39)[: 39 - LONGEST], undelayed)
-
-
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 @pytest.mark.parametrize("ctde", [False, True])
@@ -237,43 +217,6 @@ def test_backupdated_is_true_where_a_late_message_is_newer_than_the_held_one(mot
     assert flags.equal(expected)
 
 
-@pytest.mark.parametrize("order", ["generation", "arrival"])
-def test_writing_in_small_batches_around_the_ring_gives_the_same_as_writing_at_once(order):
-    scenario = everything("instant", episode=EpisodeConfig(max_steps=7))
-    delay = DelayConfig(obs={"law": "burst", "bad": LONGEST, "bad_loss": 0.3}, loss=0.1, order=order)
-    delayed = rollout(replace(scenario, delay=delay), 60)
-    whole, ring = buffer(scenario, 80), buffer(scenario, 25)
-    whole.extend(delayed)
-    for part in delayed.split(4, 1):
-        ring.extend(part)
-    n_final = 25 - 2 * LONGEST
-    at_once, in_parts = in_order(whole, n_final), in_order(ring, n_final)
-    for key in at_once.keys(True, True):
-        if key != "index":
-            assert at_once[key].equal(in_parts[key]), key
-
-
-def test_messages_from_outside_count_as_if_they_had_arrived_after_the_latest_step():
-    scenario = everything(delay=DelayConfig(obs=RANDOM_DELAY, loss=0.4))
-    steps, replay, expected = rollout(scenario, 30), buffer(scenario, 60), buffer(scenario, 60)
-    delay = steps["next", "agents", "delay"]
-    lost = (delay[:, -LONGEST:] < 0).squeeze(-1).nonzero()
-    world, agent, ago = lost[:, 0], lost[:, 2], LONGEST - 1 - lost[:, 1]
-    assert len(lost) > 10
-    arrived = steps.clone()
-    arrived["next", "agents", "delay"][world, 29 - ago, agent, 0] = ago
-    expected.extend(arrived)
-    message = steps["next", "agents", "message"][world, 29 - ago, agent]
-    steps["next", "agents", "message"][world, 29 - ago, agent] = 0.0  # no copy of the lost messages
-    replay.extend(steps)
-    with pytest.raises(AssertionError):
-        check_corrected(in_order(replay, 30), in_order(expected, 30))
-    replay.storage.receive(world, agent, ago, message)
-    check_corrected(in_order(replay, 30), in_order(expected, 30))
-    with pytest.raises(ValueError, match=f"steps_ago: 0 to {LONGEST + 1} is not between 0 and {LONGEST}"):
-        replay.storage.receive(world[:2], agent[:2], torch.tensor([0, LONGEST + 1]), message[:2])
-
-
 def test_the_actors_observations_and_actions_stay():
     scenario = everything("instant", episode=EpisodeConfig(max_steps=9))
     delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, history=2)), 30)
@@ -288,23 +231,6 @@ def test_the_actors_observations_and_actions_stay():
     begins, key = delayed["step_count"].squeeze(-1) == 0, ("agents", "global_observation")
     assert begins[:, 1:].any()
     assert corrected[key][begins].equal(delayed[key][begins])
-
-
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
-def test_a_learner_can_be_told_what_the_server_held_and_what_it_knows_in_hindsight(motion):
-    scenario = everything(motion, episode=PERSISTENT, delay=DelayConfig(obs=RANDOM_DELAY))
-    env = make_env(scenario, 4, extras=EXTRAS)
-    env.append_transform(StepCounter())
-    recompute = server_recompute(env.server, reward_terms=True, actor=True)
-    storage = BackupdateStorage(64 * 4, recompute, LONGEST, env=env, hindsight_key=keys.HINDSIGHT)
-    replay, delayed = TensorDictReplayBuffer(storage=storage), rollout(scenario, 39)
-    for part in delayed.split(13, 1):
-        replay.extend(part)
-    after = in_order(replay, 39)["next"]
-    assert after[keys.RECEIVED].equal(delayed["next", "agents", "received"].transpose(0, 1))
-    settled = 39 - LONGEST
-    assert after[keys.HINDSIGHT][:settled].equal(after[keys.MESSAGE][:settled])
-    assert not after[keys.RECEIVED][:settled].equal(after[keys.MESSAGE][:settled])
 
 
 def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened():
@@ -325,20 +251,6 @@ def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happe
     assert corrected["next", "done"][corrected["reset_after"]].all()
 
 
-def test_which_steps_are_after_an_end_does_not_depend_on_the_size_of_the_batches():
-    # A message that was sent before the steps that are recomputed still decides whether they ended.
-    scenario = square(episode=EpisodeConfig(max_steps=30, success_share=0.6))
-    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, loss=0.4)), 60, 48)
-    valid = []
-    for size in (60, 2, 5):
-        replay = buffer(scenario, 80, 48)
-        for part in delayed.split(size, 1):
-            replay.extend(part)
-        valid.append(in_order(replay, 60)["valid"])
-    assert (~valid[0]).sum() > 50
-    assert all(each.equal(valid[0]) for each in valid)
-
-
 def test_batches_and_delays_that_are_too_long_are_refused():
     scenario = everything("instant", episode=PERSISTENT)
     delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 20)
@@ -347,16 +259,6 @@ def test_batches_and_delays_that_are_too_long_are_refused():
     too_late = rollout(replace(scenario, delay=DelayConfig(obs=LONGEST + 1)), 20)
     with pytest.raises(ValueError, match="longest: a message takes 6 steps, more than 5"):
         buffer(scenario, 64).extend(too_late)
-
-
-@pytest.mark.parametrize(
-    "sampler", [SamplerWithoutReplacement(), SliceSampler(num_slices=2, end_key=("next", "done"))]
-)
-def test_torchrls_samplers_work_on_the_storage(sampler):
-    scenario = everything("instant", episode=EpisodeConfig(max_steps=9))
-    replay = buffer(scenario, 64, sampler=sampler)
-    replay.extend(rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 40))
-    assert replay.sample()["valid"].shape == (8, 1)
 
 
 @pytest.mark.parametrize("as_files", [False, True])
@@ -375,9 +277,3 @@ def test_a_saved_storage_continues_in_the_same_way(tmp_path, as_files):
         replay.extend(delayed[:, 25:])
     original, loaded = in_order(one, 40), in_order(other, 40)
     assert all(original[key].equal(loaded[key]) for key in original.keys(True, True) if key != "index")
-
-
-def test_the_message_of_a_uav_contains_its_generation_time():
-    delayed = rollout(replace(square(), delay=DelayConfig(obs=RANDOM_DELAY)), 12)
-    sent = Messages.unpack(delayed["next", "agents", "message"])
-    assert sent.time.equal(delayed["next", "step_count"].float().expand_as(sent.time))

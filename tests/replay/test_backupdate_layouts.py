@@ -72,12 +72,6 @@ def test_what_was_known_at_the_time_stays_beside_hindsight(group):
     assert (hindsight[..., 0] <= sent[..., 0]).all()
 
 
-def test_without_hindsight_key_no_entry_is_added():
-    after = stored(make_storage(()), rollout(make_env(()), 20))
-    added = {"valid", "reset_after", "backupdated"}
-    assert set(after.keys(True, True)) - added == set(make_env(()).fake_tensordict().keys(True, True))
-
-
 @both_layouts
 def test_the_ends_stay_if_recompute_returns_none(group):
     reward = next_key(key(group, "reward"))
@@ -123,9 +117,7 @@ def test_a_single_gymnasium_environment_can_be_stored_with_hindsight_alone():
     delay = ObservationDelay(Uniform(3, 7), ["observation"], ["received"], delay_key="delay", seed=0)
     env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(delay, StepCounter()))
     names = {"message_key": "observation", "received_key": "received", "hindsight_key": "hindsight"}
-    storage = BackupdateStorage(
-        100, lambda steps, messages: {}, 7, env=env, delay_key="delay", age_key="age", **names
-    )
+    storage = BackupdateStorage(100, lambda steps, messages: {}, 7, delay_key="delay", age_key="age", **names)
     after = stored(storage, env.rollout(60).unsqueeze(0))["next"].squeeze(1)
     arrived = torch.arange(60).unsqueeze(-1) + after["delay"] <= 59
     true, held, hindsight = (after[name] for name in ("observation", "received", "hindsight"))

@@ -6,22 +6,20 @@ from typing import NamedTuple
 import pytest
 import torch
 from remote import LONGEST, WORLDS, Receiver, Remote, Twin, both_layouts, key, make_storage, rollout, stored
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.delays.laws import Uniform
 from damian.keys import next_key
-from damian.replay.backupdate import BackupdateStorage
-from damian.replay.corrections import CreditLateRewards, SumLatestRewards, corrections_of
+from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.transforms import (
     ActionDelay,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
-    delay_trajectories,
 )
 
 
@@ -104,7 +102,7 @@ def storage_of(env: TransformedEnv, group: tuple[str, ...], n_steps: int) -> Bac
     """A storage of ``n_steps`` steps, with the corrections that follow from the environment."""
     recomputed = [key(group, name) for name in ("observation", "reward")]
     corrections = corrections_of(env.transform, recomputed)
-    storage = make_storage(group, corrections=corrections, env=env)
+    storage = make_storage(group, corrections=corrections)
     storage.max_size = n_steps * WORLDS
     return storage
 
@@ -156,19 +154,6 @@ def test_writing_in_small_batches_around_the_ring_gives_the_same_as_writing_at_o
 
 
 @both_layouts
-def test_without_late_rewards_sums_and_slow_clocks_nothing_is_corrected(group):
-    env = make_late(group, Case(None, 1, 1))
-    assert corrections_of(env.transform, [key(group, "observation"), key(group, "reward")]) == []
-    collected = rollout(env, 40)
-    corrections = [CreditLateRewards(key(group, "reward"), key(group, "reward_delay"))]
-    collected["next", *group, "reward_delay"] = torch.zeros_like(collected["next", *group, "delay"])
-    plain, credited = (
-        stored(make_storage(group, corrections=chosen), collected, 4) for chosen in ([], corrections)
-    )
-    assert all(plain[name].equal(credited[name]) for name in plain.keys(True, True))
-
-
-@both_layouts
 def test_neither_messages_nor_rewards_that_arrive_later_are_used(group):
     case = Case(4, 3, 2)
     env = make_late(group, case)
@@ -205,7 +190,7 @@ def test_late_rewards_alone_are_credited_in_any_environment(window):
     env = late_cartpole(CumulativeReward(window, GAMMA))
     steps = env.rollout(70, break_when_any_done=False)
     corrections = corrections_of(env.transform, ["reward"])
-    storage = BackupdateStorage(200, None, 4, corrections=corrections, env=env)
+    storage = BackupdateStorage(200, None, 4, corrections=corrections)
     buffer = ReplayBuffer(storage=storage)
     for part in steps.split(10):
         buffer.extend(part.unsqueeze(0))
@@ -236,19 +221,6 @@ def test_rewards_in_transit_at_a_reset_that_ends_no_episode_are_not_credited():
     expected = steps["next", "reward_delay"].flatten() <= left
     assert storage[storage.latest()]["next", "reward"].flatten().bool().equal(expected)
     assert not expected.all()
-
-
-def test_the_sum_is_that_of_the_transform():
-    torch.manual_seed(0)
-    env = make_late(("agents",), Case())
-    collected = rollout(env, 40)
-    played = delay_trajectories(
-        collected, CumulativeReward(3, GAMMA, ("agents", "reward")), action_spec=env.full_action_spec
-    )
-    steps = collected.transpose(0, 1)
-    correction, reward = SumLatestRewards(("agents", "reward"), 3, GAMMA), ("next", "agents", "reward")
-    summed = correction({reward: steps[reward]}, steps, steps["step_count"].squeeze(-1))
-    assert summed[reward].equal(played[reward].transpose(0, 1))
 
 
 def test_a_reward_later_than_longest_and_a_ring_without_the_earlier_steps_are_refused():
@@ -282,26 +254,26 @@ def test_transforms_that_do_not_tell_what_a_correction_needs_are_refused(transfo
     [
         ([], {}, "recompute: None needs corrections that credit late rewards"),
         (
-            [CreditLateRewards("reward", "late")],
+            corrections_of(RewardDelay(2, delay_key="late"), ["reward"]),
             {},
-            "delay_key: the steps have no late after them: RewardDelay",
+            "delay_key: .*late.* is not in the",
         ),
-        ([CreditLateRewards("reward", "reward_delay")], {}, "earned_key: the steps have no None after them"),
-        ([CreditLateRewards("reward", "reward_delay")], {"hindsight_key": "h"}, "goes without hindsight_key"),
+        (
+            corrections_of(RewardDelay(2, delay_key="reward_delay"), ["reward"]),
+            {},
+            "earned_key: nothing says",
+        ),
+        (
+            corrections_of(RewardDelay(2, delay_key="reward_delay"), ["reward"]),
+            {"hindsight_key": "h"},
+            "goes without hindsight_key",
+        ),
     ],
 )
 def test_a_storage_refuses_corrections_that_cannot_work(corrections, options, message):
+    def store() -> None:
+        storage = BackupdateStorage(100, None, 4, corrections=corrections, **options)
+        ReplayBuffer(storage=storage).extend(late_cartpole().rollout(5).unsqueeze(0))
+
     with pytest.raises(InputError, match=message):
-        BackupdateStorage(100, None, 4, corrections=corrections, env=late_cartpole(), **options)
-
-
-def test_an_entry_that_a_correction_needs_must_be_recomputed():
-    def recompute(steps: TensorDictBase, messages: torch.Tensor) -> dict[NestedKey, torch.Tensor]:
-        return {("next", "observation"): steps["next", "observation"]}
-
-    with pytest.raises(
-        InputError, match=r"recompute: it returns no \('next', 'reward'\), which a correction"
-    ):
-        make_storage(
-            (), recompute, corrections=[SumLatestRewards("reward", 2, 1.0)], env=make_late((), Case())
-        )
+        store()

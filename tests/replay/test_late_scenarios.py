@@ -17,8 +17,7 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.keys import next_key
-from damian.replay.backupdate import BackupdateStorage
-from damian.replay.corrections import corrections_of
+from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import server_recompute
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
@@ -51,9 +50,7 @@ def backupdated(scenario: ScenarioConfig, actor: bool) -> tuple[TensorDictBase, 
     recompute = server_recompute(env.server, actor=actor) if has_message_delay(scenario) else None
     observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor] if recompute else []
     corrections = corrections_of(env.transform, [keys.REWARD, *observed])
-    storage = BackupdateStorage(
-        2 * STEPS * WORLDS, recompute, LONGEST, corrections=corrections, env=env, device="cpu"
-    )
+    storage = BackupdateStorage(2 * STEPS * WORLDS, recompute, LONGEST, corrections=corrections, device="cpu")
     buffer, late = ReplayBuffer(storage=storage), fly(env)
     for steps in late.split(8):
         buffer.extend(steps.transpose(0, 1))
@@ -104,14 +101,6 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
             assert found[key][..., :n_features].equal(true[key][..., :n_features]), key
             assert found[key][..., n_features:].equal(late[key][..., n_features:]), key
             assert not late[key][..., :n_features].equal(true[key][..., :n_features])
-
-
-def test_without_recompute_actor_an_actors_observations_stay():
-    scenario = everything(delay=DelayConfig(obs=LATE, rew=3, **SUMMED), clock=ClockConfig(server="2s"))
-    late, found = backupdated(scenario, False)
-    changed = {key for key in late.keys(True, True) if not found[key].equal(late[key])}
-    assert keys.GLOBAL_OBSERVATION in changed
-    assert not changed & {keys.OBSERVATION, next_key(keys.OBSERVATION), keys.ACTION}
 
 
 def test_a_reward_counts_only_once_it_has_been_paid():

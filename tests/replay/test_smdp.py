@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from damian.replay.smdp import Decisions, find_decisions, transitions
+from damian.replay.smdp import find_decisions, transitions
 
 T, B, N = 12, 5, 3
 
@@ -80,19 +80,3 @@ def test_a_transition_has_the_observations_before_and_after_it_and_its_discounte
         expected = sum(0.9**k * reward for k, reward in enumerate(rewards))
         assert batch["next", "agents", "reward"][k].item() == pytest.approx(expected, rel=1e-5)
         assert batch["steps_to_next_obs"][k].item() == end - begin + 1
-
-
-def test_the_reward_of_a_decision_of_three_steps_by_hand():
-    steps = random_steps(1)
-    steps["next", "agents", "reward"][2:5, 1, 0, 0] = torch.tensor([1.0, 2.0, 4.0])
-    one = Decisions(*(torch.tensor([number]) for number in (2, 1, 0, 4)))
-    transition = transitions(steps, torch.arange(T), one, 0.5, [])
-    assert transition["next", "agents", "reward"].item() == 1 + 2 / 2 + 4 / 4
-    assert transition["steps_to_next_obs"].item() == 3
-
-
-def test_sample_draws_every_decision_and_nothing_else():
-    found = find_decisions(*flags(2))
-    rows = {tuple(row) for row in torch.stack(found, -1).tolist()}
-    drawn = {tuple(row) for row in torch.stack(found.sample(5000), -1).tolist()}
-    assert drawn == rows

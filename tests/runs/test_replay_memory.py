@@ -69,8 +69,8 @@ def test_a_loaded_memory_equals_the_stored_one(tmp_path, sizes, every):
 
 def same(one: ReplayBuffer, other: ReplayBuffer) -> None:
     """Check that two buffers hold the same rows at the same places, and write at the same place next."""
-    n_rows = one.storage._len_along_dim0
-    assert other.storage._len_along_dim0 == n_rows
+    n_rows = one.storage.n_steps
+    assert other.storage.n_steps == n_rows
     assert (one.storage.steps[:n_rows] == other.storage.steps[:n_rows]).all()
     assert one.storage.latest().equal(other.storage.latest())
     assert one.writer.state_dict() == other.writer.state_dict()

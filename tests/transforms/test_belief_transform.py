@@ -23,7 +23,6 @@ from damian.replay.recompute import server_recompute
 from damian.server.belief import report_rows
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
-from damian.transforms.belief import Belief
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
 
@@ -112,7 +111,7 @@ def test_back_updated_beliefs_know_what_has_arrived_since(batch):
     counted = TransformedEnv(env, Compose(StepCounter()))
     data = counted.rollout(5 * batch, break_when_any_done=False)
     recompute = server_recompute(env.server)
-    storage = BackupdateStorage(1000, recompute, LONGEST, env=counted)
+    storage = BackupdateStorage(1000, recompute, LONGEST)
     buffer = ReplayBuffer(storage=storage, batch_size=1)
     corrected = 0
     for part in data.split(batch, 1):
@@ -148,13 +147,3 @@ def test_of_the_times_when_it_says_so_often_a_flown_source_is_there_about_so_oft
         here = (said >= low) & (said < high)
         assert here.sum() > 300
         assert was[here].mean().item() == pytest.approx(said[here].mean().item(), abs=0.1), (low, high)
-
-
-@pytest.mark.parametrize("changed", [{"law": 3}, {"own": True}])
-def test_the_state_of_a_belief_of_other_messages_or_receivers_is_refused(changed):
-    env, other = make_env(tracking(2), 2), make_env(tracking(**{"law": 2, **changed}), 2)
-    env.rollout(3)
-    other.rollout(3)
-    one, two = (next(m for m in each.modules() if isinstance(m, Belief)) for each in (env, other))
-    with pytest.raises(RuntimeError, match=r"Belief has longest=\d, own=\d, but the loaded state is of one"):
-        two.load_state_dict(one.state_dict())

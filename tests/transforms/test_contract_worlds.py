@@ -74,15 +74,6 @@ def test_all_streams_of_an_environment_differ(wrap):
         check_independent(streams)
 
 
-def test_another_transform_does_not_change_the_draws():
-    alone = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(LATE))
-    beside = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ActionDelay(1), ObservationDelay(LATE)))
-    for env in (alone, beside):
-        env.set_seed(5)
-        env.reset()
-    assert alone.transform.memory["streams"].equal(beside.transform[1].memory["streams"])
-
-
 def pendulum() -> TransformedEnv:
     return TransformedEnv(GymEnv("Pendulum-v1"), Compose(ObservationDelay(LATE), RewardDelay(LATE)))
 

@@ -1,12 +1,10 @@
 """``EpisodeTotals`` around environments that are not ours (ours: ``tests/envs/test_step_and_reset.py``)."""
 
-import pytest
 import torch
 from torchrl.envs import Compose, GymEnv, RewardSum, SerialEnv, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from damian.transforms import RewardDelay
-from damian.transforms.episode_totals import EpisodeTotals
+from damian.transforms.reward import EpisodeTotals
 
 COUNTED = ("episode_reward", "step_count", ("next", "episode_reward"), ("next", "step_count"))
 
@@ -35,8 +33,3 @@ def test_totals_equal_those_of_torchrl():
 
 def test_the_specs_are_right():
     check_env_specs(carts(totals()))
-
-
-def test_a_delay_of_the_reward_that_the_totals_do_not_see_is_pointed_out():
-    with pytest.warns(UserWarning, match="episode_reward from reward before RewardDelay changes reward"):
-        carts(totals(), RewardDelay(2)).reset()

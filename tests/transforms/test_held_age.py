@@ -7,17 +7,14 @@ from helpers import play
 from transform_cases import (
     ACTION,
     LAWS,
-    N_AGENTS,
     OBSERVATION,
     ROWS,
     STEPS,
-    WORLDS,
     choices,
     column,
     delayed,
 )
 
-from damian.common.errors import InputError
 from damian.transforms import ActionHistory, ObservationDelay, SampleAndHold
 
 SENT_AT = 2
@@ -81,21 +78,3 @@ def test_an_age_that_is_held_with_the_observation_grows_too():
         for each in (held, clock())
     )
     assert found == expected
-
-
-def test_an_age_without_an_entry_that_is_held_is_refused():
-    with pytest.raises(InputError, match="age_key: age is the age of the entries that are held, but in_keys"):
-        SampleAndHold(2, [], ["action"], age_key="age")
-
-
-def test_an_age_that_nothing_writes_is_refused():
-    with pytest.raises(InputError, match=r"SampleAndHold: \('agents', 'age'\) is not among the keys"):
-        delayed(clock()).reset()
-
-
-def test_without_an_age_key_a_state_is_as_it_was():
-    """Checkpoints of earlier versions hold it."""
-    transform = SampleAndHold(3, [OBSERVATION], [ACTION])
-    delayed(transform).reset()
-    assert transform.get_extra_state().tolist() == [3, 1, 1, len(WORLDS), N_AGENTS]
-    assert set(transform.memory) == {"elapsed", "held_0", "acted_0"}

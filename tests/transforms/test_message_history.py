@@ -7,11 +7,10 @@ from helpers import square
 from plain_env import GROUP, Plain
 from tensordict import TensorDictBase
 from torchrl.data import Unbounded
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from damian import keys
-from damian.common.errors import InputError
 from damian.envs.uav_env import UavEnv
 from damian.transforms import MessageHistory, ObservationDelay
 
@@ -97,21 +96,6 @@ def test_a_message_changes_nothing_before_it_arrives():
     assert same.sum() > 0.8 * same.numel()
 
 
-@pytest.mark.parametrize(
-    ("make", "error"),
-    [
-        (lambda: MessageHistory(0), "steps: 0"),
-        (
-            lambda: TransformedEnv(UavEnv(square(), 2), MessageHistory(2, "state", group=True)).reset(),
-            "group",
-        ),
-    ],
-)
-def test_what_does_not_fit_is_refused(make, error):
-    with pytest.raises(InputError, match=error):
-        make()
-
-
 TYPES = {torch.float16: torch.float32, torch.int64: torch.float32, torch.float64: torch.float64}
 
 
@@ -123,11 +107,3 @@ def test_a_history_has_the_type_of_its_spec(sent):
     check_env_specs(env)
     found = env.rollout(3)["agents", "history"]
     assert found.dtype == env.observation_spec["agents", "history"].dtype == TYPES[sent]
-
-
-def test_workers_keep_the_type_of_a_history():
-    def make() -> TransformedEnv:
-        plain = Plain(observation=Unbounded((*GROUP, 4), dtype=torch.float64))
-        return TransformedEnv(plain, MessageHistory(K, OBSERVATION))
-
-    assert SerialEnv(2, make).rollout(2)["agents", "history"].dtype == torch.float64

@@ -4,14 +4,13 @@ import pytest
 import torch
 from delay_twin import Counting
 from torchrl.data import Categorical, Composite
-from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
+from torchrl.envs import Compose, GymEnv, Transform, TransformedEnv
 from transform_cases import ACTION
 
 from damian.common.errors import InputError
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
-    CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
@@ -28,27 +27,14 @@ def rollout(*transforms: Transform) -> None:
 @pytest.mark.parametrize(
     ("transform", "key", "known"),
     [
-        (ObservationDelay(3, ["observatoin"]), "observatoin", OUTPUTS),
         (ObservationDelay(3, ["observation", "observatoin"]), "observatoin", OUTPUTS),
-        (ObservationDelay(3, ["observatoin"], ["late"], age_key=None), "observatoin", OUTPUTS),
         (ObservationDelay(3, [("agents", "observation")]), ("agents", "observation"), OUTPUTS),
         (ObservationDelay(3, sent_key="sent"), "sent", OUTPUTS),
-        (ActionHistory(2, append_to="observatoin"), "observatoin", OUTPUTS),
         (ActionHistory(2, append_to="observation", age_key="age"), "age", OUTPUTS),
         (ActionHistory(2, recorded_key="redy"), "redy", OUTPUTS),
-        (
-            ActionHistory(2, append_to="observation", recorded_key=("agents", "ready")),
-            ("agents", "ready"),
-            OUTPUTS,
-        ),
-        (ActionHistory(2, "act"), "act", "action"),
-        (ActionDelay(2, sent_key="redy"), "redy", OUTPUTS),
         (ActionDelay(2, ("agents", "action")), ("agents", "action"), "action"),
         (RewardDelay(2, "rewrad"), "rewrad", "reward"),
-        (CumulativeReward(2, reward_key="rewrad"), "rewrad", "reward"),
-        (SampleAndHold(2, ["observatoin"]), "observatoin", OUTPUTS),
         (SampleAndHold(2, ["observation"], ["act"]), "act", "action"),
-        (SampleAndHold(2, ["observation"], ready_key="ready"), "ready", OUTPUTS),
     ],
 )
 def test_a_key_that_the_environment_does_not_have_is_one_line(transform, key, known):
@@ -68,19 +54,6 @@ def test_keys_that_earlier_transforms_write_are_known():
 )
 def test_flags_that_a_later_transform_writes_are_known(make):
     rollout(make(), ObservationDelay(2, fresh_key="fresh"))
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: ActionHistory(2, ACTION, recorded_key="ready"),
-        lambda: ActionDelay(2, ACTION, sent_key="ready"),
-    ],
-)
-def test_flags_of_environments_in_a_vector_are_known(make):
-    vector = SerialEnv(2, lambda: Counting([3, 5]))
-    TransformedEnv(vector, make()).rollout(3)
-    SerialEnv(2, lambda: TransformedEnv(Counting([3, 5]), make())).rollout(3)
 
 
 @pytest.mark.parametrize(

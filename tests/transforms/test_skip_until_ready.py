@@ -11,7 +11,6 @@ from helpers import everything, same, square
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
@@ -24,7 +23,7 @@ from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, REWARD
 from damian.server.termination import EpisodeConfig
-from damian.transforms.skip_until_ready import SkipUntilReady
+from damian.transforms.hold import SkipUntilReady
 from damian.world.landing import ActionConfig
 
 LATE = {"law": "uniform", "low": 1, "high": 5, "probability": 0.6}
@@ -191,10 +190,6 @@ def test_no_action_of_a_paused_world_arrives_in_its_next_episode():
     check_equal(scenario, interrupted={0: 3, 1: 2, 2: 4})
 
 
-def test_discounted_sums_of_rewards_are_equal():
-    check_equal(flights("all of it"), gamma=0.9)
-
-
 def test_a_reward_is_discounted_once_for_each_earlier_step_of_the_merged_step():
     flying = {"agents": 1, "motion": everything("polynomial").motion}
     action = torch.arange(8, 16).view(8, 1)  # 50 m in each direction
@@ -205,11 +200,6 @@ def test_a_reward_is_discounted_once_for_each_earlier_step_of_the_merged_step():
         total += (k < td["duration"]).unsqueeze(-1) * 0.5**k * other[REWARD]
     assert td[REWARD].equal(total)
     assert (total != other[REWARD]).any()
-
-
-def test_with_instant_motion_no_step_is_merged():
-    durations, _ = check_equal(flights("messages, lost ones, history", "instant"))
-    assert (durations == 1).all()
 
 
 def test_a_worlds_outputs_do_not_depend_on_the_other_worlds():
@@ -227,11 +217,6 @@ def test_a_worlds_outputs_do_not_depend_on_the_other_worlds():
             assert same(after["next"][world], after_one["next"][0])
 
 
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
-def test_the_outputs_match_the_specs(motion):
-    check_env_specs(make_env(skips(flights("all of it", motion)), 2, extras=EXTRAS))
-
-
 @pytest.mark.slow
 def test_the_compiled_environment_merges_the_same_steps():
     scenario = skips(flights("messages, lost ones, history"))
@@ -247,24 +232,6 @@ def test_the_compiled_environment_merges_the_same_steps():
 def test_skipping_is_refused_where_all_messages_are_needed():
     with pytest.raises(InputError, match=r"clock\.skip: True skips steps, but back-updating"):
         make_env(skips(square()), 1, extras=["message"])
-
-
-@pytest.mark.parametrize(
-    ("clock", "message"),
-    [
-        ({"skip": True, "skip_discount": 1.5}, r"clock\.skip_discount: 1\.5"),
-        ({"skip_discount": 0.9}, r"clock\.skip_discount: 0\.9 means nothing without clock\.skip=true"),
-    ],
-)
-def test_a_configuration_with_an_impossible_discount_is_refused(clock, message):
-    with pytest.raises(InputError, match=message):
-        ClockConfig(**clock)
-
-
-@pytest.mark.parametrize("gamma", [-0.1, 1.1])
-def test_a_transform_with_an_impossible_discount_is_refused(gamma):
-    with pytest.raises(InputError, match=f"gamma: {gamma}"):
-        SkipUntilReady(gamma)
 
 
 def test_the_transform_is_refused_outside_a_delayed_environment():

@@ -1,14 +1,12 @@
 """``SampleAndHold`` with random phases, beside a slow twin in plain Python."""
 
-import copy
 import math
 from typing import Any
 
 import pytest
 import torch
 from delay_twin import Counting
-from helpers import all_same, play
-from tensordict import TensorDict, TensorDictBase
+from helpers import play
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from transform_cases import ACTION, N_AGENTS, OBSERVATION, ROWS, STEPS, WORLDS, choices, column, delayed
@@ -64,13 +62,6 @@ def test_phases_are_spread_evenly_and_differ_between_episodes():
     assert abs(same - 1 / period) < 5 * math.sqrt(3 / 16 / first.numel())
 
 
-def test_a_world_alone_ticks_as_in_a_batch():
-    batch = play(delayed(staggered()), choices())
-    for w, name in enumerate(WORLDS):
-        alone = play(delayed(staggered(), worlds=[name]), choices([name]))
-        assert all_same([td[w : w + 1] for td in batch], alone)
-
-
 def test_a_seed_repeats_the_phases_and_without_stagger_nothing_is_drawn():
     def memory(**options: Any) -> dict[str, Tensor]:
         transform = SampleAndHold(50, [SENT], **options)
@@ -83,22 +74,3 @@ def test_a_seed_repeats_the_phases_and_without_stagger_nothing_is_drawn():
     state = torch.random.get_rng_state()
     assert set(memory()) == {"elapsed", "held_0"}
     assert torch.random.get_rng_state().equal(state)
-
-
-def test_a_copy_ticks_alike_also_compiled():
-    env = delayed(staggered())
-    play(env, choices(n_steps=7))
-    copied = copy.deepcopy(env)
-
-    def step(td: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
-        return copied.transform._step(copied.transform.inv(td), after)
-
-    torch._dynamo.reset()
-    compiled = torch.compile(step, fullgraph=True, backend="eager")
-    for action in choices(n_steps=9):
-        td = env.rand_action().set(ACTION, action)
-        outputs = env.step(td.clone())["next"]
-        after = copied.base_env.step(copied.transform.inv(td.clone()))["next"]
-        assert all_same([outputs], [compiled(td, after)])
-    memories = (each.transform[0].memory for each in (env, copied))
-    assert all_same(*([TensorDict(memory)] for memory in memories))

@@ -8,18 +8,15 @@ import pickle
 import pytest
 import torch
 from contract import (
-    ACTION,
     CASES,
-    LATE,
     begun,
     cartpole,
-    flat,
     memory,
     onward,
     uavs,
     unserved,
 )
-from helpers import all_same, same, square
+from helpers import all_same, same
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -27,8 +24,6 @@ from torchrl.envs import Compose, ParallelEnv, SerialEnv, Transform, Transformed
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
-from damian.delays.config import DelayConfig
-from damian.envs.pipeline import make_env
 from damian.transforms import (
     StatefulTransform,
 )
@@ -109,24 +104,6 @@ def test_a_transform_works_in_worker_processes(case):
         env.close()
 
 
-@pytest.mark.parametrize("case", [AGENTS[name] for name in ("ObservationDelay, agents", "Channel, links")])
-@pytest.mark.slow
-def test_worker_processes_draw_different_numbers_and_the_same_again_from_the_same_seed(case):
-    outputs, streams = [], []
-    for _ in range(2):
-        env = ParallelEnv(2, case.build, mp_start_method="fork")
-        try:
-            outputs.append(onward(env, begun(env, 0, seed=3), 8))
-            streams.append([v for key, v in flat(env.state_dict()).items() if key.endswith("streams")])
-        finally:
-            env.close()
-    assert all_same(*outputs)
-    found, again = streams
-    numbers = torch.cat(found)
-    assert len(numbers.unique()) == len(numbers) > 2
-    assert all(a.equal(b) for a, b in zip(found, again, strict=True))
-
-
 @some({name: case for name, case in AGENTS.items() if case.env is uavs}, fast=["ActionDelay, agents"])
 def test_a_transform_does_the_same_around_a_parallel_and_a_serial_environment(case):
     outputs = []
@@ -137,35 +114,6 @@ def test_a_transform_does_the_same_around_a_parallel_and_a_serial_environment(ca
         finally:
             env.close()
     assert all_same(*outputs)
-
-
-@pytest.mark.parametrize("processes", [False, True])
-def test_delayed_environments_in_a_vector_draw_different_delays_and_the_same_again_from_the_same_seed(
-    processes,
-):
-    vector = ParallelEnv(2, delayed, mp_start_method="fork") if processes else SerialEnv(2, delayed)
-    try:
-        one, other, again = (delays_of(vector, seed) for seed in (3, 4, 3))
-    finally:
-        vector.close()
-    assert one.equal(again)
-    assert not one.equal(other)
-    assert not one[0].equal(one[1])
-
-
-def delayed():
-    return make_env(square(delay=DelayConfig(obs=LATE, act=LATE, rew=LATE, history=2)), 2, extras=["message"])
-
-
-def delays_of(env, seed):
-    """Delays of messages after seeding, [2, T, B, N]; the state of torch's generator differs at each call."""
-    env.set_seed(seed)
-    torch.manual_seed(seed + torch.seed() % 1000)
-    td, delays = env.reset(), []
-    for _ in range(8):
-        _, td = env.step_and_maybe_reset(td.set(ACTION, torch.zeros(2, 2, 3, dtype=torch.long)))
-        delays.append(td["agents", "delay"].squeeze(-1))
-    return torch.stack(delays, 1)
 
 
 @every_case
@@ -227,15 +175,6 @@ def test_a_clone_shares_no_memory(case):
     other = TransformedEnv(case.env(), clone)
     onward(other, begun(other, seed=9), seed=9)
     assert all_same(onward(env, td.clone()), onward(control, td.clone()))
-
-
-@pytest.mark.sample(3)
-@every_case
-def test_a_clone_of_a_transform_without_memory_works(case):
-    original = case.make()
-    env, expected = TransformedEnv(case.env(), original.clone()), case.build()
-    assert all_same(onward(env, begun(env)), onward(expected, begun(expected)))
-    assert not memory(original)
 
 
 # Checkpoints.

@@ -71,14 +71,6 @@ def test_a_message_has_no_effect_before_it_arrives(name, order, tmp_path):
     assert arrived > 0
 
 
-def test_a_message_is_held_from_its_arrival_until_the_next_one():
-    def rollout(tampered: tuple[int, int, int] | None) -> list[TensorDictBase]:
-        delay = ObservationDelay(4, [OBSERVATION])
-        return play(delayed(delay, ends=0.0, tampered=tampered), choices(n_steps=20))
-
-    assert differs(rollout(None), rollout((2, 1, 6)), *OBSERVATION).equal(only_steps(10, 10, 2, 1, 20))
-
-
 def test_an_action_has_no_effect_before_it_is_executed():
     others = choices(n_steps=20)
     others[6][2, 1] += 1  # chosen before the 7th step
@@ -119,27 +111,6 @@ def test_a_worlds_outputs_do_not_depend_on_the_other_worlds():
     for w, world in enumerate(WORLDS):
         alone = play(delayed(*one_of_each(), worlds=[world]), choices([world]))
         assert all_same([td[w : w + 1] for td in together], alone)
-
-
-def test_a_reset_of_some_worlds_does_not_change_the_others():
-    def rollout(mask: Sequence[bool]) -> list[TensorDictBase]:
-        env, outputs = delayed(*one_of_each(), ends=0.0), []
-        td = env.reset()
-        for t, action in enumerate(choices(n_steps=30)):
-            stepped, td = env.step_and_maybe_reset(td.set(ACTION, action))
-            outputs.append(stepped["next"].clone())
-            if t in (4, 6, 15):
-                td = env.reset(td.exclude(ACTION).set("_reset", torch.tensor(mask).unsqueeze(-1)))
-                outputs.append(td.exclude("_reset").clone())
-        return outputs
-
-    some = rollout([True, False, False, True])
-    every = rollout([True, True, True, True])
-    none = rollout([False, False, False, False])
-    for worlds, expected in (((1, 2), none), ((0, 3), every)):
-        for w in worlds:
-            assert all_same([td[w] for td in some], [td[w] for td in expected])
-    assert not all_same([td[0] for td in some], [td[0] for td in none])
 
 
 # Delays of actions and of observations together.

@@ -8,53 +8,32 @@ from torchrl.envs import Compose, GymEnv, TransformedEnv
 from transform_cases import ACTION, OBSERVATION
 
 from damian.common.errors import InputError
-from damian.delays.laws import Lag, Uniform
+from damian.delays.laws import Burst, Uniform
 from damian.transforms import (
-    ActionDelay,
-    Channel,
     CumulativeReward,
-    MessageHistory,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
 )
 
-NO_KEY = "is not a key such as 'observation' or ('agents', 'observation'), nor a list of keys"
-NO_SEED = "is not a whole number such as 0"
-
 WRONG = {
-    "out_keys: ['a'] are not 2 keys, as many as what is sent": lambda: ObservationDelay(
-        1, ["camera", "gps"], ["a"]
-    ),
-    "out_keys: ['a', 'b'] are not 1 keys, as many as what is sent": lambda: ObservationDelay(
-        1, "camera", ["a", "b"]
-    ),
-    "in_keys: [] name nothing to send": lambda: ObservationDelay(1, []),
-    "in_keys: [] is empty, and so is in_keys_inv: name the entries or the actions to hold": lambda: (
-        SampleAndHold(2, [], [])
-    ),
-    f"keys: 3 {NO_KEY}": lambda: ObservationDelay(1, 3),  # type: ignore[arg-type]
-    f"keys: None {NO_KEY}": lambda: RewardDelay(1, [None]),  # type: ignore[arg-type,list-item]
-    f"keys: ('agents', 3) {NO_KEY}": lambda: MessageHistory(1, [("agents", 3)]),  # type: ignore[arg-type,list-item]
-    "dt: 0.0 s is not above 0 s": lambda: ObservationDelay("3s", dt=0.0),
+    "out_keys: .* are not 2 keys": lambda: ObservationDelay(1, ["camera", "gps"], ["a"]),
+    "in_keys: .* name nothing to send": lambda: ObservationDelay(1, []),
+    "in_keys: .* is empty, and so is in_keys_inv": lambda: SampleAndHold(2, [], []),
+    "keys: 3 is not a key such as": lambda: ObservationDelay(1, 3),  # type: ignore[arg-type]
+    "keys: .* is not a key such as": lambda: ObservationDelay(1, [("agents", 3)]),  # type: ignore[arg-type,list-item]
     "dt: -1 s is not above 0 s": lambda: SampleAndHold("3s", dt=-1),
-    "dt: 1s s is not above 0 s": lambda: ActionDelay("3s", dt="1s"),  # type: ignore[arg-type]
-    "dt: None s is not above 0 s": lambda: RewardDelay(Lag(1, "2s"), dt=None),  # type: ignore[arg-type]
-    "dt: True s is not above 0 s": lambda: Channel("3s", dt=True),
-    f"ObservationDelay: seed: 'a' {NO_SEED}": lambda: ObservationDelay(1, seed="a"),  # type: ignore[arg-type]
-    f"RewardDelay: seed: 1.5 {NO_SEED}": lambda: RewardDelay(1, seed=1.5),  # type: ignore[arg-type]
-    f"Channel: seed: True {NO_SEED}": lambda: Channel(1, seed=True),
-    "delay: 3.0 is neither whole steps such as 3 nor a time such as 3s or 0.5m": lambda: ObservationDelay(
-        np.float64(3)
-    ),
+    "seed: 'a' is not a whole number": lambda: ObservationDelay(1, seed="a"),  # type: ignore[arg-type]
+    "delay: 3.0 is neither whole steps such as 3 nor a time": lambda: ObservationDelay(np.float64(3)),
+    "delay: .* loses messages, but no reward": lambda: RewardDelay(Burst(bad_loss=0.5)),
+    "steps: 0 is not at least 1": lambda: CumulativeReward(0),
 }
 
 
 @pytest.mark.parametrize("line", WRONG)
 def test_a_wrong_argument_is_one_line(line):
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match=line):
         WRONG[line]()
-    assert str(error.value) == line
 
 
 def test_whole_numbers_of_numpy_are_steps_and_seeds():
@@ -86,25 +65,17 @@ class TwoLevels(Plain):
         self.full_action_spec["order"] = Unbounded((3, 1))
 
 
-LEVELS = {
-    "an agent's and a world's entry": lambda: ObservationDelay(2, [OBSERVATION, "state"]),
-    "a world's and an agent's entry": lambda: ObservationDelay(2, ["state", OBSERVATION]),
-    "entries of a clock": lambda: SampleAndHold(2, [OBSERVATION, "state"]),
-    "a world's entry and an agent's action": lambda: SampleAndHold(2, ["state"], [ACTION]),
-    "an agent's entry and a world's action": lambda: SampleAndHold(2, [OBSERVATION], ["order"]),
-    "actions": lambda: SampleAndHold(2, [], [ACTION, "order"]),
-}
-
-
-@pytest.mark.parametrize("make", LEVELS.values(), ids=LEVELS)
-def test_entries_of_agents_and_of_worlds_in_one_transform_are_refused_in_one_line(make):
-    transform = make()
-    one, other = [*transform.in_keys, *transform.in_keys_inv]
-    sizes = "[3, 2] and [3]" if isinstance(one, tuple) else "[3] and [3, 2]"
-    line = f"{type(transform).__name__}: {one} and {other} have the batch sizes {sizes}: "
-    with pytest.raises(InputError) as error:
-        TransformedEnv(TwoLevels(), transform).reset()
-    assert str(error.value) == line + "use one transform for each level"
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ObservationDelay(2, [OBSERVATION, "state"]),
+        lambda: ObservationDelay(2, ["state", OBSERVATION]),
+        lambda: SampleAndHold(2, [OBSERVATION, "state"]),
+    ],
+)
+def test_entries_of_agents_and_of_worlds_in_one_transform_are_refused(make):
+    with pytest.raises(InputError, match="have other batch sizes: use one transform for each"):
+        TransformedEnv(TwoLevels(), make()).reset()
 
 
 def test_one_transform_for_each_level_works():

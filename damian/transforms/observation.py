@@ -9,25 +9,23 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 
 from damian.common import checks
-from damian.common.text_files import show
 from damian.delays.laws import law_of, sampler_of
 from damian.delays.line import ORDERS, DelayLine, Delivery
-from damian.transforms.base import StatefulTransform
-from damian.transforms.context import ContextReader
-from damian.transforms.entries import (
+from damian.transforms.base import (
     Change,
     Entries,
+    KeyUsage,
     Memory,
+    StatefulTransform,
     as_rows,
+    existing,
     from_rows,
-    require_as_many,
     require_keys,
-    row_bytes,
     select_entries,
     sibling_key,
     spec_rows,
 )
-from damian.transforms.order import KeyUsage
+from damian.transforms.context import ContextReader
 
 
 class ObservationDelay(StatefulTransform):
@@ -73,8 +71,8 @@ class ObservationDelay(StatefulTransform):
         >>> env.rollout(100)["age"]  # steps since each observation was generated
     """
 
-    optional_keys = ("age_key", "fresh_key", "delay_key")
-    one_level = True
+    omittable_outputs = ("age_key", "fresh_key", "delay_key")
+    same_batch_size = True
 
     def __init__(
         self,
@@ -96,26 +94,23 @@ class ObservationDelay(StatefulTransform):
         checks.one_of("order", order, ORDERS)
         super().__init__(in_keys, out_keys or in_keys, seed=seed, gradients=gradients)
         checks.require(bool(self.in_keys), "in_keys", in_keys, "name nothing to send")
-        require_as_many(self.in_keys, self.out_keys)
+        as_many = len(self.in_keys) == len(self.out_keys)
+        checks.require(as_many, "out_keys", out_keys, f"are not {len(self.in_keys)} keys, as in_keys are")
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
         self.draws = self.sampler.constant_delay is None
         self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
         self.line = DelayLine(self.sampler, order, gradients)
-        self.memory_setting = "ObservationDelay: delay", show(delay)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.row_key)
-        sent_keys = [self.sent_key] if self.sent_key else []
-        self.step_keys = [*self.in_keys, *sent_keys, *self.contexts.keys.values()]
+        self.step_keys = [*self.required_keys, *self.contexts.keys.values()]
 
     @property
     def key_usage(self) -> KeyUsage:
-        created = [key for key in self.out_keys if key not in self.in_keys]
-        created += [key for key in (self.age_key, self.fresh_key, self.delay_key) if key is not None]
         ages = [(key, self.age_key) for key in self.out_keys if self.age_key is not None]
-        return KeyUsage(reads=self.step_keys, delays=self.in_keys, creates=created, ages=ages)
+        return KeyUsage(delays=self.in_keys, age_of=ages)
 
     @property
     def row_dims(self) -> dict[str, int]:
@@ -127,10 +122,7 @@ class ObservationDelay(StatefulTransform):
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
-        return [*self.in_keys, *([self.sent_key] if self.sent_key else [])]
-
-    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
-        return self.line.n_bytes(n_rows, row_bytes(select_entries(tensordict, self.in_keys), n_rows))
+        return existing([*self.in_keys, self.sent_key])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))
@@ -151,13 +143,19 @@ class ObservationDelay(StatefulTransform):
         return [as_rows(entries[key], self.rows) for key in self.in_keys]
 
     def _outputs(self, delivery: Delivery) -> Entries:
-        pairs = zip(self.out_keys, delivery.held, strict=True)
         # A copy, because the line keeps what it holds.
-        held = {key: from_rows(value, self.rows).clone() for key, value in pairs}
-        flags = {self.age_key: delivery.age.to(torch.float32), self.fresh_key: delivery.fresh}
+        entries = {
+            key: from_rows(value.clone(), self.rows)
+            for key, value in zip(self.out_keys, delivery.held, strict=True)
+        }
+        if self.age_key:
+            entries[self.age_key] = delivery.age.to(torch.float32).view(*self.rows, 1)
+        if self.fresh_key:
+            entries[self.fresh_key] = delivery.fresh.view(*self.rows, 1)
         if self.delay_key:
-            flags[self.delay_key] = torch.where(delivery.delay < self.sampler.lost, delivery.delay, -1)
-        return held | {key: flag.view(*self.rows, 1) for key, flag in flags.items() if key is not None}
+            delay = torch.where(delivery.delay < self.sampler.lost, delivery.delay, -1)
+            entries[self.delay_key] = delay.view(*self.rows, 1)
+        return entries
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         require_keys(type(self).__name__, self.in_keys, observation_spec)

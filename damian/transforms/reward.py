@@ -1,25 +1,27 @@
-"""Transforms that delay rewards, and that sum the latest rewards (paper, section 3.5)."""
+"""Transforms that delay rewards and sum them: the latest ones, or an episode's (paper, section 3.5)."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
+from damian import keys
 from damian.common import checks, devices
-from damian.common.tensors import expand_mask
-from damian.common.text_files import show
+from damian.common.errors import InputError
+from damian.common.tensors import expand_mask, next_true
 from damian.delays.laws import LOSES, law_of, sampler_of
 from damian.delays.line import advance_slot, slot_rows
-from damian.transforms.base import StatefulTransform
-from damian.transforms.batches import expand_to_rows, rows_of_batch
-from damian.transforms.context import ContextReader
-from damian.transforms.entries import (
+from damian.keys import next_key
+from damian.transforms.base import (
     Change,
+    Correction,
     Entries,
+    KeyUsage,
     Memory,
+    StatefulTransform,
     any_flag,
     as_rows,
     flag_keys,
@@ -28,12 +30,7 @@ from damian.transforms.entries import (
     sibling_key,
     spec_rows,
 )
-from damian.transforms.order import KeyUsage
-
-_FEW = 16
-"""With up to so many slots, the rest in transit is summed for all rows, whichever episodes end."""
-_SUMMED_AT_ONCE = 2**18
-"""Rewards summed together, which bounds the memory: a few arrays of 2 MB, to stay in a cache."""
+from damian.transforms.context import ContextReader
 
 
 class RewardTransform(StatefulTransform):
@@ -45,7 +42,7 @@ class RewardTransform(StatefulTransform):
         gradients: as in ``StatefulTransform``.
     """
 
-    n_past: int
+    n_slots: int
     """Number of rewards that are remembered for each of the M rows, K."""
 
     def __init__(self, reward_key: NestedKey, seed: int | None = None, gradients: bool = False) -> None:
@@ -62,27 +59,21 @@ class RewardTransform(StatefulTransform):
 
     @property
     def memory_sizes(self) -> dict[str, int]:
-        return {"n_past": self.n_past}
+        return {"n_slots": self.n_slots}
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
         return []  # a reset outputs no reward
 
-    def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
-        specs = self.env.full_reward_spec
-        require_keys(type(self).__name__, [self.reward_key], specs)
-        return rows_of_batch(tensordict.batch_size, self.env, spec_rows(specs, self.reward_key))
-
-    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
-        specs = self.env.full_reward_spec
-        spec, rows = specs[self.reward_key], spec_rows(specs, self.reward_key)
-        return self.n_past * n_rows * (spec.shape.numel() // rows.numel()) * spec.dtype.itemsize
+    @property
+    def row_dims(self) -> dict[str, int]:
+        return {"past": 1}
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         specs = self.env.full_reward_spec
-        zero = specs[self.reward_key].zero()
-        zero = expand_to_rows(zero, spec_rows(specs, self.reward_key), self.rows)
-        return {"past": zero.new_zeros(self.n_past, *zero.shape)}
+        require_keys(type(self).__name__, [self.reward_key], specs)
+        zero = self.as_rows_of_spec(specs[self.reward_key].zero(), specs, self.reward_key)
+        return {"past": zero.new_zeros(self.n_slots, *zero.shape)}
 
     def sum_dtype(self, dtype: torch.dtype) -> torch.dtype:
         """The type of the rewards that the transform writes, given the type of those that it reads."""
@@ -90,7 +81,7 @@ class RewardTransform(StatefulTransform):
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
         require_keys(type(self).__name__, [self.reward_key], reward_spec)
-        if self.n_past > 1:  # sums of rewards have other bounds than one reward
+        if self.n_slots > 1:  # sums of rewards have other bounds than one reward
             old = reward_spec[self.reward_key]
             reward_spec[self.reward_key] = Unbounded(
                 old.shape, dtype=self.sum_dtype(old.dtype), device=old.device
@@ -100,10 +91,6 @@ class RewardTransform(StatefulTransform):
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         past = memory["past"]
         return memory | {"past": past.masked_fill(expand_mask(mask, past[0]), 0)}, {}
-
-    @property
-    def row_dims(self) -> dict[str, int]:
-        return {"past": 1}
 
 
 class RewardDelay(RewardTransform):
@@ -117,8 +104,7 @@ class RewardDelay(RewardTransform):
     Rewards in transit lie in a ring of K slots (``past``), one for each coming step; ``due`` [K, M] is the
     time at which those in a slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a
     reset and at the end of an episode: whatever is in transit then is never received, and a later reward
-    takes its place. So a step writes one slot of each row, in place, and costs the same however long the
-    delay is; the end of an episode costs a pass over the slots of its rows.
+    takes its place. So a step writes one slot of each row, in place.
 
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
@@ -131,7 +117,7 @@ class RewardDelay(RewardTransform):
         delay_key: key for the delay of the reward earned in this step [steps], [..., 1] long; None to leave
             it out. An actor must not observe it; back-updating needs it.
         earned_key: key for the reward earned in this step, whenever it is received; None to leave it out. An
-            actor must not observe it; back-updating needs it if no messages tell of the reward.
+            actor must not observe it; back-updating needs it if no messages tell the reward.
         seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
             global generator at the first reset.
         gradients: let gradients flow through the received rewards (``StatefulTransform``).
@@ -147,7 +133,7 @@ class RewardDelay(RewardTransform):
         >>> rollout = env.rollout(200)  # the sum of the rewards is that of the environment
     """
 
-    optional_keys = ("delay_key", "earned_key")
+    omittable_outputs = ("delay_key", "earned_key")
 
     def __init__(
         self,
@@ -170,8 +156,7 @@ class RewardDelay(RewardTransform):
         self.draws = self.sampler.constant_delay is None
         self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
-        self.n_past = self.sampler.longest + 1
-        self.memory_setting = "RewardDelay: delay", show(delay)
+        self.n_slots = self.sampler.longest + 1
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)
 
     @property
@@ -191,13 +176,11 @@ class RewardDelay(RewardTransform):
 
     @property
     def key_usage(self) -> KeyUsage:
-        created = [key for key in (self.delay_key, self.earned_key) if key is not None]
-        return super().key_usage._replace(
-            reads=list(self.contexts.keys.values()), creates=created, pays_at_end=True
-        )
+        return KeyUsage(delays=[self.reward_key], flushes_at_end=True)
 
-    def memory_bytes(self, tensordict: TensorDictBase, n_rows: int) -> int:
-        return super().memory_bytes(tensordict, n_rows) + 8 * (self.n_past + 5) * n_rows
+    @property
+    def row_dims(self) -> dict[str, int]:
+        return {"past": 1, "due": 1}
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         memory = super().init_memory(tensordict)
@@ -205,7 +188,7 @@ class RewardDelay(RewardTransform):
         channel = self.sampler.initial_state(streams)
         zero = torch.zeros_like(streams)
         memory |= {"clock": zero, "slot": zero.clone(), "streams": streams, "channel": channel}
-        memory |= {"time": zero.clone(), "due": zero.repeat(self.n_past, 1)}
+        memory |= {"time": zero.clone(), "due": zero.repeat(self.n_slots, 1)}
         if not self.sampler.sees_context:
             return memory
         return self.contexts.init_memory(memory | {"reset_at": zero.clone()}, tensordict, self.rows)
@@ -214,9 +197,7 @@ class RewardDelay(RewardTransform):
         memory = memory | {"channel": self.sampler.begin_episode(memory["channel"], mask)}
         if self.sampler.sees_context:
             memory = memory | {"reset_at": torch.where(mask, memory["clock"], memory["reset_at"])}
-        memory["time"] = memory["time"] + self.n_past * mask
-        if self.delay_key is None and self.earned_key is None:
-            return memory, {}
+        memory["time"] = memory["time"] + self.n_slots * mask
         return memory, self._report(torch.zeros_like(memory["clock"]), torch.zeros_like(memory["past"][0]))
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
@@ -224,17 +205,16 @@ class RewardDelay(RewardTransform):
         reward = as_rows(entries[self.reward_key], self.rows)
         context = self.contexts.read(memory, entries, None, self.rows)
         delay, channel = self.sampler(memory["streams"], clock, memory["channel"], context)
-        slot = advance_slot(memory["slot"], 1, self.n_past)
+        slot = advance_slot(memory["slot"], 1, self.n_slots)
         memory = memory | {"clock": clock, "slot": slot, "channel": channel, "time": memory["time"] + 1}
         memory["past"] = self._send(memory, reward, delay, self.sending_rows(entries))
         received = self._received(memory)
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
             ended = any_flag(done, self.rows)
-            received = torch.where(
-                expand_mask(ended, received), received + self._rest(memory, ended), received
-            )
-            memory["time"] = memory["time"] + self.n_past * ended
+            in_transit = sum_in_transit(memory["past"], memory["due"], memory["time"])
+            received = torch.where(expand_mask(ended, received), received + in_transit, received)
+            memory["time"] = memory["time"] + self.n_slots * ended
         return memory, {self.reward_key: from_rows(received, self.rows)} | self._report(delay, reward)
 
     def _send(self, memory: Memory, reward: Tensor, delay: Tensor, stepped: Tensor | None) -> Tensor:
@@ -245,7 +225,7 @@ class RewardDelay(RewardTransform):
         """
         past, arrival = memory["past"], memory["time"] + delay
         flat, due = past.flatten(0, 1), memory["due"].view(-1)
-        row = slot_rows(advance_slot(memory["slot"], delay, self.n_past))
+        row = slot_rows(advance_slot(memory["slot"], delay, self.n_slots))
         there, old = flat.index_select(0, row), due.index_select(0, row)
         added = torch.where(expand_mask(old == arrival, there), there, 0) + reward
         # ``old`` is never later; a compiler that sees that it is read before writes the new times in place.
@@ -264,17 +244,6 @@ class RewardDelay(RewardTransform):
         row = slot_rows(memory["slot"])
         here, due = (memory[name].flatten(0, 1).index_select(0, row) for name in ("past", "due"))
         return torch.where(expand_mask(due == memory["time"], here), here, 0)
-
-    def _rest(self, memory: Memory, ended: Tensor) -> Tensor:
-        """Sums of the rewards that arrive in later steps, [M, ...], right for the rows of the mask [M]."""
-        ring = memory["past"], memory["due"], memory["time"]
-        if self.n_past > _FEW and not self.gradients and devices.data_dependent(ended.device):
-            return _rest_of(*ring, ended)
-        return _sum_due_later(*ring)
-
-    @property
-    def row_dims(self) -> dict[str, int]:
-        return super().row_dims | {"due": 1}
 
     def _report(self, delay: Tensor, earned: Tensor) -> Entries:
         """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards [M, ...]."""
@@ -295,32 +264,57 @@ class RewardDelay(RewardTransform):
             observation_spec[self.earned_key] = Unbounded(earned.shape, dtype=earned.dtype, device=device)
         return observation_spec
 
+    def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
+        """Credits a late reward to the step that earned it, as soon as it has been paid.
 
-def _sum_due_later(past: Tensor, due: Tensor, time: Tensor) -> Tensor:
+        Raises:
+            InputError: the delays are not written, without which nobody knows what has been paid.
+        """
+        if self.reward_key not in keys:
+            return None
+        if self.delay_key is None:
+            raise InputError("RewardDelay: back-updating needs each delay: give it delay_key='reward_delay'")
+        return Correction(self._credit, paid=self._paid, delay_key=self.delay_key)
+
+    def _credit(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
+        """What the rewards are by now: what a step earned if that has been paid, else 0."""
+        key, earned_key = next_key(self.reward_key), self.earned_key and next_key(self.earned_key)
+        if key not in entries and (earned_key is None or earned_key not in steps.keys(True)):
+            raise InputError(
+                f"earned_key: nothing says what {key} was earned: give RewardDelay an earned_key"
+            )
+        earned = entries[key] if key in entries else cast(Tensor, steps[earned_key])
+        paid = self._paid(steps, count).squeeze(-1)
+        return entries | {key: torch.where(expand_mask(paid, earned), earned, torch.zeros_like(earned))}
+
+    def _paid(self, steps: TensorDictBase, count: Tensor) -> Tensor:
+        """Whether the reward of each step has been paid by the last step, as the delay in shape."""
+        delay = cast(Tensor, steps[next_key(cast(NestedKey, self.delay_key))])
+        begins = expand_mask(count == 0, delay).expand_as(delay)
+        return paid_by_now(delay, begins, expand_mask(steps[keys.RESET_AFTER].squeeze(-1), delay))
+
+
+def sum_in_transit(past: Tensor, due: Tensor, time: Tensor) -> Tensor:
     """Sums of the rewards [K, M, ...] that are due [K, M] after a time [M], [M, ...]."""
     # In double precision, so that the order of the sum, which depends on the batch, does not matter.
     precise = torch.float64 if past.is_floating_point() else past.dtype
     return torch.where(expand_mask(due > time, past), past, 0).sum(0, dtype=precise).to(past.dtype)
 
 
-@torch.library.custom_op("damian::rest_of_rewards", mutates_args=())
-def _rest_of(past: Tensor, due: Tensor, time: Tensor, ended: Tensor) -> Tensor:
-    """The sums of ``_sum_due_later`` for the rows of the mask [M], and 0 for the others.
+def paid_by_now(delay: Tensor, begins: Tensor, reset_after: Tensor) -> Tensor:
+    """Whether the reward earned at each step has been paid by the last step, [T, *] bool.
 
-    This is a custom operator because the number of rows depends on the data, which a compiler cannot trace.
+    The last step before a reset pays what is still in transit, if the environment was done there.
+
+    Args:
+        delay: delay of the reward earned at each step [steps], [T, *].
+        begins: whether this step is the first after a reset, [T, *].
+        reset_after: whether the environment was done with this step, [T, *].
     """
-    rest, rows = torch.zeros_like(past[0]), ended.nonzero().squeeze(-1)
-    for part in rows.split(max(_SUMMED_AT_ONCE // len(past), 1)):
-        paid = _sum_due_later(
-            past.index_select(1, part), due.index_select(1, part), time.index_select(0, part)
-        )
-        rest.index_copy_(0, part, paid)
-    return rest
-
-
-@_rest_of.register_fake
-def _(past, due, time, ended):  # compilers need only the shape
-    return torch.empty_like(past[0])
+    steps = expand_mask(torch.arange(len(delay), device=delay.device), delay).expand(delay.shape)
+    none_later = torch.full_like(steps[:1], len(steps))
+    last = torch.cat([next_true(begins)[1:], none_later]) - 1
+    return (steps + delay <= last) | reset_after.expand_as(steps).gather(0, last)
 
 
 class CumulativeReward(RewardTransform):
@@ -350,9 +344,7 @@ class CumulativeReward(RewardTransform):
         checks.above("gamma", gamma, 0.0)
         checks.in_range("gamma", gamma, 0.0, 1.0)
         super().__init__(reward_key, gradients=gradients)
-        self.n_past = steps
-        self.memory_setting = "CumulativeReward: steps", steps
-        self.gamma = gamma
+        self.n_slots, self.gamma = steps, gamma
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         reward = as_rows(entries[self.reward_key], self.rows)
@@ -361,7 +353,22 @@ class CumulativeReward(RewardTransform):
         return memory | {"past": past}, {self.reward_key: from_rows(total, self.rows)}
 
     def sum_dtype(self, dtype: torch.dtype) -> torch.dtype:
-        return dtype if dtype.is_floating_point or self.n_past == 1 else torch.float32
+        return dtype if dtype.is_floating_point or self.n_slots == 1 else torch.float32
+
+    def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
+        """Sums the corrected rewards of the same episode."""
+        if self.reward_key not in keys or self.n_slots == 1:
+            return None
+        return Correction(self._sum_again, lookback=self.n_slots - 1)
+
+    def _sum_again(self, entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
+        key = next_key(self.reward_key)
+        reward = entries[key]
+        before = torch.cat([reward.new_zeros(self.n_slots - 1, *reward.shape[1:]), reward])
+        past = before.unfold(0, self.n_slots, 1).movedim(-1, 0).flip(0)  # [K, T, B, ...], the newest first
+        age = torch.arange(self.n_slots, device=count.device).view(-1, 1, 1)
+        past = past.masked_fill(expand_mask(age > count, past), 0)
+        return entries | {key: discounted_sum(past, self.gamma, cast(Tensor, steps[key]).dtype)}
 
 
 def discounted_sum(past: Tensor, gamma: float, dtype: torch.dtype) -> Tensor:
@@ -376,3 +383,67 @@ def discounted_sum(past: Tensor, gamma: float, dtype: torch.dtype) -> Tensor:
     # In double precision, so that the order of the sum, which depends on the batch, does not matter.
     precise = torch.float64 if dtype.is_floating_point else dtype
     return (weights.view(-1, *[1] * (past.dim() - 1)) * past).sum(0, dtype=precise).to(dtype)
+
+
+class EpisodeTotals(StatefulTransform):
+    """Writes the sum of the rewards, and the number of steps, of each world's episode so far.
+
+    The entries are those of TorchRL's ``RewardSum`` and ``StepCounter``, bit for bit; but a ``DelayedEnv``
+    computes them in the same function as the rest of a step and the resets after it, which saves time.
+
+    Args:
+        reward_key: key of the rewards.
+        return_key: key of their sum since the episode began, in the shape of the rewards.
+        count_key: key of the number of steps since then, [B, 1] long.
+
+    Examples:
+        >>> env = make_env(ScenarioConfig(), num_worlds=64)
+        >>> env.append_transform(EpisodeTotals())
+        >>> env.rollout(50)["next", "agents", "episode_reward"]  # [64, 50, N, 1]
+    """
+
+    sees_merged_steps_only = True
+    per_world = True
+
+    def __init__(
+        self,
+        reward_key: NestedKey = keys.REWARD,
+        return_key: NestedKey = keys.EPISODE_REWARD,
+        count_key: NestedKey = keys.STEP_COUNT,
+    ) -> None:
+        super().__init__(reward_key, [return_key, count_key])
+        self.return_key, self.count_key = self.out_keys
+        self.step_keys = self.in_keys
+
+    @property
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(computes=[(self.in_keys[0], self.return_key)])
+
+    @property
+    def required_keys(self) -> list[NestedKey]:
+        return []  # a reset outputs no reward
+
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        reward = self.env.full_reward_spec[self.in_keys[0]].zero()
+        return {"total": reward, "count": torch.zeros(len(reward), 1, dtype=torch.long, device=reward.device)}
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory = {name: old.masked_fill(expand_mask(mask, old), 0) for name, old in memory.items()}
+        return memory, self._outputs(memory)
+
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
+        memory = {"total": memory["total"] + entries[self.in_keys[0]], "count": memory["count"] + 1}
+        return memory, self._outputs(memory)
+
+    def _outputs(self, memory: Memory) -> Entries:
+        # Copies, because others may change what a step outputs in place.
+        return {self.return_key: memory["total"].clone(), self.count_key: memory["count"].clone()}
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        rewards, device = self.env.full_reward_spec, observation_spec.device
+        require_keys(type(self).__name__, self.in_keys, rewards)
+        reward = rewards[self.in_keys[0]]
+        observation_spec[self.return_key] = Unbounded(reward.shape, dtype=reward.dtype, device=device)
+        shape = torch.Size((*observation_spec.shape, 1))
+        observation_spec[self.count_key] = Unbounded(shape, dtype=torch.long, device=device)
+        return observation_spec

@@ -1,27 +1,30 @@
-"""A transform for agents and servers whose clocks are slower than the environment's (paper, section 3.6)."""
+"""Transforms for clocks that are slower than the environment's (paper, section 3.6), and skipped steps."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite, Unbounded
 
+from damian import keys
 from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
 from damian.delays.laws import Delay, in_steps
-from damian.transforms.base import StatefulTransform
-from damian.transforms.batches import expand_to_rows
-from damian.transforms.entries import (
+from damian.keys import next_key
+from damian.transforms.base import (
     Change,
+    Correction,
     Entries,
+    KeyUsage,
     Memory,
+    StatefulTransform,
     as_rows,
+    existing,
     from_rows,
     select_entries,
     sibling_key,
-    spec_rows,
 )
-from damian.transforms.order import KeyUsage
 
 
 class SampleAndHold(StatefulTransform):
@@ -50,14 +53,14 @@ class SampleAndHold(StatefulTransform):
 
     Raises:
         InputError: the period is not valid, no key is given, or there is an age but no entry is held; at the
-            first reset also: the entries and actions have different batch sizes.
+            first reset also: the entries have different batch sizes.
 
     Examples:
         >>> clock = SampleAndHold(4, ["observation"], ["action"])
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), clock)  # the agent acts in every fourth step
     """
 
-    one_level = True
+    same_batch_size = True
 
     def __init__(
         self,
@@ -84,17 +87,13 @@ class SampleAndHold(StatefulTransform):
         self.age_key = sibling_key(self.row_key, age_key)
         self.draws = stagger
         self.action_keys = self.in_keys_inv
-        self.step_keys = [*self.in_keys, *(key for key in (ready_key, self.age_key) if key)]
-
-    @property
-    def row_key(self) -> NestedKey:
-        return [*self.in_keys, *self.in_keys_inv][0]
+        self.step_keys = existing([*self.in_keys, ready_key, self.age_key])
 
     @property
     def key_usage(self) -> KeyUsage:
-        delayed = [*self.in_keys, *([self.age_key] if self.age_key else [])]
+        delayed = existing([*self.in_keys, self.age_key])
         held = [(key, self.age_key) for key in self.in_keys if self.period > 1]
-        return KeyUsage(reads=self.step_keys, delays=delayed, replaces=self.in_keys_inv, holds=held)
+        return KeyUsage(delays=delayed, replaces=self.in_keys_inv, held_entries=held)
 
     @property
     def memory_sizes(self) -> dict[str, int]:
@@ -109,13 +108,11 @@ class SampleAndHold(StatefulTransform):
         first = select_entries(tensordict, self.in_keys)
         device = next((value.device for value in first.values()), self.env.device)
         elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
-        held = {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(first.values())}
+        memory = {"elapsed": elapsed}  # steps since the latest tick
+        memory |= {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(first.values())}
         specs = self.env.full_action_spec
-        acted = {
-            f"acted_{i}": expand_to_rows(specs[key].zero(), spec_rows(specs, key), self.rows)
-            for i, key in enumerate(self.in_keys_inv)
-        }
-        memory = {"elapsed": elapsed, **held, **acted}  # "elapsed": steps since the latest tick
+        for i, key in enumerate(self.in_keys_inv):
+            memory[f"action_at_tick_{i}"] = self.as_rows_of_spec(specs[key].zero(), specs, key)
         if self.age_key:
             memory["age"] = as_rows(tensordict.get(self.age_key), self.rows)
         if not self.stagger:
@@ -136,7 +133,7 @@ class SampleAndHold(StatefulTransform):
         return self._with_age(memory, held, entries, mask, 0)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
-        return self._hold(memory, entries, self.in_keys_inv, "acted", memory["elapsed"] == 0)
+        return self._hold(memory, entries, self.in_keys_inv, "action_at_tick", memory["elapsed"] == 0)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed = memory["elapsed"] + 1
@@ -183,3 +180,93 @@ class SampleAndHold(StatefulTransform):
         new = as_rows(entries[self.age_key], self.rows)
         age = torch.where(expand_mask(sampled, new), new, memory["age"] + n_steps)
         return memory | {"age": age}, held | {self.age_key: from_rows(age, self.rows).clone()}
+
+    def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
+        """Keeps entries, between two ticks, as they are known by now for the latest tick.
+
+        Raises:
+            InputError: the clocks are staggered, so that no stored step says when they ticked.
+        """
+        held = [key for key in self.in_keys if key in keys]
+        if not held or self.period == 1:
+            return None
+        should = "has ticks that no stored step shows: back-updating needs a clock without stagger"
+        checks.require(not self.stagger, "SampleAndHold: stagger", self.stagger, should)
+
+        def hold_again(entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
+            elapsed = count + 1
+            index = torch.arange(len(count), device=count.device).unsqueeze(-1)
+            tick, world = index - elapsed % self.period, torch.arange(count.shape[1], device=count.device)
+            # Nothing is late at a reset: what was held until the first tick after it stays.
+            stays, corrected = (elapsed < self.period) | (tick < 0), dict(entries)
+            for key in map(next_key, held):
+                value = entries[key]
+                stored = steps[key][..., : value.shape[-1]]
+                at_tick = value[tick.clamp(min=0), world]
+                corrected[key] = torch.where(expand_mask(stays, value), stored, at_tick)
+            return corrected
+
+        return Correction(hold_again, lookback=self.period - 1)
+
+
+class SkipUntilReady(StatefulTransform):
+    """Steps each world until some agent can choose an action again, or the episode ends.
+
+    The outputs equal, bit for bit, those of stepping the environment until then with actions that no agent
+    executes. Only the reward is the sum of gamma^k r_k over the merged steps k = 0, 1, ..., and ``duration``,
+    [B, 1] long, is the number of these steps (0 after a reset). A learner that discounts the next state value
+    by gamma^duration learns in a semi-Markov decision process (Sutton, Precup and Singh, 1999).
+
+    The transform works only in a ``DelayedEnv`` on a ``UavEnv``, where worlds with a ready agent can pause,
+    with all of their messages in transit, while the others step on. Its place among damian's own transforms
+    does not matter, but these must come before all others. Transforms of TorchRL that come later process only
+    the merged steps: ``StepCounter`` counts decisions.
+
+    Args:
+        gamma: discount per merged step, in [0, 1]; with 1, returns are those of the single steps.
+        reward_keys: keys of the rewards to sum.
+
+    Raises:
+        InputError: gamma is not in [0, 1].
+
+    Examples:
+        >>> clock = ClockConfig(skip=True)  # adds the transform
+        >>> env = make_env(ScenarioConfig(motion=MotionConfig("polynomial"), clock=clock))
+    """
+
+    per_world = True
+
+    def __init__(self, gamma: float = 1.0, reward_keys: Sequence[NestedKey] = (keys.REWARD,)) -> None:
+        checks.in_range("gamma", gamma, 0.0, 1.0)
+        super().__init__(out_keys=[keys.DURATION])
+        self.gamma, self.reward_keys = gamma, list(reward_keys)
+        self.step_keys = [keys.DONE]
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        return memory, {keys.DURATION: torch.zeros_like(entries[keys.DONE], dtype=torch.long)}
+
+    def on_step(self, memory: Memory, entries: Entries) -> Change:
+        return memory, {keys.DURATION: torch.ones_like(entries[keys.DONE], dtype=torch.long)}
+
+    def skipped_worlds(self, entries: Entries) -> Tensor:
+        """Worlds in which no agent is ready and the episode goes on, [B] bool."""
+        ready, done = entries[keys.READY], entries[keys.DONE]
+        return ~(ready.flatten(1).any(-1) | done.view(-1))
+
+    def merge_steps(self, entries: Entries, later: Entries, stepped: Tensor) -> Entries:
+        duration = entries[keys.DURATION]
+        weight = (self.gamma**duration).view(-1)
+        sums = {k: entries[k] + expand_mask(weight, later[k]) * later[k] for k in self.reward_keys}
+        later = later | sums | {keys.DURATION: duration + 1}
+        return {key: torch.where(expand_mask(stepped, new), new, entries[key]) for key, new in later.items()}
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        raise RuntimeError(
+            "SkipUntilReady works only in a DelayedEnv on a UavEnv, before all transforms that are not "
+            "damian's, and only if all worlds step: the TensorDict must contain neither '_step' nor 'next'"
+        )
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
+        shape, device = torch.Size((*observation_spec.shape, 1)), observation_spec.device
+        observation_spec[keys.DURATION] = Unbounded(shape, dtype=torch.long, device=device)
+        return observation_spec

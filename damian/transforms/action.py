@@ -1,0 +1,278 @@
+"""A transform that delays actions (paper, section 3.3), and what transforms that remember actions share."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
+from torchrl.data.tensor_specs import Stacked
+from torchrl.envs import EnvBase
+
+from damian.common import checks
+from damian.common.errors import InputError
+from damian.delays.laws import law_of, sampler_of
+from damian.delays.line import DelayLine
+from damian.transforms.base import (
+    Change,
+    Entries,
+    KeyUsage,
+    Memory,
+    StatefulTransform,
+    as_rows,
+    existing,
+    from_rows,
+    require_keys,
+    sibling_key,
+    spec_rows,
+)
+from damian.transforms.context import ContextReader
+
+
+class ActionSpecs(NamedTuple):
+    """Actions in the shape of their spec, [*rows, ...]; a row is a world, or an agent of a world."""
+
+    rows: torch.Size
+    """Batch size of the actions' TensorDict, as the specs give it."""
+    initial: Tensor
+    """Default actions, [*rows, ...]."""
+    low: Tensor
+    """Lower bound of each number of an action, [*rows, ...] float32."""
+    width: Tensor
+    """Upper minus lower bound of each number of an action, [*rows, ...] float32; 1 where actions have no
+    bounds, can take one value only, or are one-hot."""
+    bounded: bool
+    """Whether (action - low) / width lies in [0, 1] for every number of an action."""
+
+
+class _Range(NamedTuple):
+    """Range of each number of an action, in the shape of the spec."""
+
+    low: Tensor
+    """Lowest value, in the type of the actions."""
+    high: Tensor
+    """Highest value, in the type of the actions."""
+    bounded: Tensor
+    """Whether the spec sets these bounds, bool; if not, they are those of the type of the actions."""
+
+
+def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs:
+    """Read the action spec of an environment.
+
+    Args:
+        env: environment that has the action.
+        key: key of the action.
+        default: default action: a number, or values in the shape of an action (indices for one-hot actions);
+            if None, the legal value nearest to 0.
+
+    Raises:
+        InputError: the default is no legal action.
+    """
+    specs = env.full_action_spec
+    spec, rows = specs[key], spec_rows(specs, key)
+    if isinstance(spec, OneHot):
+        indices = spec.to_categorical_spec()
+        initial = indices.to_one_hot(_default_action(_range(indices), default)).to(spec.dtype)
+        low = torch.zeros_like(initial, dtype=torch.float32)
+        return ActionSpecs(rows, initial, low, torch.ones_like(low), True)
+    space = _range(spec)
+    low = space.low.float()
+    width = space.high.float() - low
+    bounded = space.bounded & width.isfinite()
+    low, width = torch.where(bounded, low, 0), torch.where(bounded & (width > 0), width, 1)
+    return ActionSpecs(rows, _default_action(space, default), low, width, bool(bounded.all()))
+
+
+def _range(spec: TensorSpec) -> _Range:
+    """The range of each number of an action."""
+    if isinstance(spec, Stacked):  # agents with different ranges
+        parts = [_range(one) for one in cast(Any, spec).unbind(spec.dim)]
+        return _Range(*(torch.stack(part, spec.dim) for part in zip(*parts, strict=True)))
+    bounded = isinstance(spec, Categorical | Bounded)
+    if isinstance(spec, MultiCategorical):  # before Categorical, which is its base class
+        low, high = 0, spec.nvec - 1
+    elif isinstance(spec, Categorical):
+        low, high = 0, spec.n - 1
+    else:
+        low, high = spec.space.low, spec.space.high  # type: ignore[union-attr]
+    low, high = (
+        torch.as_tensor(bound, dtype=spec.dtype, device=spec.device).expand(spec.shape)
+        for bound in (low, high)
+    )
+    return _Range(low, high, torch.full_like(low, bounded, dtype=torch.bool))
+
+
+def _default_action(space: _Range, default: Any) -> Tensor:
+    """The default action in the shape and type of the range.
+
+    Raises:
+        InputError: the default is no legal action.
+    """
+    low, high = space.low, space.high
+    if default is None:
+        return torch.maximum(torch.minimum(torch.zeros_like(low), high), low)
+    real = low.is_floating_point()
+    should = (
+        f"is not a legal default action: {'numbers' if real else 'whole numbers'} between "
+        f"{low.min().item() + 0} and {high.max().item() + 0}, one for all or in the shape {tuple(low.shape)}"
+    )
+    try:
+        value = torch.as_tensor(default, dtype=low.dtype if real else None, device=low.device)
+        value = value.expand(low.shape)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"default: {default} {should}") from error
+    legal = (real or not value.is_floating_point()) and bool(((value >= low) & (value <= high)).all())
+    checks.require(legal, "default", default, should)
+    return value.to(low.dtype)
+
+
+class ActionTransform(StatefulTransform):
+    """Base class of transforms that remember actions.
+
+    Args:
+        action_key: key of the action.
+        default: default action, as in ``read_action_specs``.
+        keys: further arguments of ``StatefulTransform``.
+    """
+
+    def __init__(self, action_key: NestedKey, default: Any, **keys: Any) -> None:
+        super().__init__(in_keys_inv=[action_key], **keys)
+        self.action_key: NestedKey = self.in_keys_inv[0]
+        self.default = default
+
+    @property
+    def row_key(self) -> NestedKey:
+        return self.action_key
+
+    def action_rows(self, value: Tensor) -> Tensor:
+        """A value of ``actions`` for each of the M rows, [M, ...]."""
+        return self.as_rows_of_spec(value, self.env.full_action_spec, self.action_key)
+
+    def flag_to_require(self, key: NestedKey | None) -> list[NestedKey]:
+        """The key of a flag in the policy's input, if a reset must output it before this transform.
+
+        It need not if the specs of the whole environment name the flag: then a later transform may write it,
+        or it may be a part of the action.
+        """
+        if key is None:
+            return []
+        env = cast(EnvBase, self.container)
+        specs = (env.full_observation_spec, env.full_state_spec, env.full_action_spec, env.full_done_spec)
+        named = {key for spec in specs for key in spec.keys(True, True)}
+        return [] if key in named else [key]
+
+    @property
+    def actions(self) -> ActionSpecs:
+        """Shape, range and default of the actions, read from the environment's specs once."""
+        if "_actions" not in self.__dict__:
+            require_keys(type(self).__name__, [self.action_key], self.env.full_action_spec)
+            self.__dict__["_actions"] = read_action_specs(self.env, self.action_key, self.default)
+        return self.__dict__["_actions"]
+
+    def empty_cache(self) -> None:
+        super().empty_cache()
+        self.__dict__.pop("_actions", None)
+
+    def reset_parent(self) -> None:
+        super().reset_parent()
+        self.__dict__.pop("_actions", None)
+
+
+class ActionDelay(ActionTransform):
+    """Delays actions: the environment executes the action that the policy chose some steps ago.
+
+    Until the first action of an episode arrives, the environment executes a default action. In a step in
+    which no newer action arrives, it executes the same action again. The TensorDict keeps the chosen action.
+    With delay 0 the rollout is the same, bit for bit, as without the transform.
+
+    Args:
+        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
+            A delay is drawn for each world, each agent (under a nested key) and each step.
+        action_key: key of the action.
+        default: action that is executed until the first one arrives: a number, or values in the shape of an
+            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
+        loss: probability that an action never arrives.
+        dt: length of a step [s], for delays given as times.
+        sent_key: key of a flag in the policy's input, [...] bool: an action is sent only where it is true.
+            If not given, every action is sent.
+        valid_key: key of a flag that is written for the environment, [...] bool: true if the action is
+            executed for the first time, or is the default. The environment must read it itself; a
+            ``SerialEnv`` passes it on, a ``ParallelEnv`` only if its specs name it.
+        context_keys: key of each entry that the law may read, by the name that the law gives it
+            (``ContextSampler``). The policy's input and the outputs of a reset must have the entry.
+        seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
+            global generator at the first reset.
+        gradients: let gradients flow through the executed actions (``StatefulTransform``).
+
+    A bare name for one of the three keys above means an entry in the same TensorDict as the action.
+
+    Raises:
+        InputError: the delay is not valid, or its law reads what has no key; at the first use of the
+            environment also: the default is no legal action, or the environment has no entry ``sent_key``.
+
+    Examples:
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))
+        >>> rollout = env.rollout(100)  # each action is executed two steps after it was chosen
+    """
+
+    def __init__(
+        self,
+        delay: Any,
+        action_key: NestedKey = "action",
+        *,
+        default: Any = None,
+        loss: float = 0.0,
+        dt: float = 1.0,
+        sent_key: NestedKey | None = None,
+        valid_key: NestedKey | None = None,
+        context_keys: Mapping[str, NestedKey] | None = None,
+        seed: int | None = None,
+        gradients: bool = False,
+    ) -> None:
+        super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed, gradients=gradients)
+        law = law_of(delay)
+        self.sampler = sampler_of(law, dt, loss)
+        self.draws = self.sampler.constant_delay is None
+        self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
+        self.line = DelayLine(self.sampler, "generation", gradients)
+        self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
+        self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
+        self.action_keys = existing([self.action_key, self.sent_key, *self.contexts.keys.values()])
+
+    @property
+    def key_usage(self) -> KeyUsage:
+        return KeyUsage(replaces=[self.action_key])
+
+    @property
+    def row_dims(self) -> dict[str, int]:
+        return self.line.row_dims(1)
+
+    @property
+    def memory_sizes(self) -> dict[str, int]:
+        return {"longest": self.sampler.longest}
+
+    @property
+    def required_keys(self) -> Sequence[NestedKey]:
+        return self.flag_to_require(self.sent_key)
+
+    def init_memory(self, tensordict: TensorDictBase) -> Memory:
+        initial = self.action_rows(self.actions.initial)
+        streams = self.streams(tensordict.batch_size, initial.device)
+        memory = self.line.init_memory([initial], streams) | {"initial": initial}
+        return self.contexts.init_memory(memory, tensordict, self.rows)
+
+    def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
+        memory, _ = self.line.reset(memory, [memory["initial"]], mask)
+        return memory, {}
+
+    def on_action(self, memory: Memory, entries: Entries) -> Change:
+        chosen = as_rows(entries[self.action_key], self.rows)
+        sent = self.sending_rows(entries)
+        context = self.contexts.read(memory, entries, sent, self.rows)
+        memory, delivery = self.line.step(memory, [chosen], sent, context)
+        executed: Entries = {self.action_key: from_rows(delivery.held[0], self.rows).clone()}
+        if self.valid_key:
+            default = memory["generated_at"] == memory["reset_at"]
+            executed[self.valid_key] = (delivery.fresh | default).view(self.rows)
+        return memory, executed
