@@ -230,7 +230,7 @@ MISTAKES = {
     "topology: .* is not N x N": {"topology": [[True, False]]},
     "delay 2 x 2, topology 3 x 3: these are of different numbers": {"delay": TWO, "topology": HEARS},
     "delay: .* has an entry for each link.*server only": {"delay": TWO, "topology": "server"},
-    r"loss\[0\]\[1\]: 1.5 is not between 0 and 1": {"loss": [[0, 1.5], [0, 0]]},
+    "loss: 1.5 is not between 0 and 1": {"loss": [[0, 1.5], [0, 0]]},
     "down_delay: 2 goes only with topology='server'": {"down_delay": 2},
     "comm_range: 5 needs a position_key": {"comm_range": 5},
     "action_key: .* does not go with in_keys": {
