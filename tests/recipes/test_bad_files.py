@@ -328,7 +328,7 @@ def test_a_refused_sweep_leaves_no_folder(name, given_words):
             ["experiment=usecase2", "overrides=['++seed=3']"],
             "overrides: ++seed=3 cannot be the same",
         ),
-        ("fly", ["replay=[x.json]"], "x.json: it is no episode of version 1 or 2: no such file"),
+        ("fly", ["replay=[x.json]"], "x.json: it is no episode of version 2: no such file"),
         ("fly", ["replay=[x.json]", "journal=x"], "replay: ['x.json'] does not go with journal"),
         ("train", ["hydra.run.dir="], "hydra.run.dir: it is empty"),
         ("train", ["resume=" + "x" * 5000], "resume: "),
