@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported
 
-__version__ = "0.17.1"
+__version__ = "0.18.0.dev0"
 
 _MODULES = {
     "damian.delays.config": ["DelayConfig"],
