@@ -231,6 +231,9 @@ def _nearest_or_own(
 ) -> Tensor:
     """As ``_nearest_inside``, where ``within`` [M] says which targets lie inside."""
     nearest = own.unsqueeze(-1).repeat(1, n)
+    if not devices.data_dependent(own.device):  # the number of targets inside is not known without waiting
+        found = nearest_points(cells, points, region, target, n)
+        return torch.where(within.unsqueeze(-1) & (found >= 0), found, nearest)
     found = nearest_points(cells, points, region[within], target[within], n)
     nearest[within] = torch.where(found < 0, nearest[within], found)
     return nearest

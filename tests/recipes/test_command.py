@@ -229,7 +229,7 @@ def test_a_policys_configuration_files_are_found_however_it_is_given(tmp_path, m
     for name, used in (("a=1", "own"), ("b", None), ("c", "own"), ("other", "others")):
         (tmp_path / name).mkdir()
         own = used and str(tmp_path / used)
-        (tmp_path / name / "run.json").write_text(json.dumps({"config_dir": own}))
+        (tmp_path / name / "run.json").write_text(json.dumps({"damian": "0", "config_dir": own}))
     (tmp_path / "own").mkdir()
     (tmp_path / "others").mkdir()
     assert prepared([word])[0] == f"--config-dir={tmp_path / 'own'}"
@@ -244,7 +244,9 @@ def test_a_policy_brings_its_options_to_the_quick_look(tmp_path, monkeypatch):
     (tmp_path / "own" / "scenario").mkdir(parents=True)
     (tmp_path / "own" / "scenario" / "windy.yaml").write_text("# @package _global_")
     (tmp_path / "first").mkdir()
-    (tmp_path / "first" / "run.json").write_text(json.dumps({"config_dir": str(tmp_path / "own")}))
+    (tmp_path / "first" / "run.json").write_text(
+        json.dumps({"damian": "0", "config_dir": str(tmp_path / "own")})
+    )
     assert check_words("train", ["scenario=windy"]) is not None
     assert check_words("train", prepared(["scenario=windy", "checkpoint=first"])) is None
 
