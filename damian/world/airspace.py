@@ -158,8 +158,9 @@ def nearest_points(cells: Cells, points: Tensor, region: Tensor, target: Tensor,
     Returns:
         Ids within their region, [M, n]; -1 behind the last one of a region that has fewer than n.
     """
-    parts = [t.split(max(_SLOTS // cells.point.shape[1], 1)) for t in (region, target)]
-    return torch.cat([_nearest(cells, points, *part, n) for part in zip(*parts, strict=True)])
+    at_once = max(_SLOTS // cells.point.shape[1], 1)
+    parts = zip(region.split(at_once), target.split(at_once), strict=True)
+    return torch.cat([_nearest(cells, points, r, t, n) for r, t in parts])
 
 
 def _nearest(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: int) -> Tensor:
@@ -224,7 +225,7 @@ def _within_reach(lattice: Floats, place: Floats, n: int, side: float, farther: 
     Returns:
         Indices of the places, in ascending order, and of the points, [2, P].
     """
-    tree, targets = shapely.STRtree(shapely.points(lattice).tolist()), shapely.points(place)
+    tree, targets = shapely.STRtree(np.asarray(shapely.points(lattice))), shapely.points(place)
     reach = np.full(len(place), side * math.sqrt(n / math.pi))
     while True:
         found = tree.query(targets, predicate="dwithin", distance=reach)[0]

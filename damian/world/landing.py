@@ -293,7 +293,7 @@ def _assign_in_rounds(
     at_once, points, distances = max(BOOKING_CHUNK // n_points, 1), point.flatten(), distance.flatten()
     first = row * point.shape[1]
     parts = zip(*(each.split(at_once) for each in (first, standing, reach)), strict=True)
-    return torch.cat([_rounds(points, distances, *part, n_points) for part in parts])
+    return torch.cat([_rounds(points, distances, f, s, r, n_points) for f, s, r in parts])
 
 
 @_assign_in_rounds.register_fake
