@@ -30,8 +30,6 @@ HUGE, TINY = 1e9, 1e-9
 
 Products and ratios of a few such numbers do not overflow in single precision, nor vanish.
 """
-MEMORY_BYTES = 4_000_000_000
-"""Most bytes that one part of an environment may allocate, as far as its settings tell."""
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _KINDS = {bool: "true or false", list: "a list of places such as [[0, 0], [100, 50]]"}
@@ -188,9 +186,3 @@ def device(key: str, value: str) -> None:
     n_gpus = torch.cuda.device_count()
     available = ["cpu", *(f"cuda:{i}" for i in range(n_gpus)), *["cuda"] * bool(n_gpus)]
     require(value in available, key, value, f"is not one of the devices here: {', '.join(available)}")
-
-
-def fits(key: str, value: Any, n_bytes: int, remedy: str) -> None:
-    """Require that what a setting makes an environment allocate fits into ``MEMORY_BYTES``."""
-    problem = f"needs {n_bytes / 1e9:.1f} GB of memory, more than {MEMORY_BYTES / 1e9:g} GB: {remedy}"
-    require(n_bytes <= MEMORY_BYTES, key, value, problem)
