@@ -8,18 +8,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from damian.delays.config import DelayConfig
     from damian.delays.laws import Burst, Constant, Distance, Geometric, Lag, Law, Trace, Uniform
     from damian.delays.samplers import ContextSampler, MessageContext
-    from damian.envs.clocks import ClockConfig
     from damian.envs.pipeline import make_env
-    from damian.envs.scenario import ScenarioConfig
     from damian.envs.uav_env import UavEnv
-    from damian.learners.base import LearnerConfig, LearningSetup
     from damian.recipes.shared.environments import compose_scenario  # type: ignore[import-not-found]
     from damian.replay.backupdate import BackupdateStorage
     from damian.server.features import feature
     from damian.server.rewards import reward_term
+    from damian.settings import ClockConfig, DelayConfig, LearnerConfig, LearningSetup, ScenarioConfig
     from damian.transforms import (
         ActionDelay,
         ActionHistory,
@@ -39,18 +36,15 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it
 __version__ = "0.18.0.dev0"
 
 _MODULES = {
-    "damian.delays.config": ["DelayConfig"],
     "damian.delays.laws": ["Burst", "Constant", "Distance", "Geometric", "Lag", "Law", "Trace", "Uniform"],
     "damian.delays.samplers": ["ContextSampler", "MessageContext"],
-    "damian.envs.clocks": ["ClockConfig"],
     "damian.envs.pipeline": ["make_env"],
-    "damian.envs.scenario": ["ScenarioConfig"],
     "damian.envs.uav_env": ["UavEnv"],
-    "damian.learners.base": ["LearnerConfig", "LearningSetup"],
     "damian.recipes.shared.environments": ["compose_scenario"],
     "damian.replay.backupdate": ["BackupdateStorage"],
     "damian.server.features": ["feature"],
     "damian.server.rewards": ["reward_term"],
+    "damian.settings": ["ClockConfig", "DelayConfig", "LearnerConfig", "LearningSetup", "ScenarioConfig"],
     "damian.transforms": [
         "ActionDelay",
         "ActionHistory",

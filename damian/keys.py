@@ -4,7 +4,10 @@ The root TensorDict has the batch size [B] (worlds), the one under ``"agents"`` 
 TorchRL stores the environment's outputs with the same keys under ``"next"``.
 """
 
-from tensordict import NestedKey
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tensordict import NestedKey
 
 AGENTS = "agents"
 
@@ -104,11 +107,11 @@ RESET_AFTER = "reset_after"
 """Was the environment reset after this step, [T, B, 1] bool."""
 
 
-def next_key(key: NestedKey) -> NestedKey:
+def next_key(key: "NestedKey") -> "NestedKey":
     """The key under which TorchRL stores an entry's value after the step: ``("next", *key)``."""
     return ("next", *((key,) if isinstance(key, str) else key))
 
 
-def last_part(key: NestedKey) -> NestedKey:
+def last_part(key: "NestedKey") -> "NestedKey":
     """The last part of a key, which is its name within the innermost TensorDict."""
     return key if isinstance(key, str) else key[-1]

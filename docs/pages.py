@@ -15,8 +15,7 @@ from mkdocs.structure.files import File, Files
 
 import damian
 from damian.recipes.command import PROGRAMS, SETTINGS
-from damian.recipes.shared.help_text import help_text
-from damian.recipes.shared.known_settings import Setting, default_options, groups, known_settings
+from damian.recipes.known import Setting, default_options, groups, help_text, known_settings
 
 ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}

@@ -21,14 +21,10 @@ import socket
 import time
 from collections.abc import Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import ClassVar
 
-import hydra
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
 from damian.advice.fitting import fit, read_log, summary, trace_rows
@@ -37,99 +33,25 @@ from damian.advice.node import Node, for_uavs, scenario_of_service
 from damian.advice.rows import read_file
 from damian.advice.session import AdviceSession, read_inbox, write_answer
 from damian.baselines.greedy import greedy_policy
-from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.runs.run_lock import is_folder, locked
+from damian.settings.programs import AdviseConfig, check_token
 
+from . import cli
 from .evaluate import stored_actor
-from .shared.command_line import is_secret
-from .shared.flown_policy import FlownPolicyConfig
-from .shared.known_settings import CONF
-from .shared.launch import launch, perform, prepare, reported
-from .shared.settings import store_schema
-from .shared.stored_runs import save_config
+from .shared.runs import save_config
 
 FLEET = "main"
 """Name of the only fleet of a table or a folder."""
 
 
-@dataclass
-class AdviseConfig(FlownPolicyConfig):
-    """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
-
-    policies: ClassVar[tuple[str, ...]] = ("deterministic", "sampled", "script")
-
-    policy: str | None = None
-    """The policy of ``checkpoint``: its most likely actions (``deterministic``), or ``sampled`` ones; or the
-    ``script``. If it is not given: ``deterministic`` with a checkpoint, ``script`` without."""
-    reports: str | None = None
-    """Table of reports to answer once, CSV or JSON."""
-    folder: str | None = None
-    """Folder to watch for tables of reports; each is answered in ``advice.csv`` and ``advice.json`` there."""
-    port: int | None = None
-    """Port of the service over HTTP; 0: a free one."""
-    fit: str | None = None
-    """Journal, or table of reports with the column receive time: nothing is advised, and a trace law of its
-    delays is written into the run folder as ``trace.csv``."""
-    fit_dt: float | None = None
-    """Length of a step [s], with ``fit``: delays of the trace are whole steps, as the journal counts them;
-    without it they are times, which a simulation rounds up to whole steps."""
-    host: str = "127.0.0.1"
-    """Address that the service listens to: by default only programs of this machine reach it."""
-    token: str | None = None
-    """Password of the service over HTTP; if not given, that of the environment variable ``DAMIAN_TOKEN``, or
-    one that is made and printed. No file of the run folder keeps it."""
-    uavs: list[str] = field(default_factory=list)
-    """IDs of the UAVs of a table or a folder; those of the table, in their order, if not given."""
-    journal: str | None = None
-    """Folder of the journals, which are restored from it at the start; in the run folder if not given."""
-    durable: bool = False
-    """Make every line of a journal last even if the machine stops; it takes milliseconds."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.port is not None:
-            checks.whole("port", self.port, 0, 65535)
-        check_token("token", self.token)
-        if self.fit_dt is not None:
-            checks.above("fit_dt", self.fit_dt, 0.0, "s")
-
-    def check_source(self) -> None:
-        """Require exactly one source of reports.
-
-        Raises:
-            InputError: there is none, or more than one, or a journal is named that nothing would write.
-        """
-        given = [name for name in ("reports", "folder", "port", "fit") if getattr(self, name) is not None]
-        if len(given) != 1:
-            problem = f"{' and '.join(given)} are given" if given else "is missing"
-            raise InputError(
-                f"reports: {problem}: give one of reports=FILE, folder=FOLDER, port=NUMBER, fit=FILE"
-            )
-        if self.reports is not None or self.fit is not None:
-            for name in ("journal", "durable"):
-                problem = "is for a service or a folder, which alone have a journal: leave it out"
-                checks.require(not getattr(self, name), name, getattr(self, name), problem)
-
-
-def check_token(key: str, token: str | None) -> None:
-    """Require a password that nobody guesses and every header can carry, if there is one."""
-    good = token is None or (
-        len(token) >= 16 and token.isascii() and token.isprintable() and " " not in token
-    )
-    checks.require(good, key, "it", "is not a password of at least 16 printable ASCII characters")
-
-
 def without_token(config: AdviseConfig) -> AdviseConfig:
     """The settings, as files may keep them."""
     kept = copy.copy(config)
-    kept.token, kept.overrides = None, [word for word in config.overrides if not is_secret(word)]
+    kept.token, kept.overrides = None, [word for word in config.overrides if not cli.is_secret(word)]
     return kept
-
-
-store_schema("advise_schema", AdviseConfig)
 
 
 def make_session(config: AdviseConfig, folder: Path | None, is_locked: bool = False) -> AdviceSession:
@@ -297,17 +219,9 @@ def watch(inbox: Path, session: AdviceSession, uavs: Sequence[str]) -> None:
             time.sleep(0.2)
 
 
-@hydra.main(version_base=None, config_path=CONF, config_name="advise")
-@reported
-def main(composed: DictConfig) -> None:
-    if composed.resume is not None:
-        raise InputError("resume: nothing is trained; give the run folder as checkpoint")
-    perform(*prepare(composed), advise)  # type: ignore[arg-type]
-
-
 def run() -> None:
     """Run the program with the words of the command line."""
-    launch(main, "advise")
+    cli.run(advise, "advise")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     damian train agents=3 delay.obs=3
     damian --help
 
-A misspelt setting is answered before TorchRL, which takes seconds to import, is loaded.
+Help and wrong words are answered before TorchRL, which takes seconds to import, is loaded.
 """
 
 import os
@@ -14,9 +14,8 @@ from importlib import import_module
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
 
-from .shared.command_line import parsed, prepared
-from .shared.help_text import help_text
-from .shared.misspelt import check_words
+from .known import check_words, help_text
+from .words import parsed
 
 PROGRAMS = {
     "train": "train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one",
@@ -30,12 +29,11 @@ PROGRAMS = {
 """What each program does, by its name; the program is the module of this name."""
 SETTINGS = {
     **dict.fromkeys(("train", "evaluate", "oracle"), "train"),
-    "compare": "compare",
-    "fly": "fly",
-    "tune": "tune",
-    "advise": "advise",
+    **{name: name for name in ("compare", "fly", "tune", "advise")},
 }
 """Programs with settings of the form KEY=VALUE, and whose settings these are."""
+AGAIN = ("compare", "tune")
+"""Programs that go on in their folder with the same command."""
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -55,31 +53,34 @@ def main(words: Sequence[str] | None = None) -> None:
         print(import_module("damian").__version__)
         return
     if name not in PROGRAMS:
-        sys.exit(_refuse(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}"))
-    if name in SETTINGS and _answered(name, words):
+        sys.exit(refuse(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}"))
+    if name in SETTINGS and _answered(name, SETTINGS[name], words):
         return
     sys.argv = [f"damian {name}", *words]
     try:
-        program = import_module(f".{name.replace('-', '_')}", __package__)
+        program = import_module(f".{name}", __package__)
     except InputError as error:  # it needs a package that is not installed
-        sys.exit(_refuse(str(error)))
+        sys.exit(refuse(str(error)))
     program.run()
 
 
-def _answered(name: str, words: Sequence[str]) -> bool:
-    """Answer a question for help and a misspelt word, without loading the program."""
+def _answered(name: str, program: str, words: Sequence[str]) -> bool:
+    """Answer a question for help and a wrong word, without loading the program."""
     try:
         given = parsed(words)
         if given.help:
             keys = [word for word in given.overrides if "=" not in word]
-            _show(help_text(name, SETTINGS[name], keys, given.config_dir))
+            _show(help_text(name, program, keys, given.config_dir))
             return True
-        problem = check_words(SETTINGS[name], prepared(words))
+        check_words(program, given.overrides, given.config_dir)
     except InputError as error:
-        problem = str(error)
-    if problem:
-        sys.exit(_refuse(problem))
-    return False
+        sys.exit(refuse(str(error)))
+    cli = import_module(".cli", __package__)  # with Hydra, which takes a while to import
+    with cli.one_line_errors():
+        cli.check(program, given, name in AGAIN)
+        if given.cfg:
+            _show(cli.configuration(program, given))
+    return bool(given.cfg)
 
 
 def _show(text: str) -> None:
@@ -100,7 +101,7 @@ def usage() -> str:
 MORE = "damian PROGRAM --help explains a program's settings, damian --version prints the version."
 
 
-def _refuse(problem: str) -> int:
+def refuse(problem: str) -> int:
     """Print an error, and return the exit code of wrong input."""
     print(f"error: {one_line(problem)}", file=sys.stderr)
     return 2

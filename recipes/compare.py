@@ -16,19 +16,11 @@ figure.png and curves.png. With report_only=true these are made again, from the 
 any, from results.csv and curves.csv.
 """
 
-import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
-
-import hydra
-from hydra import compose
-from hydra.core.config_store import ConfigStore
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import MISSING, DictConfig
 
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
@@ -36,7 +28,6 @@ from damian.common.errors import InputError
 from damian.compare.comparison import (
     HELD_OUT_MARK,
     NOT_LATE,
-    SCORES,
     TRAINED,
     TRAINED_DETERMINISTIC,
     Comparison,
@@ -46,109 +37,22 @@ from damian.compare.figures import plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.envs.pipeline import has_message_delay
+from damian.settings import TrainConfig
+from damian.settings.programs import SEEDS, CompareConfig
 
-from . import oracle
+from . import cli, oracle
 from .evaluate import fly, fly_untrained
-from .shared.command_line import command, typed_words, whole_laws
 from .shared.comparison_results import ROWS, Results, results_of, stored_results, write_csv
-from .shared.composition_errors import COMPOSITION_ERRORS, one_line
-from .shared.experiment import Experiment
-from .shared.inheritance import check_policy_fits
-from .shared.known_settings import CONF
-from .shared.launch import checked, launch, reported, shown
 from .shared.many_runs import LOG, RayTasks, Run, SlurmJobs, check_stored, perform_all, stop_code
-from .shared.settings import TrainConfig
+from .shared.runs import check_policy_fits
+from .shared.settings import check_learning, late
 from .train import train
+from .words import whole_laws
 
 TABLE, MARKDOWN, FIGURE, CURVES = "table.csv", "table.md", "figure.png", "curves.png"
-SEEDS, EPISODES = 10, 100
+EPISODES = 100
 """A report with an arm of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
 POLICIES = {"sampled": TRAINED, "deterministic": TRAINED_DETERMINISTIC}
-
-
-@dataclass
-class CompareConfig:
-    """All settings of ``damian compare``."""
-
-    experiment: Experiment = MISSING
-    seeds: int | None = None
-    """Number of seeds, counted from ``experiment.first_seed``. If it is not given: 10, and with
-    ``report_only`` as many as are stored."""
-    processes: int = 1
-    """Number of runs at the same time; each has one thread unless ``overrides`` sets ``threads``."""
-    launcher: str = "local"
-    """Where the runs are carried out: in processes of this machine (``local``), as Ray tasks (``ray``) on the
-    cluster of ``RAY_ADDRESS`` or else on this machine, or as Slurm jobs (``slurm``). All machines must see
-    the folder of the comparison (docs/scaling.md)."""
-    slurm: Any = None
-    """Parameters of submitit's executor with ``launcher=slurm``, such as
-    ``{slurm_partition: cpu, timeout_min: 600}``; ``{cluster: local}`` starts the jobs on this machine."""
-    tasks: list[str] | None = None
-    """Names of the tasks to run; all of the experiment's if not given."""
-    delays: list[str] | None = None
-    """Names of the delays to run; all of the experiment's if not given."""
-    arms: list[str] | None = None
-    """Names of the arms to run; all of the experiment's if not given."""
-    overrides: list[str] = field(default_factory=list)
-    """Further overrides of ``damian train`` for every run."""
-    score: str = "return"
-    """The measure J that J_norm and recovery are computed from: return, success_rate or steps,
-    of what truly happened; perceived_return, perceived_success_rate or steps, as the server perceived it."""
-    policy: str = "sampled"
-    """The evaluation that J comes from: actions ``sampled`` from the policy, or the most likely ones
-    (``deterministic``)."""
-    report_only: bool = False
-    """Train and fly nothing; write tables and figures from the finished or the stored results."""
-
-    def __post_init__(self) -> None:
-        if self.seeds is not None:
-            checks.whole("seeds", self.seeds, 1, 10_000)
-        checks.whole("processes", self.processes, 1, 1024)
-        checks.one_of("launcher", self.launcher, ("local", "ray", "slurm"))
-        should = "means nothing without launcher=slurm"
-        checks.require(self.slurm is None or self.launcher == "slurm", "slurm", self.slurm, should)
-        mapping = self.slurm is None or isinstance(self.slurm, dict)
-        checks.require(mapping, "slurm", self.slurm, "is no mapping such as {slurm_partition: cpu}")
-        checks.one_of("score", self.score, SCORES)
-        checks.one_of("policy", self.policy, POLICIES)
-        for word in self.overrides:
-            ours = re.match(r"[+~]*(seed|resume|checkpoint|logger|overrides|hydra)\b", word)
-            should = "cannot be the same for every run: the comparison sets it; leave it out"
-            checks.require(not ours, "overrides", word, should)
-        for kind in ("tasks", "delays", "arms"):
-            none = getattr(self, kind) == [] and kind != "delays"
-            checks.require(not none, kind, [], "names none: leave it out, for all of them")
-            for name in getattr(self, kind) or ():
-                checks.one_of(kind, name, getattr(self.experiment, kind))
-        for name, arm in self.chosen("arms").items():
-            if arm.policy_of is not None:
-                sources = [
-                    n
-                    for n, a in self.chosen("arms").items()
-                    if a.policy_of is None and not (a.oracle or a.untrained)
-                ]
-                checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, sources)
-
-    def chosen(self, kind: str) -> dict[str, Any]:
-        """The experiment's tasks, delays or arms (``kind``) that are asked for, by name."""
-        every, only = getattr(self.experiment, kind), getattr(self, kind)
-        return {name: every[name] for name in every if only is None or name in only}
-
-    def includes(self, row: Row) -> bool:
-        """Is a row of results of a task, a delay, an arm and a seed that are asked for?"""
-        task, delays = row["task"].partition(HELD_OUT_MARK)[0], [NOT_LATE, *self.chosen("delays")]
-        chosen = task in self.chosen("tasks") and row["arm"] in self.chosen("arms")
-        seeds = range(self.experiment.first_seed, sys.maxsize) if self.seeds is None else self.every_seed
-        return chosen and row["delay"] in delays and row["seed"] in seeds
-
-    @property
-    def every_seed(self) -> range:
-        """The seeds that are asked for."""
-        n_seeds = SEEDS if self.seeds is None else self.seeds
-        return range(self.experiment.first_seed, self.experiment.first_seed + n_seeds)
-
-
-ConfigStore.instance().store(name="compare_schema", node=CompareConfig)
 
 
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
@@ -208,16 +112,16 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     overrides = whole_laws(["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides])
     try:
         unseeded = _composed(*overrides)
-        late = [] if arm.delayed else unseeded.late
+        late_by = [] if arm.delayed else late(unseeded)
         should = "delays this arm, with which others are compared: put delays under experiment.delays"
-        checks.require(not late, ", ".join(late), "its value", should)
+        checks.require(not late_by, ", ".join(late_by), "its value", should)
         flies_script = arm.oracle and unseeded.seeks_source and has_message_delay(unseeded)
         if flies_script:
             oracle.check(unseeded)
         elif source is None and not arm.oracle and not arm.untrained:
-            unseeded.check_learning()
-    except COMPOSITION_ERRORS as error:
-        raise InputError(f"{task}/{delay}/{name}: {one_line(error)}") from error
+            check_learning(unseeded)
+    except InputError as error:
+        raise InputError(f"{task}/{delay}/{name}: {error}") from error
     if arm.oracle and not flies_script:
         return  # nothing is won by finding the source, as the script does, or no message is late
     for seed in config.every_seed:
@@ -234,7 +138,15 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
 @cache  # several arms differ only in whose policy they fly; Hydra takes a fifth of a second
 def _composed(*overrides: str) -> TrainConfig:
     """The settings of a training with these overrides."""
-    return checked(compose("train", list(overrides)))
+    return cli.settings(*overrides)
+
+
+def includes(config: CompareConfig, row: Row) -> bool:
+    """Is a row of results of a task, a delay, an arm and a seed that are asked for?"""
+    task, delays = row["task"].partition(HELD_OUT_MARK)[0], [NOT_LATE, *config.chosen("delays")]
+    chosen = task in config.chosen("tasks") and row["arm"] in config.chosen("arms")
+    seeds = range(config.experiment.first_seed, sys.maxsize) if config.seeds is None else config.every_seed
+    return chosen and row["delay"] in delays and row["seed"] in seeds
 
 
 def report(config: CompareConfig, results: Results, missing: Sequence[str], folder: Path) -> None:
@@ -262,9 +174,9 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
     for row in rows:
         by_arm.setdefault((row["task"], row["delay"], row["arm"]), set()).add(row["seed"])
     seeds, episodes = sorted(set().union(*by_arm.values())), sorted({int(row["episodes"]) for row in rows})
-    words = [word for word in typed_words() if not word.startswith("report_only")]
+    words = [word for word in cli.typed_words if not word.startswith("report_only")]
     notes = [
-        f"`{command(words)}`",
+        f"`{cli.command(words)}`",
         f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {' or '.join(map(str, episodes))} episodes each",
         "Mean over seeds [95 % interval: stratified bootstrap over seeds, widened for few seeds; none below "
         f"{FEWEST}]; J: {config.score} of the {config.policy} policy; perceived: as far as the server knew, "
@@ -280,14 +192,12 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
     return notes + ([f"missing: {', '.join(missing)}"] if missing else [])
 
 
-@hydra.main(version_base=None, config_path=CONF, config_name="compare")
-@reported
-def main(composed: DictConfig) -> None:
-    config: CompareConfig = checked(composed, "compare")
-    folder, failed = Path(HydraConfig.get().runtime.output_dir), []
+def compare(config: CompareConfig, folder: Path) -> None:
+    """Carry out the runs of a comparison that are not finished, and report on them."""
+    failed: list[Run] = []
     if config.report_only and _stores_results(config, folder):
         results, missing = stored_results(folder), []
-        results = results.only(config.includes)
+        results = results.only(partial(includes, config))
     else:
         if config.report_only and config.seeds is None:
             config = replace(config, seeds=_seeds_of_runs(config, folder))
@@ -296,7 +206,7 @@ def main(composed: DictConfig) -> None:
         raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")
     report(config, results, missing, folder)
     print((folder / MARKDOWN).read_text())
-    print(f"results: {shown(folder)}")
+    print(f"results: {cli.shown(folder)}")
     if failed:
         sys.exit(1)
 
@@ -348,7 +258,7 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
 
 def run() -> None:
     """Run the program with the words of the command line."""
-    launch(main, "compare")
+    cli.run(compare, "compare", again=True)
 
 
 if __name__ == "__main__":

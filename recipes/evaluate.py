@@ -12,9 +12,7 @@ return of the trained policy beside the untrained one, the script and random act
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-import hydra
 import torch
-from omegaconf import DictConfig
 from torchrl.modules import ProbabilisticActor
 
 from damian.baselines.greedy import greedy_policy
@@ -26,11 +24,10 @@ from damian.envs.pipeline import has_message_delay, make_env
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import DETERMINISTIC, save_results
 from damian.runs.training_state import load_networks
+from damian.settings import TrainConfig
 
-from .shared.known_settings import CONF
-from .shared.launch import launch, perform, prepare, reported
-from .shared.settings import TrainConfig
-from .shared.stored_runs import save_config
+from . import cli
+from .shared.runs import save_config
 
 MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
 of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
@@ -138,15 +135,9 @@ def own_code(learner: str) -> AbstractContextManager[None]:
     return naming_errors(learner) if ":" in learner else nullcontext()
 
 
-@hydra.main(version_base=None, config_path=CONF, config_name="train")
-@reported
-def main(composed: DictConfig) -> None:
-    perform(*prepare(composed), fly)
-
-
 def run() -> None:
     """Run the program with the words of the command line."""
-    launch(main)
+    cli.run(fly)
 
 
 if __name__ == "__main__":

@@ -15,16 +15,13 @@ flight that it tells. Nor is it with ``replay``, which makes one page, replay.ht
 side by side: the same seed flown with and without a delay shows what the delay does.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import ClassVar
 
-import hydra
 import numpy as np
 from matplotlib.animation import FFMpegWriter
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
@@ -37,84 +34,18 @@ from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
+from damian.settings import TrainConfig
+from damian.settings.programs import FILMS, FlyConfig
 from damian.show.belief_figure import plot_beliefs
 from damian.show.episode import Episode, record
-from damian.show.film import VIEWS, check_gif, save_film
+from damian.show.film import check_gif, save_film
 from damian.show.geojson import origin_of, save_geojson
-from damian.show.replay_page import MOST, save_page
+from damian.show.replay_page import save_page
 
+from . import cli
 from .evaluate import stored_actor
-from .shared.flown_policy import FlownPolicyConfig
-from .shared.inheritance import key_of, without
-from .shared.known_settings import CONF
-from .shared.launch import checked, composed_with, launch, perform, prepare, reported
-from .shared.settings import TrainConfig, store_schema
-from .shared.stored_runs import save_config
-
-KEPT = ("all", "extremes")
-FORMATS = ("gif", "mp4", "png", "html", "geojson")
-FILMS = FORMATS[:2]
-
-
-@dataclass
-class FlyConfig(FlownPolicyConfig):
-    """All settings of ``damian fly``: those of ``damian train``, and what to fly and to keep."""
-
-    policies: ClassVar[tuple[str, ...]] = ("sampled", "deterministic", "script", "random")
-
-    eval_episodes: int = 1
-    """Episodes to fly."""
-    policy: str | None = None
-    """The policy of ``checkpoint``: ``sampled`` actions, or its most likely ones (``deterministic``); the
-    ``script``; or ``random``. If it is not given: ``sampled`` with a checkpoint, ``script`` without."""
-    keep: str = "all"
-    """Which episodes to keep: ``all``, or the ``extremes``: the best, the median and the worst by return."""
-    formats: list[str] = field(default_factory=lambda: ["gif", "png"])
-    """What to make of each: films as ``gif`` or ``mp4`` (which needs ffmpeg), the figure ``png``, ``html``, a
-    page that plays it in any browser, and ``geojson`` for map tools, over a real region."""
-    views: list[str] = field(default_factory=lambda: ["2d"])
-    """Views of the films: ``2d``, from above, and ``3d``, with the space above the region."""
-    journal: str | None = None
-    """Journal of ``damian advise`` whose flight to show, instead of flying; its settings apply too."""
-    span: list[float] | None = None
-    """First and last time of the journal to show, since every UAV had reported [s]; all if not given."""
-
-    replay: list[str] = field(default_factory=list)
-    """Files of stored episodes to play side by side in one page, instead of flying."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        sources = [name for name in ("journal", "replay") if getattr(self, name)]
-        checks.require(len(sources) < 2, "replay", self.replay, "does not go with journal: leave one out")
-        for source in sources:
-            for key, default in (
-                ("checkpoint", None),
-                ("policy", None),
-                ("eval_episodes", 1),
-                ("keep", "all"),
-            ):
-                given = getattr(self, key)
-                checks.require(
-                    given == default, key, given, f"means nothing with {source}, which flies nothing"
-                )
-        if self.replay:
-            checks.in_range("replay", len(self.replay), 1, MOST, "episodes")
-        if self.span is not None:
-            good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal is not None
-            checks.require(good, "span", self.span, "is not [FIRST, LAST], two times of a journal [s]")
-        checks.one_of("keep", self.keep, KEPT)
-        for each in self.formats:
-            checks.one_of("formats", each, FORMATS)
-        for each in self.views:
-            checks.one_of("views", each, VIEWS)
-        films = [kind for kind in self.formats if kind in FILMS]
-        should = f"names no view for the films that formats={films} asks for: choose 2d or 3d"
-        checks.require(bool(self.views) or not films, "views", [], should)
-        films = "mp4" not in self.formats or FFMpegWriter.isAvailable()
-        checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
-
-
-store_schema("fly_schema", FlyConfig)
+from .shared.runs import require_trust, save_config, without
+from .words import key_of
 
 
 def fly(config: FlyConfig) -> list[Episode]:
@@ -143,8 +74,10 @@ def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
     told = read_head(Path(str(config.journal))).about.overrides
     of_advice = {each.name for each in fields(AdviseConfig)} - {each.name for each in fields(TrainConfig)}
     replaced = [*map(key_of, config.overrides), *of_advice, "checkpoint", "eval_episodes"]
-    overrides = [*without(told, replaced), *config.overrides]
-    settings: FlyConfig = checked(composed_with("fly", overrides), "fly")
+    overrides = [*without(told, [*replaced, "hydra", "trust"]), *config.overrides]
+    found = cli.composed("fly", overrides)
+    require_trust(found, "journal", config.trust, config.overrides)
+    settings: FlyConfig = cli.checked(found, "fly")
     settings.overrides = overrides
     return settings
 
@@ -245,20 +178,23 @@ def summary(name: str, episode: Episode) -> str:
     )
 
 
-@hydra.main(version_base=None, config_path=CONF, config_name="fly")
-@reported
-def main(composed: DictConfig) -> None:
-    if composed.resume is not None:
-        raise InputError("resume: nothing is trained; give the run folder as checkpoint")
-    config, folder = prepare(composed)
-    if composed.journal is not None:
-        config = with_settings_of_journal(config)  # type: ignore[arg-type]
-    perform(config, folder, replay if composed.replay else show)  # type: ignore[arg-type]
+def fly_or_show(config: FlyConfig, folder: Path) -> None:
+    """Replay or fly episodes, or take the flight of a journal with the settings by which it was advised.
+
+    Raises:
+        InputError: a film needs a program that is not there, or the journal is none.
+    """
+    films = "mp4" not in config.formats or FFMpegWriter.isAvailable()
+    checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
+    if config.replay:
+        replay(config, folder)
+        return
+    show(config if config.journal is None else with_settings_of_journal(config), folder)
 
 
 def run() -> None:
     """Run the program with the words of the command line."""
-    launch(main, "fly")
+    cli.run(fly_or_show, "fly")
 
 
 if __name__ == "__main__":

@@ -20,9 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-import hydra
 import torch
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torch.nn.functional import one_hot
@@ -35,18 +33,16 @@ from damian.common.errors import InputError
 from damian.compare.comparison import KNOWN_ON_TIME
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
-from damian.envs.scenario import ScenarioConfig
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import save_results
 from damian.server.belief import SourceGrid
 from damian.server.server import Server
+from damian.settings import ScenarioConfig, TrainConfig
 from damian.world.messages import Messages
 
+from . import cli
 from .evaluate import stored
-from .shared.known_settings import CONF
-from .shared.launch import launch, perform, prepare, reported
-from .shared.settings import TrainConfig
-from .shared.stored_runs import save_config
+from .shared.runs import save_config
 
 ALL = Messages._fields
 PLACE = ("position", "target", "track", "trail")
@@ -170,17 +166,9 @@ def true_belief(env: DelayedEnv) -> TensorDictModule:
     return TensorDictModule(know, in_keys=[keys.STATE, keys.MESSAGE], out_keys=[keys.BELIEF])
 
 
-@hydra.main(version_base=None, config_path=CONF, config_name="train")
-@reported
-def main(composed: DictConfig) -> None:
-    if composed.resume is not None:
-        raise InputError("resume: nothing is trained; give the run folder as checkpoint")
-    perform(*prepare(composed), fly)
-
-
 def run() -> None:
     """Run the program with the words of the command line."""
-    launch(main)
+    cli.run(fly)
 
 
 if __name__ == "__main__":

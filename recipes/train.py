@@ -19,10 +19,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
 import torch
 from numpy.typing import NDArray
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from tqdm import tqdm
@@ -31,6 +29,7 @@ from damian import keys
 from damian.common import checks
 from damian.common.errors import RunError
 from damian.common.threads import using_threads
+from damian.delays.config import settings_longer_than
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay
 from damian.keys import next_key
@@ -44,14 +43,14 @@ from damian.runs.loggers import make_loggers
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, FIGURE, plot_learning_curve
 from damian.runs.training_state import TrainingState, load_networks
+from damian.settings import TrainConfig
+from damian.settings.fields import leaves
 
+from . import cli
 from .evaluate import make_eval_env, own_code, report
 from .shared.collectors import WorkerLost, collecting, collector_parts, learning_env, ticks
-from .shared.inheritance import settings_by_key
-from .shared.known_settings import CONF
-from .shared.launch import interrupted, launch, perform, prepare, reported
-from .shared.settings import TrainConfig
-from .shared.stored_runs import run_folder, save_config, stored_config
+from .shared.runs import interrupted, run_folder, save_config, stored_config
+from .shared.settings import backupdates, check_learning, learning_setup, longest_wait
 from .shared.training_film import film_policy
 
 Watch = Callable[[int, dict[str, float]], None]
@@ -65,7 +64,7 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
         InputError: the settings do not allow training, or the checkpoint cannot be loaded.
         RunError: the learner has diverged, or a file cannot be written.
     """
-    config.check_learning()
+    check_learning(config)
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
@@ -97,7 +96,7 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     """The replay buffer (back-updating or not) of the learner, if it needs one."""
     with own_code(config.learner.name):
-        size = config.learner.buffer_size(config.learning_setup)
+        size = config.learner.buffer_size(learning_setup(config))
     return None if size is None else make_buffer(config, env, size)
 
 
@@ -105,7 +104,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
     """The learner, with the replay buffer that it needs."""
     name = config.learner.name
     with own_code(name):
-        learner = config.learner.make(env, config.learning_setup, buffer)
+        learner = config.learner.make(env, learning_setup(config), buffer)
         has_actor = "actor" in learner.components()
     should = "has no actor, which evaluations load: return {'actor': self.actor, ...}"
     checks.require(has_actor, f"{name}: components", [*learner.components()], should)
@@ -114,9 +113,9 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
 
 def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer:
     """A replay buffer of ``size`` environment steps; with ``backupdate``, what arrives late corrects them."""
-    if not config.backupdates:
+    if not backupdates(config):
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
-    setup, actor = config.learning_setup, config.recompute_actor
+    setup, actor = learning_setup(config), config.recompute_actor
     least = setup.least_buffer
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
     checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
@@ -130,7 +129,7 @@ def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer
     storage = BackupdateStorage(
         size,
         recompute,
-        config.longest_wait,
+        longest_wait(config),
         corrections=corrections,
         hindsight_key=keys.HINDSIGHT if hindsight else None,
         device=config.device,
@@ -146,7 +145,7 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
     if config.resume:
         state.load()
     elif config.checkpoint:
-        trained = stored_config(run_folder(Path(config.checkpoint)), "checkpoint").learner.name
+        trained = stored_config(run_folder(Path(config.checkpoint)), "checkpoint", trust=True).learner.name
         names = ["actor", "critic"] if trained == config.learner.name else ["actor"]
         networks = {name: state.components[name] for name in names if name in state.components}
         load_networks(Path(config.checkpoint), "checkpoint", networks)
@@ -236,7 +235,7 @@ def distributions(batch: TensorDictBase) -> dict[str, NDArray[Any]]:
 def open_log(config: TrainConfig, state: TrainingState) -> MetricsLog:
     """The files and loggers that get the numbers of each update."""
     loggers, log_to = make_loggers(config.logger.custom, state.folder), config.logger
-    frames, settings = state.progress.frames, dict(settings_by_key(config))
+    frames, settings = state.progress.frames, dict(leaves(config))
     return MetricsLog(state.folder, log_to.tensorboard, log_to.csv, frames, loggers, settings)
 
 
@@ -276,19 +275,13 @@ def note_what_never_happens(config: TrainConfig) -> None:
     if warm_up > config.frames:
         print(f"note: learner.warm_up: all {config.frames} steps are fewer than {warm_up}: nothing is learnt")
     n_steps = config.episode.max_steps
-    for key in config.delay.settings_longer_than(n_steps, config.clock.dt) if n_steps else ():
+    for key in settings_longer_than(config.delay, n_steps, config.clock.dt) if n_steps else ():
         print(f"note: {key} is at least as long as an episode of {n_steps} steps: nothing arrives in it")
-
-
-@hydra.main(version_base=None, config_path=CONF, config_name="train")
-@reported
-def main(composed: DictConfig) -> None:
-    perform(*prepare(composed), train)
 
 
 def run() -> None:
     """Run the program with the words of the command line."""
-    launch(main)
+    cli.run(train)
 
 
 if __name__ == "__main__":

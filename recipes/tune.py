@@ -22,15 +22,11 @@ import shlex
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
-from hydra import compose
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 from tqdm import tqdm
 
 from damian.common import checks
@@ -38,17 +34,16 @@ from damian.common.atomic_files import write_atomically
 from damian.common.csv_table import csv_table
 from damian.common.errors import InputError, RunError
 from damian.common.markdown import markdown_table
-from damian.compare.comparison import LESS_IS_BETTER, SCORES
+from damian.settings import TrainConfig
+from damian.settings.programs import TuneConfig
 
+from . import cli
 from .compare import POLICIES
-from .shared.command_line import command, typed_words
-from .shared.composition_errors import COMPOSITION_ERRORS, one_line
-from .shared.known_settings import CONF, known_settings
-from .shared.launch import checked, launch, reported, shown
+from .known import known_settings, no_such_key
 from .shared.many_runs import Run, perform_each, stop_code
-from .shared.misspelt import no_such_key
-from .shared.settings import TrainConfig, store_schema
+from .shared.settings import check_learning
 from .train import train
+from .words import key_of
 
 try:
     import optuna
@@ -77,48 +72,8 @@ WARM_UP = 5
 """Trials before one may be pruned."""
 
 
-@dataclass
-class TuneConfig(TrainConfig):
-    """All settings of ``damian tune``: those of ``damian train``, and how to search."""
-
-    search: dict[str, Any] = field(default_factory=dict)
-    """What to vary: settings of ``damian train``, each as ``{low: 1, high: 8}``, with ``log: true`` or
-    ``step``, or as ``{choices: [...]}``; conf/search has a file for each learner."""
-    trials: int = 30
-    """Number of trainings, pruned ones included."""
-    processes: int = 1
-    """Number of trainings at the same time; each has one thread unless ``threads`` says otherwise."""
-    prune: bool = True
-    """Whether to stop trainings that are worse than the median."""
-    score: str = "return"
-    """The measure of the evaluation that is to be best (least, if it counts steps): return,
-    success_rate or steps, of what truly happened; perceived_return, perceived_success_rate or steps, as the
-    server perceived it."""
-    policy: str = "sampled"
-    """The policy that is evaluated: actions ``sampled`` from it, or the most likely ones
-    (``deterministic``)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.whole("trials", self.trials, 1, 1_000_000)
-        checks.whole("processes", self.processes, 1, 1024)
-        checks.one_of("score", self.score, SCORES)
-        checks.one_of("policy", self.policy, POLICIES)
-        succeeds = self.episode.success_share is not None or "success" not in self.score
-        should = "is the same for every policy: in this task nothing can be reached; choose return"
-        checks.require(succeeds, "score", self.score, should)
-        should = "is not for a search, which trains every policy from the beginning: leave it out"
-        checks.require(self.checkpoint is None, "checkpoint", self.checkpoint, should)
-
-    @property
-    def sign(self) -> int:
-        """1 if the greatest score is the best, -1 if the least is."""
-        return -1 if self.score in LESS_IS_BETTER else 1
-
-
 OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields(TrainConfig)}
 """Settings that a training does not have."""
-store_schema("tune_schema", TuneConfig)
 
 
 def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, BaseDistribution]:
@@ -161,7 +116,7 @@ def _distribution(key: str, choices: Any = (), log: Any = False, **values: Any) 
             return CategoricalDistribution([json.dumps(each, separators=(",", ":")) for each in choices])
         return (IntDistribution if whole else FloatDistribution)(log=log, **values)
     except (TypeError, ValueError) as error:
-        raise InputError(f"search.{key}: {one_line(error)}") from error
+        raise InputError(f"search.{key}: {cli.reason(error)}") from error
 
 
 def _word(value: Any) -> str:
@@ -246,9 +201,9 @@ class Search:
         """The training of the trial with a number."""
         words = ["logger=csv", "threads=1", *overrides]
         try:
-            config = checked(compose("train", words))
-        except COMPOSITION_ERRORS as error:
-            raise InputError(f"{name}: {one_line(error)}") from error
+            config = cli.settings(*words)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
         config.overrides = words
         program = functools.partial(train_watched, storage=self.storage, number=number, pruner=self.pruner)
         return Run("tune", "", "", config, self.folder / name, program)
@@ -314,7 +269,7 @@ def search(config: TuneConfig, overrides: list[str], folder: Path) -> None:
             bar.set_postfix({config.score: "-" if value is None else f"{value:.3g}", "best": f"{best:.3g}"})
             bar.update()
             if error is not None:
-                print(f"failed: {run.folder}: {one_line(error)}", file=sys.stderr)
+                print(f"failed: {run.folder}: {cli.reason(error)}", file=sys.stderr)
     report(found)
 
 
@@ -332,7 +287,7 @@ def report(found: Search) -> None:
     head = ["trial", "state", found.config.score, *found.space]
     write_atomically(found.folder / TRIALS, csv_table([head, *(row(trial) for trial in trials)]))
     lines = [
-        f"`{command(typed_words())}`",
+        f"`{cli.command(cli.typed_words)}`",
         f"{len(trials)} trials: {len(complete)} with a value, "
         f"{sum(trial.state == TrialState.PRUNED for trial in trials)} pruned, "
         f"{sum(trial.state == TrialState.FAIL for trial in trials)} failed or interrupted. All have the seed "
@@ -368,17 +323,11 @@ def plot(found: Search) -> None:
             figure.savefig(found.folder / f"{name}.png", dpi=120, bbox_inches="tight")
 
 
-@hydra.main(version_base=None, config_path=CONF, config_name="tune")
-@reported
-def main(composed: DictConfig) -> None:
-    if composed.resume is not None:
-        raise InputError("resume: the same command in the same folder continues a search")
+def search_all(config: TuneConfig, folder: Path) -> None:
+    """Search for settings until there are as many trials as were asked for."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    config: TuneConfig = checked(composed, "tune")
-    config.check_learning()
-    folder, words = shown(Path(HydraConfig.get().runtime.output_dir)), HydraConfig.get().overrides.task
-    overrides = [word for word in words if word.lstrip("+~").partition("=")[0].split(".")[0] not in OWN]
-    folder.mkdir(parents=True, exist_ok=True)
+    check_learning(config)
+    overrides = [word for word in config.overrides if key_of(word).split(".")[0] not in OWN]
     try:
         search(config, overrides, folder)
     except KeyboardInterrupt as error:
@@ -389,7 +338,7 @@ def main(composed: DictConfig) -> None:
 
 def run() -> None:
     """Run the program with the words of the command line."""
-    launch(main, "tune")
+    cli.run(search_all, "tune", again=True)
 
 
 if __name__ == "__main__":

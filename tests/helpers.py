@@ -13,7 +13,6 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from twin import Uav
 
-from damian.envs.clocks import ClockConfig
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.learners.base import LearningSetup
@@ -21,6 +20,7 @@ from damian.learners.networks import ModelConfig
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig, ServerContext
 from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.termination import EpisodeConfig
+from damian.settings import ClockConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.messages import Messages

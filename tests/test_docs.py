@@ -5,14 +5,12 @@ import re
 import runpy
 import shlex
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import yaml
-from hydra import initialize_config_dir
 
 import damian
 import damian.transforms
@@ -20,10 +18,9 @@ from damian import Constant
 from damian.delays.laws import LAWS
 from damian.delays.line import DelayLine
 from damian.delays.samplers import Sampler
+from damian.recipes.cli import settings
 from damian.recipes.command import PROGRAMS, SETTINGS
-from damian.recipes.shared.known_settings import CONF, known_settings
-from damian.recipes.shared.launch import checked, composed_with
-from damian.recipes.shared.misspelt import check_words
+from damian.recipes.known import check_words, known_settings
 from damian.replay.hindsight import MessageLog, latest_arrived
 from damian.server.features import GLOBAL, LOCAL
 from damian.show.episode import COLUMNS
@@ -62,7 +59,7 @@ def test_every_command_that_a_file_names_exists(file):
         assert name in PROGRAMS, line
         own = [word for word in words if "FOLDER" not in word and "NAME" not in word]
         if name in SETTINGS and "--help" not in words:
-            assert check_words(SETTINGS[name], own) is None, line
+            check_words(SETTINGS[name], own)
 
 
 def test_every_comparison_that_a_file_names_has_its_tasks_delays_and_arms():
@@ -71,10 +68,8 @@ def test_every_comparison_that_a_file_names_has_its_tasks_delays_and_arms():
         words for words in found if any(word.split("=")[0] in ("tasks", "delays", "arms") for word in words)
     ]
     assert len(found) > 2
-    import_module("damian.recipes.compare")  # stores its settings
-    with initialize_config_dir(CONF, version_base=None):
-        for words in found:
-            checked(composed_with("compare", [word for word in words if "hydra" not in word]), "compare")
+    for words in found:
+        settings(*[word for word in words if "hydra" not in word], program="compare")
 
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: file.name)

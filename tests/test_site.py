@@ -9,7 +9,7 @@ import pytest
 
 import damian
 from damian.recipes.command import PROGRAMS
-from damian.recipes.shared.known_settings import SCHEMAS, known_settings
+from damian.recipes.known import SCHEMAS, known_settings
 
 ROOT = Path(damian.__file__).parents[1]
 pytestmark = pytest.mark.slow

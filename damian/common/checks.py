@@ -11,8 +11,6 @@ from numbers import Integral
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-import torch
-
 from damian.common.errors import InputError
 
 METRES = 2.0e7
@@ -183,6 +181,8 @@ def distinct(key: str, values: Sequence[Any]) -> None:
 
 def device(key: str, value: str) -> None:
     """Require ``cpu`` or a CUDA device of this machine."""
+    import torch  # noqa: PLC0415 (settings are read without it)
+
     n_gpus = torch.cuda.device_count()
     available = ["cpu", *(f"cuda:{i}" for i in range(n_gpus)), *["cuda"] * bool(n_gpus)]
     require(value in available, key, value, f"is not one of the devices here: {', '.join(available)}")

@@ -4,8 +4,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import torch
-
 
 def available_cores() -> int:
     """Number of cores that this process may use; at most ``OMP_NUM_THREADS``, if the environment sets it."""
@@ -18,6 +16,8 @@ def available_cores() -> int:
 @contextmanager
 def using_threads(number: int) -> Iterator[None]:
     """Let torch use this number of threads within the context."""
+    import torch  # noqa: PLC0415 (settings are read without it)
+
     before = torch.get_num_threads()
     torch.set_num_threads(number)
     try:

@@ -19,6 +19,7 @@ from damian.compare.statistics import (
     recovery,
 )
 from damian.runs.run_folder import DETERMINISTIC
+from damian.settings.programs import Arm
 
 TRAINED, UNTRAINED, SCRIPT, RANDOM = "trained", "untrained", "script", "random"
 TRAINED_DETERMINISTIC, UNTRAINED_DETERMINISTIC = TRAINED + DETERMINISTIC, UNTRAINED + DETERMINISTIC
@@ -88,29 +89,6 @@ BOUNDS = {column.name: column.bounds for column in MEASURED}
 Row = Mapping[str, Any]
 """Evaluation of one policy: task, delay, arm, regime, seed, policy, a number for each measure, and of its run
 the ``frames`` (environment steps in training) and ``seconds``. Unknown or meaningless numbers are nan."""
-
-
-@dataclass
-class Arm:
-    """One way to train policies for a task, or to fly those of another arm."""
-
-    overrides: list[str] = field(default_factory=list)
-    """Overrides of the settings of ``damian train``."""
-    delayed: bool = True
-    """Whether the arm has delays. Exactly one arm has none: the reference, run once for each task."""
-    naive: bool = False
-    """Whether the arm ignores the delay; recovery 0 is the score of the best such arm."""
-    policy_of: str | None = None
-    """Arm whose policies this one flies, without any training of its own; None: this arm trains."""
-    untrained: bool = False
-    """Whether the networks fly as they are before the first update, with their prior; nothing is trained."""
-    oracle: bool = False
-    """Whether the script flies with ever more known on time (``damian oracle``), and nothing is trained."""
-    tasks: list[str] | None = None
-    """Tasks of the experiment that the arm does; all of them if not given."""
-    regime: str = ""
-    """Information that the arm uses: R0: messages that have arrived; R1: the truth, for the critic; R2: no
-    delay in training; R3: no delay at all. If it is not given, ``delayed`` and ``policy_of`` decide."""
 
 
 def regime(arms: Mapping[str, Arm], name: str) -> str:

@@ -22,7 +22,7 @@ from torchrl.envs import Compose, Transform
 
 from damian import keys
 from damian.common import checks
-from damian.delays.config import CONTEXT_KEYS
+from damian.delays.config import CONTEXT_KEYS, check_laws, delay_law, delay_reads, delay_sampler, link_reads
 from damian.delays.laws import law_of, sampler_of
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
@@ -42,7 +42,7 @@ from damian.transforms import (
 )
 from damian.transforms.hold import SkipUntilReady
 from damian.transforms.server_node import OnboardNode
-from damian.world.landing import ActionConfig, displacement
+from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.vehicles import MOTION_MODELS
 
 _SENT = [keys.MESSAGE, keys.MESSAGE_SENT]
@@ -76,7 +76,8 @@ def make_env(
     checks.require(not (scenario.clock.skip and "message" in extras), "clock.skip", True, problem)
     remote, dt = has_server_node(scenario), scenario.clock.dt
     needed = {"message"} if remote or scenario.links.kind == "matrix" else set()
-    needed |= {"position"} if scenario.delay.reads(dt) | scenario.links.reads(dt) else set()
+    needed |= {"position"} if delay_reads(scenario.delay, dt) | link_reads(scenario.links, dt) else set()
+    check_laws(scenario.delay, scenario.clock.dt)
     simulation = make_simulation(scenario, seed)
     server = make_server(scenario, simulation)
     env = UavEnv(
@@ -115,7 +116,7 @@ def action_transforms(scenario: ScenarioConfig) -> list[Transform]:
     if not has_delay(scenario, "act") and clock.steps("agents") == 1:
         return []
     late = ActionDelay(
-        delay.law("act"),
+        delay_law(delay, "act"),
         keys.ACTION,
         default=hold_action(scenario.actions),
         dt=clock.dt,
@@ -159,7 +160,7 @@ def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_dela
     """
     delay = scenario.delay
     return ObservationDelay(
-        delay.law("obs"),
+        delay_law(delay, "obs"),
         keys.MESSAGE,
         keys.RECEIVED,
         loss=delay.loss,
@@ -223,7 +224,7 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         loss=links.loss,
         topology="all" if links.hears is None else links.hears,
         comm_range=links.range,
-        position_key=keys.POSITION if links.reads(dt) else None,
+        position_key=keys.POSITION if link_reads(links, dt) else None,
         limit=links.limit,
         sent_key=keys.MESSAGE_SENT,
         known_at_reset=True,
@@ -243,7 +244,7 @@ def reward_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list
         # With a message delay the server computes in hindsight what was earned.
         earned_key = keys.EARNED_REWARD if reported and not has_message_delay(scenario) else None
         late = RewardDelay(
-            delay.law("rew"),
+            delay_law(delay, "rew"),
             keys.REWARD,
             dt=dt,
             context_keys=CONTEXT_KEYS,
@@ -332,7 +333,7 @@ def has_message_delay(scenario: ScenarioConfig) -> bool:
 
 def has_delay(scenario: ScenarioConfig, name: str) -> bool:
     """Whether the delay ``obs``, ``act`` or ``rew`` of a scenario ever delays anything."""
-    return scenario.delay.sampler(name, scenario.clock.dt).constant_delay != 0
+    return delay_sampler(scenario.delay, name, scenario.clock.dt).constant_delay != 0
 
 
 def hold_action(actions: ActionConfig) -> int:
@@ -349,5 +350,5 @@ def action_codes(actions: ActionConfig) -> Tensor | None:
     """
     if actions.kind == "continuous":
         return None
-    distance, heading = actions.table().unbind(-1)
+    distance, heading = action_table(actions).unbind(-1)
     return (displacement(distance / distance.max(), heading) + 1) / 2

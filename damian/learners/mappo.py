@@ -1,7 +1,6 @@
 """MAPPO, from batches that late messages may have corrected (paper, section 4.3)."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -15,14 +14,14 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, set_recurrent_mode
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from damian import keys
-from damian.common import checks
 from damian.common.compiling import compiled
-from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
+from damian.learners.base import LearningSetup
 from damian.learners.networks import COMPILE_OPTIONS, make_critic
 from damian.learners.recurrent import RECURRENT_KEYS
 from damian.learners.reward_scale import update_value_scale, value_scale
 from damian.learners.schedule import LinearSchedule
 from damian.replay.backupdate import BackupdateStorage
+from damian.settings.learners import MappoConfig
 
 LOSSES = ("loss_objective", "loss_entropy", "loss_critic")
 """Names of the terms of the loss (``mappo_losses``)."""
@@ -38,64 +37,6 @@ LOSS_KEYS: list[NestedKey] = [
     keys.READY,
 ]
 """Entries of a step that the loss reads, beside the critic's observation."""
-
-
-@LEARNERS.register("mappo")
-@dataclass
-class MappoConfig(LearnerConfig):
-    """Multi-agent PPO (Yu et al. 2022) with one shared policy."""
-
-    name: str = "mappo"
-    lmbda: float = 0.9
-    """Lambda of the generalised advantage estimate."""
-    clip_epsilon: float = 0.2
-    """Clipping of the importance ratio."""
-    entropy_coeff: float = 0.01
-    """Weight of the entropy bonus."""
-    entropy_coeff_end: float | None = None
-    """If set, the weight of the entropy bonus goes linearly from ``entropy_coeff`` to this, which it reaches
-    after ``frames`` environment steps; a run that is resumed with more frames reaches it later."""
-    critic_coeff: float = 0.5
-    """Weight of the critic's loss."""
-    max_grad_norm: float = 0.5
-    """The gradient is scaled down to this norm if its norm is larger."""
-    epochs: int = 4
-    """Passes over the batch per update."""
-    minibatches: int = 4
-    """Minibatches per pass."""
-    normalize_advantage: bool = True
-    """Whether to scale the advantages of a batch to mean 0 and standard deviation 1."""
-    normalize_value: bool = False
-    """Whether the critic learns values of mean 0 and standard deviation 1, by running statistics of its
-    targets, so that learning does not depend on the scale of the rewards. Advantages that
-    ``normalize_advantage`` does not scale are then divided by the same standard deviation."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.above("learner.max_grad_norm", self.max_grad_norm, 0.0)
-        checks.in_range("learner.lmbda", self.lmbda, 0.0, 1.0)
-        checks.in_range("learner.clip_epsilon", self.clip_epsilon, 0.0, 1.0)  # a ratio is not negative
-        for name in ("entropy_coeff", "critic_coeff"):
-            checks.in_range(f"learner.{name}", getattr(self, name), 0.0)
-        if self.entropy_coeff_end is not None:
-            checks.in_range("learner.entropy_coeff_end", self.entropy_coeff_end, 0.0)
-        for name in ("epochs", "minibatches"):
-            checks.in_range(f"learner.{name}", getattr(self, name), 1, checks.STEPS)
-
-    def check(self, setup: LearningSetup) -> None:
-        recurrent, shortest, longest = setup.model.recurrent, setup.shortest_period, setup.longest_delay
-        samples = setup.worlds if recurrent else setup.worlds * shortest
-        checks.in_range("learner.minibatches", self.minibatches, 1, samples)
-        should = f"needs more than {longest} steps (longest delay) per update (learner.steps), not {shortest}"
-        checks.require(not setup.settle or longest < shortest, "settle", True, should)
-        should = "does not go with model.rnn: hidden states are not recomputed from corrected observations"
-        checks.require(not (recurrent and setup.recompute_actor), "recompute_actor", True, should)
-
-    def buffer_size(self, setup: LearningSetup) -> int | None:
-        return setup.least_buffer if setup.backupdate else None
-
-    def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "Mappo":
-        return Mappo(env, self, setup, buffer)
 
 
 class Mappo:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
 import torch
@@ -19,6 +18,7 @@ from damian import keys
 from damian.common import checks
 from damian.learners.recurrent import AgentGRU
 from damian.learners.reward_scale import NormalizedValue
+from damian.settings.learners import ModelConfig
 
 COMPILE_OPTIONS = {
     "cpp.use_decompose_tanh": True,  # by exponentials, in half the time; the difference is rounding
@@ -33,79 +33,45 @@ Network = TypeVar("Network", bound=nn.Module)
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
-@dataclass
-class ModelConfig:
-    """Networks of actor and critic, one multilayer perceptron each."""
+def make_mlp(
+    config: ModelConfig, n_in: int, n_out: int, device: torch.device | None, gain: float = 1.0
+) -> MLP:
+    """Make a multilayer perceptron from features [*, n_in] to outputs [*, n_out].
 
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-    """Width of each hidden layer."""
-    activation: str = "tanh"
-    """Activation function: tanh, relu, elu or silu."""
-    rnn: str = "none"
-    """none or gru. With gru the actor's last hidden layer is a gated recurrent unit, so that a UAV remembers
-    its observations of the episode."""
-    skip: bool = False
-    """The actor's logits are the network's outputs plus, times a learnt weight, the logarithm of the feature
-    that has a probability for each action (``observation.belief=[belief_gain]``). The actor begins as one
-    that prefers actions of high probability."""
-    shared_value: bool = False
-    """MAPPO's critic gives one value for all UAVs of a world, from the observations of all of them, instead
-    of a value for each UAV. Updates are faster, but it learns less where each UAV has a reward of its own,
-    and it ties the critic, not the policy, to the number of UAVs."""
-    init: str = "default"
-    """Initial weights: default (PyTorch's), or orthogonal: orthogonal matrices and biases of 0 (Saxe et al.
-    2014), with a gain of sqrt(2) in hidden layers (1 in a recurrent one), of 0.01 at the policy's output, so
-    that it begins close to chance, and of 1 at a critic's output."""
+    ``gain`` is that of the output layer; it counts for an orthogonal initialisation only.
+    """
+    activation = _ACTIVATIONS[config.activation]
+    network = MLP(n_in, n_out, num_cells=config.hidden, activation_class=activation, device=device)
+    return initialized(config, network, gain)
 
-    def __post_init__(self) -> None:
-        checks.one_of("model.activation", self.activation, _ACTIVATIONS)
-        checks.one_of("model.rnn", self.rnn, ["none", "gru"])
-        checks.one_of("model.init", self.init, ["default", "orthogonal"])
-        should = "needs at least one layer for model.rnn=gru"
-        checks.require(not self.recurrent or bool(self.hidden), "model.hidden", [], should)
-        checks.in_range("model.hidden (number of layers)", len(self.hidden), 0, 64)
-        for width in self.hidden:
-            checks.in_range("model.hidden", width, 1, 16384)
 
-    @property
-    def recurrent(self) -> bool:
-        """Whether the actor has a recurrent layer."""
-        return self.rnn != "none"
+def make_gru(config: ModelConfig, n_in: int, device: torch.device | None) -> AgentGRU:
+    """Make all hidden layers for features [*, n_in]; the last one is recurrent."""
+    *widths, n_hidden = config.hidden
+    encoder = hidden_layers(config, n_in, widths, device) if widths else nn.Identity()
+    return initialized(config, AgentGRU(encoder, widths[-1] if widths else n_in, n_hidden, device), 1.0)
 
-    def network(self, n_in: int, n_out: int, device: torch.device | None, gain: float = 1.0) -> MLP:
-        """Make a multilayer perceptron from features [*, n_in] to outputs [*, n_out].
 
-        ``gain`` is that of the output layer; it counts for an orthogonal initialisation only.
-        """
-        activation = _ACTIVATIONS[self.activation]
-        network = MLP(n_in, n_out, num_cells=self.hidden, activation_class=activation, device=device)
-        return self.initialized(network, gain)
+def hidden_layers(config: ModelConfig, n_in: int, widths: Sequence[int], device: torch.device | None) -> MLP:
+    """Make layers of these widths, each with its activation, for features [*, n_in]."""
+    *inner, n_out = widths
+    kind = _ACTIVATIONS[config.activation]
+    options: dict[str, Any] = {"activation_class": kind, "activate_last_layer": True, "device": device}
+    return MLP(n_in, n_out, num_cells=inner, **options)
 
-    def gru(self, n_in: int, device: torch.device | None) -> AgentGRU:
-        """Make all hidden layers for features [*, n_in]; the last one is recurrent."""
-        *widths, n_hidden = self.hidden
-        encoder = self.hidden_layers(n_in, widths, device) if widths else nn.Identity()
-        return self.initialized(AgentGRU(encoder, widths[-1] if widths else n_in, n_hidden, device), 1.0)
 
-    def hidden_layers(self, n_in: int, widths: Sequence[int], device: torch.device | None) -> MLP:
-        """Make layers of these widths, each with its activation, for features [*, n_in]."""
-        *inner, n_out = widths
-        kind = _ACTIVATIONS[self.activation]
-        options: dict[str, Any] = {"activation_class": kind, "activate_last_layer": True, "device": device}
-        return MLP(n_in, n_out, num_cells=inner, **options)
-
-    def initialized(self, network: Network, gain: float) -> Network:
-        """Initialise the weights as the setting ``init`` says, with ``gain`` in the last layer."""
-        if self.init != "orthogonal":
-            return network
-        layers = [each for each in network.modules() if isinstance(each, nn.Linear | nn.GRUCell)]
-        for layer in layers:
-            for weights in layer.parameters():
-                if weights.ndim == 1:
-                    nn.init.zeros_(weights)
-                else:
-                    nn.init.orthogonal_(weights, gain if layer is layers[-1] else math.sqrt(2))
+def initialized(config: ModelConfig, network: Network, gain: float) -> Network:
+    """Initialise the weights as the setting ``init`` says, with ``gain`` in the last layer."""
+    if config.init != "orthogonal":
         return network
+    layers = [each for each in network.modules() if isinstance(each, nn.Linear | nn.GRUCell)]
+    for layer in layers:
+        for weights in layer.parameters():
+            if weights.ndim == 1:
+                nn.init.zeros_(weights)
+            else:
+                nn.init.orthogonal_(weights, gain if layer is layers[-1] else math.sqrt(2))
+    return network
 
 
 class LegalCategorical(Distribution):
@@ -211,9 +177,9 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
         return TensorDictModule(module, in_keys=[in_key], out_keys=list(out_keys))
 
     if not config.recurrent:
-        return head(config.network(n_features, n_out, env.device, POLICY_GAIN), keys.OBSERVATION)
-    linear = config.initialized(nn.Linear(config.hidden[-1], n_out, device=env.device), POLICY_GAIN)
-    gru = config.gru(n_features, env.device)
+        return head(make_mlp(config, n_features, n_out, env.device, POLICY_GAIN), keys.OBSERVATION)
+    linear = initialized(config, nn.Linear(config.hidden[-1], n_out, device=env.device), POLICY_GAIN)
+    gru = make_gru(config, n_features, env.device)
     return TensorDictSequential([gru, head(linear, keys.HIDDEN)])  # type: ignore[list-item]
 
 
@@ -254,9 +220,9 @@ def make_critic(
     """
     n_agents, n_features = env.observation_spec[critic_key].shape[-2:]
     if config.shared_value:
-        network: nn.Module = SharedValue(config.network(n_agents * n_features, 1, env.device))
+        network: nn.Module = SharedValue(make_mlp(config, n_agents * n_features, 1, env.device))
     else:
-        network = config.network(n_features, 1, env.device)
+        network = make_mlp(config, n_features, 1, env.device)
     if normalize:
         network = NormalizedValue(network, env.device)
     return TensorDictModule(network, in_keys=[critic_key], out_keys=[keys.STATE_VALUE])

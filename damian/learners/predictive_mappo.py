@@ -7,7 +7,6 @@ chooses. It learns to predict from the replay buffer, in which the late messages
 Nothing here depends on what the messages mean.
 """
 
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -23,65 +22,15 @@ from damian import keys
 from damian.common import checks
 from damian.common.tensors import expand_mask, gather_rows, next_true
 from damian.keys import next_key
-from damian.learners.base import LEARNERS, LearningSetup
-from damian.learners.mappo import LOSS_KEYS, Mappo, MappoConfig
-from damian.learners.networks import POLICY_GAIN, ModelConfig, with_distribution
+from damian.learners.base import LearningSetup
+from damian.learners.mappo import LOSS_KEYS, Mappo
+from damian.learners.networks import POLICY_GAIN, ModelConfig, hidden_layers, make_mlp, with_distribution
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import arrived_by_now
+from damian.settings.learners import PredictiveMappoConfig
 
 _NEEDS = "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
 _CONSTANT = "needs a constant action delay (delay.act): it predicts what each action leads to, and when"
-
-
-@LEARNERS.register("predictive_mappo")
-@dataclass
-class PredictiveMappoConfig(MappoConfig):
-    """MAPPO with a learnt belief: attention over the messages that have arrived, trained by prediction."""
-
-    name: str = "predictive_mappo"
-    prediction_steps: int = 100
-    """Steps of gradient descent on the predictions after each update."""
-    prediction_batch: int = 400
-    """Environment steps in each of them."""
-    prediction_lr: float = 2e-3
-    """Learning rate of the predictions."""
-    prediction_buffer: int = 32_000
-    """Environment steps, over all worlds, from which predictions are learnt."""
-    heads: int = 4
-    """Number of attention heads over the messages that an actor knows."""
-    width: int = 32
-    """Size of the embedding of a message."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("prediction_steps", "prediction_batch", "prediction_buffer"):
-            checks.in_range(f"learner.{name}", getattr(self, name), 1, checks.STEPS)
-        checks.above("learner.prediction_lr", self.prediction_lr, 0.0)
-        checks.in_range("learner.prediction_lr", self.prediction_lr, 0.0, 1.0)
-        checks.in_range("learner.heads", self.heads, 1, 1024)
-        checks.in_range("learner.width", self.width, 1, 16384)
-
-    def check(self, setup: LearningSetup) -> None:
-        super().check(setup)
-        model, should = setup.model, f"does not go with learner={self.name}, whose actor has its own encoder"
-        checks.require(setup.backupdate, "learner", self.name, _NEEDS)
-        checks.require(setup.action_delay is not None, "learner", self.name, _CONSTANT)
-        checks.require(not model.recurrent, "model.rnn", model.rnn, should)
-        checks.require(not model.skip, "model.skip", True, should)
-        checks.require(bool(model.hidden), "model.hidden", model.hidden, should)
-        checks.require(not setup.recompute_actor, "recompute_actor", True, should)
-
-    def buffer_size(self, setup: LearningSetup) -> int | None:
-        least = super().buffer_size(setup)
-        return None if least is None else max(least, self.prediction_buffer // setup.worlds * setup.worlds)
-
-    def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "PredictiveMappo":
-        late = keys.DELAY in env.observation_spec.keys(True, True)  # rewards alone may be late
-        checks.require(late, "learner", self.name, _NEEDS)
-        return PredictiveMappo(env, self, setup, buffer)
-
-    def make_actor(self, env: EnvBase, model: ModelConfig) -> ProbabilisticActor:
-        return make_belief_actor(env, model, self.heads, self.width)
 
 
 class PredictiveMappo(Mappo):
@@ -100,6 +49,9 @@ class PredictiveMappo(Mappo):
     def __init__(
         self, env: EnvBase, config: PredictiveMappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None
     ) -> None:
+        late = keys.DELAY in env.observation_spec.keys(True, True)  # rewards alone may be late
+        problem = "needs a message delay (delay.obs): what arrives late is what it predicts"
+        checks.require(late, "learner", "predictive_mappo", problem)
         super().__init__(env, config, setup, buffer)
         self.head = next(each for each in self.actor.modules() if isinstance(each, BeliefHead))
         self.head_optimizer = torch.optim.Adam(self.head.parameters(), lr=config.prediction_lr, fused=True)
@@ -234,7 +186,7 @@ class MessageEncoder(nn.Module):
             nn.ReLU(),
             nn.Linear(2 * width, heads * width, device=device),
         )
-        self.layers = config.hidden_layers(heads * width + n_known + n_code, config.hidden, device)
+        self.layers = hidden_layers(config, heads * width + n_known + n_code, config.hidden, device)
 
     def forward(self, observation: Tensor, history: Tensor, codes: Tensor) -> Tensor:
         """Encode observations [*, F] and histories [*, L, C], for Q codes each [*, Q, K], into [*, Q, H]."""
@@ -421,7 +373,7 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
         encoder = MessageEncoder(n_features, history.shape[-1], n_code, config, heads, width, device)
         head = BeliefHead(encoder, n_encoding, n_targets, n_actions, n_code, device)
         read = [keys.OBSERVATION, *head.out_keys]
-        policy = config.network(n_features + n_encoding, n_out, device, POLICY_GAIN)
+        policy = make_mlp(config, n_features + n_encoding, n_out, device, POLICY_GAIN)
         module = Preference(policy, n_targets, device) if discrete else NormalPolicy(policy)
         parts = [head, TensorDictModule(module, read, list(out_keys))]
         return TensorDictSequential(parts)  # type: ignore[arg-type]

@@ -1,7 +1,6 @@
 """Soft actor-critic on TorchRL's losses, from single decisions drawn from a replay buffer."""
 
 import math
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
@@ -14,13 +13,13 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 
 from damian import keys
-from damian.common import checks
 from damian.keys import next_key
-from damian.learners.base import LEARNERS, LearnerConfig, LearningSetup
-from damian.learners.networks import ModelConfig
+from damian.learners.base import LearningSetup
+from damian.learners.networks import ModelConfig, make_mlp
 from damian.learners.reward_scale import ReturnScale
 from damian.replay.smdp import find_decisions, transitions
 from damian.replay.time_storage import TimeStorage
+from damian.settings.learners import SacConfig
 
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 """Terms of the loss, by their names in TorchRL's losses."""
@@ -28,76 +27,6 @@ NUMBERS = (*LOSSES, "alpha", "entropy", "gradient_norm_actor", "gradient_norm_cr
 """Numbers that a round of updates logs; ``alpha`` is the temperature, ``entropy`` in nats."""
 N_CRITICS = 2
 """Number of critics, of which the lower value counts."""
-
-
-@LEARNERS.register("sac")
-@dataclass
-class SacConfig(LearnerConfig):
-    """Soft actor-critic (Haarnoja et al. 2018; discrete: Christodoulou 2019) with one shared policy."""
-
-    name: str = "sac"
-    lr: float = 1e-3
-    """Learning rate of Adam."""
-    steps: int = 4
-    """Steps per world between two rounds of updates, unless ``clock.system`` sets the period."""
-    alpha_lr: float = 1e-2
-    """Learning rate of the temperature's logarithm; high, since the temperature must first find the scale of
-    the rewards."""
-    alpha_init: float = 0.01
-    """Initial temperature (weight of the entropy)."""
-    tau: float = 0.01
-    """Share by which the target networks move towards the trained networks in each update."""
-    target_entropy: float = 0.5
-    """Target entropy for discrete actions, as a share of the entropy of a uniform choice among the UAV's
-    legal actions. For continuous actions it is minus the number of their dimensions, on [-1, 1]."""
-    n_steps: int = 1
-    """Number of decisions over which rewards are summed before a value is estimated (n-step returns)."""
-    updates: int = 4
-    """Updates per round."""
-    batch_size: int = 512
-    """Decisions per update."""
-    buffer_steps: int = 200_000
-    """Capacity of the replay buffer [environment steps over all worlds]."""
-    warm_up: int = 5_000
-    """Environment steps, over all worlds, before learning begins."""
-    normalize_reward: bool = False
-    """Whether to divide rewards by the running root mean square of the discounted returns, so that learning
-    does not depend on their scale. The temperature is then the weight of the entropy against such rewards."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("alpha_lr", "tau", "alpha_init"):
-            checks.above(f"learner.{name}", getattr(self, name), 0.0)
-        for name in ("alpha_lr", "tau", "target_entropy"):
-            checks.in_range(f"learner.{name}", getattr(self, name), 0.0, 1.0)
-        for name in ("n_steps", "updates", "batch_size"):
-            checks.in_range(f"learner.{name}", getattr(self, name), 1, checks.STEPS)
-        checks.in_range("learner.buffer_steps", self.buffer_steps, 1)
-        checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_steps)
-
-    def check(self, setup: LearningSetup) -> None:
-        should = "is for learner=mappo only: SAC learns from single decisions, without the steps before them"
-        checks.require(not setup.model.recurrent, "model.rnn", setup.model.rnn, should)
-        should = "is for learner=mappo only: SAC's critics value the actions of a single UAV"
-        checks.require(not setup.model.shared_value, "model.shared_value", True, should)
-        should = "is for learner=mappo only: SAC has no importance ratios"
-        checks.require(not setup.recompute_actor, "recompute_actor", True, should)
-        checks.in_range("learner.buffer_steps", self.buffer_steps, setup.least_buffer, unit="steps")
-        checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")
-
-    def critic_keys(self, setup: LearningSetup) -> list[NestedKey]:
-        """Entries that the critics read, beside the action.
-
-        Only the actor's observation holds the UAV's past actions: if a critic of late observations did not
-        read them, the actor could not learn to use them.
-        """
-        return list(dict.fromkeys((setup.critic_key, keys.OBSERVATION)))
-
-    def buffer_size(self, setup: LearningSetup) -> int:
-        return self.buffer_steps // setup.worlds * setup.worlds
-
-    def make(self, env: EnvBase, setup: LearningSetup, buffer: ReplayBuffer | None) -> "Sac":
-        return Sac(env, self, setup, cast(ReplayBuffer, buffer))
 
 
 class Sac:
@@ -114,7 +43,11 @@ class Sac:
             stored steps.
     """
 
-    def __init__(self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer) -> None:
+    def __init__(
+        self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer | None
+    ) -> None:
+        if buffer is None:
+            raise ValueError("buffer: SAC needs a replay buffer on a TimeStorage")
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = config.make_actor(env, setup.model)
         read = config.critic_keys(setup)
@@ -218,8 +151,8 @@ def make_action_value(env: EnvBase, model: ModelConfig, read: list[NestedKey]) -
     n_features = sum(env.observation_spec[key].shape[-1] for key in read)
     spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
-        return TensorDictModule(model.network(n_features, spec.n, env.device), read, ["action_value"])
-    network = model.network(n_features + spec.shape[-1], 1, env.device)
+        return TensorDictModule(make_mlp(model, n_features, spec.n, env.device), read, ["action_value"])
+    network = make_mlp(model, n_features + spec.shape[-1], 1, env.device)
     return TensorDictModule(network, [*read, keys.ACTION], ["state_action_value"])
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.envs.clocks import ClockConfig
+from damian.settings.delays import ClockConfig
 
 
 class SystemClock:

@@ -15,6 +15,7 @@ from damian.keys import next_key
 from damian.learners.recurrent import add_recurrent_state
 from damian.replay.recompute import beliefs_in_hindsight
 from damian.server.features import FEATURES
+from damian.server.rewards import features_read
 from damian.server.server import Server
 
 
@@ -106,7 +107,7 @@ def evaluation(rollout: TensorDictBase, server: Server) -> Evaluation:
 
 def _true_belief(rollout: TensorDictBase, server: Server, elapsed: Tensor) -> Tensor | None:
     """The belief from undelayed messages in first episodes, [B, T, K]; None if no reward term reads it."""
-    if not any(FEATURES.get(name, "feature").scope == "belief" for name in server.reward.features):
+    if not any(FEATURES.get(name, "feature").scope == "belief" for name in features_read(server.reward)):
         return None
     steps = rollout.select(keys.MESSAGE, keys.BELIEF, next_key(keys.MESSAGE), next_key(keys.BELIEF))
     sent = cast(Tensor, rollout[next_key(keys.MESSAGE_SENT)])

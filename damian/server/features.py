@@ -6,7 +6,6 @@ these are the latest messages sent or the latest received.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -25,6 +24,7 @@ from damian.server.belief import (
     first_belief,
     report_rows,
 )
+from damian.settings.server import ObservationConfig
 from damian.world.battery import BatteryConfig, observed
 from damian.world.coverage import (
     FootprintTables,
@@ -34,76 +34,6 @@ from damian.world.coverage import (
     updated_share,
 )
 from damian.world.messages import Messages
-
-
-@dataclass
-class ObservationConfig:
-    """Which features the actor and the critic observe."""
-
-    local_features: list[str] = field(default_factory=lambda: ["spotted"])
-    """Features of the UAV itself: battery, spotted, or ``package.module:feature`` of your own."""
-    global_features: list[str] = field(
-        default_factory=lambda: ["source_distance", "source_bearing", "source_time"]
-    )
-    """Features that the server computes from the messages of all UAVs (Table 2): source_distance,
-    source_bearing, source_drift, source_time, agent_distances, coverage, mean_distance,
-    mean_distance_not_spotting, mean_distance_spotting, spotting_agents, or your own."""
-    ctde: bool = False
-    """Centralised training, decentralised execution: the actor observes only the local features."""
-    time_scale: float | None = None
-    """Times are divided by this [s]; if not given, by the episode's time limit, or else by an hour."""
-    age: bool = False
-    """Append to each actor's observation the age of the message that the server holds of its UAV (age of
-    information). The critic does not observe it: after back-updating, the age would tell the critic how far a
-    step is from the end of its batch."""
-    age_scale: float = 10.0
-    """Ages are divided by this [s]."""
-    own: bool = False
-    """Each UAV observes its own latest message without delay. If false, as in the paper, its whole
-    observation follows from the messages that the server holds, its own included."""
-    estimate: str = "mean"
-    """How the server estimates the source's position. ``mean``: the mean position of all UAVs' latest
-    detections. ``newest``: the mean of only the newest of these, as a moving source has left the older
-    ones."""
-    belief: list[str] = field(default_factory=list)
-    """Features of where the source is, by Bayes' rule from all messages that have arrived, appended to what
-    actor and critic observe: belief_gain (for each discrete action, the probability that it leads to where
-    the source is detected), belief_moments, belief_map, or ``package.module:feature`` of your own."""
-    belief_cell: float | None = None
-    """Edge of a cell of the belief [m]; if not given, 0.8 footprint radii, or more in large regions."""
-    window: int = 2
-    """Number of each UAV's latest landing points whose footprints the coverage counts."""
-
-    def __post_init__(self) -> None:
-        checks.convert_types("observation", self)
-        for scope in ("local", "global"):
-            for name in getattr(self, f"{scope}_features"):
-                check_feature(f"observation.{scope}_features", name, scope)
-            checks.distinct(f"observation.{scope}_features", getattr(self, f"{scope}_features"))
-        for name in self.belief:
-            check_feature("observation.belief", name, "belief")
-        checks.distinct("observation.belief", self.belief)
-        if self.belief_cell is not None:
-            checks.above("observation.belief_cell", self.belief_cell, 0.0, "m")
-        if self.time_scale is not None:
-            checks.above("observation.time_scale", self.time_scale, 0.0, "s")
-        checks.above("observation.age_scale", self.age_scale, 0.0, "s")
-        checks.one_of("observation.estimate", self.estimate, ("mean", "newest"))
-        checks.whole("observation.window", self.window, 1, 16)
-        should = "leaves the actor or the critic without any feature"  # the critic observes no ages
-        sees = bool(self.critic and self.actor)
-        checks.require(sees, "observation.local_features", self.local_features, should)
-
-    @property
-    def actor(self) -> list[str]:
-        """Features of the actor's observation, in order."""
-        features = [*self.local_features, *self.belief] if self.ctde else self.critic
-        return [*features, "age"] if self.age else features
-
-    @property
-    def critic(self) -> list[str]:
-        """Features of the critic's observation, in order."""
-        return [*self.global_features, *self.local_features, *self.belief]
 
 
 class ServerContext(NamedTuple):
@@ -288,6 +218,17 @@ FEATURES = Registry[Feature]("feature", _not_a_feature)
 def feature_of(name: str) -> Feature:
     """The feature of a name or path."""
     return FEATURES.get(name, "feature")
+
+
+def check_features(config: ObservationConfig) -> None:
+    """Require that every feature of an observation exists and has the scope in which it is used.
+
+    Raises:
+        InputError: there is no such feature, or it has another scope.
+    """
+    for scope, key in (("local", "local_features"), ("global", "global_features"), ("belief", "belief")):
+        for name in getattr(config, key):
+            check_feature(f"observation.{key}", name, scope)
 
 
 def check_feature(key: str, name: str, scope: str) -> None:

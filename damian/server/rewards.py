@@ -6,7 +6,6 @@ configuration and its tag in the logs have the same name.
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
@@ -16,20 +15,7 @@ from damian.common import checks
 from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
 from damian.server.features import FEATURES
 from damian.server.termination import Status
-
-INDIVIDUAL = ("coverage", "spotted", "battery")
-"""Terms of the individual reward (eq. 7)."""
-SYSTEM = (
-    "source_distance",
-    "source_time",
-    "source_bearing",
-    "source_drift",
-    "spotting_agents",
-    "mean_distance",
-    "mean_distance_not_spotting",
-    "mean_distance_spotting",
-)
-"""Terms of the system reward (eq. 6)."""
+from damian.settings.server import INDIVIDUAL, SYSTEM, RewardConfig
 
 
 class Counters(NamedTuple):
@@ -126,121 +112,49 @@ def custom_term(written: Any, key: str) -> CustomTerm:
     return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)
 
 
-@dataclass
-class RewardConfig:
-    """The task, as weights of the reward terms (eq. 5-8). A term with weight 0 is not computed."""
+def own_terms(config: RewardConfig) -> dict[str, CustomTerm]:
+    """The user's own terms by name, read once from the settings.
 
-    coverage: float = 0.0
-    """Weight of the share of the UAV's latest footprints that is new, in the region and in no other UAV's
-    footprint (w_ca of R1^a, eq. 7)."""
-    spotted: float = 1.0
-    """Weight of spotting the source, over the motions since the UAV last spotted it (w_k of R2^a, eq. 7)."""
-    battery: float = 0.0
-    """Weight of the battery level, in [0, 1] (w_b of R3^a, eq. 7)."""
-    source_distance: float = 0.0
-    """Weight of being near the source, as estimated from detections, over the motions since the UAV last
-    spotted it (w_ds of R1^s, eq. 6)."""
-    source_time: float = 0.0
-    """Weight of a recent detection by any UAV (w_ts of R2^s, eq. 6)."""
-    source_bearing: float = 0.0
-    """Weight of a small bearing of the source, clockwise from north (w_bs of R3^s, eq. 6)."""
-    source_drift: float = 0.0
-    """Weight of a heading towards the source (w_th of R4^s, eq. 6); ``drift`` says how it is paid."""
-    spotting_agents: float = 0.0
-    """Weight of a share of spotting UAVs near ``desired_spotting`` (w_ss of R5^s, eq. 6)."""
-    mean_distance: float = 0.0
-    """Weight of a mean distance to the other UAVs near ``desired_distance`` (w_avg of R6^s, eq. 6)."""
-    mean_distance_not_spotting: float = 0.0
-    """Weight of a mean distance between UAVs that do not spot near ``desired_distance_not_spotting`` (w_nss
-    of R7^s, eq. 6)."""
-    mean_distance_spotting: float = 0.0
-    """Weight of a mean distance of the spotting UAVs to the source near ``desired_distance_spotting`` (w_ss
-    of R8^s, eq. 6)."""
-    individual: float = 1.0
-    """Weight of the individual reward, the terms coverage, spotted and battery (w_a, eq. 8)."""
-    system: float = 1.0
-    """Weight of the system reward, the terms from source_distance to mean_distance_spotting (w_s, eq. 8)."""
-    drift: str = "smooth"
-    """R4^s for a drift theta. ``smooth``: 1 - |2 theta - 1|; ``printed``: 2 theta up to 1/2, then
-    1 - theta, as eq. 6 is printed."""
-    desired_spotting: float = 1.0
-    """M_ss of R5^s: desired share of the UAVs that spot the source."""
-    desired_distance: float = 0.5
-    """D of R6^s: desired mean distance, as a share of the region's largest vertex distance."""
-    desired_distance_not_spotting: float = 0.5
-    """D_nss of R7^s: desired mean distance between UAVs that do not spot, as such a share."""
-    desired_distance_spotting: float = 0.1
-    """D_ss of R8^s: desired mean distance of the spotting UAVs to the source, as such a share."""
-    bonus: float = 0.0
-    """Added to the reward of every UAV on success."""
-    bonus_over_steps: bool = False
-    """Divide the bonus by the elapsed steps of the episode (use case 2: 2 / steps)."""
-    penalty: float = 0.0
-    """Subtracted from the reward of every UAV when an episode ends without success."""
-    custom: list[Any] = field(default_factory=list)
-    """Your own terms (``damian.reward_term``), each as ``{term: package.module:name, weight: 0.1}`` with
-    any parameters of the term beside its weight, and a ``name`` if a term appears twice."""
+    Raises:
+        InputError: a term does not exist or has no such parameter, or two terms have the same name.
+    """
+    found: dict[str, CustomTerm] | None = getattr(config, "_own_terms", None)
+    if found is None:
+        terms = [custom_term(written, f"reward.custom[{i}]") for i, written in enumerate(config.custom)]
+        found = {term.name: term for term in terms}
+        names, problem = [term.name for term in terms], "must differ from each other and the built-in terms"
+        once = len(found) == len(terms) and not {*INDIVIDUAL, *SYSTEM} & {*found}
+        remedy = "; a name does, as in {term: ..., name: low}"
+        checks.require(once, "reward.custom", names, problem + remedy)
+        config._own_terms = found  # type: ignore[attr-defined]
+    return found
 
-    def __post_init__(self) -> None:
-        checks.convert_types("reward", self)
-        terms = [custom_term(written, f"reward.custom[{i}]") for i, written in enumerate(self.custom)]
-        self._custom = {term.name: term for term in terms}
-        taken = {*INDIVIDUAL, *SYSTEM} & {*self._custom}
-        once = len(self._custom) == len(self.custom) and not taken
-        checks.require(
-            once,
-            "reward.custom",
-            [term.name for term in terms],
-            "must differ from each other and the built-in terms; a name does, as in {term: ..., name: low}",
-        )
-        for name in (*INDIVIDUAL, *SYSTEM, "individual", "system", "bonus", "penalty"):
-            checks.weight(f"reward.{name}", getattr(self, name))
-        checks.one_of("reward.drift", self.drift, ["smooth", "printed"])
-        checks.in_range("reward.desired_spotting", self.desired_spotting, 0.0, 1.0)
-        for name in ("desired_distance", "desired_distance_not_spotting", "desired_distance_spotting"):
-            checks.in_range(f"reward.{name}", getattr(self, name), 0.0, 2.0)  # 1.25 in the paper's code
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The settings alone, because a worker process finds the functions by their paths."""
-        return {name: value for name, value in vars(self).items() if name != "_custom"}
+def used_terms(config: RewardConfig) -> list[CustomTerm]:
+    """The user's own terms whose weight is not 0."""
+    return [term for name, term in own_terms(config).items() if name in config.terms]
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self.__post_init__()
 
-    @property
-    def terms(self) -> list[str]:
-        """Names of the terms whose weight is not 0."""
-        individual = [n for n in INDIVIDUAL if getattr(self, n) * self.individual != 0]
-        system = [n for n in SYSTEM if getattr(self, n) * self.system != 0]
-        return [*individual, *system, *(name for name in self._custom if self.weight(name) != 0)]
+def features_read(config: RewardConfig) -> list[str]:
+    """Names of the features that the terms read; a built-in term reads the feature of its name."""
+    own = own_terms(config)
+    reads = [own[name].reads if name in own else [name] for name in config.terms]
+    return list(dict.fromkeys(itertools.chain(*reads)))
 
-    @property
-    def custom_terms(self) -> list[CustomTerm]:
-        """The terms of ``custom`` whose weight is not 0."""
-        return [self._custom[name] for name in self.terms if name in self._custom]
 
-    @property
-    def features(self) -> list[str]:
-        """Names of the features that these terms read; a built-in term reads the feature of its name."""
-        read = ([name] if name not in self._custom else self._custom[name].reads for name in self.terms)
-        return list(dict.fromkeys(itertools.chain(*read)))
+def weight_of(config: RewardConfig, name: str) -> float:
+    """The weight of a term in the total reward (eq. 8)."""
+    if term := own_terms(config).get(name):
+        return term.weight * (config.individual if term.scope == "individual" else config.system)
+    group = config.individual if name in INDIVIDUAL else config.system
+    return getattr(config, name) * group
 
-    def weight(self, name: str) -> float:
-        """The weight of a term in the total reward (eq. 8)."""
-        if name in self._custom:
-            term = self._custom[name]
-            return term.weight * (self.individual if term.scope == "individual" else self.system)
-        group = self.individual if name in INDIVIDUAL else self.system
-        return getattr(self, name) * group
 
-    def value(self, name: str, features: dict[str, Tensor], counters: Counters) -> Tensor:
-        """A term before it is weighted, [*, N]."""
-        if name in self._custom:
-            term = self._custom[name]
-            value = term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
-            return value.float()
-        return _TERMS[name](features[name], counters, self)
+def value_of(config: RewardConfig, name: str, features: dict[str, Tensor], counters: Counters) -> Tensor:
+    """A term before it is weighted, [*, N]."""
+    if term := own_terms(config).get(name):
+        return term.compute({n: features[n] for n in term.reads}, counters, **term.parameters).float()
+    return _TERMS[name](features[name], counters, config)
 
 
 def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig) -> dict[str, Tensor]:
@@ -254,7 +168,9 @@ def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig
     Returns:
         Each term whose weight is not 0, [*, N].
     """
-    return {name: config.weight(name) * config.value(name, features, counters) for name in config.terms}
+    return {
+        name: weight_of(config, name) * value_of(config, name, features, counters) for name in config.terms
+    }
 
 
 def final_reward(ended: Status, counters: Counters, config: RewardConfig) -> Tensor:

@@ -16,8 +16,16 @@ from damian.common import checks
 from damian.common.errors import naming_errors
 from damian.common.tensors import gather_rows, tree_map
 from damian.server.belief import SourceGrid, build_source_grid, certain_belief
-from damian.server.features import ObservationConfig, ServerContext, feature_of, observe, observe_own, stack
-from damian.server.rewards import Counters, RewardConfig, final_reward, reward
+from damian.server.features import (
+    ObservationConfig,
+    ServerContext,
+    check_features,
+    feature_of,
+    observe,
+    observe_own,
+    stack,
+)
+from damian.server.rewards import Counters, RewardConfig, features_read, final_reward, reward, used_terms
 from damian.server.termination import EpisodeConfig, Status, status
 from damian.world.airspace import Airspace
 from damian.world.battery import BatteryConfig
@@ -102,13 +110,14 @@ class Server:
         n_points = airspace.points.shape[:2].numel()
         should = "are more landing points than a message can number: take a larger step"
         checks.require(n_points < MAX_EXACT_INTEGER, "region.lattice_step", n_points, should)
+        check_features(observation)
         self.observation, self.reward, self.episode, self.battery = observation, reward, episode, battery
         self.dt, self.time_scale = dt, time_scale
         widths = readings or {}
         firsts = itertools.accumulate(widths.values(), initial=0)
         self._readings = {name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)}
         self._n_readings = sum(widths.values())
-        self._names = sorted({*observation.actor, *observation.critic, *reward.features})
+        self._names = sorted({*observation.actor, *observation.critic, *features_read(reward)})
         self._scale = airspace.scale
         self._max_points = airspace.max_points
         self._points = airspace.points.flatten(0, 1)
@@ -205,7 +214,7 @@ class Server:
                 should = "but depends on the messages of other UAVs: make it global"
                 checks.require(alone.allclose(values[:, :1]), f"feature {name}", "is local,", should)
         features, counters = observe(messages, context, self._names), Counters(steps, messages.motions)
-        for term in self.reward.custom_terms:
+        for term in used_terms(self.reward):
             with naming_errors(f"reward term {term.name}"):
                 values = term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
             check_uav_values(f"reward term {term.name}", values, shape)

@@ -1,41 +1,13 @@
 """The ends of episodes and the success of the task, as the server knows them (paper, section 4.1)."""
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from damian.common import checks
+from damian.settings.server import EpisodeConfig
 from damian.world.messages import Messages
-
-
-@dataclass
-class EpisodeConfig:
-    """Conditions that end an episode (paper, section 4.1). Without any of them the task never ends."""
-
-    max_steps: int | None = 50
-    """Time limit [steps]; no limit if not given."""
-    since_detection: bool = False
-    """Count the time limit from the latest detection instead of from the start of the episode."""
-    success_share: float | None = None
-    """Share of the UAVs that must spot the source at the same time for success; if not given, no success."""
-    discharged_share: float | None = None
-    """Share of the UAVs whose empty batteries end the episode; if not given, batteries never end it. A
-    battery is empty if its observed level is 0, or if it allows nothing but holding."""
-    end_with_source: bool = False
-    """End the episode when the source has finished its walk and stops for good (``source.after_walk``)."""
-
-    def __post_init__(self) -> None:
-        checks.convert_types("episode", self)
-        if self.max_steps is not None:
-            checks.whole("episode.max_steps", self.max_steps, 1, checks.STEPS)
-        for name in ("success_share", "discharged_share"):
-            value = getattr(self, name)
-            if value is not None:
-                checks.above(f"episode.{name}", value, 0.0)
-                checks.in_range(f"episode.{name}", value, 0.0, 1.0)
 
 
 class Status(NamedTuple):

@@ -4,59 +4,13 @@ The cruise power is proportional to the speed, so the drain of any part of a cru
 proportional to its length, whatever the time step and the speed profile.
 """
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
-from damian.common import checks
-from damian.world.regions.places import check_places
+from damian.settings.world import BatteryConfig
 
 _VERTICAL_FACTOR = 0.9
 """In takeoff and landing, the drain at full engine power is divided by this factor."""
-
-
-@dataclass
-class BatteryConfig:
-    """Batteries of the UAVs, and the places where they charge."""
-
-    enabled: bool = False
-    """Whether flights drain the battery; if not, it stays full."""
-    engine_power_kw: float = 10.0
-    """Engine power at the reference speed, and in takeoff and landing [kW]."""
-    reference_speed: float = 20.0
-    """Cruise speed at which the engine takes its full power [m/s]."""
-    capacity_kwh: float = 9.0
-    """Energy of a full battery [kWh]."""
-    efficiency: float = 12.0
-    """Efficiency factor; the consumption is divided by it."""
-    charging_power_kw: float = 4.0
-    """Power with which a landed UAV charges [kW]."""
-    resolution: float = 5.0
-    """Observed battery levels are rounded down to a multiple of this [%]."""
-    charging_points: list | None = None
-    """Places inside the region, [x, y] in metres or {lat: 53.1, lon: -4.5} in degrees (as for
-    region.start_positions); UAVs charge at the landing point nearest each, or anywhere if not given."""
-
-    def __post_init__(self) -> None:
-        checks.convert_types("battery", self)
-        checks.above("battery.engine_power_kw", self.engine_power_kw, 0.0, "kW")
-        checks.above("battery.reference_speed", self.reference_speed, 0.0, "m/s")
-        checks.in_range("battery.capacity_kwh", self.capacity_kwh, 1e-6, unit="kWh")
-        checks.above("battery.efficiency", self.efficiency, 0.0)
-        checks.above("battery.charging_power_kw", self.charging_power_kw, 0.0, "kW")
-        checks.above("battery.resolution", self.resolution, 0.0, "%")
-        checks.in_range("battery.resolution", self.resolution, 0.0, 100.0, "%")
-        checks.require(
-            self.charging_points != [],
-            "battery.charging_points",
-            "[]",
-            "is not a list of places; leave it out to charge anywhere",
-        )
-        check_places("battery.charging_points", self.charging_points or [])
-        should = "needs battery.enabled=true: the batteries stay full"
-        alone = self.charging_points and not self.enabled
-        checks.require(not alone, "battery.charging_points", self.charging_points, should)
 
 
 def cruise_drain(distance: Tensor, battery: BatteryConfig) -> Tensor:

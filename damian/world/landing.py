@@ -1,7 +1,6 @@
 """Actions (paper, section 4.2): a distance and a heading that lead to a landing point for one UAV alone."""
 
 import math
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import shapely
@@ -9,8 +8,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from damian.common import checks, devices
+from damian.common import devices
 from damian.common.tensors import gather_rows
+from damian.settings.world import ActionConfig
 from damian.world.airspace import Airspace, Cells, inside, nearest_points
 
 BOOKING_CHUNK = 2**22
@@ -24,43 +24,10 @@ _EDGES_AT_ONCE = 2**18
 """Pairs of target and polygon edge compared at once, which bounds the memory: a few arrays of 2 MB."""
 
 
-@dataclass
-class ActionConfig:
-    """The (distance, heading) actions of the UAVs (paper, section 4.2)."""
-
-    kind: str = "discrete"
-    """``discrete`` (every listed distance with every listed heading) or ``continuous``."""
-    distances: list[float] = field(default_factory=lambda: [0.0, 50.0, 100.0, 150.0, 200.0])
-    """Distances [m]; 0 holds the position. Continuous actions reach up to the largest distance."""
-    headings: list[float] = field(
-        default_factory=lambda: [-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0]
-    )
-    """Headings clockwise from north [deg]; only discrete actions use them."""
-    mask: bool = True
-    """Mask discrete actions without effect: target outside the region, battery too low, UAV in flight."""
-
-    def __post_init__(self) -> None:
-        checks.convert_types("actions", self)
-        checks.one_of("actions.kind", self.kind, ["discrete", "continuous"])
-        checks.require(len(self.distances) > 0, "actions.distances", self.distances, "is empty")
-        checks.require(len(self.headings) > 0, "actions.headings", self.headings, "is empty")
-        for distance in self.distances:
-            checks.in_range("actions.distances", distance, 0.0, unit="m")
-        for heading in self.headings:
-            checks.in_range("actions.headings", heading, -360.0, 360.0, unit="deg")
-        checks.above("actions.distances (largest)", max(self.distances), 0.0, "m")
-        for name in ("distances", "headings"):
-            checks.distinct(f"actions.{name}", getattr(self, name))
-
-    @property
-    def n_actions(self) -> int:
-        """Number of discrete actions."""
-        return len(self.distances) * len(self.headings)
-
-    def table(self, dtype: torch.dtype = torch.float32) -> Tensor:
-        """Discrete actions as (distance [m], heading [rad]), [A, 2]; the heading changes fastest."""
-        headings = [math.radians(heading) for heading in self.headings]
-        return torch.tensor([[d, h] for d in self.distances for h in headings], dtype=dtype)
+def action_table(actions: ActionConfig, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Discrete actions as (distance [m], heading [rad]), [A, 2]; the heading changes fastest."""
+    headings = [math.radians(heading) for heading in actions.headings]
+    return torch.tensor([[d, h] for d in actions.distances for h in headings], dtype=dtype)
 
 
 def displacement(distance: Tensor, heading: Tensor) -> Tensor:
@@ -142,7 +109,7 @@ class Candidates:
         holds, infinite if its target lies outside; ``hold`` [A] marks one action that holds (the first
         action, if no listed distance is 0).
         """
-        table = self.config.table(torch.float64)
+        table = action_table(self.config, torch.float64)
         shape = (*self.airspace.points.shape[:2], len(table))
         self.distance = torch.zeros(shape)
         self.ranking = Ranking(

@@ -5,59 +5,19 @@ level, landing (paper, eq. 1). Each phase follows a polynomial time law of degre
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from damian.common import checks
+from damian.settings.world import MotionConfig
 
 _TINY = 1e-9
 
 # Largest first and second derivative of each time law over tau in [0, 1].
 _PEAK_SPEED = {3: 3 / 2, 5: 15 / 8, 7: 35 / 16}
 _PEAK_ACCELERATION = {3: 6.0, 5: 10 * math.sqrt(3) / 3, 7: 84 * math.sqrt(5) / 25}
-
-
-@dataclass
-class MotionConfig:
-    """How UAVs move."""
-
-    kind: str = "instant"
-    """``instant``: a UAV is at its target when the step ends; ``polynomial``: flights take several steps;
-    ``package.module:Class``: your own ``MotionModel``."""
-    degree: int = 5
-    """Degree of the time law of each phase: 3, 5 or 7."""
-    max_speed: float = 5.0
-    """Speed limit of a phase [m/s]."""
-    max_acceleration: float = 2.0
-    """Acceleration limit of a phase [m/s^2]."""
-    sensing_time: float = 0.0
-    """Time that a landed UAV senses before it may choose again [s]."""
-    min_level: float = 1.0
-    """Flight level of the first UAV [m]."""
-    max_level: float = 20.0
-    """Highest flight level [m]. UAVs that fly instantly share levels if there are too few for all of them."""
-    level_separation: float = 0.5
-    """Vertical distance between the flight levels of two UAVs [m]."""
-
-    options: Any = None
-    """Settings of your own motion model, as a mapping."""
-
-    def __post_init__(self) -> None:
-        checks.convert_types("motion", self)
-        if ":" not in str(self.kind):  # ``damian.world.vehicles`` imports it
-            checks.one_of("motion.kind", self.kind, ["instant", "polynomial"])
-            problem = f"mean nothing with motion.kind={self.kind}"
-            checks.require(self.options is None, "motion.options", self.options, problem)
-        checks.one_of("motion.degree", self.degree, [3, 5, 7])
-        checks.in_range("motion.max_speed", self.max_speed, 1e-3, unit="m/s")
-        checks.in_range("motion.max_acceleration", self.max_acceleration, 1e-3, unit="m/s^2")
-        checks.in_range("motion.sensing_time", self.sensing_time, 0.0, unit="s")
-        checks.above("motion.min_level", self.min_level, 0.0, "m")
-        checks.in_range("motion.max_level", self.max_level, self.min_level, unit="m")
-        checks.above("motion.level_separation", self.level_separation, 0.0, "m")
 
 
 class Pose(NamedTuple):

@@ -7,109 +7,20 @@ polygon, the straight line between two stops may leave the polygon.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 import torch
 from torch import Tensor
 
-from damian.common import checks
-from damian.world.regions.places import check_place
+from damian.settings.world import SourceConfig
 from damian.world.regions.polygon import sample_interior
 
 _Polygon = shapely.Polygon | shapely.MultiPolygon
 
 _TINY = 1e-9
 _FULL_DISC_ROUNDS, _ROUNDS = 256, 320
-
-
-@dataclass
-class SourceConfig:
-    """The signal source that the UAVs search for."""
-
-    level_db: float = 140.0
-    """Sound level at 1 m [dB re 1e-12 W/m^2]."""
-    microphone_db: float = 105.0
-    """Lowest level that a UAV's microphone detects [dB re 1e-12 W/m^2]."""
-    motion: str = "static"
-    """``static``, or ``dynamic``: the source walks over hotspots."""
-    emission: str = "constant"
-    """``constant``; ``per_stop`` or ``per_step``: on or off, drawn at each stop or simulation step."""
-    emission_probability: float = 0.5
-    """Probability that an intermittent source is on."""
-    after_walk: str = "loop"
-    """What a dynamic source does after the last stop of its walk. ``loop``: it goes straight back to its
-    first hotspot and makes the same round again, with the same waits (an emission per stop is drawn anew);
-    ``stop``: it stays there, silent for good."""
-    position: Any = None
-    """Position, or start of the walk: [x, y] in metres, or {lat: 53.1, lon: -4.5} in degrees (as for
-    region.start_positions); drawn for each initial condition if not given."""
-    n_hotspots: int = 10
-    """Number of hotspots of a walk."""
-    min_stops: int = 3
-    """Smallest number of inner points around a hotspot."""
-    max_stops: int = 7
-    """Largest number of inner points around a hotspot."""
-    local_distance: float = 50.0
-    """Largest distance of an inner point from its hotspot [m]."""
-    speed: float = 20.0
-    """Largest speed on the way to another hotspot [m/s]."""
-    acceleration: float = 2.5
-    """Acceleration on the way to another hotspot [m/s^2]."""
-    local_speed: float = 1.7
-    """Largest speed between stops around one hotspot [m/s]."""
-    local_acceleration: float = 1.1
-    """Acceleration between stops around one hotspot [m/s^2]."""
-    min_wait: float = 60.0
-    """Shortest wait at a stop [s]."""
-    max_wait: float = 360.0
-    """Longest wait at a stop [s]."""
-
-    @property
-    def emits(self) -> float:
-        """Probability that the source emits in a step, if nothing else is known of it."""
-        return 1.0 if self.emission == "constant" else self.emission_probability
-
-    def __post_init__(self) -> None:
-        checks.convert_types("source", self)
-        checks.in_range("source.microphone_db", self.microphone_db, 0.0, unit="dB")
-        checks.in_range("source.level_db", self.level_db, -300.0, 300.0, "dB")
-        checks.require(
-            self.microphone_db < self.level_db,
-            "source.level_db",
-            f"{self.level_db} dB",
-            f"is not above microphone_db={self.microphone_db:g} dB: not heard even at 1 m",
-        )
-        checks.one_of("source.motion", self.motion, ["static", "dynamic"])
-        checks.one_of("source.emission", self.emission, ["constant", "per_stop", "per_step"])
-        checks.one_of("source.after_walk", self.after_walk, ["loop", "stop"])
-        checks.require(
-            self.motion == "dynamic" or self.after_walk == "loop",
-            "source.after_walk",
-            "stop",
-            "needs source.motion=dynamic: a static source does not walk",
-        )
-        checks.require(
-            self.motion == "dynamic" or self.emission != "per_stop",
-            "source.emission",
-            "per_stop",
-            "needs source.motion=dynamic: a static source has one stop; take constant or per_step",
-        )
-        checks.in_range("source.emission_probability", self.emission_probability, 0.0, 1.0)
-        if self.position is not None:
-            check_place("source.position", self.position)
-        checks.whole("source.n_hotspots", self.n_hotspots, 1, 1000)
-        checks.whole("source.min_stops", self.min_stops, 1)
-        checks.whole("source.max_stops", self.max_stops, self.min_stops, 1000)
-        for name in ("speed", "local_speed"):
-            checks.above(f"source.{name}", getattr(self, name), 0.0, "m/s")
-        for name in ("acceleration", "local_acceleration"):
-            checks.above(f"source.{name}", getattr(self, name), 0.0, "m/s^2")
-        checks.above("source.local_distance", self.local_distance, 0.0, "m")
-        checks.in_range("source.min_wait", self.min_wait, 0.0, unit="s")
-        checks.in_range("source.max_wait", self.max_wait, self.min_wait, unit="s")
 
 
 class Walk(NamedTuple):

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
+from damian.settings.world import WorldConfig
 from damian.world.airspace import Airspace, nearest_points
 from damian.world.battery import observed
-from damian.world.config import WorldConfig
+from damian.world.config import airspace_of
 from damian.world.landing import Candidates, assign_landing_points
 from damian.world.messages import Messages
 from damian.world.regions.places import local_places
@@ -59,7 +60,7 @@ class Simulation:
         self.config, self.dt = config, dt
         self.sensors = sensors_of(config.sensors)
         self.radius = footprint_radius(config.source)
-        self.airspace = config.airspace(rng)
+        self.airspace = airspace_of(config, rng)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         drawn = _draw_initial_conditions(config, self.airspace, rng)
         self.walk = drawn.walk

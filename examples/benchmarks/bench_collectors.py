@@ -17,8 +17,8 @@ import torch
 from damian.common.markdown import markdown_table
 from damian.common.threads import using_threads
 from damian.learners.schedule import SystemClock
+from damian.recipes.cli import settings as composed_config
 from damian.recipes.shared.collectors import collecting, learning_env, ticks
-from damian.recipes.shared.launch import composed_config
 from damian.recipes.train import make_learner, replay_buffer
 
 TRACKING = ["scenario=delaybench/tracking", "delay=paper", "aware=belief"]

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
@@ -23,7 +22,7 @@ from torchrl.envs import EnvBase
 from damian import LearnerConfig, LearningSetup, keys, make_env
 from damian.common import checks
 from damian.envs.pipeline import has_message_delay
-from damian.recipes.shared.stored_runs import check_run, stored_config
+from damian.recipes.shared.runs import stored_config
 from damian.runs.training_state import load_networks
 
 OFFSET = 2  # last columns of the privileged observation: the true way to the source, which no teacher sees
@@ -93,8 +92,7 @@ def load_teacher(folder: str, env: EnvBase) -> Any:
     """The actor of a run without delay, which observes what the critic observes as if nothing were late."""
     key = "learner.teacher"
     checks.require(bool(folder), key, "''", "is missing: the run folder of a policy trained without delay")
-    check_run(Path(folder), key)
-    config = OmegaConf.to_object(stored_config(Path(folder), key))
+    config = stored_config(Path(folder), key)
     checks.require(not has_message_delay(config), key, folder, "was trained with delayed messages")
     world = make_env(config.eval_scenario, 1, device=env.device)
     spec, wanted = env.full_action_spec_unbatched[keys.ACTION], world.full_action_spec_unbatched[keys.ACTION]

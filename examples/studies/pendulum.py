@@ -39,11 +39,11 @@ from damian import keys
 from damian.common.markdown import markdown_table
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
-from damian.learners.bpql import BpqlConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.time_storage import TimeStorage
+from damian.settings import BpqlConfig
 from damian.transforms import ActionHistory, ObservationDelay
 
 ARMS = ("undelayed", "naive", "history", "bpql")

@@ -36,11 +36,12 @@ from damian.learners.schedule import SystemClock
 from damian.runs.checkpoint import plain
 from damian.runs.training_state import CarriedStep, RandomState
 from damian.server.server import Server
+from damian.settings import TrainConfig
 from damian.transforms.reward import EpisodeTotals
 
-from .launch import seed_generators
 from .ray_cluster import connected_ray
-from .settings import TrainConfig
+from .runs import seed_generators
+from .settings import backupdates
 
 START_LIMIT = 300
 """Seconds after which a Ray cluster that has no room for the workers is given up."""
@@ -50,7 +51,7 @@ _ENDLESS = 2**62
 
 def learning_env(config: TrainConfig) -> DelayedEnv:
     """The environment of the training, [B], with what the learner and the logs need."""
-    messages = config.backupdates or config.clock.trigger is not None
+    messages = backupdates(config) or config.clock.trigger is not None
     privileged = config.critic == "privileged"
     reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}

@@ -19,7 +19,7 @@ from damian.compare.figures import LABELS
 from damian.runs.metrics_log import METRICS, read_metrics
 from damian.runs.run_record import read_record
 
-from .composition_errors import one_line
+from ..cli import reason
 from .many_runs import Run
 
 ROWS, CURVES = "results.csv", "curves.csv"
@@ -104,9 +104,7 @@ def _read(path: Path, columns: Sequence[str]) -> Sequence[Row]:
             raise ValueError(f"no column {missing[0]}")
         return rows
     except (OSError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: it does not hold the results of a comparison ({one_line(error)})"
-        ) from error
+        raise InputError(f"{path}: it does not hold the results of a comparison ({reason(error)})") from error
 
 
 def _value(name: str, text: str) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 from damian.envs.scenario import ScenarioConfig
 from damian.interop.gym import UavGymEnv, UavVectorEnv
 
-from .launch import composed_config
+from ..cli import settings
 
 
 def compose_scenario(*overrides: str) -> ScenarioConfig:
@@ -21,7 +21,7 @@ def compose_scenario(*overrides: str) -> ScenarioConfig:
     Raises:
         InputError: an override is misspelt, or its value is impossible.
     """
-    return composed_config(*overrides)
+    return settings(*overrides)
 
 
 def gymnasium_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavGymEnv:

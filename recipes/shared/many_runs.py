@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import torch
-from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
@@ -39,12 +38,12 @@ from damian.runs.metrics import EVALUATED
 from damian.runs.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.runs.run_lock import locked
 from damian.runs.run_record import POLICY, read_record
+from damian.settings import TrainConfig
+from damian.settings.fields import leaves
 
-from .composition_errors import one_line
-from .launch import Program, perform
+from ..cli import Work, reason
 from .ray_cluster import connected_ray
-from .settings import TrainConfig
-from .stored_runs import stored_config
+from .runs import perform, stored_config
 
 LOG = "log.txt"
 STOP_LIMIT = 120
@@ -74,7 +73,7 @@ class Run:
     arm: str
     config: TrainConfig
     folder: Path
-    program: Program
+    program: Work
     """The work to do, importable by name."""
     trains: bool = True
     """Does the program train, so that it writes checkpoints and can be resumed?"""
@@ -118,7 +117,7 @@ class Run:
                 raise ValueError(f"no {missing[0]}")
             return rows
         except (KeyError, TypeError, ValueError) as error:
-            problem = f"it does not hold the results of a run ({one_line(error)})"
+            problem = f"it does not hold the results of a run ({reason(error)})"
             raise InputError(f"{file}: {problem}; delete the folder") from error
 
 
@@ -131,11 +130,10 @@ def check_stored(run: Run) -> None:
     if not (run.folder / CONFIG).exists():
         return
     try:
-        stored = stored_config(run.folder, "hydra.run.dir")
+        stored = stored_config(run.folder, "hydra.run.dir", named=[repr(dict(leaves(run.config)))])
     except InputError as error:
         raise InputError(f"{error}; delete the folder") from error
-    asked = OmegaConf.create(OmegaConf.to_yaml(OmegaConf.structured(run.config)))
-    old, new = (dict(_leaves(OmegaConf.to_container(config))) for config in (stored, asked))
+    old, new = dict(leaves(stored)), dict(leaves(run.config))
     for key in new | old:
         if key == "checkpoint" and _same_run(old.get(key), new.get(key)):
             continue
@@ -149,15 +147,6 @@ def check_stored(run: Run) -> None:
 def _same_run(folder: str | None, other: str | None) -> bool:
     """Do two paths name the same delay, arm and seed, wherever their experiment lies?"""
     return folder is not None and other is not None and Path(folder).parts[-3:] == Path(other).parts[-3:]
-
-
-def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every dotted key of nested dictionaries with its value."""
-    if isinstance(node, dict) and node:
-        for key, value in node.items():
-            yield from _leaves(value, f"{path}.{key}" if path else key)
-    else:
-        yield path, node
 
 
 # Where runs are carried out.
@@ -211,7 +200,7 @@ class SlurmJobs:
             self._executor = submitit.AutoExecutor(folder, cluster=options.pop("cluster", "slurm"))
             self._executor.update_parameters(**options)
         except (NameError, RuntimeError, TypeError, ValueError) as error:
-            raise InputError(f"slurm: {one_line(error)}") from error
+            raise InputError(f"slurm: {reason(error)}") from error
         self._jobs: list[Any] = []
 
     def carry_out(self, run: Run) -> None:

@@ -10,10 +10,9 @@ from damian.common.atomic_files import writing
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
+from damian.settings import TrainConfig
 from damian.show.episode import record
 from damian.show.film import save_film
-
-from .settings import TrainConfig
 
 FOLDER = "films"
 

@@ -21,7 +21,7 @@ from damian.runs.metrics import evaluate
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig, displacement
+from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
@@ -52,7 +52,7 @@ def landing_points(env: DelayedEnv, td: TensorDictBase) -> Tensor:
     action = greedy_policy(env)(td)["agents", "action"][0]
     worlds = env.uav_env
     if worlds.scenario.actions.kind == "discrete":
-        distance, heading = worlds.scenario.actions.table()[action].unbind(-1)
+        distance, heading = action_table(worlds.scenario.actions)[action].unbind(-1)
     else:
         distance, heading = action[:, 0] * 300.0, action[:, 1] * 2 * torch.pi
     target = sent_messages(td).position[0] + displacement(distance, heading)
@@ -167,7 +167,7 @@ def test_uavs_fly_where_their_footprints_hold_most_fresh_ground_by_the_shortest_
     region = held.trail[:, 0, 0] // policy.points.shape[1]
     assert len(region.unique()) == 3
     fresh, chosen = policy.fresh(held, policy.points[region]), greedy_policy(env)(td)["agents", "action"]
-    moves = displacement(*scenario.actions.table().unbind(-1))
+    moves = displacement(*action_table(scenario.actions).unbind(-1))
     for world, uav in itertools.product(range(8), range(3)):
         points, start = policy.points[region[world]][policy.real[region[world]]], held.position[world, uav]
         ends = points[distances(start + moves, points).argmin(-1)]

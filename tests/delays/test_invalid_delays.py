@@ -8,10 +8,9 @@ from context_law import Crowd
 from transform_cases import ACTION, OBSERVATION, delayed, trace
 
 from damian.common.errors import InputError
-from damian.delays.config import DelayConfig, LinkConfig
+from damian.delays.config import DelayConfig, LinkConfig, check_laws
 from damian.delays.laws import LONGEST, Burst, Constant, Held, Lag, Uniform
 from damian.delays.samplers import ContextSampler, Sampler
-from damian.envs.scenario import ScenarioConfig
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 STEPS_OR_TIME = "is neither whole steps such as 3 nor a time such as 3s"
@@ -46,7 +45,7 @@ INVALID_LAWS = [
 def test_an_invalid_law_raises_one_line_that_names_its_key(setting, error):
     for name in ("obs", "act", "rew"):
         with pytest.raises(InputError) as caught:
-            ScenarioConfig(delay=DelayConfig(**{name: setting}))
+            check_laws(DelayConfig(**{name: setting}), 1.0)
         assert str(caught.value).startswith(f"delay.{name}{error}")
         assert "\n" not in str(caught.value)
 
@@ -56,7 +55,7 @@ def test_an_invalid_law_raises_one_line_that_names_its_key(setting, error):
     [
         ({"loss": 2}, "delay.loss: 2 is not between 0 and 1"),
         ({"order": "newest"}, "delay.order: newest is not one of generation, arrival"),
-        ({"history": 2.5}, "delay.history: 2.5 actions is not a whole number"),
+        ({"history": 2.5}, "delay.history: 2.5 is not a whole number"),
         ({"reward_window": 0}, "delay.reward_window: 0 steps is not between 1 and 10000 steps"),
         ({"reward_discount": math.nan}, "delay.reward_discount: nan is not above 0"),
     ],
@@ -74,9 +73,18 @@ def test_an_invalid_delay_setting_raises_an_error_that_names_its_key(settings, e
         ({"kind": "ring"}, "links.kind: ring is not one of"),
         ({"delay": 3}, "links.delay: 3 means nothing with links=server"),
         ({"kind": "matrix", "range": 50.0, "hears": [[True]]}, "links.range: 50.0 does not go with links.he"),
-        ({"kind": "matrix", "delay": [[0, 1], [1, 0]]}, "links.delay: 2 x 2 is not 3 x 3"),
-        ({"kind": "matrix", "loss": [[0, 0, 0], [0, 0, 2], [0, 0, 0]]}, "links.loss: 2 is not between 0 and"),
-        ({"kind": "matrix", "hears": [[1, 1, 1]] * 3}, "links.hears: [[1, 1, 1], [1, 1, 1], [1, 1, 1]] is n"),
+        (
+            {"kind": "matrix", "delay": [[0, 1], [1, 0]]},
+            "links.delay: it is not 3 lists (receivers) of 3 entries",
+        ),
+        (
+            {"kind": "matrix", "loss": [[0, 0, 0], [0, 0, 2], [0, 0, 0]]},
+            "links.loss[1][2]: 2 is not between 0 and 1",
+        ),
+        (
+            {"kind": "matrix", "hears": [[1, 1, 1]] * 3},
+            "links.hears[0][0]: 1 is not a list of true and false",
+        ),
     ],
     ids=str,
 )
@@ -100,7 +108,7 @@ def test_an_invalid_trace_raises_one_line_that_names_the_file_and_the_line(tmp_p
     if text is not None:
         file.write_text(text)
     with pytest.raises(InputError) as caught:
-        DelayConfig(obs={"law": "trace", "path": str(file)}).check(1.0)
+        check_laws(DelayConfig(obs={"law": "trace", "path": str(file)}), 1.0)
     assert str(caught.value).startswith(f"{file}: {error}")
 
 
@@ -115,7 +123,7 @@ def test_a_law_with_memory_or_context_is_refused_as_an_inner_law(user, tmp_path)
 
 
 def test_losses_are_refused_where_a_reward_would_be_lost():
-    for make in (lambda: DelayConfig(rew={"law": "burst"}).check(1.0), lambda: RewardDelay(Burst())):
+    for make in (lambda: check_laws(DelayConfig(rew={"law": "burst"}), 1.0), lambda: RewardDelay(Burst())):
         with pytest.raises(InputError, match="no reward may be lost"):
             make()
 
@@ -132,7 +140,7 @@ def test_a_law_that_reads_what_there_is_not_is_refused():
     with pytest.raises(InputError, match="has no key for position, which the law Crowd reads"):
         ObservationDelay(Crowd())
     with pytest.raises(InputError, match=r"delay.act: .* reads altitude, but a law can read only position"):
-        ScenarioConfig(delay=DelayConfig(act=Crowd("altitude")))
+        check_laws(DelayConfig(act=Crowd("altitude")), 1.0)
     with pytest.raises(InputError, match="reads: position is not a list of names"):
         ContextSampler(len, 3, reads="position")
     env = delayed(ActionDelay(Crowd("seen"), ACTION, context_keys={"seen": "speed"}))

@@ -12,11 +12,12 @@ from torch import Tensor
 
 from damian.delays.config import DelayConfig
 from damian.delays.laws import law_of
-from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import action_codes, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED
+from damian.settings import ClockConfig
+from damian.world.landing import action_table
 from damian.world.messages import Messages
 from damian.world.signal_source import SourceConfig
 
@@ -82,7 +83,7 @@ def test_the_action_history_holds_the_chosen_displacements_east_and_north():
     scenario = square(delay=DelayConfig(act=2, history=2), episode=KEEPS_GOING)
     env, undelayed = delayed(scenario), UavEnv(square(), 4)
     actions = choices(env, 6)
-    distance, heading = scenario.actions.table().unbind(-1)
+    distance, heading = action_table(scenario.actions).unbind(-1)
     displacements = torch.stack([distance * heading.sin(), distance * heading.cos()], -1)
     codes = (displacements / 200 + 1) / 2
     outputs = play(env, actions)

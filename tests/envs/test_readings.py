@@ -10,12 +10,12 @@ from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from damian.delays.config import DelayConfig
-from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
+from damian.settings import ClockConfig
 
 LATE = 3
 """Constant delay of the messages [steps]."""

@@ -14,12 +14,12 @@ from helpers import square
 from damian import keys
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.clocks import ClockConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig, make_simulation
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
+from damian.settings import ClockConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig

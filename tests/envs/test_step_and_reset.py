@@ -9,11 +9,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase, RewardSum, StepCounter
 
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.keys import AGENTS, EPISODE_REWARD, GLOBAL_OBSERVATION, REWARD
+from damian.settings import ClockConfig
 from damian.transforms.reward import EpisodeTotals
 
 STEPS = 20

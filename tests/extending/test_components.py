@@ -12,9 +12,9 @@ from torchrl.envs.utils import check_env_specs
 
 from damian import UavEnv, make_env
 from damian.delays.config import DelayConfig
-from damian.envs.clocks import ClockConfig
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
+from damian.settings import ClockConfig
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
 
@@ -47,7 +47,7 @@ SENSOR = [
 def check_trained_and_evaluated(run: Callable[..., Path], *overrides: str) -> dict[str, str]:
     """Train and evaluate with extensions; returns the last row of the metrics."""
     first = run(*TINY, *overrides)
-    second = run(f"checkpoint={first}", "seed=1", program="evaluate", name="evaluated")
+    second = run(f"checkpoint={first}", "seed=1", "trust=true", program="evaluate", name="evaluated")
     assert (second / "result.csv").is_file()
     with (first / "metrics.csv").open(newline="") as file:
         return list(csv.DictReader(file))[-1]

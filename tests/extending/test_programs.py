@@ -102,7 +102,9 @@ def test_a_scenario_of_ones_own_is_trained_with_a_learner_and_a_logger_of_ones_o
     assert json.loads((first / "run.json").read_text())["config_dir"] == str(folder / "conf")
     # The learner and the folder of configuration files are found again.
     # The policy keeps its action history, which a file of the scenario has chosen.
-    evaluated = run("checkpoint=run", "agents=3", "delay=paper", program="evaluate", name="evaluated")
+    evaluated = run(
+        "checkpoint=run", "trust=true", "agents=3", "delay=paper", program="evaluate", name="evaluated"
+    )
     config = OmegaConf.load(evaluated / "config.yaml")
     assert config.learner.name == "learner:ReinforceConfig"
     assert (config.delay.obs.law, config.delay.history) == ("uniform", 2)
@@ -112,7 +114,7 @@ def test_a_scenario_of_ones_own_is_trained_with_a_learner_and_a_logger_of_ones_o
 
 def run_resumed(run, name: str) -> None:
     """Resume a run; it stays in its folder."""
-    run(f"resume={name}", "frames=256", name="unused")
+    run(f"resume={name}", "trust=true", "frames=256", name="unused")
 
 
 @pytest.mark.slow

@@ -10,15 +10,14 @@ from helpers import everything
 from torchrl.data import ReplayBuffer
 
 from damian.delays.config import DelayConfig
-from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.learners.bpql import BpqlConfig
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
-from damian.recipes.shared.settings import LoggerConfig, TrainConfig
+from damian.recipes.shared.settings import learning_setup
 from damian.recipes.train import learning_env, make_learner, replay_buffer, train
 from damian.replay.time_storage import TimeStorage
+from damian.settings import BpqlConfig, ClockConfig, LoggerConfig, TrainConfig
 
 AWARE = {
     "none": {},
@@ -100,7 +99,7 @@ def test_a_learner_trains_the_actor_that_evaluations_make(kind):
     settings = replace(config("mappo", "none", "discrete", "instant", "none"), delay=DelayConfig())
     env = learning_env(settings)
     buffer = ReplayBuffer(storage=TimeStorage(400))
-    learner = OwnActor().make(env, settings.learning_setup, None if kind is MappoConfig else buffer)
+    learner = OwnActor().make(env, learning_setup(settings), None if kind is MappoConfig else buffer)
     activations = {type(module) for module in learner.actor.modules()} & {torch.nn.ReLU, torch.nn.Tanh}
     assert activations == {torch.nn.ReLU}
 

@@ -21,10 +21,10 @@ from damian.learners.predictive_mappo import (
     TargetScale,
     prediction_loss,
 )
-from damian.recipes.shared.settings import LoggerConfig, TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.replay.backupdate import BackupdateStorage
 from damian.server.termination import EpisodeConfig
+from damian.settings import LoggerConfig, TrainConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
 

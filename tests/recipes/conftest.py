@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from damian.recipes.shared.launch import launch
-from damian.recipes.train import main
+from damian.recipes.train import run as main
 
 
 @pytest.fixture
@@ -17,7 +16,7 @@ def run(tmp_path, monkeypatch) -> Callable[..., Path]:
 
     def run_recipe(*overrides: str, folder: str = "run") -> Path:
         monkeypatch.setattr(sys, "argv", ["train.py", *overrides, f"hydra.run.dir={folder}"])
-        launch(main)
+        main()
         return tmp_path / folder
 
     return run_recipe

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from damian.recipes.shared.launch import launch
-from damian.recipes.train import main
+from damian.recipes.train import run as main
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.metrics_log import MetricsLog
 
@@ -70,7 +69,7 @@ def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
         tqdm.set_lock(threading.RLock())  # its own one is shared, and a killed child would keep it
         sys.argv = ["train.py", *words]
         prepare()
-        launch(main)
+        main()
         code = 0
     except SystemExit as stopped:
         code = stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)

@@ -20,9 +20,9 @@ from helpers import check_refused
 
 from damian.advice.session import AdviceSession, read_inbox
 from damian.common.errors import RunError
-from damian.recipes.advise import AdviseConfig, main, make_session
-from damian.recipes.shared.launch import launch
-from damian.recipes.train import main as train
+from damian.recipes.advise import AdviseConfig, make_session
+from damian.recipes.advise import run as main
+from damian.recipes.train import run as train
 from damian.runs.run_lock import is_locked, locked
 from damian.world.regions.config import RegionConfig
 
@@ -44,7 +44,7 @@ def run(tmp_path, monkeypatch):
 
     def run_recipe(*overrides: str) -> Path:
         monkeypatch.setattr(sys, "argv", ["advise.py", *overrides, "hydra.run.dir=run"])
-        launch(main, "advise")
+        main()
         return tmp_path / "run"
 
     return run_recipe
@@ -75,7 +75,7 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
     words = ["agents=2", "frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "eval_episodes=2"]
     words += ["actions.distances=[0,30,60]", "episode.max_steps=6", "delay.obs=2", "delay.history=2"]
     monkeypatch.setattr(sys, "argv", ["train.py", *words, "hydra.run.dir=trained"])
-    launch(train)
+    train()
     rows = TABLE.splitlines()
     Path("two.csv").write_text("\n".join(rows[:3]))
     answer = json.loads((run("checkpoint=trained", "reports=two.csv") / "advice.json").read_text())

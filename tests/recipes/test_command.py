@@ -1,38 +1,22 @@
-"""The command ``damian``: its programs, its help, and its quick answers to misspelt settings."""
+"""The command ``damian``: its programs, its help, and one line for each kind of mistake."""
 
-import json
-import os
 import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
 
 import pytest
-from hydra import initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 import damian
 from damian.common.errors import InputError
-from damian.learners.base import LEARNERS
+from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
-from damian.recipes.compare import CompareConfig
-from damian.recipes.shared.command_line import prepared
-from damian.recipes.shared.known_settings import CONF, groups, known_settings
-from damian.recipes.shared.launch import checked, composed_with
-from damian.recipes.shared.misspelt import check_words
-from damian.recipes.shared.settings import TrainConfig
-
-
-def keys_of(config: DictConfig, path: str = "") -> set[str]:
-    """Every dotted key of a configuration."""
-    keys = set()
-    for name in config:
-        keys.add(f"{path}{name}")
-        node = config._get_node(name)
-        if isinstance(node, DictConfig) and not node._is_missing():
-            keys |= keys_of(config[name], f"{path}{name}.")
-    return keys
+from damian.recipes.known import CONF, groups, known_settings
+from damian.recipes.words import parsed
+from damian.settings import LEARNERS, TrainConfig
+from damian.settings.fields import leaves, rules
+from damian.settings.programs import SEARCHES
 
 
 def refusal(capsys, *words: str) -> str:
@@ -43,38 +27,164 @@ def refusal(capsys, *words: str) -> str:
     assert stop.value.code == 2
     assert printed.out == ""
     assert printed.err.count("\n") == 1
-    return printed.err.strip()
+    return printed.err.removeprefix("error: ").strip()
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import damian.settings",
+        "from damian.recipes.command import main; main(['--help'])",
+        "from damian.recipes.command import main; main(['train', '--help'])",
+        "from damian.recipes.command import main; main(['compare', '--help', 'experiment'])",
+        "from damian.recipes.command import main; main(['train', 'agnts=3'])",
+        "from damian.recipes.command import main; main(['train', 'agents=0'])",
+    ],
+)
+def test_settings_help_and_wrong_words_need_no_torch(code):
+    code = f"import sys\ntry:\n    {code}\nfinally:\n    assert 'torch' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "AssertionError" not in done.stderr
+    assert done.returncode == (2 if "agnts" in code or "agents=0" in code else 0)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["trian"], "trian: no such program; the programs are train, evaluate"),
+        (["train", "agnts=3"], "agnts: no such key; did you mean agents?"),
+        (["train", "learner.lrr=1"], "learner.lrr: no such key; did you mean learner.lr?"),
+        (["train", "+agents.x=1"], "agents"),
+        (["train", "+motion.foo=1"], "motion.foo: no such key"),
+        (["train", "lr=1"], "lr: no such key; did you mean learner.lr?"),
+        (["train", "belief=true"], "belief: no such key; did you mean aware=belief?"),
+        (["train", "num_envs=8"], "num_envs: no such key; did you mean worlds?"),
+        (["train", "total_frames=8"], "total_frames: no such key; did you mean frames?"),
+        (["train", "delay=3"], "delay: 3 is no option of this group; write delay.obs=3"),
+        (["train", "delay=papers"], "delay: papers is not one of burst, distance, lag, paper, none"),
+        (["train", "-m", "seed=0,x"], "seed: Value 'x'"),
+        (["train", "seed=0,1"], "seed: several values need -m"),
+        (["train", "--confg-dir=own"], "unrecognized arguments: --confg-dir=own"),
+        (["train", "--experimental-rerun=x.pickle"], "unrecognized arguments: --experimental-rerun"),
+        (["train", "--config-dir=nowhere"], "--config-dir: 'nowhere' is no folder"),
+        (["train", "agents"], "'agents': this word is not of the form KEY=VALUE"),
+        (["train", "delay.obs={law: uniform"], "delay.obs: '{law: uniform' cannot be read"),
+        (["train", "agents=two"], "agents: Value 'two' of type 'str' could not be converted to Integer"),
+        (["train", "model.hidden=8"], "model.hidden: Invalid value assigned"),
+        (["train", "agents=0"], "agents: 0 is not between 1 and 1000"),
+        (["train", "region.lattice_angle=100"], "region.lattice_angle: 100.0 deg is not between"),
+        (["train", "clock.agents=1.5s"], "clock.agents: 1.5s is not a multiple of clock.simulation=1s"),
+        (["train", "collector=threads"], "collector: threads is not one of sync, process, ray"),
+        (["train", "region.pool=64"], "region.pool: no such key of the chosen region"),
+        (["train", "links.delay=3"], "links.delay: no such key of the chosen links"),
+        (["train", "learner.tau=0.1"], "learner.tau: no such key of the chosen learner"),
+        (["train", "region=geojson"], "region.path: it is missing: region.kind=geojson needs it"),
+        (["train", "observation.own=true", "links=updown"], "observation.own: True does not go with links"),
+        (["train", "learner=nowhere:Config"], "learner: nowhere:Config: No module named 'nowhere'"),
+        (["compare", "experiment=usecase2", "agents=3"], "agents: it is a setting of the runs"),
+        (["compare", "experiment=usecase2", "arms=[nope]"], "arms: nope is not one of undelayed, unaware"),
+        (["compare", "-m", "experiment=usecase2"], "-m: not with"),
+        (["fly", "resume=x"], "resume: x nothing is trained"),
+        (["fly", "policy=sampled"], "policy: sampled needs checkpoint"),
+        (["advise", "token=short"], "token: it is not a password"),
+        (["tune", "score=success_rate", "scenario=delaybench/tracking"], "score: success_rate is the same"),
+    ],
+    ids=lambda part: part[-1] if isinstance(part, list) else "",
+)
+def test_a_mistake_is_answered_in_one_line(capsys, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert refusal(capsys, *words).startswith(message)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["delay.obs={law: poisson}"], "delay.obs.law: poisson is not one of constant, uniform"),
+        (["delay.obs={law: trace, path: nowhere.csv}"], "nowhere.csv: no such file"),
+        (["checkpoint=nowhere"], "checkpoint: 'nowhere': there is no such folder"),
+        (["resume=nowhere", "agents=4"], "agents=4: a resumed run keeps its configuration"),
+        (["device=abacus"], "device: abacus is not one of the devices here"),
+        (["region=fir", "region.path=no.csv", "region.id=X"], "no.csv: no such file"),
+        (["learner=sac", "model=gru"], "model.rnn: gru is for learner=mappo only"),
+    ],
+)
+def test_what_only_a_program_can_tell_is_one_line_too_and_leaves_no_folder(
+    capsys, tmp_path, monkeypatch, words, message
+):
+    monkeypatch.chdir(tmp_path)
+    assert message in refusal(capsys, "train", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("# @package _global_\nagents: 2\n\tseed: 3\n", "mine.yaml"),
+        ("# @package _global_\nmodel: {hidden: 8}\n", "model.hidden"),
+        ("# @package _global_\nagnts: 8\n", "agnts: no such key; did you mean agents?"),
+    ],
+)
+def test_a_mistake_in_your_own_file_is_one_line(capsys, tmp_path, monkeypatch, text, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own" / "scenario").mkdir(parents=True)
+    (tmp_path / "own" / "scenario" / "mine.yaml").write_text(text)
+    assert message in refusal(capsys, "train", "--config-dir=own", "scenario=mine")
+
+
+def test_your_own_file_is_an_option(tmp_path):
+    (tmp_path / "scenario").mkdir()
+    (tmp_path / "scenario" / "mine.yaml").write_text("# @package _global_\nagents: 2\n")
+    assert cli.settings("scenario=mine", own_folder=str(tmp_path)).agents == 2
 
 
 @pytest.mark.parametrize("program", ["train", "tune", "fly", "advise"])
 def test_every_program_takes_every_learner(program):
-    import_module(f"damian.recipes.{program}")  # stores its settings
-    with initialize_config_dir(CONF, version_base=None):
-        for name, settings in LEARNERS.items():
-            config = checked(composed_with(program, [f"learner={name}"]), program)
-            assert type(config.learner) is settings
+    for name, settings in LEARNERS.items():
+        assert type(cli.settings(f"learner={name}", program=program).learner) is settings
+    assert set(SEARCHES) == set(LEARNERS)
 
 
-def test_the_settings_read_from_the_source_are_those_of_the_dataclasses():
-    configs = [
-        OmegaConf.structured(TrainConfig),
-        *(OmegaConf.create({"learner": make()}) for _, make in LEARNERS.items()),
-    ]
-    assert set(known_settings("train")) == set().union(*map(keys_of, configs))
-    assert set(known_settings("compare")) > set(OmegaConf.structured(CompareConfig))
-    assert known_settings("train")["agents"].default == "3"
-    assert (
-        known_settings("train")["learner.lr"].default
-        == "0.001 (bpql, sac) or 0.0003 (mappo, predictive_mappo)"
-    )
-    assert all(setting.text for key, setting in known_settings("train").items() if setting.default), (
-        "undocumented"
-    )
+def test_a_training_has_few_settings_and_each_is_documented():
+    found = cli.composed("train", [])
+
+    def count(node) -> int:
+        return sum(count(node[k]) if OmegaConf.is_dict(node[k]) else 1 for k in node if k != "hydra")
+
+    assert count(found) <= 120
+    assert len([*CONF.rglob("*.yaml")]) <= 50
+    undocumented = [k for k, each in known_settings("train").items() if each.default and not each.text]
+    assert [k for k in undocumented if k != "learner.name"] == []
 
 
-def test_every_program_is_a_module_of_the_recipes_and_says_what_it_does(capsys):
-    folder = Path(sys.modules["damian.recipes.command"].__file__).parent
-    assert {*PROGRAMS} == {path.stem for path in folder.glob("*.py")} - {"__init__", "command"}
+def test_every_number_of_a_training_has_bounds_or_a_largest_value():
+    with pytest.raises(InputError, match=r"reward\.bonus: 1e\+30 is not between"):
+        cli.settings("reward.bonus=1e30")
+    with pytest.raises(InputError, match=r"source\.speed: 1e\+300 m/s is not between"):
+        cli.settings("source=dynamic", "source.speed=1e300")
+
+
+def test_a_configuration_is_what_the_python_dataclasses_say():
+    config = cli.settings()
+    assert isinstance(config, TrainConfig)
+    stored = dict(leaves(config))
+    assert "region.vertices" not in stored, "only the kind vertices reads it"
+    assert "overrides" not in stored, "a constant"
+    assert rules(TrainConfig)["agents"].meaning == "Number of UAVs."
+
+
+def test_what_a_scenario_says_of_the_learner_gives_way_to_the_command_line():
+    tracking = "scenario=delaybench/tracking"
+    assert cli.settings(tracking).learner.lr == 1e-3
+    assert cli.settings(tracking, "learner.lr=3e-4").learner.lr == 3e-4
+    assert cli.settings(tracking, "learner=sac").learner.target_entropy == 0.3
+    assert cli.settings("scenario=delaybench/flights").learner.gamma == 0.95
+    assert cli.settings("scenario=paper/usecase1_far").learner.lmbda == 0.9
+
+
+def test_every_program_is_a_module_and_says_what_it_does(capsys):
+    for name in PROGRAMS:
+        assert import_module(f"damian.recipes.{name.replace('-', '_')}").run
     main([])
     printed = capsys.readouterr().out
     assert all(f"\n  {name} " in printed and what in printed for name, what in PROGRAMS.items())
@@ -85,245 +195,24 @@ def test_every_program_is_a_module_of_the_recipes_and_says_what_it_does(capsys):
 def test_help_explains_a_program_a_section_and_a_setting(capsys):
     main(["train", "--help"])
     page = capsys.readouterr().out
-    assert all(name in page for name in groups() if name not in ("experiment", "search", "tuning"))
-    assert len(page.splitlines()) < 45
-    main(["evaluate", "-h"])
-    assert "damian evaluate checkpoint=" in capsys.readouterr().out
+    assert all(name in page for name in groups() if name != "experiment")
     main(["train", "--help", "delay", "learner.gamma"])
     printed = capsys.readouterr().out
     assert "delay.loss: float = 0.0\n    Probability that a message" in printed
     assert "learner.gamma: float = 0.95\n    Discount factor per step." in printed
+    assert "paper: damian train delay=paper" in printed
+    main(["train", "--cfg", "job", "agents=4"])
+    assert "agents: 4" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["trian"], "trian: no such program; the programs are train, evaluate"),
-        (["train", "agnts=3"], "agnts: no such key; did you mean agents?"),
-        (["train", "agents=2", "learner.lrr=1"], "learner.lrr: no such key; did you mean learner.lr?"),
-        (["train", "delay=papers"], "delay: papers is not one of burst, distance, lag, none, paper"),
-        (
-            ["train", "-m", "delay=none,papers"],
-            "delay: papers is not one of burst, distance, lag, none, paper",
-        ),
-        (["evaluate", "delay.obs.hgih=3s"], None),
-        (["compare", "experimnt=usecase1"], "experimnt: no such key; did you mean experiment?"),
-        (
-            ["compare", "agents=3"],
-            "agents: it is a setting of the runs; all of them get it by \"overrides=['agents=3']\"",
-        ),
-        (["compare", "delay=paper"], "delay: it is a setting of the runs; all of them"),
-        (["train", "experiment=usecase1"], "experiment: no such key"),
-        (["train", "learner.sdev=1"], "learner.sdev: no such key"),
-        (["train", "--confg-dir=own"], "unrecognized arguments: --confg-dir=own"),
-        (["train", "task=spotting"], "task: no such key; since damian 0.2 it is reward"),
-    ],
-)
-def test_a_misspelt_word_is_answered_in_one_line(capsys, monkeypatch, words, message):
-    if message is None:  # a quick look cannot tell: the program itself answers
-        monkeypatch.setattr(f"damian.recipes.{words[0]}.run", lambda: print("runs"))
-        main(words)
-        assert capsys.readouterr().out == "runs\n"
-    else:
-        assert refusal(capsys, *words).startswith(f"error: {message}")
+def test_folders_of_any_name_are_quoted_for_hydra(tmp_path):
+    words = parsed(["checkpoint=runs/it's 1,2", "agents=2", "-m", "hydra.run.dir=null"]).overrides
+    assert words == ["checkpoint='runs/it\\'s 1','2'", "agents=2", "hydra.run.dir='null'"]
+    odd = tmp_path / "a, b=[c]"
+    found = cli.composed("train", parsed([f"hydra.run.dir={odd}"]).overrides)
+    assert Path(found.hydra.run.dir) == odd
 
 
-def test_an_option_of_ones_own_is_found_where_its_folder_was_not_named(capsys, monkeypatch, tmp_path):
-    (tmp_path / "own" / "delay").mkdir(parents=True)
-    (tmp_path / "own" / "delay" / "mine.yaml").write_text("delay: {obs: 3}")
-    monkeypatch.chdir(tmp_path)
-    hint = "; for own/delay/mine.yaml add --config-dir=own"
-    assert refusal(capsys, "train", "delay=mine").endswith(hint)
-    assert "add" not in refusal(capsys, "train", "delay=others")
-
-
-def test_a_misspelt_word_is_answered_without_loading_torch():
-    code = "import sys; from damian.recipes.command import main\n"
-    code += "try: main(['train', 'agnts=3'])\nfinally: print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == "False"
-    assert done.returncode == 2
-
-
-@pytest.mark.parametrize("word", ["hydra.run.dir={}", "hydra.run.dir='{}/deeper'", "hydra.sweep.dir={}"])
-def test_a_file_is_no_run_folder(tmp_path, word):
-    (tmp_path / "a b").write_text("")
-    key = word.partition("=")[0]
-    with pytest.raises(InputError, match=rf"{key}: .*a b'? is a file: name a folder"):
-        prepared([word.format(tmp_path / "a b")])
-
-
-def test_words_are_prepared_for_hydra():
-    words = ["agents=2", "-m", "-cd", "conf", "seed=0,1", "--cfg", "job"]
-    options = {"--multirun", "--config-dir=conf", "--cfg=job"}
-    assert {*prepared(words)[:3]} == options
-    assert prepared(words)[3:] == ["agents=2", "seed=0,1"]
-    law = "delay.obs={law: uniform}"
-    assert prepared(["delay=paper", law]) == ["delay=paper", "delay.obs=0", law]
-
-
-@pytest.mark.parametrize(
-    ("words", "options"),
-    [
-        (["agents=3", "--info"], ["--info=all"]),
-        (["--info", "defaults", "agents=3"], ["--info=defaults"]),
-        (["agents=3", "--config-d", "own"], ["--config-dir=own"]),
-        (["-cd=own", "agents=3"], ["--config-dir=own"]),
-        (["agents=3", "--experimental-re", "job.pickle"], ["--experimental-rerun=job.pickle"]),
-        (["-m", "agents=3", "--resolve"], ["--resolve", "--multirun"]),
-    ],
-)
-def test_options_keep_their_values_wherever_they_stand(words, options):
-    assert prepared(words) == [*options, "agents=3"]
-
-
-def value_for_hydra(word: str) -> object:
-    return OverridesParser.create().parse_override(word).value()
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["täst", "a(b)", "x[1]", "p#q", "it's=1", 'say "so"', "a,b", "seed=1,a=2", "1e3", "null", "b\\", "b c"],
-)
-@pytest.mark.parametrize("key", ["checkpoint", "resume", "+checkpoint", "++resume"])
-def test_a_folder_may_have_any_name(tmp_path, monkeypatch, name, key):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / name).mkdir()
-    (tmp_path / "plain").mkdir()
-    (word,) = prepared([f"{key}={name}"])
-    assert value_for_hydra(word) == name
-    assert prepared([f"{key}=plain"]) == [f"{key}=plain"]
-    if "," not in name:
-        (word,) = prepared([f"{key}=plain,{name}"])
-        assert [getattr(each, "text", each) for each in value_for_hydra(word).list] == ["plain", name]
-    if name in ("täst", "a(b)", "x[1]", "p#q", "it's=1"):
-        (word,) = prepared([f"hydra.run.dir=new/{name}"])
-        assert value_for_hydra(word) == f"new/{name}"
-
-
-def test_words_that_name_no_folder_and_resolvers_stay_as_they_are(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for word in (
-        "checkpoint=a,b",
-        "checkpoint=a(b)",
-        "hydra.run.dir=runs/${now:%H}",
-        "agents=a(b)",
-        "checkpoint=",
-    ):
-        assert prepared([word]) == [word]
-
-
-@pytest.mark.parametrize(
-    "word",
-    [
-        "checkpoint=a=1",
-        "checkpoint='a=1'",
-        '+checkpoint="a=1"',
-        "++checkpoint='a=1'",
-        "checkpoint=a=1,b",
-        "checkpoint='a=1','c'",
-    ],
-)
-def test_a_policys_configuration_files_are_found_however_it_is_given(tmp_path, monkeypatch, word):
-    monkeypatch.chdir(tmp_path)
-    for name, used in (("a=1", "own"), ("b", None), ("c", "own"), ("other", "others")):
-        (tmp_path / name).mkdir()
-        own = used and str(tmp_path / used)
-        (tmp_path / name / "run.json").write_text(json.dumps({"damian": "0", "config_dir": own}))
-    (tmp_path / "own").mkdir()
-    (tmp_path / "others").mkdir()
-    assert prepared([word])[0] == f"--config-dir={tmp_path / 'own'}"
-    assert prepared([word, "--config-dir=mine"])[0] == "--config-dir=mine"
-    assert prepared(["checkpoint=b"]) == ["checkpoint=b"]
-    with pytest.raises(InputError, match=r"others and .*own: evaluate them one after the other"):
-        prepared(["-m", "checkpoint=c,other"])
-
-
-def test_a_policy_brings_its_options_to_the_quick_look(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "own" / "scenario").mkdir(parents=True)
-    (tmp_path / "own" / "scenario" / "windy.yaml").write_text("# @package _global_")
-    (tmp_path / "first").mkdir()
-    (tmp_path / "first" / "run.json").write_text(
-        json.dumps({"damian": "0", "config_dir": str(tmp_path / "own")})
-    )
-    assert check_words("train", ["scenario=windy"]) is not None
-    assert check_words("train", prepared(["scenario=windy", "checkpoint=first"])) is None
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["hydra.searchpath=[file://own]", "scenario=windy", "learner.mine=1"],
-        ["++hydra.searchpath=[file://own]", "scenario=windy"],
-        ["+hydra.searchpath=[file://own]", "scenario=windy"],
-        ["--config-d=own", "scenario=windy", "learner.mine=1"],
-        ["--config-dir", "own", "scenario=windy"],
-        ["--config-path=own", "wind=3"],
-        ["--config-name=mine", "wind=3"],
-        ["observation.local_features.0=spotted"],
-        ["model.hidden.0=8"],
-        ["sensors.0=geiger:counts"],
-        ["learner=package.module:Name", "learner.mine=1"],
-        ["checkpoint=runs/first", "learner.mine=1"],
-        ["--info", "agents=3"][1:],
-        ["~tuning@learner", "tuning@learner=none", "hydra/launcher=basic", "+learner.x=1"],
-        ["scenario='paper/usecase1'", "delay=null", "-m", "seed=range(3)", "delay=none,paper"],
-        ["delay.obs.high=3s", "reward.custom=[a:b]", "logger.custom=[{logger: a:b}]"],
-    ],
-)
-def test_a_valid_command_is_never_refused(words):
-    assert check_words("train", words) is None
-
-
-def test_every_option_of_a_group_says_what_it_is(capsys):
-    for group in {*groups()} - {"experiment", "search", "tuning"}:
-        main(["train", "--help", group])
-        printed = capsys.readouterr().out
-        assert all(f"\n    {option}: " in printed for option in groups()[group]), group
-
-
-def test_help_for_a_reader_that_stops_early_ends_quietly():
-    code = "from damian.recipes.command import main; main(['train', '--help', 'learner'])"
-    read, write = os.pipe()
-    os.close(read)
-    done = subprocess.run([sys.executable, "-c", code], stdout=write, stderr=subprocess.PIPE, check=False)
-    os.close(write)
-    assert (done.returncode, done.stderr) == (0, b"")
-
-
-@pytest.mark.parametrize("chosen", [None, "7"])
-def test_threads_that_wait_sleep_soon_unless_the_user_chooses(chosen, monkeypatch, capsys):
-    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
-    if chosen:
-        monkeypatch.setenv("GOMP_SPINCOUNT", chosen)
-    main(["--version"])
-    assert os.environ["GOMP_SPINCOUNT"] == (chosen or "1000")
-
-
-def test_help_may_stand_anywhere_and_explains_groups_and_experiments(capsys):
-    def printed(*words: str) -> str:
-        main(words)
-        return capsys.readouterr().out
-
-    page = printed("train", "--help")
-    assert printed("train", "agents=3", "--help") == page
-    assert printed("train", "--help", "--config-dir", "own", "-m") == page
-    scenarios = printed("train", "--help", "scenario")
-    assert scenarios.startswith("choose one with scenario=OPTION: coverage, ")
-    assert "[spotting]" in scenarios
-    assert "delaybench/tracking" in scenarios
-    assert "/_" not in scenarios
-    assert "\n    spotting: A static source at an unknown place;" in scenarios
-    assert "\n    paper: the paper's section 5: 15 % of the messages" in printed("train", "--help", "delay")
-    learner = printed("train", "--help", "learner")
-    assert "choose one with learner=OPTION: bpql, [mappo], predictive_mappo, sac\n" in learner
-    assert (
-        "= 'bpql' (bpql) or 'mappo' (mappo) or 'predictive_mappo' (predictive_mappo) or 'sac' (sac)\n"
-        in learner
-    )
-    assert "learner.gamma: float = 0.95\n" in learner
-    experiment = printed("compare", "--help", "experiment")
-    assert "choose one with experiment=OPTION: delaybench, " in experiment
-    assert "experiment.arms.NAME.policy_of: str | None = None\n    Arm whose policies" in experiment
-    assert "did you mean agents?" in printed("train", "--help", "agnts")
+def test_a_law_replaces_the_law_of_a_group():
+    config = cli.settings("delay=paper", "delay.obs={law: uniform, low: 1, high: 2}")
+    assert dict(config.delay.obs) == {"law": "uniform", "low": 1, "high": 2}

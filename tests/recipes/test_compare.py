@@ -14,13 +14,13 @@ from helpers import check_refused
 from hydra import initialize_config_dir
 
 from damian.compare.comparison import KNOWN_ON_TIME, TRAINED, Arm
-from damian.recipes.compare import CompareConfig, Experiment, main, plan
+from damian.recipes.compare import CompareConfig, Experiment, plan
+from damian.recipes.compare import run as main
 from damian.recipes.evaluate import fly
-from damian.recipes.shared.known_settings import CONF
-from damian.recipes.shared.launch import launch
+from damian.recipes.known import CONF
 from damian.recipes.shared.many_runs import Run, perform_all, perform_each, stop_code
-from damian.recipes.shared.settings import TrainConfig
 from damian.runs.run_lock import locked
+from damian.settings import TrainConfig
 
 STORED = Path(__file__).parents[2] / "docs" / "results"
 SMALL = [
@@ -48,7 +48,7 @@ def compare(tmp_path, monkeypatch):
 
     def run_recipe(*overrides: str) -> Path:
         monkeypatch.setattr(sys, "argv", ["compare.py", *overrides])
-        launch(main, "compare")
+        main()
         return tmp_path / "runs" / "usecase2"
 
     return run_recipe

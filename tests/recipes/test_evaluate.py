@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from damian.common.errors import InputError
 from damian.compare.comparison import OF_ARM
 from damian.recipes import evaluate, train
-from damian.recipes.shared.inheritance import check_policy_fits, note_what_a_history_holds
-from damian.recipes.shared.launch import composed_config, launch
+from damian.recipes.cli import settings as composed_config
+from damian.recipes.shared.runs import check_policy_fits, note_what_a_history_holds
 
 TRAINED = [
     "frames=64",
@@ -36,7 +36,7 @@ def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train.py", *TRAINED, f"hydra.run.dir={folder}"])
-        launch(train.main)
+        train.run()
     return folder
 
 
@@ -51,7 +51,7 @@ def fly(trained, tmp_path, monkeypatch) -> Callable[..., Path]:
         policy = [f"checkpoint={of}"] if of else []
         words = [*(TRAINED if program is train else []), *overrides, *policy, f"hydra.run.dir={folder}"]
         monkeypatch.setattr(sys, "argv", ["evaluate.py", *words])
-        launch(program.main)
+        program.run()
         return tmp_path / folder
 
     return run_recipe
@@ -85,7 +85,7 @@ def test_a_policy_trained_with_three_uavs_flies_ten(fly):
 
 def test_a_policy_of_sac_is_evaluated_like_one_of_mappo(fly, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py", "learner=sac", *TRAINED, "hydra.run.dir=soft"])
-    launch(train.main)
+    train.run()
     assert results(fly("agents=5", of="soft")).keys() == {*results(tmp_path / "soft")}
 
 

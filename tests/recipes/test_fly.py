@@ -15,9 +15,9 @@ from matplotlib.image import imread
 from PIL import Image
 from shapely.geometry import shape
 
-from damian.recipes.fly import kept, main
-from damian.recipes.shared.launch import launch
-from damian.recipes.train import main as train
+from damian.recipes.fly import kept
+from damian.recipes.fly import run as main
+from damian.recipes.train import run as train
 from damian.show.episode import Episode
 from damian.show.replay_page import page
 
@@ -34,7 +34,7 @@ def run(tmp_path, monkeypatch):
 
     def run_recipe(*overrides: str, folder: str = "run") -> Path:
         monkeypatch.setattr(sys, "argv", ["fly.py", *SHORT, *overrides, f"hydra.run.dir={folder}"])
-        launch(main, "fly")
+        main()
         return tmp_path / folder
 
     return run_recipe
@@ -77,7 +77,7 @@ def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run,
     words = ["agents=2", "frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "eval_episodes=2"]
     words += ["actions.distances=[0,30,60]", "episode.max_steps=6", "delay.obs=2", "hydra.run.dir=trained"]
     monkeypatch.setattr(sys, "argv", ["train.py", *words])
-    launch(train)
+    train()
     words = [
         "policy=deterministic",
         "checkpoint=trained",
@@ -103,7 +103,7 @@ def test_the_episodes_are_those_in_which_a_training_evaluates_its_policy(run, mo
     flown = ["agents=2", "scenario=tracking", "delay=paper", "actions.distances=[0,30,60]", "eval_episodes=6"]
     words = ["frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "hydra.run.dir=trained"]
     monkeypatch.setattr(sys, "argv", ["train.py", *flown, *words, "episode.max_steps=20"])
-    launch(train)
+    train()
     with Path("trained", "result.csv").open(newline="") as file:
         measured = {row["policy"]: float(row["perceived_return"]) for row in csv.DictReader(file)}
     for policy, own in (("deterministic", ["checkpoint=trained"]), ("script", flown)):
@@ -235,7 +235,7 @@ def replay(tmp_path, monkeypatch):
 
     def run_recipe(*words: str) -> Path:
         monkeypatch.setattr(sys, "argv", ["fly.py", *words, "hydra.run.dir=page"])
-        launch(main, "fly")
+        main()
         return tmp_path / "page"
 
     return run_recipe

@@ -10,8 +10,7 @@ from helpers import check_refused
 from PIL import Image
 
 from damian.advice.journal import About, Head, Journal, Received
-from damian.recipes.fly import main
-from damian.recipes.shared.launch import launch
+from damian.recipes.fly import run as main
 from damian.show.episode import Episode
 
 WORDS = ["region=llanbedr", "delay=paper", "port=0", "policy=script", "agents=5", "token=x"]
@@ -26,7 +25,7 @@ def show(tmp_path, monkeypatch):
     def run(*overrides: str) -> Path:
         words = ["journal=north.jsonl", "formats=[]", *overrides, "hydra.run.dir=run"]
         monkeypatch.setattr(sys, "argv", ["fly.py", *words])
-        launch(main, "fly")
+        main()
         return tmp_path / "run"
 
     return run

@@ -15,7 +15,7 @@ def test_a_worker_ends_with_a_comparison_that_was_killed(tmp_path):
     run = f"""import time
 from pathlib import Path
 from damian.recipes.shared.many_runs import Run, perform_all
-from damian.recipes.shared.settings import TrainConfig
+from damian.settings import TrainConfig
 
 def wait(config, folder):
     (folder / "begun").touch()

@@ -15,7 +15,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.recipes import oracle, train
-from damian.recipes.shared.launch import composed_config, launch
+from damian.recipes.cli import settings as composed_config
 from damian.server.features import ObservationConfig
 from damian.world.messages import Messages
 from damian.world.regions.config import RegionConfig
@@ -92,7 +92,7 @@ def foresee(tmp_path, monkeypatch):
 
     def run(program, *words: str) -> None:
         monkeypatch.setattr(sys, "argv", ["recipe.py", *words])
-        launch(program.main)
+        program.run()
 
     run(train, *TINY, "delay.obs=2", "hydra.run.dir=trained")
 
@@ -154,7 +154,7 @@ def returns(tmp_path, monkeypatch):
     """The true return of every row of the recipe's table."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["damian oracle", *WORDS])
-    launch(oracle.main)
+    oracle.run()
     with (tmp_path / "script/result.csv").open(newline="") as file:
         return {row["policy"]: float(row["return"]) for row in csv.DictReader(file)}
 

@@ -28,7 +28,6 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration
 
 from damian.delays.config import DelayConfig
 from damian.delays.laws import Held, law_of
-from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
@@ -37,9 +36,9 @@ from damian.keys import GLOBAL_OBSERVATION, PRIVILEGED_OBSERVATION
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig, make_critic
 from damian.learners.sac import Sac, SacConfig
-from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.server.features import ObservationConfig
+from damian.settings import ClockConfig, TrainConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from damian.recipes.shared.launch import composed_config
-from damian.recipes.shared.settings import TrainConfig
+from damian.recipes.cli import settings as composed_config
+from damian.settings import TrainConfig
 
 FOLDER = Path(__file__).parents[2] / "conf" / "scenario"
 SCENARIOS = sorted(

@@ -16,10 +16,10 @@ from damian.envs.pipeline import make_env
 from damian.learners.networks import make_actor, make_critic
 from damian.recipes import evaluate
 from damian.recipes import train as train_recipe
-from damian.recipes.shared.launch import composed_config, seed_generators
-from damian.recipes.shared.settings import TrainConfig
-from damian.recipes.shared.stored_runs import stored_config
+from damian.recipes.cli import settings as composed_config
+from damian.recipes.shared.runs import seed_generators, stored_config
 from damian.runs.training_state import load_networks
+from damian.settings import TrainConfig
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
@@ -139,7 +139,7 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
 
 
 def test_every_policy_is_evaluated_in_the_same_episodes(run):
-    only_hold = ["battery.enabled=true", "battery.capacity_kwh=1e-6", "actions.mask=false", "delay=paper"]
+    only_hold = ["battery=charging", "battery.capacity_kwh=1e-6", "actions.mask=false", "delay=paper"]
     folder = run(*TINY, *only_hold, "frames=128", "source.level_db=150")
     with (folder / "result.csv").open(newline="") as file:
         _, one, *others = [row[1:] for row in csv.reader(file)]

@@ -14,8 +14,7 @@ from stopped_runs import killed_after
 
 from damian.common.errors import InputError, RunError
 from damian.recipes import tune
-from damian.recipes.shared.known_settings import CONF
-from damian.recipes.shared.launch import launch
+from damian.recipes.known import CONF
 from damian.recipes.tune import read_space
 
 SPACE = ["search.learner.lr={low: 1e-4, high: 1e-2, log: true}", "search.model.hidden.choices=[[8],[8,8]]"]
@@ -29,7 +28,7 @@ def search(tmp_path, monkeypatch):
 
     def run(*words, space=SPACE, folder="found"):
         monkeypatch.setattr(sys, "argv", ["damian tune", *TINY, *space, *words, f"hydra.run.dir={folder}"])
-        launch(tune.main, "tune")
+        tune.run()
         return tmp_path / folder
 
     return run

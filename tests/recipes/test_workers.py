@@ -24,6 +24,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
 from damian.common.errors import InputError
+from damian.recipes.cli import settings as composed_config
 from damian.recipes.shared.collectors import (
     collecting,
     collector_parts,
@@ -31,11 +32,10 @@ from damian.recipes.shared.collectors import (
     worker_env,
     worker_seed,
 )
-from damian.recipes.shared.launch import composed_config
 from damian.recipes.shared.ray_cluster import connected_ray
-from damian.recipes.shared.settings import TrainConfig
 from damian.recipes.train import make_learner, replay_buffer
 from damian.runs.checkpoint import plain
+from damian.settings import TrainConfig
 
 TWO = ["collector=process", "workers=2"]
 LATE = ["delay=paper", "aware=both", "delay.rew=2"]

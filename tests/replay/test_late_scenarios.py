@@ -12,7 +12,6 @@ from torchrl.envs import StepCounter
 
 from damian import keys
 from damian.delays.config import DelayConfig, LinkConfig
-from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
@@ -21,6 +20,7 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import server_recompute
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
+from damian.settings import ClockConfig
 
 STEPS, WORLDS, LONGEST = 40, 4, 5
 LATE = {"law": "uniform", "low": 0, "high": LONGEST}

@@ -10,9 +10,9 @@ from damian import keys
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import DelayConfig, ScenarioConfig
 from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
+from damian.settings import DelayConfig, ScenarioConfig
 from damian.show.episode import COLUMNS, Episode, record
 from damian.world.signal_source import SourceConfig
 

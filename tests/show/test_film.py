@@ -13,7 +13,7 @@ from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.common.plotting import COLOURS
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import DelayConfig, ScenarioConfig
+from damian.settings import DelayConfig, ScenarioConfig
 from damian.show import film as films
 from damian.show.episode import record
 from damian.show.film import Film, FilmPixels, save_film

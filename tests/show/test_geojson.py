@@ -12,8 +12,8 @@ from shapely.geometry import shape
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import DelayConfig, ScenarioConfig
 from damian.server.features import ObservationConfig
+from damian.settings import DelayConfig, ScenarioConfig
 from damian.show.episode import record
 from damian.show.geojson import feature_collection
 from damian.world.regions.config import RegionConfig

@@ -16,13 +16,13 @@ from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.delays.laws import Law
 from damian.delays.samplers import ContextSampler, MessageContext, Sampler
-from damian.envs.clocks import ClockConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, REWARD
 from damian.server.termination import EpisodeConfig
+from damian.settings import ClockConfig
 from damian.transforms.hold import SkipUntilReady
 from damian.world.landing import ActionConfig
 

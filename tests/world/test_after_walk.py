@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from walks import dynamic_walks, n_stops, twin_position
 
-from damian.envs.clocks import ClockConfig
+from damian.settings import ClockConfig
 from damian.world.signal_source import SourceConfig, Walk, locate
 
 LOOP = {"after_walk": "loop"}

@@ -26,6 +26,7 @@ from golden_records import (
 from helpers import DATA, GOLDEN, act, nearest, sent_messages, usecase
 
 from damian.envs.uav_env import UavEnv
+from damian.world.landing import action_table
 from damian.world.motion import MotionConfig
 
 TOLERANCE = 1e-4
@@ -106,7 +107,7 @@ def test_the_recorded_geometry_is_reproduced(case):
 
 @pytest.mark.parametrize("case", [1, 2])
 def test_the_recorded_action_table_is_reproduced(case):
-    table = usecase(case).actions.table()
+    table = action_table(usecase(case).actions)
     for ours, row in zip(table.tolist(), GOLDEN[case]["action_table"], strict=True):
         assert ours[0] == row["distance_m"]
         assert math.remainder(ours[1] - row["heading_rad"], 2 * math.pi) == pytest.approx(0, abs=1e-6)

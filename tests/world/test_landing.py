@@ -19,7 +19,14 @@ from damian.world import airspace as search
 from damian.world import landing
 from damian.world.airspace import build_airspace, build_cells, inside, nearest_points
 from damian.world.config import WorldConfig
-from damian.world.landing import ActionConfig, Candidates, Ranking, assign_landing_points, displacement
+from damian.world.landing import (
+    ActionConfig,
+    Candidates,
+    Ranking,
+    action_table,
+    assign_landing_points,
+    displacement,
+)
 from damian.world.regions.config import RegionConfig
 from damian.world.regions.region import Region
 from damian.world.simulation import Simulation
@@ -199,7 +206,7 @@ def candidates(kind):
 def test_discrete_and_continuous_actions_have_the_same_candidates():
     discrete, config = candidates("discrete")
     continuous, _ = candidates("continuous")
-    airspace, table = discrete.airspace, config.table()
+    airspace, table = discrete.airspace, action_table(config)
     compared = 0
     for region, count in enumerate(airspace.n_points.tolist()):
         points = torch.arange(count) + region * airspace.max_points
@@ -247,7 +254,7 @@ def test_the_table_holds_every_heading_of_the_first_distance_then_of_the_next():
     config = ActionConfig(distances=[0.0, 10.0], headings=[0.0, 90.0, -90.0])
     expected = [[d, math.radians(h)] for d in (0.0, 10.0) for h in (0.0, 90.0, -90.0)]
     assert config.n_actions == 6
-    assert config.table().tolist() == [pytest.approx(row) for row in expected]
+    assert action_table(config).tolist() == [pytest.approx(row) for row in expected]
 
 
 @both_kinds

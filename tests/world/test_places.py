@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from damian.common.errors import InputError
 from damian.world.battery import BatteryConfig
 from damian.world.config import WorldConfig
-from damian.world.regions.config import RegionConfig
+from damian.world.regions.config import RegionConfig, regions_of
 from damian.world.regions.geodesy import to_latlon
 from damian.world.regions.places import local_places
 from damian.world.regions.region import Region, centred
@@ -49,7 +49,7 @@ def test_a_place_in_degrees_is_the_same_place_in_metres(lat, lon, x, y):
 
 
 def test_places_of_a_geographic_region_may_be_in_degrees_or_metres(park):
-    origin = park.regions(np.random.default_rng(0))[0].origin
+    origin = regions_of(park, np.random.default_rng(0))[0].origin
     metres = [[-80.0, 0.0], [0.0, 50.0], [60.0, -70.0]]
     degrees = [
         {"lat": float(lat), "lon": float(lon)} for lat, lon in (to_latlon(*xy, origin) for xy in metres)

@@ -23,7 +23,7 @@ from damian.envs.uav_env import UavEnv
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.rewards import INDIVIDUAL, SYSTEM, RewardConfig
 from damian.server.termination import EpisodeConfig
-from damian.world.landing import ActionConfig
+from damian.world.landing import ActionConfig, action_table
 from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
@@ -98,7 +98,7 @@ def check_observation(world: twin.World, observation: torch.Tensor):
 @pytest.mark.parametrize("n_agents", [1, 2, 4])
 def test_rollouts_equal_those_of_the_twin(n_agents, kind, since, estimate):
     env = UavEnv(twin_scenario(n_agents, kind, since, estimate), num_worlds=12, seed=n_agents)
-    table = env.scenario.actions.table()
+    table = action_table(env.scenario.actions)
     generator = torch.Generator().manual_seed(n_agents)
     compared = ended = spotted = 0
     for _ in range(3):

@@ -1,0 +1,401 @@
+"""Settings of the networks and of the learners, each of which names the class that learns with them."""
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+from damian import keys
+from damian.common import checks
+from damian.common.registry import Registry
+from damian.settings.fields import Settings, constant, setting
+
+if TYPE_CHECKING:
+    from tensordict import NestedKey
+    from torchrl.data import ReplayBuffer
+    from torchrl.envs import EnvBase
+    from torchrl.modules import ProbabilisticActor
+
+
+def _not_a_learner(found: Any) -> str | None:
+    good = isinstance(found, type) and issubclass(found, LearnerConfig)
+    if good and "__dataclass_fields__" not in vars(found):
+        return "is no dataclass: write @dataclass above the class"
+    if good and (found.learner or found.make is not LearnerConfig.make):
+        return None
+    return "is no dataclass derived from damian.LearnerConfig with a method make"
+
+
+LEARNERS = Registry[type["LearnerConfig"]]("learner", _not_a_learner)
+"""Settings of learners, by name; the user's own as ``package.module:Name``."""
+_ENCODER = "does not go with learner=predictive_mappo, whose actor has an encoder of its own"
+_NEEDS = "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
+_CONSTANT = "needs a constant action delay (delay.act): it predicts what each action leads to, and when"
+
+
+def resolved(path: str) -> Any:
+    """The class or function at ``package.module:Name``, which is imported when it is needed."""
+    module, _, name = path.partition(":")
+    return getattr(import_module(module), name)
+
+
+@dataclass
+class ModelConfig(Settings):
+    """Networks of actor and critic, one multilayer perceptron each."""
+
+    section: ClassVar[str] = "model"
+
+    hidden: list[int] = setting([256, 256], "Width of each hidden layer.", low=1, high=16384)
+    activation: str = setting(
+        "tanh", "Activation function: tanh, relu, elu or silu.", choices=("tanh", "relu", "elu", "silu")
+    )
+    rnn: str = setting(
+        "none",
+        "none or gru. With gru the actor's last hidden layer is a gated recurrent unit, so that a UAV "
+        "remembers its observations of the episode.",
+        choices=("none", "gru"),
+    )
+    skip: bool = setting(
+        False,
+        "The actor's logits are the network's outputs plus, times a learnt weight, the logarithm of the "
+        "feature that has a probability for each action (``observation.belief=[belief_gain]``). The actor "
+        "begins as one that prefers actions of high probability.",
+    )
+    shared_value: bool = setting(
+        False,
+        "MAPPO's critic gives one value for all UAVs of a world, from the observations of all of them, "
+        "instead of a value for each UAV. Updates are faster, but it learns less where each UAV has a "
+        "reward of its own, and it ties the critic, not the policy, to the number of UAVs.",
+    )
+    init: str = setting(
+        "default",
+        "Initial weights: default (PyTorch's), or orthogonal: orthogonal matrices and biases of 0 (Saxe "
+        "et al. 2014), with a gain of sqrt(2) in hidden layers (1 in a recurrent one), of 0.01 at the "
+        "policy's output, so that it begins close to chance, and of 1 at a critic's output.",
+        choices=("default", "orthogonal"),
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        problem = "needs at least one layer for model.rnn=gru"
+        checks.require(not self.recurrent or bool(self.hidden), "model.hidden", [], problem)
+        checks.in_range("model.hidden (number of layers)", len(self.hidden), 0, 64)
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether the actor has a recurrent layer."""
+        return self.rnn != "none"
+
+
+class LearningSetup(NamedTuple):
+    """Properties of a run that a learner needs beside its own settings."""
+
+    model: ModelConfig
+    """Networks of actor and critic."""
+    worlds: int
+    """Number of parallel environments, B."""
+    shortest_period: int
+    """Smallest number of steps per world between two updates."""
+    longest_period: int
+    """Largest number of steps per world between two updates."""
+    longest_delay: int = 0
+    """Longest delay of a message, or with back-updating of a reward, if that is longer [steps]."""
+    backupdate: bool = False
+    """Whether the replay buffer corrects stored steps as late messages arrive (paper, section 3.4)."""
+    settle: bool = False
+    """Whether to learn from a step only when neither its messages nor its reward can be in transit."""
+    recompute_actor: bool = False
+    """Whether late messages also replace the actor's observations (the original authors' variant)."""
+    critic_key: "NestedKey" = keys.GLOBAL_OBSERVATION
+    """Key of the critic's observation."""
+    compile: bool = False
+    """Whether to compile the loss, so that updates are faster once it is compiled."""
+    frames: int = 300_000
+    """Environment steps of the run, over all worlds."""
+    action_delay: int | None = 0
+    """Delay of every action [steps]; None if it differs between actions."""
+
+    @property
+    def settle_steps(self) -> int:
+        """Number of steps by which learning from a step is postponed."""
+        return self.longest_delay if self.settle else 0
+
+    @property
+    def least_buffer(self) -> int:
+        """Environment steps that back-updating needs in the buffer: a period and twice the longest delay."""
+        return (self.longest_period + 2 * self.longest_delay) * self.worlds
+
+
+READABLE = ("message", "state", "reward_terms", "privileged", "hindsight")
+"""What a learner may name in ``LearnerConfig.reads``."""
+
+
+@dataclass
+class LearnerConfig(Settings):
+    """Settings of a learner, which make it; those that all learners share.
+
+    A learner of your own has a dataclass derived from this class, with fields for its own settings, that
+    implements ``make``. Whatever changes in the learner must be among its ``components``, or a resumed run
+    loses it. The settings ``learner=package.module:Name learner.lr=1e-3`` choose it."""
+
+    section: ClassVar[str] = "learner"
+
+    name: str = setting(
+        "",
+        "Name of the learner, or the path of its settings' class; the group ``learner`` sets it.",
+    )
+    lr: float = setting(0.0003, "Learning rate of Adam.", above=0, high=1)
+    gamma: float = setting(0.95, "Discount factor per step.", low=0, high=1)
+    steps: int = setting(
+        32,
+        "Steps per world between two updates, unless ``clock.system`` sets the period.",
+        low=1,
+        high=checks.STEPS,
+    )
+
+    reads: ClassVar[tuple[str, ...]] = ()
+    """Optional outputs of the environment that the learner needs in its batches: ``message``, ``state``,
+    ``reward_terms`` or ``privileged`` (``damian.make_env``); and ``hindsight``: with back-updating, stored
+    steps then also hold the newest message that has arrived since (``keys.HINDSIGHT``)."""
+    learner: ClassVar[str] = ""
+    """Path of the class that ``make`` builds, from environment, settings, setup and replay buffer."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        key, reads = f"{type(self).__name__}.reads", self.reads
+        checks.require(isinstance(reads, tuple | list), key, reads, "is not a tuple such as ('message',)")
+        for name in reads:
+            checks.one_of(key, name, READABLE)
+
+    def check(self, setup: LearningSetup) -> None:
+        """Check that this learner can learn in such a run.
+
+        Raises:
+            InputError: a setting does not fit; the message names its key.
+        """
+
+    def buffer_size(self, setup: LearningSetup) -> int | None:
+        """Environment steps, over all worlds, that the replay buffer must hold; None if none is needed."""
+        return None
+
+    def make(self, env: "EnvBase", setup: LearningSetup, buffer: "ReplayBuffer | None") -> Any:
+        """Build the learner (``damian.learners.base.Learner``) for an environment.
+
+        Args:
+            env: environment of the training, with batch size [B].
+            setup: properties of the run.
+            buffer: replay buffer of ``buffer_size`` steps, on a ``TimeStorage``, or with back-updating on a
+                ``BackupdateStorage``, which corrects what is stored; None if ``buffer_size`` is None.
+        """
+        return resolved(self.learner)(env, self, setup, buffer)
+
+    def make_actor(self, env: "EnvBase", model: ModelConfig) -> "ProbabilisticActor":
+        """Build an actor as the learner has it, for evaluations, which load its weights."""
+        return resolved("damian.learners.networks:make_actor")(env, model)
+
+
+@LEARNERS.register("mappo")
+@dataclass
+class MappoConfig(LearnerConfig):
+    """Multi-agent PPO (Yu et al. 2022) with one shared policy."""
+
+    name: str = "mappo"
+    lmbda: float = setting(0.9, "Lambda of the generalised advantage estimate.", low=0, high=1)
+    clip_epsilon: float = setting(0.2, "Clipping of the importance ratio.", low=0, high=1)
+    entropy_coeff: float = setting(0.01, "Weight of the entropy bonus.", low=0)
+    entropy_coeff_end: float | None = setting(
+        None,
+        "If set, the weight of the entropy bonus goes linearly from ``entropy_coeff`` to this, which it "
+        "reaches after ``frames`` environment steps; a run that is resumed with more frames reaches it "
+        "later.",
+        low=0,
+    )
+    critic_coeff: float = constant(
+        0.5, "Weight of the critic's loss. Actor and critic share no weights, so that Adam cancels it.", low=0
+    )
+    max_grad_norm: float = setting(
+        0.5, "The gradient is scaled down to this norm if its norm is larger.", above=0
+    )
+    epochs: int = setting(4, "Passes over the batch per update.", low=1, high=checks.STEPS)
+    minibatches: int = setting(4, "Minibatches per pass.", low=1, high=checks.STEPS)
+    normalize_advantage: bool = setting(
+        True,
+        "Whether to scale the advantages of a batch to mean 0 and standard deviation 1.",
+    )
+    normalize_value: bool = setting(
+        False,
+        "Whether the critic learns values of mean 0 and standard deviation 1, by running statistics of "
+        "its targets, so that learning does not depend on the scale of the rewards. Advantages that "
+        "``normalize_advantage`` does not scale are then divided by the same standard deviation.",
+    )
+
+    learner: ClassVar[str] = "damian.learners.mappo:Mappo"
+
+    def check(self, setup: LearningSetup) -> None:
+        recurrent, shortest, longest = setup.model.recurrent, setup.shortest_period, setup.longest_delay
+        most_minibatches = setup.worlds if recurrent else setup.worlds * shortest
+        checks.in_range("learner.minibatches", self.minibatches, 1, most_minibatches)
+        should = f"needs more than {longest} steps (longest delay) per update (learner.steps), not {shortest}"
+        checks.require(not setup.settle or longest < shortest, "settle", True, should)
+        should = "does not go with model.rnn: hidden states are not recomputed from corrected observations"
+        checks.require(not (recurrent and setup.recompute_actor), "recompute_actor", True, should)
+
+    def buffer_size(self, setup: LearningSetup) -> int | None:
+        return setup.least_buffer if setup.backupdate else None
+
+
+@LEARNERS.register("predictive_mappo")
+@dataclass
+class PredictiveMappoConfig(MappoConfig):
+    """MAPPO with a learnt belief: attention over the messages that have arrived, trained by prediction."""
+
+    name: str = "predictive_mappo"
+    prediction_steps: int = setting(
+        100, "Steps of gradient descent on the predictions after each update.", low=1, high=checks.STEPS
+    )
+    prediction_batch: int = setting(400, "Environment steps in each of them.", low=1, high=checks.STEPS)
+    prediction_lr: float = setting(0.002, "Learning rate of the predictions.", above=0, high=1)
+    prediction_buffer: int = setting(
+        32000,
+        "Environment steps, over all worlds, from which predictions are learnt.",
+        low=1,
+        high=checks.STEPS,
+    )
+    heads: int = setting(
+        4, "Number of attention heads over the messages that an actor knows.", low=1, high=1024
+    )
+    width: int = setting(32, "Size of the embedding of a message.", low=1, high=16384)
+
+    learner: ClassVar[str] = "damian.learners.predictive_mappo:PredictiveMappo"
+
+    def check(self, setup: LearningSetup) -> None:
+        super().check(setup)
+        model = setup.model
+        checks.require(setup.backupdate, "learner", "predictive_mappo", _NEEDS)
+        checks.require(setup.action_delay is not None, "learner", "predictive_mappo", _CONSTANT)
+        for key, value, good in (
+            ("model.rnn", model.rnn, not model.recurrent),
+            ("model.skip", model.skip, not model.skip),
+            ("model.hidden", model.hidden, bool(model.hidden)),
+            ("recompute_actor", setup.recompute_actor, not setup.recompute_actor),
+        ):
+            checks.require(good, key, value, _ENCODER)
+
+    def buffer_size(self, setup: LearningSetup) -> int | None:
+        least = super().buffer_size(setup)
+        return None if least is None else max(least, self.prediction_buffer // setup.worlds * setup.worlds)
+
+    def make_actor(self, env: "EnvBase", model: ModelConfig) -> "ProbabilisticActor":
+        make = resolved("damian.learners.predictive_mappo:make_belief_actor")
+        return make(env, model, self.heads, self.width)
+
+
+@LEARNERS.register("sac")
+@dataclass
+class SacConfig(LearnerConfig):
+    """Soft actor-critic (Haarnoja et al. 2018; discrete: Christodoulou 2019) with one shared policy."""
+
+    name: str = "sac"
+    lr: float = setting(
+        0.001,
+        "Learning rate of Adam.",
+    )
+    steps: int = setting(
+        4,
+        "Steps per world between two rounds of updates, unless ``clock.system`` sets the period.",
+    )
+    alpha_lr: float = setting(
+        0.01,
+        "Learning rate of the temperature's logarithm; high, since the temperature must first find the "
+        "scale of the rewards.",
+        above=0,
+        high=1,
+    )
+    alpha_init: float = setting(0.01, "Initial temperature (weight of the entropy).", above=0)
+    tau: float = setting(
+        0.01,
+        "Share by which the target networks move towards the trained networks in each update.",
+        above=0,
+        high=1,
+    )
+    target_entropy: float = setting(
+        0.5,
+        "Target entropy for discrete actions, as a share of the entropy of a uniform choice among the "
+        "UAV's legal actions. For continuous actions it is minus the number of their dimensions, on [-1, "
+        "1].",
+        low=0,
+        high=1,
+    )
+    n_steps: int = setting(
+        1,
+        "Number of decisions over which rewards are summed before a value is estimated (n-step returns).",
+        low=1,
+        high=checks.STEPS,
+    )
+    updates: int = setting(4, "Updates per round.", low=1, high=checks.STEPS)
+    batch_size: int = setting(512, "Decisions per update.", low=1, high=checks.STEPS)
+    buffer_steps: int = setting(
+        200000, "Capacity of the replay buffer [environment steps over all worlds].", low=1
+    )
+    warm_up: int = setting(5000, "Environment steps, over all worlds, before learning begins.", low=0)
+    normalize_reward: bool = setting(
+        False,
+        "Whether to divide rewards by the running root mean square of the discounted returns, so that "
+        "learning does not depend on their scale. The temperature is then the weight of the entropy "
+        "against such rewards.",
+    )
+
+    learner: ClassVar[str] = "damian.learners.sac:Sac"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_steps)
+
+    def check(self, setup: LearningSetup) -> None:
+        should = "is for learner=mappo only: SAC learns from single decisions, without the steps before them"
+        checks.require(not setup.model.recurrent, "model.rnn", setup.model.rnn, should)
+        should = "is for learner=mappo only: SAC's critics value the actions of a single UAV"
+        checks.require(not setup.model.shared_value, "model.shared_value", True, should)
+        should = "is for learner=mappo only: SAC has no importance ratios"
+        checks.require(not setup.recompute_actor, "recompute_actor", True, should)
+        checks.in_range("learner.buffer_steps", self.buffer_steps, setup.least_buffer, unit="steps")
+        checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")
+
+    def critic_keys(self, setup: LearningSetup) -> "list[NestedKey]":
+        """Entries that the critics read, beside the action.
+
+        Only the actor's observation holds the UAV's past actions: if a critic of late observations did not
+        read them, the actor could not learn to use them.
+        """
+        return list(dict.fromkeys((setup.critic_key, keys.OBSERVATION)))
+
+    def buffer_size(self, setup: LearningSetup) -> int:
+        return self.buffer_steps // setup.worlds * setup.worlds
+
+
+@LEARNERS.register("bpql")
+@dataclass
+class BpqlConfig(SacConfig):
+    """BPQL (Kim et al. 2023): soft actor-critic with critics that are free of delay.
+
+    The actor reads the newest observation that has arrived and its own actions since (``aware=both``). The
+    critics read nothing but the state in which the action was chosen, which the replay buffer knows by the
+    time of learning: Q(s, a), with a from the policy at what the actor observed. Those of ``learner=sac``
+    also read what the actor observed. A step is learnt from when all of its messages must have arrived, as
+    with ``settle=true``.
+
+    The state is the entry ``LearningSetup.critic_key``. It has no actions that wait for their execution: with
+    ``delay.act`` the critics do not know these."""
+
+    name: str = "bpql"
+
+    def critic_keys(self, setup: LearningSetup) -> "list[NestedKey]":
+        return [setup.critic_key]
+
+    def check(self, setup: LearningSetup) -> None:
+        super().check(setup)
+        true = setup.longest_delay == 0 or setup.backupdate or setup.critic_key != keys.GLOBAL_OBSERVATION
+        should = "needs back-updating, which gives its critics the states that have arrived: aware=both"
+        checks.require(true, "learner", self.name, should)
+
+    def make(self, env: "EnvBase", setup: LearningSetup, buffer: "ReplayBuffer | None") -> Any:
+        return super().make(env, setup._replace(settle=True), buffer)

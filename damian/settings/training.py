@@ -1,0 +1,186 @@
+"""All settings of ``damian train``."""
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from damian.common import checks
+from damian.common.threads import available_cores
+from damian.settings.fields import Settings, constant, setting
+from damian.settings.learners import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
+from damian.settings.scenario import ScenarioConfig
+
+COLLECTORS = ("sync", "process", "ray")
+
+
+@dataclass
+class LoggerConfig(Settings):
+    """Which files of metrics the training writes into the run folder."""
+
+    section: ClassVar[str] = "logger"
+
+    tensorboard: bool = setting(
+        True,
+        "Write TensorBoard events.",
+    )
+    csv: bool = setting(
+        True,
+        "Write ``metrics.csv``.",
+    )
+    film_every: int = setting(
+        0,
+        "Updates from one film of an evaluation's episode to the next, in ``films/`` and TensorBoard; 0: "
+        "none. A film takes several seconds.",
+        low=0,
+        high=1e12,
+    )
+    custom: list[Any] = setting(
+        [],
+        "Loggers of your own, each ``package.module:Name``, or ``{logger: package.module:Name, ...}`` "
+        "with its parameters.",
+    )
+
+
+@dataclass
+class TrainConfig(ScenarioConfig):
+    """All settings of ``damian train``, beside those of the scenario."""
+
+    learner: LearnerConfig = setting(
+        MappoConfig,
+        "Settings of the learner: ``MappoConfig``, ``SacConfig``, or a class of your own.",
+    )
+    model: ModelConfig = setting(
+        ModelConfig,
+        "Networks of actor and critic.",
+    )
+    critic: str = setting(
+        "server",
+        "The critic observes the messages that the ``server`` holds, or (``privileged``) the true state "
+        "without delay (regime R1, docs/protocol.md).",
+        choices=("server", "privileged"),
+    )
+    logger: LoggerConfig = setting(LoggerConfig)
+    seed: int = setting(0, "Seed of all random draws.", low=0, high=2**31)
+    worlds: int = setting(64, "Number of parallel environments.", low=1, high=checks.WORLDS)
+    frames: int = setting(300000, "Environment steps to learn from, over all worlds.", low=1, high=1e12)
+    episodes: int | None = setting(
+        None,
+        "Stop training after this number of episodes, if that comes before ``frames``.",
+        low=1,
+        high=1e12,
+    )
+    eval_episodes: int = setting(
+        200, "Episodes of each evaluation after the training.", low=1, high=checks.WORLDS
+    )
+    checkpoint_every: int = setting(
+        20, "Updates between two checkpoints: what a killed run loses at most.", low=1, high=1e12
+    )
+    backupdate: bool = setting(
+        False,
+        "Back-updating (paper, section 3.4): late messages correct stored steps before the learner uses "
+        "them. They correct the critic's observations, rewards and ends of episodes, but not the actor's "
+        "observations. A late reward (``delay.rew``) counts for the step that earned it, as soon as it "
+        "has been paid.",
+    )
+    settle: bool = setting(
+        False,
+        "With ``backupdate``: learn from a step only when neither its messages nor its reward can be in "
+        "transit any more.",
+    )
+    recompute_actor: bool = setting(
+        False,
+        "With ``backupdate``, the original authors' variant: late messages correct the actor's "
+        "observations too, and the log-probabilities of its actions follow from these.",
+    )
+    checkpoint: str | None = setting(
+        None,
+        "Run folder of a policy, or the ``best.pt`` in it: the one with which a training begins, or that "
+        "another program flies. That run's overrides apply too, unless others are given.",
+    )
+    overrides: list[str] = constant(
+        [],
+        "Overrides on the command line; the program fills them in.",
+    )
+    resume: str | None = setting(
+        None,
+        "Run folder of the run to continue.",
+    )
+    device: str = setting(
+        "cpu",
+        "Device of all tensors: cpu, cuda, cuda:1, ...",
+    )
+    threads: int | None = setting(
+        None,
+        "Number of threads with which the networks learn; all cores if not given. The worlds always step "
+        "with one, because their tensors are small. Another number of threads gives other rounding "
+        "errors.",
+        low=1,
+        high=1024,
+    )
+    collector: str = setting(
+        "sync",
+        "Where the worlds step: in this process (``sync``), in ``workers`` processes of this machine "
+        "(``process``), or in ``workers`` Ray actors (``ray``), on the cluster of ``RAY_ADDRESS`` or else "
+        "on this machine. The workers get the weights of the actor before every batch (docs/scaling.md).",
+        choices=COLLECTORS,
+    )
+    workers: int = setting(
+        1,
+        "Number of workers, among which the worlds are divided evenly, with ``collector=process`` or "
+        "``ray``; each needs a core. The worlds are those of ``collector=sync``; actions are drawn from a "
+        "generator for each worker, whose seed follows from ``seed`` and the worker's number.",
+        low=1,
+        high=1024,
+    )
+    compile: bool = setting(
+        False,
+        "Compile the environment's step, the actor's, and the loss of MAPPO (unless ``model.rnn`` is "
+        "set). The program then begins half a minute later, or a few seconds if it has run before; this "
+        "pays off from about a million environment steps on.",
+    )
+
+    trust: bool = setting(
+        False,
+        "Import the components (``package.module:Name``) that the stored settings of ``checkpoint``, "
+        "``resume`` or a journal name. Nothing that a run folder names is imported without it.",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        matches = type(self.learner) is LEARNERS.get(self.learner.name, "learner")
+        problem = f"is not the learner of these settings: choose one with learner={'|'.join(LEARNERS)}"
+        checks.require(matches, "learner.name", self.learner.name, problem)
+        if not self.seeks_source:  # aware=belief suits any task: observe no belief by which nothing is won
+            self.observation = replace(self.observation, belief=[])
+            self.model = replace(self.model, skip=False)
+
+    @property
+    def learning_threads(self) -> int:
+        """Number of threads with which the networks learn."""
+        return self.threads or available_cores()
+
+    @property
+    def update_steps(self) -> int:
+        """Steps of every world before the first update: the system clock's period, or ``learner.steps``."""
+        return self.clock.steps("system") if self.clock.system else self.learner.steps
+
+    @property
+    def eval_scenario(self) -> ScenarioConfig:
+        """The scenario of an evaluation; it skips no steps, because every step is measured."""
+        return replace(self, clock=replace(self.clock, skip=False, skip_discount=1.0))
+
+    @property
+    def train_scenario(self) -> ScenarioConfig:
+        """The scenario of the training; rewards of skipped steps are discounted by ``learner.gamma``."""
+        discount = self.learner.gamma if self.clock.skip else 1.0
+        return replace(self, clock=replace(self.clock, skip_discount=discount))
+
+    @property
+    def eval_seed(self) -> int:
+        """Seed of the initial conditions of an evaluation; they differ from those of the training."""
+        return self.seed + 10_000
+
+    @property
+    def horizon(self) -> int:
+        """Steps after which an episode of an evaluation is cut off, if nothing else ends it."""
+        limit = self.episode.max_steps or 200
+        return 4 * limit if self.episode.since_detection else limit

@@ -1,0 +1,254 @@
+"""What can be said on a command line: keys, groups and options, with help, and hints for what is not there.
+
+Nothing here imports torch or Hydra, so that help and a misspelt word are answered at once.
+"""
+
+import dataclasses
+import difflib
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from damian.common.errors import InputError
+from damian.common.text_files import read_text, show
+from damian.settings import LEARNERS, TrainConfig
+from damian.settings.fields import default_of, rules
+from damian.settings.programs import AdviseConfig, CompareConfig, FlyConfig, TuneConfig
+
+CONF = Path(__file__).parents[1] / "conf"
+"""Folder of the configuration files."""
+SCHEMAS: dict[str, type] = {
+    "train": TrainConfig,
+    "fly": FlyConfig,
+    "tune": TuneConfig,
+    "advise": AdviseConfig,
+    "compare": CompareConfig,
+}
+"""Settings of the programs."""
+FILELESS = ("train", "fly", "advise")
+"""Programs that need no file in conf/ beside defaults.yaml."""
+CHOSEN = ("region", "motion", "source", "battery", "links", "learner")
+"""Sections whose keys depend on the option that is chosen."""
+PLAIN = {
+    "region": ["random", "vertices", "fir", "geojson"],
+    "motion": ["instant"],
+    "source": ["static", "dynamic"],
+    "battery": ["none", "charging"],
+    "links": ["server", "updown", "matrix"],
+    "actions": ["discrete", "continuous"],
+    "learner": [*LEARNERS],
+    "model": ["mlp"],
+    "logger": ["all", "csv", "tensorboard", "wandb", "mlflow"],
+    "delay": ["none"],
+    "aware": ["none"],
+}
+"""Options of the groups that need no file, because they only choose a kind."""
+LOGGERS = {name: f"damian.runs.loggers:{name}" for name in ("wandb", "mlflow")}
+"""Loggers of DAMIAN that stand in settings by their paths."""
+SYNONYMS = {
+    "lr": "learner.lr",
+    "learning_rate": "learner.lr",
+    "gamma": "learner.gamma",
+    "belief": "aware=belief",
+    "history": "delay.history",
+    "num_envs": "worlds",
+    "n_envs": "worlds",
+    "total_frames": "frames",
+    "total_timesteps": "frames",
+    "timesteps": "frames",
+    "n_agents": "agents",
+    "num_agents": "agents",
+    "uavs": "agents",
+    "algo": "learner",
+    "task": "scenario",
+    "env": "scenario",
+    "gpu": "device",
+    "cuda": "device",
+}
+"""What people type who know other programs, and what it is called here."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting as its dataclass declares it."""
+
+    kind: str
+    """Type annotation."""
+    default: str
+    """Default value as text; empty for a section."""
+    text: str
+    """What the setting means, with its unit."""
+
+
+@functools.cache
+def known_settings(program: str) -> dict[str, Setting]:
+    """Every setting of a program by its dotted key, sections included; those of every learner."""
+    found = _described(SCHEMAS[program], "")
+    if "learner" in found:
+        for _, learner in LEARNERS.items():
+            found = {**_described(learner, "learner."), **found}
+    return found
+
+
+def _described(kind: type, path: str) -> dict[str, Setting]:
+    found: dict[str, Setting] = {}
+    every = rules(kind)
+    for each in fields(kind):
+        rule, default = every[each.name], default_of(each)
+        if rule.fixed:
+            continue
+        kept: Any = (
+            each.type if is_dataclass(each.type) else None
+        )  # such as an experiment, which must be chosen
+        section: Any = type(default) if is_dataclass(default) else kept
+        text = "" if section or default is dataclasses.MISSING else f"{default!r}"
+        named = (
+            getattr(each.type, "__name__", str(each.type)) if "[" not in str(each.type) else str(each.type)
+        )
+        found[f"{path}{each.name}"] = Setting(named, text, rule.meaning)
+        if section:
+            found |= _described(section, f"{path}{each.name}.")
+    return found
+
+
+@functools.cache
+def default_options(program: str) -> dict[str, str]:
+    """The groups of a program, each with its default option; ``???`` if one must be chosen."""
+    if program in FILELESS:
+        return default_options("defaults")
+    found: dict[str, str] = {}
+    for each in yaml.safe_load((CONF / f"{program}.yaml").read_text())["defaults"]:
+        if each == "defaults":
+            found |= default_options("defaults")
+        elif not isinstance(each, str):
+            (group, option), *_ = each.items()
+            found |= {} if " " in group else {group: option}
+    return found
+
+
+def groups(own_folder: str | None = None) -> dict[str, list[str]]:
+    """Options of every group, by the group's name; a file _NAME.yaml is no option, but what options share.
+
+    Args:
+        own_folder: a folder with configuration files of the user's own, whose options come first.
+    """
+    options: dict[str, list[str]] = {}
+    for root in map(Path, filter(None, [own_folder, CONF])):
+        for file in sorted(root.rglob("[!_]*.yaml")):
+            group, *rest = file.relative_to(root).with_suffix("").parts
+            if rest:
+                options.setdefault(group, []).append("/".join(rest))
+    return {g: [*options.get(g, []), *PLAIN.get(g, [])] for g in dict.fromkeys([*options, *PLAIN])}
+
+
+def no_such_key(key: str, program: str = "train", section: Sequence[str] = ()) -> str:
+    """The message for an unknown key, with the nearest known one.
+
+    Args:
+        key: the dotted key.
+        program: one of ``SCHEMAS``.
+        section: keys beside it, where they are known; a learner of the user's own has its own keys.
+    """
+    if key in SYNONYMS:
+        return f"{key}: no such key; did you mean {SYNONYMS[key]}?"
+    known = {**known_settings(program), **(known_settings("train") if program != "compare" else {})}
+    group = key.partition(".")[0]
+    if key in known and group in CHOSEN:
+        return f"{key}: no such key of the chosen {group}; another {group}=OPTION has it"
+    if program == "compare" and (key in known_settings("train") or key in default_options("train")):
+        return f"{key}: it is a setting of the runs; all of them get it by \"overrides=['{key}=...']\""
+    names = [*section, *known, *default_options(program)]
+    near = difflib.get_close_matches(key, names, n=1, cutoff=0.7)
+    near = near or [name for name in names if name.rpartition(".")[2] == key][:1]
+    return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in near)
+
+
+def check_words(program: str, words: Sequence[str], own_folder: str | None = None) -> None:
+    """Refuse unknown keys and options, as far as a look at the words can tell; the schemas tell the rest.
+
+    Raises:
+        InputError: a word names what does not exist.
+    """
+    known, options = known_settings(program), groups(own_folder)
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals:
+            if not word.startswith("~"):
+                raise InputError(f"{show(word)}: this word is not of the form KEY=VALUE")
+        elif key.partition("@")[0] in options and not key.startswith(("+", "~")):
+            first = value.partition(",")[0]
+            plain = all(part.isidentifier() for part in first.split("/"))
+            if key == "delay" and first[:1].isdigit():
+                raise InputError(f"delay: {value} is no option of this group; write delay.obs={value}")
+            if plain and first not in (*options[key], "null"):
+                raise InputError(f"{key}: {first} is not one of {', '.join(options[key])}")
+        elif not (_is_known(key, known) or own_folder or key.startswith(("hydra", "+", "~"))):
+            raise InputError(no_such_key(key, program))
+
+
+def _is_known(key: str, known: dict[str, Setting]) -> bool:
+    """Is a key that of a setting, or below one that holds anything, or of a learner of the user's own?"""
+    parts = key.split(".")
+    above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]
+    is_open = any(each and each.kind.startswith(("typing.Any", "list", "dict")) for each in above)
+    return key in known or is_open or parts[0] == "learner"
+
+
+def help_text(name: str, program: str, keys: Sequence[str] = (), own_folder: str | None = None) -> str:
+    """What ``--help`` prints: a page on a program, or the meaning of settings and groups.
+
+    Args:
+        name: of the program.
+        program: whose settings it has, one of ``SCHEMAS``.
+        keys: groups, and dotted keys of settings or sections, to explain.
+        own_folder: a folder with configuration files of the user's own.
+    """
+    if keys:
+        found = [[*_options(program, key, own_folder), *_meaning(program, key)] for key in keys]
+        return "\n".join("\n".join(f or [no_such_key(k, program)]) for k, f in zip(keys, found, strict=True))
+    lines = [f"damian {name} [GROUP=OPTION] [KEY=VALUE] ...", "", "Groups (the default in brackets):"]
+    for group, default in default_options(program).items():
+        options = [f"[{o}]" if o == default else o for o in groups(own_folder).get(group, [])]
+        lines.append(f"  {group:10} {'   '.join(options)}")
+    return "\n".join([*lines, "", HINTS.format(name=name)])
+
+
+HINTS = """\
+Often used: agents=3 seed=0 frames=300000 worlds=64 device=cuda compile=true learner.lr=3e-4
+  delay.obs=3 (steps) | 3s | "delay.obs={{law: uniform, low: 3s, high: 7s}}"   delay.act=   delay.loss=
+  resume=FOLDER   checkpoint=FOLDER   hydra.run.dir=FOLDER   -m seed=0,1,2 (a sweep)   --config-dir FOLDER
+Meaning, type, default and unit: damian {name} --help KEY | GROUP ...   All settings: docs/settings.md"""
+
+
+def _options(program: str, group: str, own_folder: str | None) -> list[str]:
+    """How to choose an option of a group, with all options, the default one in brackets; or nothing."""
+    if group not in default_options(program):
+        return []
+    default, options = default_options(program)[group], groups(own_folder)[group]
+    shown_options = [f"[{option}]" if option == default else option for option in options]
+    said = {option: _comment(group, option, own_folder) for option in options}
+    lines = [f"    {option}: {text}" for option, text in said.items() if text]
+    return [f"choose one with {group}=OPTION: {', '.join(shown_options)}", *lines]
+
+
+def _comment(group: str, option: str, own_folder: str | None) -> str:
+    """What the comment at the top of an option's file says."""
+    files = (Path(root, group, f"{option}.yaml") for root in filter(None, (own_folder, CONF)))
+    text = next((read_text(file) for file in files if file.is_file()), "")
+    lines = takewhile(lambda line: line.startswith("#"), text.splitlines())
+    return " ".join(line.lstrip("# ") for line in lines if "@package" not in line)
+
+
+def _meaning(program: str, key: str) -> list[str]:
+    """Key, type, default and meaning of a setting, or of all settings of a section."""
+    lines = []
+    for name, each in known_settings(program).items():
+        if name == key or name.startswith(f"{key}."):
+            default = f" = {each.default}" if each.default else ""
+            lines += [f"{name}: {each.kind}{default}", *([f"    {each.text}"] if each.text else [])]
+    return lines

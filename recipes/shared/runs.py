@@ -1,0 +1,376 @@
+"""Runs in their folders: starting and resuming them, and taking settings and policy of a stored one."""
+
+import os
+import random
+import signal
+import sys
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from damian.common.atomic_files import remove_unfinished, write_atomically
+from damian.common.errors import InputError
+from damian.common.text_files import show
+from damian.envs.pipeline import history_since_message
+from damian.runs.checkpoint import digest
+from damian.runs.interrupt import exit_code
+from damian.runs.run_folder import CHECKPOINT, CONFIG
+from damian.runs.run_lock import is_folder
+from damian.runs.run_record import POLICY, check_version, new_record, read_record, timed, write_record
+from damian.runs.training_state import checkpoint_file, stored_progress
+from damian.settings import LEARNERS, PredictiveMappoConfig, ScenarioConfig, TrainConfig
+from damian.settings.fields import leaves
+
+from ..cli import (
+    Work,
+    checked,
+    composed,
+    reason,
+    typed_command,
+    typed_words,
+)
+from ..known import LOGGERS, SCHEMAS, check_words
+from ..words import key_of, parsed
+from .settings import check_components
+
+SWEEP = "multirun.yaml"
+"""File that Hydra writes into the folder of a sweep."""
+OVERRIDES = "overrides"
+"""Entry of a run's record: the words of its command line, which programs that fly its policy apply too."""
+
+
+# ------------------------------------------------------------------------------------------ starting
+
+
+def prepared(
+    program: str, words: Sequence[str], own_folder: str | None, folder: Path, again: bool = False
+) -> tuple[Any, Path]:
+    """The checked settings of a run, and its folder.
+
+    A resumed run goes on in its own folder with its own settings; only ``frames`` and ``episodes`` may
+    change.
+    The overrides of the run that ``checkpoint`` names apply too, unless others are given.
+
+    Args:
+        program: one of ``SCHEMAS``.
+        words: overrides on the command line.
+        own_folder: a folder with configuration files of the user's own.
+        folder: the run folder that the command line names.
+        again: the folder may hold what the same command has left there.
+
+    Raises:
+        InputError: a value is impossible, a key is unknown, or there is no run to resume.
+    """
+    given = composed(program, words, own_folder)
+    words = [word for word in words if not key_of(word).startswith("hydra")]
+    if again:
+        config = checked(given, program)
+        if program != "compare":
+            config.overrides = list(words)
+        return config, folder
+    if given.resume is not None and program == "train":
+        folder = Path(given.resume)
+        return resumed(folder, given, words), folder
+    if (folder / CONFIG).exists():
+        remedy = f"choose another folder, or continue the run with resume={folder}"
+        raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
+    if given.checkpoint is None:
+        config, overrides = checked(given, program), list(words)
+    else:
+        stored_in = run_folder(Path(given.checkpoint))
+        stored = stored_config(stored_in, "checkpoint", given.trust, words)
+        before = stored_overrides(stored_in)
+        # Hydra imports a learner, and reads files that may name one, while it composes.
+        require_trust(
+            [word.partition("=")[2].strip("'\"") for word in before], "checkpoint", given.trust, words
+        )
+        own_folder = own_folder or (_folder_of_files(stored_in) if given.trust else None)
+        overrides = inherited(stored, before, words, own_defaults(SCHEMAS[program]))
+        check_words(program, overrides, own_folder)
+        found = composed(program, overrides, own_folder)
+        require_trust(found, "checkpoint", bool(given.trust), words)
+        config = checked(found, program)
+        check_policy_fits(config, stored)
+        if changed := changes(config, stored):
+            print(f"changed since the training: {changed}")
+        note_what_a_history_holds(config, stored)
+    config.overrides = overrides
+    check_components(config)
+    return config, folder
+
+
+def perform(config: TrainConfig, folder: Path, work: Work) -> None:
+    """Do the work of a program in one thread with the seed of its settings."""
+    torch.set_num_threads(1)
+    seed_generators(config.seed)
+    remove_unfinished(folder)
+    with timed(folder):
+        work(config, folder)
+    print(f"results: {folder}")
+
+
+def seed_generators(seed: int) -> None:
+    """Seed the global random generators of torch, NumPy and Python; your own components may use each."""
+    for set_seed in (torch.manual_seed, np.random.seed, random.seed):
+        set_seed(seed)
+
+
+def interrupted(folder: Path, number: int = signal.SIGINT) -> int:
+    """Say that a signal has stopped a run, and how to continue it; returns the exit code."""
+    remedy = f"; continue with resume={folder}" if (folder / CHECKPOINT).exists() else ""
+    print(f"interrupted{remedy}", file=sys.stderr)
+    return exit_code(number)
+
+
+def save_config(config: TrainConfig, folder: Path) -> None:
+    """Write the record of words, versions and machine into the run folder, then the settings."""
+    is_gpu = config.device.startswith("cuda")
+    device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
+    own_folder = parsed(typed_words).config_dir if typed_words else None
+    record = new_record(typed_command(), device, config.learning_threads, own_folder)
+    record[OVERRIDES] = read_record(folder).get(OVERRIDES) if config.resume else list(config.overrides)
+    if config.checkpoint and not config.resume:  # a resumed run no longer needs that policy
+        record[POLICY] = digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
+    write_record(folder, record)
+    write_atomically(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(_nested(leaves(config)))))
+
+
+def _nested(settings: Iterator[tuple[str, Any]]) -> dict[str, Any]:
+    """Settings by dotted key as nested mappings."""
+    found: dict[str, Any] = {}
+    for key, value in settings:
+        *sections, name = key.split(".")
+        node = found
+        for section in sections:
+            node = node.setdefault(section, {})
+        node[name] = value
+    return found
+
+
+# ------------------------------------------------------------------------------------------ stored runs
+
+
+def run_folder(written: Path) -> Path:
+    """The run folder that a folder, or a checkpoint file in it, stands for."""
+    return written.parent if os.path.isfile(written) else written
+
+
+def check_run(folder: Path, key: str) -> None:
+    """Check that a folder holds a run.
+
+    Raises:
+        InputError: it does not, such as the folder of a sweep.
+    """
+    if not is_folder(folder):
+        raise InputError(f"{key}: {show(str(folder))}: there is no such folder")
+    if (folder / CONFIG).is_file():
+        return
+    if (folder / SWEEP).is_file():
+        raise InputError(f"{key}: {folder} is a sweep: give one of the folders in it")
+    raise InputError(f"{key}: {folder} holds no {CONFIG}, so there is no run")
+
+
+def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[str] = ()) -> TrainConfig:
+    """The settings of the run in a folder; keys that it lacks have their defaults.
+
+    Args:
+        folder: the run folder.
+        key: the setting that names the folder, for errors.
+        trust: whether components of other code that the file names may be imported.
+        named: words of the command line, whose components may be imported.
+
+    Raises:
+        InputError: there is no run, it cannot be read, another minor version of damian has written it, or it
+            names code that may not be imported.
+    """
+    check_run(folder, key)
+    check_version(folder, key)
+    file = folder / CONFIG
+    try:
+        saved = cast(DictConfig, OmegaConf.load(file))
+        missing = [name for name in ("agents", "learner", "region", "seed", "worlds") if name not in saved]
+        if missing:
+            raise InputError(f"it has no {missing[0]}, so it is not the whole configuration of a training")
+        require_trust(saved, key, trust, named)
+        learner = LEARNERS.get(saved.learner.name, "learner")(name=saved.learner.name)
+        for name in {*saved} - {each.name for each in fields(TrainConfig)}:
+            raise InputError(f"{name} is no setting of damian train: no policy was trained there")
+        config = OmegaConf.merge(OmegaConf.structured(TrainConfig(learner=learner)), saved)
+        return cast(TrainConfig, OmegaConf.to_object(config))
+    except InputError as error:
+        raise InputError(str(error) if str(error).startswith(key) else f"{key}: {file}: {error}") from None
+    except Exception as error:  # a damaged file can raise anything
+        raise InputError(f"{key}: {file}: {reason(error)}") from None
+
+
+def stored_overrides(folder: Path) -> list[str]:
+    """The words of the command line with which a run was started, without those that concern its start."""
+    words = read_record(folder).get(OVERRIDES) or []
+    texts = [word for word in words if isinstance(word, str)] if isinstance(words, list) else []
+    own = ("trust", "checkpoint", "resume")
+    return [word for word in texts if key_of(word) not in own and not key_of(word).startswith("hydra")]
+
+
+def require_trust(found: Any, key: str, trust: bool, named: Sequence[str]) -> None:
+    """Refuse components of other code that stored settings name, unless the caller has named or trusts them.
+
+    Importing ``package.module:Name`` runs the module, and a stored file may come from anybody.
+
+    Args:
+        found: the stored settings, before anything is made of them.
+        key: the setting that names the file, for errors.
+        trust: ``trust=true`` was given.
+        named: words of the command line.
+
+    Raises:
+        InputError: there is such a component.
+    """
+    typed = " ".join(named)
+    foreign = [path for path in _components(found) if path not in typed]
+    if foreign and not trust:
+        raise InputError(
+            f"{key}: its settings name {foreign[0]}, which is no part of DAMIAN; trust=true imports its code"
+        )
+
+
+def _components(node: Any, name: str = "") -> Iterator[str]:
+    """Every text ``package.module:Name`` in settings, but for DAMIAN's own."""
+    if isinstance(node, DictConfig | Mapping):
+        for key in node:
+            if key not in ("hydra", "where", "device"):  # where=PROPERTY:VALUE, device=cuda:0
+                yield from _components(node[key], str(key))
+    elif isinstance(node, str):
+        module, colon, last = node.partition(":")
+        path = all(part.isidentifier() for part in (*module.split("."), last))
+        if colon and path and node not in LOGGERS.values():
+            yield node
+    elif isinstance(node, Sequence):
+        for each in node:
+            yield from _components(each, name)
+
+
+def _folder_of_files(folder: Path) -> str | None:
+    """The folder with configuration files that a run was started with, if it is still there."""
+    found = read_record(folder).get("config_dir")
+    return found if isinstance(found, str) and os.path.isdir(found) else None
+
+
+def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfig:
+    """The settings of a run to resume; only ``frames`` and ``episodes`` may change.
+
+    Raises:
+        InputError: there is no run to resume, or something else is to change.
+    """
+    allowed = ("resume", "frames", "episodes", "trust")
+    if refused := [word for word in words if key_of(word) not in allowed]:
+        problem = "a resumed run keeps its configuration; only frames= and episodes= may change"
+        raise InputError(f"{refused[0]}: {problem}")
+    config = stored_config(folder, "resume", given.trust, words)
+    checkpoint_file(folder, "resume")
+    for key in {"frames", "episodes"} & set(map(key_of, words)):
+        setattr(config, key, given[key])
+    config.__post_init__()
+    check_components(config)
+    stored = stored_progress(folder)
+    done = {"frames": stored["progress"]["frames"], "episodes": stored["episodes"]["finished"]}
+    for key, number in done.items():
+        limit = getattr(config, key)
+        if limit is not None and number >= limit:
+            print(f"{key}: {limit} are asked for, and the run has {number} already: nothing is left to train")
+            break
+    return config
+
+
+# ------------------------------------------------------------------------------------------ flying
+
+
+def inherited(
+    stored: TrainConfig, before: Sequence[str], given: Sequence[str], own: Collection[str] = ()
+) -> list[str]:
+    """The given overrides, preceded by those of a stored run that they do not replace.
+
+    The policy keeps its histories of actions and messages, because it observes them, even if a file of the
+    stored run's scenario or an option of ``delay`` says otherwise.
+
+    Args:
+        stored: settings of the stored run.
+        before: overrides of the stored run.
+        given: those of the new program.
+        own: keys that have another default in this program, which those of the stored run do not replace.
+    """
+    keys = [*map(key_of, given), *own]
+    history = [] if {"delay.history", "aware"} & {*keys} else [f"delay.history={stored.delay.history}"]
+    messages = stored.delay.messages
+    history += [f"delay.messages={messages}"] if messages and "delay.messages" not in keys else []
+    return [*without(before, [*keys, *map(key_of, history)]), *history, *given]
+
+
+def without(overrides: Sequence[str], replaced: Collection[str]) -> list[str]:
+    """The overrides but those that set one of these keys and groups, or a key below them."""
+    return [w for w in overrides if not any(f"{key_of(w)}.".startswith(f"{key}.") for key in replaced)]
+
+
+def own_defaults(kind: type) -> set[str]:
+    """Keys of the training to which the settings of another program give another default."""
+    defaults = {each.name: each.default for each in fields(TrainConfig)}
+    return {each.name for each in fields(kind) if each.default != defaults.get(each.name, each.default)}
+
+
+def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
+    """Check that a policy can fly in another scenario than the one that it was trained in.
+
+    Raises:
+        InputError: its observations, actions or layers would differ; the message names the setting.
+    """
+    new, old = _shape(config), _shape(stored)
+    for key, value in new.items():
+        if value != old[key]:
+            trained, asked = show(old[key]), show(value)
+            raise InputError(f"{key}: the policy was trained with {trained}, so it cannot fly with {asked}")
+
+
+def _shape(config: TrainConfig) -> dict[str, Any]:
+    """What the sizes of a policy's networks follow from, by setting."""
+    observation, actions, model = config.observation, config.actions, config.model
+    discrete, predicts = actions.kind == "discrete", isinstance(config.learner, PredictiveMappoConfig)
+    # An actor with a learnt belief predicts the critic's observation, so that its layers depend on it too.
+    used = observation.critic if predicts else observation.actor
+    return {
+        "learner=predictive_mappo": predicts,
+        "observation.ctde": observation.ctde,
+        "observation.local_features": [*observation.local_features],
+        "observation.global_features": [*observation.global_features] * (predicts or not observation.ctde),
+        "observation.belief": [*observation.belief],
+        # After the features, from which it follows: a policy with other features does not lack UAVs.
+        "agents": config.agents if "agent_distances" in used else "any number of UAVs",
+        "observation.age": observation.age,
+        "delay.history": config.delay.history,
+        "delay.messages": config.delay.messages,
+        "actions.kind": actions.kind,
+        "number of actions.distances": discrete and len(actions.distances),
+        "number of actions.headings": discrete and len(actions.headings),
+        **{f"model.{each.name}": getattr(model, each.name) for each in fields(model)},
+    }
+
+
+def note_what_a_history_holds(config: TrainConfig, stored: TrainConfig) -> None:
+    """Say if a policy observes other actions in its history than in its training, which had other delays."""
+    before, now = history_since_message(stored), history_since_message(config)
+    if before == now or not (stored.delay.history and config.delay.history):
+        return
+    newer = "only actions newer than its message that the server holds"
+    held, holds = (newer if since else "all of its latest actions" for since in (before, now))
+    print(f"note: delay.history: in the training a UAV's history held {held}; now it holds {holds}")
+
+
+def changes(config: TrainConfig, stored: TrainConfig) -> str:
+    """The settings of the scenario that differ between a stored run and a new one, on one line."""
+    names = {each.name for each in fields(ScenarioConfig)}
+    old, new = ({k: v for k, v in leaves(each) if k.split(".")[0] in names} for each in (stored, config))
+    differ = [key for key in new if old[key] != new[key]]
+    return ", ".join(f"{key}: {show(old[key])} -> {show(new[key])}" for key in differ)
