@@ -17,7 +17,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``one_line_errors`` prints them
 
@@ -279,6 +279,8 @@ def one_line_errors() -> Iterator[None]:
     try:
         yield
     except (InputError, RunError, OSError, *ERRORS) as error:
+        if is_interrupt(error):
+            _end_interrupted()
         line, wrong = reason(error), not isinstance(error, RunError | OSError)
         foreign = isinstance(error.__cause__, Exception) and not isinstance(
             error.__cause__, (*ERRORS, InputError)
@@ -290,8 +292,19 @@ def one_line_errors() -> Iterator[None]:
         print(f"error: {line}", file=sys.stderr)
         sys.exit(2 if wrong else RUN_ERROR)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(exit_code(signal.SIGINT))
+        _end_interrupted()
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Was the error raised by Ctrl-C, or while a library cleaned up after it?"""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _end_interrupted() -> NoReturn:
+    print("interrupted", file=sys.stderr)
+    sys.exit(exit_code(signal.SIGINT))
 
 
 # ------------------------------------------------------------------------------------------ running

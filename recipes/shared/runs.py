@@ -19,9 +19,10 @@ from damian.common.text_files import show
 from damian.envs.pipeline import history_since_message
 from damian.runs.checkpoint import digest
 from damian.runs.interrupt import exit_code
+from damian.runs.metrics_log import EVENTS
 from damian.runs.run_folder import CHECKPOINT, CONFIG
-from damian.runs.run_lock import is_folder
-from damian.runs.run_record import POLICY, check_version, new_record, read_record, timed, write_record
+from damian.runs.run_lock import LOCK, is_folder
+from damian.runs.run_record import POLICY, RECORD, check_version, new_record, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file, stored_progress
 from damian.settings import LEARNERS, PredictiveMappoConfig, ScenarioConfig, TrainConfig
 from damian.settings.fields import leaves
@@ -31,6 +32,7 @@ from ..cli import (
     checked,
     composed,
     reason,
+    shown,
     typed_command,
     typed_words,
 )
@@ -74,7 +76,7 @@ def prepared(
             config.overrides = list(words)
         return config, folder
     if given.resume is not None and program == "train":
-        folder = Path(given.resume)
+        folder = shown(Path(given.resume))
         return resumed(folder, given, words), folder
     if (folder / CONFIG).exists():
         remedy = f"choose another folder, or continue the run with resume={folder}"
@@ -109,9 +111,22 @@ def perform(config: TrainConfig, folder: Path, work: Work) -> None:
     torch.set_num_threads(1)
     seed_generators(config.seed)
     remove_unfinished(folder)
-    with timed(folder):
-        work(config, folder)
+    try:
+        with timed(folder):
+            work(config, folder)
+    except InputError:
+        _drop_unused(folder)
+        raise
     print(f"results: {folder}")
+
+
+def _drop_unused(folder: Path) -> None:
+    """Remove what a refused run has written before its first update, if there is nothing else."""
+    files = [path for path in folder.iterdir() if path.name != LOCK]
+    first = all(path.name in (CONFIG, RECORD, CHECKPOINT) or path.name.startswith(EVENTS) for path in files)
+    learnt = (folder / CHECKPOINT).exists() and stored_progress(folder)["progress"]["updates"] > 0
+    for path in files if first and not learnt else ():
+        path.unlink()
 
 
 def seed_generators(seed: int) -> None:
@@ -272,6 +287,7 @@ def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfi
         raise InputError(f"{refused[0]}: {problem}")
     config = stored_config(folder, "resume", given.trust, words)
     checkpoint_file(folder, "resume")
+    config.resume = str(folder)
     for key in {"frames", "episodes"} & set(map(key_of, words)):
         setattr(config, key, given[key])
     config.__post_init__()

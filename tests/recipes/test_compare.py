@@ -14,13 +14,14 @@ from helpers import check_refused
 from hydra import initialize_config_dir
 
 from damian.compare.comparison import KNOWN_ON_TIME, TRAINED, Arm
-from damian.recipes.compare import CompareConfig, Experiment, plan
+from damian.recipes.compare import plan
 from damian.recipes.compare import run as main
 from damian.recipes.evaluate import fly
 from damian.recipes.known import CONF
 from damian.recipes.shared.many_runs import Run, perform_all, perform_each, stop_code
 from damian.runs.run_lock import locked
 from damian.settings import TrainConfig
+from damian.settings.programs import CompareConfig, Experiment
 
 STORED = Path(__file__).parents[2] / "docs" / "results"
 SMALL = [
