@@ -81,8 +81,8 @@ class FlownPolicyConfig(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        problem = "nothing is trained: give the run folder as checkpoint"
-        checks.require(self.resume is None, "resume", self.resume, problem)
+        if self.resume is not None:
+            raise InputError("resume: nothing is trained; give the run folder as checkpoint")
         if self.policy is None:
             return
         checks.one_of("policy", self.policy, self.policies)

@@ -213,7 +213,7 @@ def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[s
             raise InputError(f"it has no {missing[0]}, so it is not the whole configuration of a training")
         require_trust(saved, key, trust, named)
         learner = LEARNERS.get(saved.learner.name, "learner")(name=saved.learner.name)
-        for name in {*saved} - {each.name for each in fields(TrainConfig)}:
+        for name in sorted({*saved} - {each.name for each in fields(TrainConfig)}):
             raise InputError(f"{name} is no setting of damian train: no policy was trained there")
         config = OmegaConf.merge(OmegaConf.structured(TrainConfig(learner=learner)), saved)
         return cast(TrainConfig, OmegaConf.to_object(config))
@@ -388,5 +388,5 @@ def changes(config: TrainConfig, stored: TrainConfig) -> str:
     """The settings of the scenario that differ between a stored run and a new one, on one line."""
     names = {each.name for each in fields(ScenarioConfig)}
     old, new = ({k: v for k, v in leaves(each) if k.split(".")[0] in names} for each in (stored, config))
-    differ = [key for key in new if old[key] != new[key]]
-    return ", ".join(f"{key}: {show(old[key])} -> {show(new[key])}" for key in differ)
+    differ = [key for key in new if key not in old or old[key] != new[key]]
+    return ", ".join(f"{key}: {show(old.get(key, 'none'))} -> {show(new[key])}" for key in differ)

@@ -84,7 +84,7 @@ def test_settings_help_and_wrong_words_need_no_torch(code):
         (["compare", "experiment=usecase2", "agents=3"], "agents: it is a setting of the runs"),
         (["compare", "experiment=usecase2", "arms=[nope]"], "arms: nope is not one of undelayed, unaware"),
         (["compare", "-m", "experiment=usecase2"], "-m: not with"),
-        (["fly", "resume=x"], "resume: x nothing is trained"),
+        (["fly", "resume=x"], "resume: nothing is trained"),
         (["fly", "policy=sampled"], "policy: sampled needs checkpoint"),
         (["advise", "token=short"], "token: it is not a password"),
         (["tune", "score=success_rate", "scenario=delaybench/tracking"], "score: success_rate is the same"),

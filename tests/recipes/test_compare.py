@@ -48,7 +48,7 @@ def compare(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def run_recipe(*overrides: str) -> Path:
-        monkeypatch.setattr(sys, "argv", ["compare.py", *overrides])
+        monkeypatch.setattr(sys, "argv", ["damian compare", *overrides])
         main()
         return tmp_path / "runs" / "usecase2"
 
@@ -337,7 +337,7 @@ def test_runs_go_seed_by_seed_and_an_arm_does_its_tasks_only():
     arms["flown"] = Arm(policy_of="best", tasks=["b"])
     tasks = {task: ["scenario=delaybench/tracking"] for task in ("a", "b")}
     experiment = Experiment(tasks, {"late": ["delay.obs=2"]}, arms, first_seed=3)
-    with initialize_config_dir(CONF, version_base=None):
+    with initialize_config_dir(str(CONF), version_base=None):
         runs = plan(CompareConfig(experiment, seeds=2), Path("runs"))
     trained = [
         f"{name}/seed_{seed}" for seed in (3, 4) for name in ("a/none/best", "a/late/naive", "b/none/best")
@@ -349,6 +349,6 @@ def test_the_script_flies_only_where_messages_are_late():
     arms = {"best": Arm(delayed=False), "known": Arm(oracle=True)}
     delays = {"late": ["delay.obs=2"], "act": ["delay.act=2"]}
     experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms)
-    with initialize_config_dir(CONF, version_base=None):
+    with initialize_config_dir(str(CONF), version_base=None):
         runs = plan(CompareConfig(experiment, seeds=1), Path("runs"))
     assert [run.name for run in runs] == ["a/none/best/seed_0", "a/late/known/seed_0"]

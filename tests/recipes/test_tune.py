@@ -61,7 +61,7 @@ def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys
         assert trial.value == pytest.approx(float(results["trained"]["return"]))
         assert float(row["return"]) == pytest.approx(trial.value, rel=1e-3)
         assert float(row["learner.lr"]) == pytest.approx(trial.params["learner.lr"], rel=1e-5)
-        text = (folder / f"trial_{row['trial']}" / "config.yaml").read_text()
+        text = (folder / f"trial_{row['trial']}" / "run.json").read_text()
         assert f"learner.lr={row['learner.lr']}" in text
         assert f"model.hidden={row['model.hidden']}" in text
     best = max(found, key=lambda row: float(row["return"]))
@@ -167,7 +167,7 @@ def test_every_learner_has_a_space(capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["resume=x"], "resume: the same command"),
+        (["resume=x"], "resume: x is not for a search"),
         (["trials=0"], "trials: 0"),
         (["checkpoint=first"], "checkpoint: first is not for a search, which trains every policy from"),
         (
