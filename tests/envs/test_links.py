@@ -113,14 +113,14 @@ WRONG = {
     "links.kind": {"kind": "mesh"},
     "links.range": {"kind": "updown", "range": 5.0},
     "links.hears": {"kind": "matrix", "hears": [[True, True], [True, True]]},
-    "links.loss: a is not between 0 and 1": {"kind": "matrix", "loss": [[0, "a", 0]] * 3},
+    r"links.loss\[0\]\[1\]: a is not between 0 and 1": {"kind": "matrix", "loss": [[0, "a", 0]] * 3},
     "links.loss: 1.5 is not between 0 and 1": {"kind": "matrix", "loss": 1.5},
     r"links.delay\[0\]\[2\]: soon is neither": {"kind": "matrix", "delay": [[0, 1, "soon"]] * 3},
     r"links.delay\[0\]\[1\].low: 5 ": {
         "kind": "matrix",
         "delay": [[0, {"law": "uniform", "low": 5, "high": 1}, 0]] * 3,
     },
-    "links.delay: .* is not N x N": {"kind": "matrix", "delay": [[0, 1], [1]]},
+    "links.delay: .* is not 3 lists": {"kind": "matrix", "delay": [[0, 1], [1]]},
 }
 
 

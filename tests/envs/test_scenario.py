@@ -64,8 +64,8 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "seeds: [3] of torch.int64 are not 2 integers": lambda: make_env(square(), 2).seed_worlds(
         torch.arange(3)
     ),
-    "motion.max_level: 2 m leaves room for 2 flight levels": lambda: ScenarioConfig(
-        motion=MotionConfig("polynomial", min_level=1, max_level=2, level_separation=1)
+    "motion.max_level: 2 m leaves room for 2 flight levels": lambda: make_env(
+        square(motion=MotionConfig("polynomial", min_level=1, max_level=2, level_separation=1))
     ),
 }
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from damian.envs.uav_env import UavEnv
-from damian.learners.networks import ModelConfig, make_actor, make_critic
+from damian.learners.networks import ModelConfig, make_actor, make_critic, make_mlp
 from damian.learners.sac import Sac, SacConfig
 from damian.replay.time_storage import TimeStorage
 
@@ -61,6 +61,6 @@ def test_both_critics_of_sac_and_their_targets_begin_with_orthogonal_weights_of_
 
 def test_the_default_is_pytorchs():
     torch.manual_seed(0)
-    weights = ModelConfig(hidden=[16]).network(5, 3, None)[0].weight
+    weights = make_mlp(ModelConfig(hidden=[16]), 5, 3, None)[0].weight
     torch.manual_seed(0)
     assert weights.equal(nn.Linear(5, 16).weight)

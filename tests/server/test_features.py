@@ -123,7 +123,7 @@ def test_an_impossible_declaration_or_setting_is_one_line():
         (lambda: ObservationConfig(["source_time"]), "observation.local_features: source_time is not one of"),
         (
             lambda: ObservationConfig([], ctde=True),
-            r"observation.local_features: \[\] leaves the actor or the",
+            r"observation.local_features: \[\] leaves the actor blind",
         ),
         (lambda: ObservationConfig(window=0), "observation.window: 0 is not between 1 and 16"),
     ):

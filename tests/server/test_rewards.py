@@ -161,7 +161,7 @@ def test_every_end_without_success_costs_the_penalty(terminated):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: RewardConfig(coverage=math.nan), "reward.coverage: nan is not a finite weight"),
+        (lambda: RewardConfig(coverage=math.nan), "reward.coverage: nan is not between -1e+06 and 1e+06"),
         (lambda: RewardConfig(drift="rough"), "reward.drift: rough is not one of smooth, printed"),
         (lambda: RewardConfig(desired_distance=3.0), "reward.desired_distance: 3.0 is not between 0 and 2"),
         (lambda: EpisodeConfig(max_steps=0), "episode.max_steps: 0 is not between 1 and 1e+06"),

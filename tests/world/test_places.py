@@ -153,7 +153,7 @@ def test_two_start_positions_lead_to_one_landing_point_only_if_uavs_start_togeth
 def test_a_setting_that_the_kind_of_region_does_not_read_is_refused(settings, value, readers):
     with pytest.raises(InputError) as error:
         RegionConfig(**settings)
-    problem = f"means nothing with region.kind={settings.get('kind', 'random')}: only {readers} reads it"
+    problem = f"means nothing with region={settings.get('kind', 'random')}: only {readers} reads it"
     assert str(error.value) == f"region.{value} {problem}"
 
 

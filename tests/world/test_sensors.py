@@ -15,7 +15,6 @@ from damian.common.errors import InputError
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
-from damian.world.config import WorldConfig
 from damian.world.messages import Messages
 
 
@@ -155,5 +154,5 @@ def test_a_pickled_environment_with_sensors_continues_in_the_same_way():
 )
 def test_a_mistake_in_the_list_of_sensors_is_one_line(sensors, message):
     with pytest.raises(InputError) as error:
-        WorldConfig(sensors=sensors)
+        UavEnv(everything(sensors=sensors))
     assert str(error.value) == message
