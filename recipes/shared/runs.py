@@ -213,7 +213,7 @@ def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[s
             raise InputError(f"it has no {missing[0]}, so it is not the whole configuration of a training")
         require_trust(saved, key, trust, named)
         learner = LEARNERS.get(saved.learner.name, "learner")(name=saved.learner.name)
-        for name in sorted({*saved} - {each.name for each in fields(TrainConfig)}):
+        for name in sorted({*map(str, saved)} - {each.name for each in fields(TrainConfig)}):
             raise InputError(f"{name} is no setting of damian train: no policy was trained there")
         config = OmegaConf.merge(OmegaConf.structured(TrainConfig(learner=learner)), saved)
         return cast(TrainConfig, OmegaConf.to_object(config))
