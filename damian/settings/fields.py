@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import UnionType
-from typing import Any, ClassVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, TypeGuard, Union, cast, get_args, get_origin, get_type_hints
 
 from damian.common import checks
 from damian.common.errors import InputError
@@ -172,7 +172,7 @@ def _converted(key: str, value: Any, hint: Any) -> Any:
     article = _KINDS.get(origin, f"a {getattr(origin, '__name__', origin)}")
     checks.require(good, key, value, f"is not {article}")
     if origin is list and inner:
-        return [_converted(key, each, inner[0]) for each in list(value)]
+        return [_converted(key, each, inner[0]) for each in cast(Sequence[Any], value)]
     return value
 
 
@@ -207,7 +207,7 @@ def plain(value: Any) -> Any:
     return [plain(each) for each in value] if type(value) in (list, tuple) else value
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
     """Is a value a number, and neither true nor false?"""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
