@@ -195,7 +195,7 @@ def _is_known(key: str, known: dict[str, Setting]) -> bool:
     """Is a key that of a setting, or below one that holds anything, or of a learner of the user's own?"""
     parts = key.split(".")
     above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]
-    is_open = any(each and each.kind.startswith(("typing.Any", "list", "dict")) for each in above)
+    is_open = any(each and each.kind.startswith(("Any", "list", "dict")) for each in above)
     return key in known or is_open or parts[0] == "learner"
 
 

@@ -4,12 +4,10 @@ Every number has a largest sensible value, even where a check names none, becaus
 and time and memory run out, long before a computer refuses a number.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
-from types import UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 from damian.common.errors import InputError
 
@@ -30,7 +28,6 @@ Products and ratios of a few such numbers do not overflow in single precision, n
 """
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-_KINDS = {bool: "true or false", list: "a list of places such as [[0, 0], [100, 50]]"}
 
 
 def require(condition: bool, key: str, value: Any, should: str) -> None:
@@ -38,41 +35,6 @@ def require(condition: bool, key: str, value: Any, should: str) -> None:
     if not condition:
         text = str(value)
         raise InputError(f"{key}: {text if len(text) <= 100 else f'{text[:50]}...{text[-25:]}'} {should}")
-
-
-def convert_types(section: str, settings: Any) -> None:
-    """Convert the fields of a dataclass of settings, in place, to the types that they declare.
-
-    Arrays and numbers of NumPy and torch become plain ones, and numbers become texts where a text is wanted
-    (a time such as 2). A value of another type is refused, if no other check refuses it: those of numbers
-    and names look at the type too.
-
-    Args:
-        section: of the settings, such as ``region``, for errors; empty for those of a whole scenario.
-        settings: instance of the dataclass.
-    """
-    hints = get_type_hints(type(settings))
-    for field in dataclasses.fields(settings):
-        value, declared = _plain(getattr(settings, field.name)), hints[field.name]
-        choices = get_args(declared) if get_origin(declared) is UnionType else (declared,)
-        kind = get_origin(choices[0]) or choices[0]
-        value = str(value) if kind is str and _is_number(value) else value
-        setattr(settings, field.name, value)
-        if kind in (Any, int, float, str) or (value is None and type(None) in choices):
-            continue
-        key = f"{section}.{field.name}".lstrip(".")
-        require(isinstance(value, kind), key, value, f"is not {_KINDS.get(choices[0], f'a {kind.__name__}')}")
-
-
-def _plain(value: Any) -> Any:
-    """A value with Python's own lists and numbers instead of those of NumPy and torch."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return [_plain(each) for each in value] if type(value) in (list, tuple) else value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def in_range(key: str, value: float, low: float, high: float | None = None, unit: str = "") -> None:
@@ -186,3 +148,7 @@ def device(key: str, value: str) -> None:
     n_gpus = torch.cuda.device_count()
     available = ["cpu", *(f"cuda:{i}" for i in range(n_gpus)), *["cuda"] * bool(n_gpus)]
     require(value in available, key, value, f"is not one of the devices here: {', '.join(available)}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

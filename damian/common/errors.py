@@ -2,10 +2,9 @@
 
 import sysconfig
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
 
 
 class InputError(ValueError):
@@ -60,19 +59,3 @@ def described(error: BaseException) -> str:
 
 
 _PACKAGE = Path(__file__).parents[1]
-
-
-class Declared(dict[str, Any]):
-    """Values that a component may read by name; any other name is one line of error.
-
-    Args:
-        values: by name.
-        problem: what to say of another name, which takes the place of ``NAME``.
-    """
-
-    def __init__(self, values: Mapping[str, Any], problem: str) -> None:
-        super().__init__(values)
-        self._problem = problem
-
-    def __missing__(self, name: object) -> NoReturn:
-        raise InputError(self._problem.replace("NAME", str(name)))

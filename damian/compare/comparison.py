@@ -27,6 +27,8 @@ SCRIPTED = (RANDOM, SCRIPT)
 """Policies that fly the same episodes beside each arm, and learn nothing."""
 OF_ARM = (TRAINED, TRAINED_DETERMINISTIC, UNTRAINED, UNTRAINED_DETERMINISTIC)
 """Policies of an arm: its network after the training and before the first update."""
+UNTRAINED_OF = dict(zip(OF_ARM[:2], OF_ARM[2:], strict=True))
+"""The policy of an untrained arm that stands for the trained one of other arms."""
 ALL_MESSAGES = "all messages"
 KNOWN_ON_TIME = {
     "what has arrived": "R0",
@@ -203,8 +205,8 @@ class Comparison:
 
     def values(self, task: str, delay: str, arm: str, policy: str, measure: str) -> dict[int, float]:
         """Values of a measure by seed; an untrained arm has none but those of its untrained network."""
-        if arm in self.arms and self.arms[arm].untrained and policy in OF_ARM[:2]:
-            policy = OF_ARM[OF_ARM.index(policy) + 2]
+        if arm in self.arms and self.arms[arm].untrained:
+            policy = UNTRAINED_OF.get(policy, policy)
         return {row["seed"]: row[measure] for row in self._rows_of.get((task, delay, arm, policy), ())}
 
     @cached_property
@@ -387,8 +389,9 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
                     # An arm that flies the policies of another one has no untrained network.
                     if comparison.values(task, delay, arm, policy, comparison.score):
                         line = _line(comparison, task, delay, arm, policy)
-                        of_arm = policy.removeprefix("un") if comparison.arms[arm].untrained else policy
-                        found = compared.get(arm) if of_arm == comparison.policy else None
+                        untrained = UNTRAINED_OF if comparison.arms[arm].untrained else {}
+                        best = policy == untrained.get(comparison.policy, comparison.policy)
+                        found = compared.get(arm) if best else None
                         yield replace(line, compared=found) if found else line
             for arm in arms[:1]:
                 for policy in SCRIPTED:

@@ -26,7 +26,7 @@ KEPT = ("all", "extremes")
 FORMATS = ("gif", "mp4", "png", "html", "geojson")
 FILMS = FORMATS[:2]
 VIEWS = ("2d", "3d")
-MOST = 12
+MOST_EPISODES = 12
 """Episodes that one page can play side by side."""
 LAUNCHERS = ("local", "ray", "slurm")
 _HIDDEN = {"hidden": {"choices": [[64, 64], [128, 128], [256, 256]]}}
@@ -158,7 +158,7 @@ class FlyConfig(FlownPolicyConfig):
                 given, problem = getattr(self, key), f"means nothing with {source}, which flies nothing"
                 checks.require(given == none, key, given, problem)
         if self.replay:
-            checks.in_range("replay", len(self.replay), 1, MOST, "episodes")
+            checks.in_range("replay", len(self.replay), 1, MOST_EPISODES, "episodes")
         if self.span is not None:
             good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal is not None
             checks.require(good, "span", self.span, "is not [FIRST, LAST], two times of a journal [s]")

@@ -17,10 +17,9 @@ from urllib.parse import quote
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.plotting import COLOURS
+from damian.settings.programs import MOST_EPISODES
 from damian.show.episode import LIKELY, Episode
 
-MOST = 12
-"""Largest number of episodes on a page: browsers draw no more views of the space at once."""
 _PAGE = Path(__file__).parent / "page"
 _LIBRARIES = "libraries.min.js"
 _PLAIN = " !$&'()*+,-./:;<=>?@[]^_`{|}~\\\""
@@ -35,7 +34,7 @@ def save_page(episodes: Sequence[Episode], path: Path) -> None:
     """Write a page that plays episodes side by side, on one time line.
 
     Raises:
-        InputError: there are no episodes, or more than ``MOST``.
+        InputError: there are no episodes, or more than ``MOST_EPISODES``.
         RunError: the file cannot be written.
     """
     write_atomically(path, page(episodes))
@@ -45,9 +44,9 @@ def page(episodes: Sequence[Episode]) -> str:
     """The text of a page that plays episodes.
 
     Raises:
-        InputError: there are no episodes, or more than ``MOST``.
+        InputError: there are no episodes, or more than ``MOST_EPISODES``.
     """
-    checks.in_range("episodes", len(episodes), 1, MOST)
+    checks.in_range("episodes", len(episodes), 1, MOST_EPISODES)
     shared, names = titles(episodes)
     shown = [{"title": name, **episode.document()} for name, episode in zip(names, episodes, strict=True)]
     replay = {"colours": COLOURS, "likely": LIKELY, "shared": shared, "episodes": shown}

@@ -12,6 +12,7 @@ from bench_timing import Measured, in_turn
 from bench_training import ARMS, HEADER, RIVALS, WIDTHS, Seconds, arm_config, rows, training
 
 from damian.envs.pipeline import has_message_delay
+from damian.recipes.shared.settings import backupdates
 
 TINY = bench.Sizes(
     worlds=4,
@@ -75,7 +76,7 @@ def test_growth_has_a_row_for_each_size(presets):
 def test_arms_differ_in_delay_awareness_compiling_and_critic_only():
     configs = [arm_config(words, [64, 64], worlds=8, steps=16) for words in ARMS]
     assert [has_message_delay(config) for config in configs] == [False] * 3 + [True] * 2
-    assert [config.backupdates for config in configs] == [False] * 3 + [True] * 2
+    assert [backupdates(config) for config in configs] == [False] * 3 + [True] * 2
     assert [config.compile for config in configs] == [False, True, True, False, True]
     assert [config.model.shared_value for config in configs] == [False, False, True, False, True]
     for config in configs:

@@ -1,8 +1,5 @@
 """Checks of settings: one failed check of each kind, and what they convert."""
 
-from dataclasses import dataclass
-
-import numpy as np
 import pytest
 
 from damian.common import checks
@@ -41,20 +38,3 @@ def test_what_is_right_passes_and_is_converted():
     assert [checks.seconds("key", time) for time in ("2s", "0.5m", "1h", 0.2)] == [2.0, 30.0, 3600.0, 0.2]
     assert checks.known_keys("key", {"inner": 5}, ["inner", "outer"]) == {"inner": 5}
     assert checks.known_keys("key", None, ["inner"]) == {}
-
-
-@dataclass
-class Section:
-    """Settings of each kind of type."""
-
-    time: str = "1s"
-    places: list[float] | None = None
-    on: bool = True
-
-
-def test_numbers_and_arrays_become_the_types_that_the_fields_declare():
-    section = Section(2, np.array([1.0, 2.0]))  # type: ignore[arg-type]
-    checks.convert_types("section", section)
-    assert section == Section("2", [1.0, 2.0])
-    with pytest.raises(InputError, match=r"^section\.on: yes is not true or false$"):
-        checks.convert_types("section", Section(on="yes"))  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ def run(tmp_path, monkeypatch) -> Callable[..., Path]:
     monkeypatch.chdir(tmp_path)
 
     def run_recipe(*overrides: str, folder: str = "run") -> Path:
-        monkeypatch.setattr(sys, "argv", ["train.py", *overrides, f"hydra.run.dir={folder}"])
+        monkeypatch.setattr(sys, "argv", ["damian train", *overrides, f"hydra.run.dir={folder}"])
         main()
         return tmp_path / folder
 

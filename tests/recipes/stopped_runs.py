@@ -52,6 +52,20 @@ def killed_after(rows: int) -> Iterator[None]:
             yield
 
 
+@contextmanager
+def counted_updates() -> Iterator[list[int]]:
+    """Count the updates that the run inside logs itself, without those of its checkpoint."""
+    add, count = MetricsLog.add, [0]
+
+    def add_and_count(log: MetricsLog, frames: int, numbers: dict[str, float]) -> None:
+        count[0] += 1
+        add(log, frames, numbers)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MetricsLog, "add", add_and_count)
+        yield count
+
+
 def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
     """Start the recipe with words in a forked child, which needs no second for imports; returns its id."""
     child = os.fork()

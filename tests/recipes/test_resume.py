@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stopped_runs import SAC, TINY, check_equal, ended, files, forked, killed_after
+from stopped_runs import SAC, TINY, check_equal, counted_updates, ended, files, forked, killed_after
 
 from damian.runs import replay_memory
 
@@ -53,8 +53,12 @@ def test_a_run_that_was_stopped_twice_equals_one_that_never_was(run, case, monke
         run(*words, folder="other")
     with killed_after(7):
         run("resume=other", folder="unused")
-    other = run("resume=other", folder="unused").with_name("other")
+    with counted_updates() as updates:
+        other = run("resume=other", folder="unused").with_name("other")
     check_equal(whole, other)
+    assert (
+        updates[0] <= len((whole / "metrics.csv").read_text().splitlines()) - 1 - 6
+    )  # 6 were in the checkpoint
     has_memory = case in ("recurrent", "sac", "sac bursts", "everything", "predictive")
     assert any(name.startswith("replay/") for name in files(whole)) == has_memory
 
