@@ -27,7 +27,7 @@ SCRIPTED = (RANDOM, SCRIPT)
 """Policies that fly the same episodes beside each arm, and learn nothing."""
 OF_ARM = (TRAINED, TRAINED_DETERMINISTIC, UNTRAINED, UNTRAINED_DETERMINISTIC)
 """Policies of an arm: its network after the training and before the first update."""
-UNTRAINED_OF = dict(zip(OF_ARM[:2], OF_ARM[2:], strict=True))
+UNTRAINED_OF: dict[str, str] = dict(zip(OF_ARM[:2], OF_ARM[2:], strict=True))
 """The policy of an untrained arm that stands for the trained one of other arms."""
 ALL_MESSAGES = "all messages"
 KNOWN_ON_TIME = {
