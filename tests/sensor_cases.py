@@ -58,42 +58,6 @@ def calm(features: dict[str, Tensor], counters: Counters) -> Tensor:
     return features["sensor_cases:gust_felt"].sum(-1) + features["sensor_cases:widest_gap"]
 
 
-@reward_term(reads=["sensor_cases:gust_felt"])
-def unsummed(features: dict[str, Tensor], counters: Counters) -> Tensor:
-    """A mistake: two values for each UAV."""
-    return features["sensor_cases:gust_felt"]
-
-
-@feature("local", width=2)
-def single(cache: FeatureCache) -> Tensor:
-    """A mistake: one value for each UAV, not two."""
-    return cache.messages.track
-
-
-@feature("local")
-def unbatched(cache: FeatureCache) -> Tensor:
-    """A mistake: the values of the first world for all."""
-    return cache.messages.track[0]
-
-
-@feature("global", width=None)
-def flat(cache: FeatureCache) -> Tensor:
-    """A mistake: no last dimension."""
-    return cache.messages.track
-
-
-@feature("local")
-def smelt(cache: FeatureCache) -> Tensor:
-    """A mistake: there is no such sensor."""
-    return cache.reading("odour")
-
-
-@sensor(width=3)
-def three(state: State, world: Simulation) -> Tensor:
-    """A mistake: one value for each UAV, not three."""
-    return state.battery
-
-
 def readings_of(env: UavEnv, strength: float = 2.0) -> Tensor:
     """What a UAV on the ground reads in the current state, by a loop over worlds and UAVs, [B, N, 3]."""
     state, rows = env.state, []

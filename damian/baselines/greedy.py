@@ -37,8 +37,7 @@ WORTH = 0.3
 """A UAV does not fly where it detects the source with less than this share of the highest probability, but as
 near to the best landing point as it can."""
 MAX_PAIRS = 400_000_000
-"""Most pairs of landing points: the script weighs each of them against every other one of its region. A
-training leaves the script out of its results instead of running out of memory at its end."""
+"""Most pairs of landing points: the script weighs each of them against every other one of its region."""
 
 
 def greedy_policy(env: DelayedEnv) -> TensorDictModule:
@@ -46,9 +45,6 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
 
     It is stateless and deterministic: equal messages give equal actions. It writes ``("agents", "action")``
     [B, N], or [B, N, 2] if actions are continuous. The environment must have ``message`` among its extras.
-
-    Raises:
-        InputError: there are more than ``MAX_PAIRS`` pairs of landing points.
     """
     n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
     shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
@@ -106,11 +102,8 @@ class Greedy:
     def choose(self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None) -> Tensor:
         """Actions that lead to the landing points of most gain, [B, N] or, if continuous, [B, N, 2].
 
-        Args:
-            held: messages [B, N], whose targets are where the UAVs begin.
-            gain: what is won on each landing point, [B, N, L].
-            region: index of the region, [B].
-            mask: legal discrete actions, [B, N, A]; all if not given.
+        The UAVs begin at the targets of the messages ``held`` [B, N]; ``gain`` is won on each landing point,
+        [B, N, L].
         """
         ground = self.points[region]
         gain = gain.where(self.real[region].unsqueeze(1), -torch.inf)
@@ -124,15 +117,7 @@ class Greedy:
         return self.best_move(held, gain, flown, left, ground)
 
     def fresh(self, held: Messages, ground: Tensor) -> Tensor:
-        """Which landing points are nearest to the UAV and outside its latest footprints.
-
-        Args:
-            held: messages [B, N].
-            ground: landing points of each world's region, east, north [m], [B, L, 2].
-
-        Returns:
-            1 where both hold, else 0, [B, N, L].
-        """
+        """1 for landing points [B, L, 2] nearest to the UAV and outside its latest footprints, [B, N, L]."""
         distance = _distances(held.target, ground)
         own = distance <= distance.amin(1, keepdim=True)
         from_trail = _distances(gather_rows(self.points.flatten(0, 1), held.trail), ground.unsqueeze(1))
@@ -168,13 +153,10 @@ class Greedy:
         return (log - log.amax(-1, keepdim=True)).exp(), moved <= RECENT * self.radius
 
     def best_action(self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
-        """The best legal discrete action, [B, N].
+        """The best legal discrete action of UAVs that stand on points of these flat ids, [B, N].
 
-        Args:
-            standing: flat ids of the landing points on which the UAVs stand or will land, [B, N].
-            gain: weight in the footprint of each landing point, [B, N, L].
-            left: distance from each landing point to the best one [m], [B, N, L].
-            mask: legal actions, [B, N, A]; all if not given.
+        ``gain`` and ``left`` are the weight in the footprint of each landing point, and its distance to the
+        best one [m], [B, N, L].
         """
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = standing.unsqueeze(-1) * len(action) + action
@@ -185,12 +167,8 @@ class Greedy:
     def best_move(self, held: Messages, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor) -> Tensor:
         """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2].
 
-        Args:
-            held: messages [B, N].
-            gain: weight in the footprint of each landing point, [B, N, L].
-            flown: distance to each landing point [m], [B, N, L].
-            left: distance from each landing point to the best one [m], [B, N, L].
-            ground: landing points of each world's region, east, north [m], [B, L, 2].
+        ``gain`` and ``left`` are as for ``best_action``, ``flown`` is the distance to each landing point of
+        ``ground`` [m], [B, N, L].
         """
         best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
         east, north = (_places_at(ground, best) - held.target).unbind(-1)
@@ -200,15 +178,7 @@ class Greedy:
 
 
 def _best(gain: Tensor, flown: Tensor, left: Tensor) -> Tensor:
-    """Index of the choice with the largest gain, the nearest of equals, [B, N].
-
-    If no choice gains anything, it is the choice that leaves the shortest distance to the goal.
-
-    Args:
-        gain: weight that each choice gains, -inf if the choice is not allowed, [B, N, C].
-        flown: distance to each choice [m], [B, N, C].
-        left: distance from each choice to the goal, the best landing point of all [m], [B, N, C].
-    """
+    """Index of the choice of most gain, the nearest of equals, or nearest the goal if none gains, [B, N]."""
     gains = gain.amax(-1, keepdim=True) > _LEAST_GAIN
     return torch.where(gains, gain - _FLIGHT_COST * flown, -left.where(gain.isfinite(), torch.inf)).argmax(-1)
 

@@ -13,28 +13,14 @@ DELAYED = ("obs", "act", "rew")
 
 
 def delay_law(delay: DelayConfig, name: str) -> Law:
-    """The law of ``act``, of ``rew``, or of ``obs`` with ``hold`` applied; it is parsed once.
-
-    Raises:
-        InputError: there is no such law, or it has no such parameter.
-    """
-    laws: dict[str, Law] = vars(delay).setdefault("_laws", {})
-    if name not in laws:
-        law = law_of(getattr(delay, name), f"delay.{name}")
-        laws[name] = Held(law) if name == "obs" and delay.hold == "max" else law
-    return laws[name]
+    """The law of ``act``, of ``rew``, or of ``obs`` with ``hold`` applied."""
+    law = law_of(getattr(delay, name), f"delay.{name}")
+    return Held(law) if name == "obs" and delay.hold == "max" else law
 
 
 def delay_sampler(delay: DelayConfig, name: str, dt: float) -> Sampler:
-    """The sampler of this law for steps of ``dt`` seconds, without the losses of ``loss``; it is built once.
-
-    Raises:
-        InputError: a parameter of the law is invalid.
-    """
-    samplers: dict[tuple[str, float], Sampler] = vars(delay).setdefault("_samplers", {})
-    if (name, dt) not in samplers:
-        samplers[name, dt] = sampler_of(delay_law(delay, name), dt, key=f"delay.{name}")
-    return samplers[name, dt]
+    """The sampler of this law for steps of ``dt`` seconds, without the losses of ``loss``."""
+    return sampler_of(delay_law(delay, name), dt, key=f"delay.{name}")
 
 
 def delay_reads(delay: DelayConfig, dt: float) -> set[str]:
@@ -43,11 +29,7 @@ def delay_reads(delay: DelayConfig, dt: float) -> set[str]:
 
 
 def check_laws(delay: DelayConfig, dt: float) -> None:
-    """Check that every law is valid for steps of ``dt`` seconds.
-
-    Raises:
-        InputError: a law is invalid or reads what there is not, or the reward delay loses rewards.
-    """
+    """Check that every law is valid for steps of ``dt`` seconds."""
     for name in DELAYED:
         for read in delay_sampler(delay, name, dt).reads:
             problem = f"reads {read}, but a law can read only {', '.join(CONTEXT_KEYS)}"

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.errors import InputError, naming_errors
+from damian.common.errors import InputError
 from damian.common.registry import Registry
 from damian.common.text_files import named, parse_table, read_text
 from damian.delays.samplers import (
@@ -30,12 +30,11 @@ from damian.delays.samplers import (
     Recorded,
     Sampler,
 )
+from damian.settings.delays import LONGEST
+from damian.settings.fields import rules, setting
 
 Delay = int | str
 """Whole steps (``3``), or a time with its unit (``"3s"``)."""
-
-LONGEST = 10_000
-"""Longest delay allowed [steps], because every message in transit takes memory."""
 
 LOSES = "loses messages, but no reward may be lost"
 
@@ -45,10 +44,7 @@ LOST = "lost"
 
 @dataclass(frozen=True)
 class Law(ABC):
-    """Distribution of message delays.
-
-    A delay may depend on the circumstances under which the message is sent (``ContextSampler``).
-    """
+    """Distribution of message delays; bounds of its parameters may stand in its fields (``setting``)."""
 
     @abstractmethod
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
@@ -58,39 +54,24 @@ class Law(ABC):
             dt: length of a step [s].
             loss: probability that a message is lost, whatever its delay.
             key: config key of the law, for error messages.
-
-        Raises:
-            InputError: a parameter of the law is invalid.
         """
 
 
-def law_name(law: Law) -> str:
-    """The path of a law's class, such as ``lab:Satellite``, for errors."""
-    return f"{type(law).__module__}:{type(law).__qualname__}"
-
-
 def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-    """Build the sampler of a law, or of what ``law_of`` takes; the arguments are those of ``Law.sampler``.
-
-    Raises:
-        InputError: a parameter is invalid, or a law of the user's own raises an error or returns no
-            ``Sampler``.
-    """
+    """Build the sampler of a law, or of what ``law_of`` takes; the arguments are those of ``Law.sampler``."""
     checks.above("dt", dt, 0.0, "s")
     law = law_of(written, key)
-    with naming_errors(f"{key}: law {law_name(law)}"):
-        sampler = law.sampler(dt, loss, key)
-    should = f"of sampler(dt, loss, key) of the law {law_name(law)} is no Sampler"
-    checks.require(isinstance(sampler, Sampler), key, f"the {type(sampler).__name__}", should)
-    return sampler
+    for name, rule in rules(type(law)).items():
+        value = getattr(law, name)
+        if rule.above is not None and value != math.inf:  # an infinite speed or range is meant so
+            checks.above(f"{key}.{name}", value, rule.above, rule.unit)
+        if rule.low is not None:
+            checks.in_range(f"{key}.{name}", value, rule.low, rule.high, rule.unit)
+    return law.sampler(dt, loss, key)
 
 
 def in_steps(key: str, delay: Delay, dt: float) -> int:
-    """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up.
-
-    Raises:
-        InputError: the delay is neither steps nor a time, or longer than ``LONGEST``.
-    """
+    """Convert a delay to whole steps of ``dt`` seconds; a time is rounded up."""
     if isinstance(delay, str):
         steps = math.ceil(_seconds(key, delay) / dt - 1e-9)
     else:
@@ -132,7 +113,7 @@ class Constant(Law):
     """Delay: steps, or a time."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return Sampler([_only(in_steps(key, self.delay, dt))], loss=loss)
+        return Sampler([[0.0] * in_steps(key, self.delay, dt) + [1.0]], loss=loss)
 
 
 @LAWS.register("uniform")
@@ -151,11 +132,10 @@ class Uniform(Law):
     """Shortest delay: steps, or a time."""
     high: Delay = 0
     """Longest delay, written as ``low`` is."""
-    probability: float = 1.0
+    probability: float = setting(1.0, low=0, high=1)
     """Probability that a message is late at all."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        checks.in_range(f"{key}.probability", self.probability, 0.0, 1.0)
         low, high = in_steps(f"{key}.low", self.low, dt), in_steps(f"{key}.high", self.high, dt)
         in_time = isinstance(self.low, str), isinstance(self.high, str)
         if all(in_time):
@@ -204,29 +184,25 @@ class Burst(Law):
     good from t = 2 on: messages sent at t = 0, 1 and 2 arrive at t = 3, 4 and 2.
     """
 
-    enter: float = 0.05
+    enter: float = setting(0.05, low=0, high=1)
     """Probability that a good channel turns bad, per step."""
-    leave: float = 0.25
+    leave: float = setting(0.25, low=0, high=1)
     """Probability that a bad channel turns good, per step."""
     good: Any = 0
     """Law of the delays while the channel is good; it must be memoryless."""
     bad: Any = 5
     """Law of the delays while the channel is bad; it must be memoryless."""
-    good_loss: float = 0.0
+    good_loss: float = setting(0.0, low=0, high=1)
     """Probability that a message is lost while the channel is good."""
-    bad_loss: float = 0.5
+    bad_loss: float = setting(0.5, low=0, high=1)
     """Probability that a message is lost while the channel is bad."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        for name in ("enter", "leave", "good_loss", "bad_loss"):
-            checks.in_range(f"{key}.{name}", getattr(self, name), 0.0, 1.0)
         checks.above(f"{key}.enter + leave", self.enter + self.leave, 0.0)
-        states = []
-        for name in ("good", "bad"):
-            inner_loss = getattr(self, f"{name}_loss")
-            states.append(_memoryless("burst", getattr(self, name), dt, inner_loss, f"{key}.{name}"))
+        good = _memoryless(self.good, dt, self.good_loss, f"{key}.good")
+        bad = _memoryless(self.bad, dt, self.bad_loss, f"{key}.bad")
         transitions = [[1 - self.enter, self.enter], [self.leave, 1 - self.leave]]
-        return Sampler(states, transitions, loss)
+        return Sampler([good, bad], transitions, loss)
 
 
 @LAWS.register("trace")
@@ -245,8 +221,7 @@ class Trace(Law):
         checks.require(bool(self.path), f"{key}.path", "it", "is missing: the file with the delays")
         with named(str(self.path)):
             rows = parse_table(read_text(Path(str(self.path))), ["delay"])
-            if not rows:
-                raise InputError("line 2: there is no delay under the header")
+            checks.require(bool(rows), "delay", "the column", "is empty")
             written = {f"line {row.line}: delay": row.cells["delay"] for row in rows}
             delays = [-1 if d == LOST else in_steps(at, _number(d), dt) for at, d in written.items()]
         return Recorded(delays, loss)
@@ -268,7 +243,7 @@ class Lag(Law):
     """Law from which the lags are drawn; it must be memoryless."""
     update_period: Delay = 1
     """Time between two draws: steps, a time, or ``episode``: a lag is held until the end of the episode."""
-    hold_probability: float = 0.0
+    hold_probability: float = setting(0.0, low=0, high=1)
     """Probability that an update keeps the lag instead of drawing another one."""
     shared: bool = False
     """All agents of a world have the same lags and losses."""
@@ -277,23 +252,16 @@ class Lag(Law):
     all update in the same step."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        checks.in_range(f"{key}.hold_probability", self.hold_probability, 0.0, 1.0)
-        key_of_period, period = f"{key}.update_period", None
+        period, draws_again = None, bool(self.hold_probability) or self.stagger
         if self.update_period == "episode":
-            idle = "hold_probability" if self.hold_probability else "stagger"
-            should = "has no effect with update_period=episode, which draws one lag per episode"
-            checks.require(not getattr(self, idle), f"{key}.{idle}", getattr(self, idle), should)
+            problem = "draws one lag: hold_probability and stagger have no effect"
+            checks.require(not draws_again, f"{key}.update_period", "episode", problem)
         else:
-            period = in_steps(key_of_period, self.update_period, dt)
-            checks.require(period > 0, key_of_period, self.update_period, "is not above 0; or write episode")
-        return LagSampler(
-            _memoryless("lag", self.lag, dt, 0.0, f"{key}.lag"),
-            loss,
-            period=period,
-            hold_probability=self.hold_probability,
-            shared=self.shared,
-            stagger=self.stagger,
-        )
+            period = in_steps(f"{key}.update_period", self.update_period, dt)
+            problem = "is not above 0; or write episode"
+            checks.require(period > 0, f"{key}.update_period", self.update_period, problem)
+        lags = _memoryless(self.lag, dt, 0.0, f"{key}.lag")
+        return LagSampler(self, lags, loss, period)
 
 
 @LAWS.register("distance")
@@ -313,13 +281,13 @@ class Distance(Law):
 
     base: Delay = 0
     """Delay at distance 0, of processing and transmission: steps, or a time."""
-    speed: float = math.inf
+    speed: float = setting(math.inf, above=0, unit="m/s")
     """Propagation speed [m/s]."""
-    range: float = math.inf
+    range: float = setting(math.inf, above=0, unit="m")
     """Distance at which half of the messages are lost [m]."""
-    path_loss_exponent: float = 2.0
+    path_loss_exponent: float = setting(2.0, above=0)
     """Exponent n of the path loss; 2 in free space, 3 to 5 in cities."""
-    shadowing: float = 6.0
+    shadowing: float = setting(6.0, above=0, unit="dB")
     """Standard deviation sigma of the path loss around its mean [dB]; a small one makes the range sharp."""
     receiver: Any = (0.0, 0.0)
     """Place of the receiver, east and north [m], if messages have no ``receiver_position``."""
@@ -327,25 +295,13 @@ class Distance(Law):
     """Longest delay, to which longer ones are cut: steps, or a time."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        for name, unit in (("speed", "m/s"), ("range", "m")):
-            value = getattr(self, name)
-            if value != math.inf:  # an infinite speed or range is meant so
-                checks.above(f"{key}.{name}", value, 0.0, unit)
-        checks.above(f"{key}.path_loss_exponent", self.path_loss_exponent, 0.0)
-        checks.above(f"{key}.shadowing", self.shadowing, 0.0, "dB")
         checks.place(f"{key}.receiver", self.receiver)
         longest = in_steps(f"{key}.longest", self.longest, dt)
-        should = f"is longer than longest={self.longest}"
-        checks.require(in_steps(f"{key}.base", self.base, dt) <= longest, f"{key}.base", self.base, should)
+        in_steps(f"{key}.base", self.base, dt)  # refuses what is no delay
         base = _seconds(f"{key}.base", self.base) / dt if isinstance(self.base, str) else self.base
-        return ContextSampler(
-            partial(self.delays, base),
-            longest,
-            loss,
-            loses=math.isfinite(self.range),
-            reads=["position"],
-            optional_reads=["receiver_position"],
-        )
+        loses, compute = math.isfinite(self.range), partial(self.delays, base)
+        reads = {"reads": ["position"], "optional_reads": ["receiver_position"]}
+        return ContextSampler(compute, longest, loss, loses=loses, **reads)
 
     def delays(self, base: float, context: MessageContext) -> Tensor:
         """Delay of each of M messages [steps], [M], -1 if it is lost; ``base`` is in steps, too."""
@@ -393,24 +349,17 @@ def law_of(written: Any, key: str = "delay") -> Law:
         return Constant(_number(written))
     kind = written.get("law")
     law = LAWS.get(kind, f"{key}.law")
-    values = {name: _plain(value) for name, value in written.items() if name != "law"}
+    values = {name: _number(value) for name, value in written.items() if name != "law"}
     names = [field.name for field in fields(law)]
     for name, value in values.items():
         should = f"is no setting of the law {kind}, which has {', '.join(names) or 'none'}"
         checks.require(name in names, f"{key}.{name}", value, should)
-    with naming_errors(f"{key}: law {kind}"):
-        return law(**values)
+    return law(**values)
 
 
-def _memoryless(user: str, written: Any, dt: float, loss: float, key: str) -> list[float]:
-    """Probabilities of the delays 0, 1, ... of a law that another law, the user, draws from.
-
-    Raises:
-        InputError: it is no law, or one with memory or context.
-    """
+def _memoryless(written: Any, dt: float, loss: float, key: str) -> list[float]:
+    """Probabilities of the delays 0, 1, ... of a law from which another law draws."""
     inner = sampler_of(written, dt, loss, key)
-    should = f"depends on the context of the message, which a {user} does not know"
-    checks.require(not inner.sees_context, key, written, should)
     checks.require(inner.memoryless, key, written, "is not a memoryless law")
     return inner.chances[0].tolist()[:-1]
 
@@ -420,22 +369,11 @@ def _number(written: Any) -> Any:
     return int(written) if isinstance(written, str) and written.strip().isdecimal() else written
 
 
-def _plain(written: Any) -> Any:
-    """Convert the strings of digits in a setting, and any kind of list to a ``list``."""
-    is_list = isinstance(written, Sequence) and not isinstance(written, str)
-    return [_plain(value) for value in written] if is_list else _number(written)
-
-
-def _only(steps: int) -> list[float]:
-    """Probabilities of 0, 1, ... steps if there is only one delay."""
-    return [0.0] * steps + [1.0]
-
-
 def _rounded_up(low: float, high: float) -> list[float]:
     """Probabilities of 0, 1, ... steps for a time uniform in [low, high] steps and rounded up."""
     last = math.ceil(high - 1e-9)
     if high - low < 1e-9:
-        return _only(last)
+        return [0.0] * last + [1.0]
     return [max(0.0, min(k, high) - max(k - 1, low)) / (high - low) for k in range(last + 1)]
 
 
@@ -451,9 +389,6 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
         loss: probability that a message is lost, or an N x N nested list or tensor of it.
         dt: length of a step [s].
         key: name of the delay, for errors.
-
-    Raises:
-        InputError: a law or a probability is invalid, or the two are of different sizes.
     """
     n = same_size({key: delay, "loss": loss})
     if n is None:
@@ -469,29 +404,14 @@ def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> 
             distinct.append(law)
             samplers.append(sampler_of(law, dt, key=name))
         index.append(distinct.index(law))
-    check_losses("loss", loss)
     losses = torch.as_tensor(loss, dtype=torch.float64).expand(n, n)
+    for probability in losses.flatten().tolist():
+        checks.in_range("loss", probability, 0.0, 1.0)
     return LinkSampler(samplers, torch.tensor(index), losses.flatten().clone())
 
 
-def check_losses(key: str, loss: Any) -> None:
-    """Require a probability, or a nested list or tensor of one for each link.
-
-    Raises:
-        InputError: one is not between 0 and 1.
-    """
-    written: Any = loss.tolist() if isinstance(loss, Tensor) else loss
-    for row in written if is_matrix(written) else [[written]]:
-        for probability in row:
-            checks.in_range(key, probability, 0.0, 1.0)
-
-
 def same_size(settings: Mapping[str, Any]) -> int | None:
-    """The number N of agents of those settings that are N x N, by name; None if none is.
-
-    Raises:
-        InputError: one is not square, or they are of different sizes.
-    """
+    """The number N of agents of those settings that are N x N, by name; None if none is."""
     sizes = {}
     for key, matrix in settings.items():
         if is_matrix(matrix):

@@ -185,9 +185,6 @@ class BroadcastLine:
       delay plus 1, and ``held_i``: contents of the message that each link's receiver holds, [L, ...]; zeros
       before a message has arrived.
 
-    Steps and resets are pure functions of the memory, except that ``write`` and ``step`` write the ring and
-    the times of generation in place.
-
     Args:
         sampler: draws the delays.
     """

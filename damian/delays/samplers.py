@@ -5,24 +5,19 @@ delays alone as in a batch.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 
 from damian.common import checks, counter_rng
-from damian.common.errors import InputError
 
 _LOSS_DRAW, _HOLD_DRAW, _PHASE_DRAW, _LINK_LOSS_DRAW = 0, 1, 2, 3
 """Counters that tell the further draws of a message from the draw of its delay."""
 
 
 class MessageContext(NamedTuple):
-    """Circumstances of M messages at the instant at which they are sent; nothing in it lies in the future.
-
-    Fields: ``sender``, ``receiver`` and ``n_sending`` [M] long, ``time`` [s], [M], ``uniform`` [M] in [0, 1),
-    ``dt`` [s], and ``entries``, a dict of what the law reads, such as ``position`` [m], [M, 2].
-    """
+    """Circumstances of M messages at the instant at which they are sent; nothing in it lies in the future."""
 
     sender: Tensor
     """Index of the sender among the agents of its world, [M] long; 0 if a world has one agent."""
@@ -52,9 +47,6 @@ class Sampler(nn.Module):
         transitions: probabilities of the transitions between the channel states per step, [S, S]; there is
             one state if they are not given.
         loss: probability that a message is lost, whatever its delay.
-
-    Raises:
-        InputError: a probability is not within 0 and 1, or the delays have more than 1 in all.
     """
 
     sees_context: bool = False
@@ -74,10 +66,6 @@ class Sampler(nn.Module):
         super().__init__()
         checks.in_range("loss", loss, 0.0, 1.0)
         self.longest = max(map(len, states)) - 1
-        for chances in states:
-            proper = sum(chances) <= 1 + 1e-6 and all(chance >= 0 for chance in chances)
-            should = "are not at least 0 and at most 1 in all"
-            checks.require(proper, "chances of the delays", chances, should)
         arrive = torch.zeros(len(states), self.longest + 1, dtype=torch.float64)
         for row, chances in zip(arrive, states, strict=True):
             row[: len(chances)] = torch.tensor(chances, dtype=torch.float64) * (1 - loss)
@@ -213,29 +201,20 @@ class LagSampler(Sampler):
     of steps that it is still held.
 
     Args:
+        law: the law ``Lag``, whose ``hold_probability``, ``shared`` and ``stagger`` are read.
         chances: probabilities of the lags 0, 1, ... [steps]; if they sum to less than 1, the rest is the
             probability that a message is lost.
         loss: probability that a message is lost in addition, whatever its delay.
         period: steps between two updates; None: one lag per episode.
-        hold_probability, shared, stagger: as in the law ``Lag``.
     """
 
-    def __init__(
-        self,
-        chances: list[float],
-        loss: float,
-        *,
-        period: int | None,
-        hold_probability: float,
-        shared: bool,
-        stagger: bool,
-    ) -> None:
+    def __init__(self, law: Any, chances: list[float], loss: float, period: int | None) -> None:
         super().__init__([chances], loss=loss)
         arrives = sum(chances)
         self._lags = Sampler([[chance / arrives for chance in chances]] if arrives else [[1.0]])
         self._loss = self.chances[0, -1].item() if self.loses else 0.0
-        self._period, self._hold_probability = period or _NEVER, hold_probability
-        self.same_draws_for_all_agents, self._stagger = shared, stagger
+        self._period, self._hold_probability = period or _NEVER, law.hold_probability
+        self.same_draws_for_all_agents, self._stagger = law.shared, law.stagger
 
     def initial_state(self, streams: Tensor) -> Tensor:
         return torch.stack([torch.full_like(streams, -1), torch.zeros_like(streams)], -1)
@@ -277,20 +256,16 @@ class ContextSampler(Sampler):
     the message arrives at t = 3. For a message sent at t = 1 it returns -1: the message never arrives.
 
     Args:
-        delay_fn: pure function of a ``MessageContext`` that returns the delays [steps], [M]; they are rounded
-            up and cut to ``longest``, and a message of negative delay is lost. So that rounding errors cost
-            no step, 1e-5 steps (or of a longer delay, its share 1e-5) are taken from a delay that is a float
-            before it is rounded up. A method of the law can be pickled, as worker processes need; it must
-            have no branches on data.
+        delay_fn: pure function of a ``MessageContext``, without branches on data, that returns the delays
+            [steps], [M]; they are rounded up (less a share of 1e-5 for rounding errors) and cut to
+            ``longest``, and a message of negative delay is lost. A method of the law can be pickled, as
+            worker processes need.
         longest: longest delay [steps].
         loss: probability that a message is lost, whatever its delay.
         loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, so that the
             sampler can delay rewards, none of which may be lost.
         reads: names of the entries that ``delay_fn`` reads, such as ``position``.
         optional_reads: names of the entries that it reads if the transform has a key for them.
-
-    Raises:
-        InputError: an argument is invalid, or ``delay_fn`` does not return one number for each message.
 
     Examples:
         >>> ContextSampler(lambda context: context.n_sending // 4, longest=5, loses=False)
@@ -306,8 +281,6 @@ class ContextSampler(Sampler):
         reads: Sequence[str] = (),
         optional_reads: Sequence[str] = (),
     ) -> None:
-        checks.whole("longest", longest, 0, unit="steps")
-        checks.require(not isinstance(reads, str), "reads", reads, "is not a list of names")
         # The table holds the worst case, because the true chances depend on the contexts: it serves only to
         # tell the longest delay, and whether messages can be lost.
         super().__init__([[0.0] * longest + [float(not loses)]], loss=loss)
@@ -318,14 +291,7 @@ class ContextSampler(Sampler):
     def forward(
         self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
-        if context is None:
-            raise ValueError("context: it is missing, but the delays of a ContextSampler depend on it")
-        delay = self._delay_fn(context)
-        # Another shape would be broadcast without a word.
-        if not isinstance(delay, Tensor) or delay.shape != streams.shape or delay.dtype == torch.bool:
-            found = f"{delay.dtype} {[*delay.shape]}" if isinstance(delay, Tensor) else repr(delay)
-            name = getattr(self._delay_fn, "__qualname__", type(self._delay_fn).__name__)
-            raise InputError(f"{name}: {found} is not one number of steps per message, {[*streams.shape]}")
+        delay = self._delay_fn(cast(MessageContext, context)).view_as(streams)
         arrives = delay >= 0  # false for nan too
         steps = torch.where(arrives, delay, 0)
         if steps.dtype.is_floating_point:  # 21.000002 steps are 21

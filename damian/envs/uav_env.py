@@ -103,7 +103,7 @@ class UavEnv(EnvBase):
         known = messages_only or self.server.grid is None
         checks.require(known, "observation.belief", self.server.observation.belief, problem)
         initial = self.simulation.initial
-        features = self.server.checked_features(initial.sent, initial.steps)
+        features = self.server.features(initial.sent, initial.steps)
         self.action_columns = self.server.action_columns(features)
         """Columns of the actors' observations with a value for each action; None if there are none."""
         self._reset_outputs = self._outputs_at_reset(initial, features)

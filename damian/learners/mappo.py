@@ -51,7 +51,6 @@ class Mappo:
     """
 
     loss_keys: Sequence[NestedKey] = LOSS_KEYS
-    """Entries of a step that the loss reads, beside the critic's observation."""
 
     def __init__(
         self, env: EnvBase, config: MappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None = None
@@ -76,9 +75,8 @@ class Mappo:
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Make one update from a batch [B, T].
 
-        Returns:
-            what ``optimize`` returns, ``explained_variance`` of the critic before the update, and with a
-            replay buffer the share of ``backupdated`` messages.
+        It logs what ``optimize`` returns, the critic's ``explained_variance`` before the update, and with a
+        replay buffer the share of ``backupdated`` messages.
         """
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
@@ -110,11 +108,9 @@ class Mappo:
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
         """Make ``epochs`` passes over a batch [B, T] with advantages.
 
-        Minibatches are drawn over steps; for a recurrent actor, over worlds with their whole sequences.
-
-        Returns:
-            means over all minibatches of ``LOSSES``, ``NUMBERS`` and the norm of the gradient before it is
-            scaled down, ``gradient_norm``.
+        Minibatches are drawn over steps; for a recurrent actor, over worlds with their whole sequences. It
+        returns means over all minibatches of ``LOSSES``, ``NUMBERS`` and the norm of the gradient before it
+        is scaled down, ``gradient_norm``.
         """
         terms = []
         for entries in self._minibatches(batch):
@@ -156,10 +152,9 @@ def mappo_losses(
     """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names, [3].
 
     The terms of the loss are the clipped objective of PPO and the entropy (Schulman et al. 2017), over
-    decisions, and the error of the critic, over all steps. The policy also outputs actions for UAVs in
-    flight, but these have no effect. The numbers are means over decisions, without gradients: an estimate of
-    the Kullback-Leibler divergence from the policy that collected the steps (ratio - 1 - log ratio, which is
-    never negative), the share of importance ratios beyond the clipping, and the entropy [nats].
+    decisions, and the error of the critic, over all steps. The numbers are means over decisions, without
+    gradients: an estimate of the Kullback-Leibler divergence from the policy that collected the steps
+    (ratio - 1 - log ratio), the share of importance ratios beyond the clipping, and the entropy [nats].
 
     Args:
         entries: what the networks read, and ``LOSS_KEYS``, by key. They are no TensorDict, so that a compiled
@@ -237,10 +232,7 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
 
 
 def explained_variance(batch: TensorDictBase) -> Tensor:
-    """Share of the variance of a batch's value targets that its values explain, []; nan if there is none.
-
-    It is 1 for a perfect critic, and 0 for one that is no better than a constant.
-    """
+    """Share of the variance of a batch's value targets that its values explain, []; nan if there is none."""
     target = batch[keys.VALUE_TARGET].double()
     variance, left = target.var(correction=0), (target - batch[keys.STATE_VALUE]).var(correction=0)
     return torch.where(variance > 0, 1 - left / variance, torch.nan)

@@ -36,10 +36,7 @@ _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU
 def make_mlp(
     config: ModelConfig, n_in: int, n_out: int, device: torch.device | None, gain: float = 1.0
 ) -> MLP:
-    """Make a multilayer perceptron from features [*, n_in] to outputs [*, n_out].
-
-    ``gain`` is that of the output layer; it counts for an orthogonal initialisation only.
-    """
+    """Make a multilayer perceptron; ``gain`` is that of the output layer, if ``init`` is orthogonal."""
     activation = _ACTIVATIONS[config.activation]
     network = MLP(n_in, n_out, num_cells=config.hidden, activation_class=activation, device=device)
     return initialized(config, network, gain)
@@ -75,13 +72,9 @@ def initialized(config: ModelConfig, network: Network, gain: float) -> Network:
 
 
 class LegalCategorical(Distribution):
-    """Categorical distribution over the legal actions.
+    """Categorical distribution over the legal actions ``mask`` [*, A] bool (all if None), of logits [*, A].
 
     TorchRL's ``MaskedCategorical`` is the same, but its log-probability and entropy take four times as long.
-
-    Args:
-        logits: unnormalised log-probabilities, [*, A].
-        mask: legal actions, [*, A] bool; None if all are.
     """
 
     def __init__(self, logits: Tensor, mask: Tensor | None = None) -> None:
@@ -91,7 +84,6 @@ class LegalCategorical(Distribution):
 
     @property
     def arg_constraints(self) -> dict[str, Any]:
-        """None: arguments are not checked, which takes time."""
         return {}
 
     @property
@@ -186,11 +178,8 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
 class SkipConnection(nn.Module):
     """Logits that are the outputs of a network plus, times a learnt weight, the logarithm of a probability.
 
-    The policy begins as one that prefers actions of high probability, however small all of them are.
-
-    Args:
-        network: from its input to outputs [*, A], whose last layer begins with zeros.
-        columns: of the observation, which hold a probability for each action.
+    The policy begins as one that prefers actions of high probability, however small all of them are: the last
+    layer begins with zeros. ``columns`` of the observation hold a probability for each action.
     """
 
     def __init__(self, network: nn.Module, columns: slice) -> None:
@@ -229,17 +218,13 @@ def make_critic(
 
 
 class SharedValue(nn.Module):
-    """One value for all UAVs of a world, from the observations of all of them.
-
-    Args:
-        network: from the features of all UAVs [*, N G] to a value [*, 1].
-    """
+    """One value for all UAVs of a world, from the features of all of them, [*, N G]."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Return the value of observations [*, N, G], the same for each UAV, [*, N, 1]."""
+        """The value of observations [*, N, G], the same for each UAV, [*, N, 1]."""
         value = self.network(observations.flatten(-2)).unsqueeze(-2)
         return value.expand(*observations.shape[:-1], 1)

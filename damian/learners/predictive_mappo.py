@@ -1,10 +1,9 @@
 """A learnt belief: MAPPO whose actor predicts, from the messages that have arrived, what arrives later.
 
-Under delay a receiver holds a set of messages with ages, of its own and of others, and its own latest
-actions. The actor asks this set questions, by attention: one for each action that it might choose. From the
-answers it predicts what the messages will have said when that action has ended, once they have arrived, and
-chooses. It learns to predict from the replay buffer, in which the late messages have arrived.
-Nothing here depends on what the messages mean.
+The actor asks the messages that a receiver holds questions, by attention: one for each action that it might
+choose. From the answers it predicts what the messages will have said when that action has ended, once they
+have arrived, and chooses. It learns to predict from the replay buffer, in which the late messages have
+arrived. Nothing here depends on what the messages mean.
 """
 
 from typing import Any, cast
@@ -28,9 +27,6 @@ from damian.learners.networks import POLICY_GAIN, ModelConfig, hidden_layers, ma
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.hindsight import arrived_by_now
 from damian.settings.learners import PredictiveMappoConfig
-
-_NEEDS = "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
-_CONSTANT = "needs a constant action delay (delay.act): it predicts what each action leads to, and when"
 
 
 class PredictiveMappo(Mappo):
@@ -63,9 +59,7 @@ class PredictiveMappo(Mappo):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Make one update of MAPPO from a batch [B, T], then ``prediction_steps`` of learning to predict.
 
-        Returns:
-            what ``Mappo.learn`` returns, and the mean ``prediction_error``: 1 for predictions that are no
-            better than the mean.
+        It also logs the mean ``prediction_error``: 1 for predictions that are no better than the mean.
         """
         # What is known after a step is what is known before the next one: it need not be stored twice.
         numbers = super().learn(batch.exclude(next_key(keys.HISTORY)))
@@ -74,11 +68,7 @@ class PredictiveMappo(Mappo):
         return {**numbers, "prediction_error": torch.stack(errors).mean().item()}
 
     def learn_prediction(self, last: Tensor) -> Tensor:
-        """Make one step of gradient descent on random steps of the replay buffer; the error before it, [].
-
-        Args:
-            last: what ``last_steps`` returns.
-        """
+        """Make one step of gradient descent on random steps of the replay buffer; the error before it, []."""
         before, target, counts = self.sample(last)
         self.head.norm.update(target, counts)
         wanted = self.head.norm.normalize(target)
@@ -96,9 +86,8 @@ class PredictiveMappo(Mappo):
     def last_steps(self) -> Tensor:
         """The last step of the action that each UAV has chosen, or carries on, in each stored step.
 
-        Returns:
-            index among the T stored steps in order of time, [T, B, N]; T if the action has not ended yet, or
-            was never executed.
+        It is an index among the T stored steps in order of time, [T, B, N]; T if the action has not ended
+        yet, or was never executed.
         """
         steps, rows = self.storage.steps, self.storage.latest()
         ready, reset = (cast(Tensor, steps[key])[rows] for key in (next_key(keys.READY), keys.RESET_AFTER))
@@ -106,9 +95,6 @@ class PredictiveMappo(Mappo):
 
     def sample(self, last: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
         """Draw K stored steps: what predictions are made from, what came after, and what of it counts.
-
-        Args:
-            last: what ``last_steps`` returns.
 
         Returns:
             observations, histories and actions of the steps, [K, N, ...]; the critic's observation when these
@@ -164,7 +150,6 @@ class MessageEncoder(nn.Module):
         config: the hidden layers follow the attention; the last one is the encoding.
         heads: number of queries for a code.
         width: size of the embedding of a message, E.
-        device: of the weights.
     """
 
     def __init__(
@@ -211,8 +196,7 @@ class MessageEncoder(nn.Module):
 
 
 def _linear_of_parts(layer: nn.Module, *parts: Tensor) -> Tensor:
-    """What a linear layer makes of features in several parts, [*, K] each, without copies of the ones that
-    are the same for all queries: their products are broadcast."""
+    """What a linear layer makes of features in several parts, [*, K] each, broadcast without copies."""
     weights = cast(nn.Linear, layer).weight.split([part.shape[-1] for part in parts], -1)
     return sum((part @ w.T for part, w in zip(parts, weights, strict=True)), cast(nn.Linear, layer).bias)
 
@@ -224,12 +208,7 @@ def _apply(layers: list[nn.Module], features: Tensor) -> Tensor:
 
 
 class TargetScale(nn.Module):
-    """Running mean and standard deviation of each of G numbers, so that errors do not depend on their scales.
-
-    Args:
-        n_targets: how many numbers, G.
-        device: of the statistics.
-    """
+    """Running mean and standard deviation of each of G numbers, so that errors have one scale."""
 
     moments: Tensor
     """Running means of 1, the numbers and their squares, which begin with 0, [3, G]."""
@@ -257,15 +236,10 @@ class TargetScale(nn.Module):
 class BeliefHead(TensorDictModuleBase):
     """Predicts what arrives later, for every discrete action, and encodes what is known for a policy.
 
-    The predictions tell, in units of their running standard deviation, what the G numbers of the targets will
-    have been when the action ends (after the step that executes it; with real flight times after the
-    landing), once the messages of that step have arrived. Code 0 asks what will have been whatever the
-    action; its encoding is for the policy.
-
-    While acting it writes ``("agents", "encoding")`` [*, H] and, with discrete actions,
+    The predictions are normalised targets. Code 0 asks what will have been whatever the action; its encoding
+    is for the policy. While acting it writes ``("agents", "encoding")`` [*, H] and, with discrete actions,
     ``("agents", "prediction")`` [*, A G]. In TorchRL's recurrent mode, which the losses of a policy switch
-    on, it does nothing: what the policy has read stays as it was, like an observation, so that learning to
-    predict never changes what a policy has done.
+    on, it does nothing: what the policy has read stays as it was, like an observation.
 
     Args:
         encoder: from observations, histories and codes to encodings [*, Q, H].
@@ -273,7 +247,6 @@ class BeliefHead(TensorDictModuleBase):
         n_targets: number of numbers to predict, G.
         n_actions: number of discrete actions, A; None if they are continuous, and codes of themselves.
         n_code: size of a code, K.
-        device: of the weights.
     """
 
     def __init__(
@@ -309,10 +282,7 @@ class BeliefHead(TensorDictModuleBase):
     def predict(self, observation: Tensor, history: Tensor, action: Tensor) -> Tensor:
         """Normalised predictions, whatever the action and for this one, [*, 2, G].
 
-        Args:
-            observation: observations, [*, F].
-            history: messages with ages, [*, L, C].
-            action: actions, [*], or [*, K] if they are continuous.
+        Of observations [*, F], histories [*, L, C] and actions, [*] or, if they are continuous, [*, K].
         """
         code = action if self.n_actions is None else gather_rows(self.codes, action + 1)
         codes = torch.stack([self.codes[0].expand_as(code), code], -2)
@@ -320,13 +290,7 @@ class BeliefHead(TensorDictModuleBase):
 
 
 class Preference(nn.Module):
-    """Logits from observations, encodings and what is predicted for each action, with learnt weights.
-
-    Args:
-        network: from observations and encodings [*, F + H] to logits [*, A].
-        n_targets: number of predicted numbers, G.
-        device: of the weights.
-    """
+    """Logits from observations, encodings and what is predicted for each action, with learnt weights."""
 
     def __init__(self, network: nn.Module, n_targets: int, device: torch.device | None) -> None:
         super().__init__()
@@ -339,11 +303,7 @@ class Preference(nn.Module):
 
 
 class NormalPolicy(nn.Module):
-    """Means and scales of continuous actions, [*, n] each, from observations and encodings.
-
-    Args:
-        network: from observations and encodings [*, F + H] to [*, 2 n].
-    """
+    """Means and scales of continuous actions, [*, n] each, from observations and encodings."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -355,11 +315,7 @@ class NormalPolicy(nn.Module):
 
 
 def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int) -> ProbabilisticActor:
-    """Make the policy from observations and histories to ``("agents", "action")``.
-
-    Raises:
-        InputError: the environment has no history of messages.
-    """
+    """Make the policy from observations and histories to ``("agents", "action")``."""
     known, device = env.observation_spec.keys(True, True), env.device
     should = "reads no messages: set delay.messages, or add damian.MessageHistory to the environment"
     checks.require(keys.HISTORY in known, "learner", "predictive_mappo", should)
@@ -382,15 +338,14 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
 
 
 def ends_of_actions(ready: Tensor, reset: Tensor, delay: int) -> Tensor:
-    """The last step of the action that is chosen in each of T steps.
+    """The last step of the action that is chosen in each of T steps, [T, ...].
+
+    It is T if it comes later, or if a reset came before the action was executed.
 
     Args:
         ready: whether the UAV could choose after each step, [T, ...] bool.
         reset: whether the episode was reset after each step, bool, broadcast to ``ready``.
         delay: steps until an action is executed, d.
-
-    Returns:
-        index of the step, [T, ...]; T if it comes later, or if a reset came before the action was executed.
     """
     ends, n_steps = next_true(ready | reset), len(ready)
     executed = torch.arange(n_steps, device=ready.device) + delay
@@ -400,12 +355,6 @@ def ends_of_actions(ready: Tensor, reset: Tensor, delay: int) -> Tensor:
 
 
 def prediction_loss(predicted: Tensor, target: Tensor, counts: Tensor) -> Tensor:
-    """Mean square error of predictions, []; 0 if none counts.
-
-    Args:
-        predicted: normalised predictions, [*, G].
-        target: normalised numbers that later arrived, [*, G]; anything where they do not count.
-        counts: whether they have arrived, [*, 1] bool.
-    """
+    """Mean square error of predictions of targets [*, G] where they count, [*, 1] bool; 0 if none does."""
     error = torch.where(counts, predicted - target, 0.0).square()
     return error.sum() / counts.expand_as(error).sum().clamp(min=1)

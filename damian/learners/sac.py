@@ -46,8 +46,7 @@ class Sac:
     def __init__(
         self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer | None
     ) -> None:
-        if buffer is None:
-            raise ValueError("buffer: SAC needs a replay buffer on a TimeStorage")
+        assert buffer is not None, "SAC needs a replay buffer on a TimeStorage"
         self.config, self.setup, self.buffer = config, setup, buffer
         self.actor = config.make_actor(env, setup.model)
         read = config.critic_keys(setup)
@@ -76,16 +75,12 @@ class Sac:
             self.return_scale = ReturnScale(env.full_reward_spec[keys.REWARD].zero(), config.gamma)
 
     def components(self) -> dict[str, Any]:
-        """Networks, optimiser and statistics that a checkpoint stores, beside the replay buffer."""
+        """What a checkpoint stores, beside the replay buffer."""
         networks = {"actor": self.actor, "critic": self.loss, "optimizer": self.optimizer}
         return networks if self.return_scale is None else {**networks, "return_scale": self.return_scale}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Store a batch [B, T], and make a round of updates.
-
-        Returns:
-            the means of ``NUMBERS``; nan before learning begins.
-        """
+        """Store a batch [B, T], and make a round of updates; means of ``NUMBERS``, nan before it begins."""
         if self.return_scale is not None:
             self.return_scale.update(batch)
         self.buffer.extend(batch.exclude(*self.unread))

@@ -16,9 +16,6 @@ class SystemClock:
     Args:
         config: settings of the clocks.
         period: the first period [steps].
-
-    Raises:
-        InputError: the first period is out of its bounds.
     """
 
     def __init__(self, config: ClockConfig, period: int) -> None:
@@ -48,11 +45,11 @@ class SystemClock:
         self.period = min(max(changed, self.shortest), self.longest)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state that a checkpoint stores."""
+        """The state for a checkpoint."""
         return {"period": self.period}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state that a checkpoint has stored."""
+        """Restore the state of a checkpoint."""
         self.period = int(state["period"])
 
 
@@ -77,10 +74,10 @@ class LinearSchedule:
         self.value.fill_(self.first + (self.last - self.first) * min(self.learnt / self.frames, 1.0))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state that a checkpoint stores."""
+        """The state for a checkpoint."""
         return {"learnt": self.learnt}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state that a checkpoint has stored."""
+        """Restore the state of a checkpoint."""
         self.learnt = 0
         self.advance(int(state["learnt"]))

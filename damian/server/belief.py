@@ -104,9 +104,6 @@ def build_source_grid(
         radius: radius of a UAV's footprint [m].
         dt: length of a step [s].
         cell: edge of a cell [m].
-
-    Raises:
-        InputError: there are too many cells.
     """
     polygons = [region.polygon for region in airspace.regions]
     area = max(polygon.area for polygon in polygons)
@@ -150,10 +147,8 @@ def _columns(polygons: list, edge: float) -> np.ndarray:
 
 
 def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarray:
-    """Moves of the source in steps of ``dt``, counted from walks, [S, 2] metres.
-
-    Independent moves like these get as far in ``STEPS_PER_MOVE`` steps as the source does.
-    """
+    """Moves of the source in steps of ``dt``, counted from walks, [S, 2] metres."""
+    # Independent moves like these get as far in STEPS_PER_MOVE steps as the source does.
     rng, polygons = np.random.default_rng(_SEED), polygons[:_WALKS]
     source = replace(source, position=None)  # where it begins is not told
     time = torch.arange(_STEPS + 1, dtype=torch.float64) * dt
@@ -169,12 +164,7 @@ def _displacements(polygons: list, source: SourceConfig, dt: float) -> np.ndarra
 
 
 def _moves(columns: np.ndarray, displacement: np.ndarray) -> Tensor:
-    """Weight of each move from cell to cell, [K, K].
-
-    The source is anywhere in its cell, and moves in any direction alike: the weights are averaged over the
-    symmetries of a square. ``columns`` are those of ``_columns``, [K, 2], ``displacement`` moves [cells],
-    [S, 2].
-    """
+    """Weight of each move from cell to cell, [K, K], from moves [S, 2] in cells."""
     reach = int(np.ptp(columns, axis=0).max())
     weight = np.full((2 * reach + 1, 2 * reach + 1), _RARE)
     near = displacement[(np.abs(displacement) < reach - 1).all(-1)] if reach > 1 else displacement[:0]
@@ -183,6 +173,7 @@ def _moves(columns: np.ndarray, displacement: np.ndarray) -> Tensor:
     for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
         share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
         np.add.at(weight, (whole[:, 0] + dx + reach, whole[:, 1] + dy + reach), share / len(displacement))
+    # The source moves in any direction alike: averaged over the symmetries of a square.
     weight = np.mean([np.rot90(each, turns) for each in (weight, weight.T) for turns in range(4)], 0)
     offset = columns[None].astype(int) - columns[:, None].astype(int) + reach
     return torch.as_tensor(weight[offset[..., 0], offset[..., 1]], dtype=torch.float32)
@@ -197,12 +188,12 @@ def _renewed(centres: Tensor, moves: Tensor | None, edge: float) -> float:
 
 
 def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
-    """The table ``SourceGrid.log_reports``.
+    """The table ``SourceGrid.log_reports``, from the probability of a detection if it emits, [P, K].
 
     A cell that a footprint covers in part would be ruled out by the same silence again and again, although a
     source that stays may be in its other part. So a repeated report counts only as far as the source may have
     moved since: with probability ``renewed``, the share of a cell by which it moves in a step, it is anywhere
-    in its cell, else it is where it was. ``detects`` is the probability of a detection if it emits, [P, K].
+    in its cell, else it is where it was.
     """
     silent = 1 - detects
     again = renewed * silent + (1 - renewed) * silent / (1 - emits * detects)
@@ -214,10 +205,7 @@ def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
 
 
 def _one_step_before(grid: SourceGrid, chances: Tensor) -> Tensor:
-    """Probability of a detection by the cell of the source one step before, [P, K].
-
-    ``chances`` is that if the source emits in a cell, [P, K]; P / R rows are of each of the R regions.
-    """
+    """Probability of a detection by the cell of the source one step before, from that by its cell, [P, K]."""
     if grid.moves is None:
         return grid.emits * chances
     if len(grid.prior) == 1:
@@ -369,7 +357,7 @@ class Window(NamedTuple):
 
 
 def empty_window(grid: SourceGrid, longest: int, n_worlds: int, n_agents: int, own: bool) -> Window:
-    """A window for messages that are at most ``longest`` steps late; ``own``: also for each UAV."""
+    """A window for messages that are at most ``longest`` steps late; with ``own`` also for each UAV."""
     device, n_slots, n_viewers = grid.prior.device, longest + 2, 1 + n_agents * own
     belief = torch.ones(n_slots, n_viewers, n_worlds, grid.prior.shape[-1], device=device)
     report = torch.full((n_slots, n_agents, n_worlds), grid.no_report, device=device)
@@ -497,11 +485,11 @@ def _(tables, emits, ring, slot, sent, sent_delay, region, stepped):
 
 
 def _first_outdated(grid: SourceGrid, window: Window, slot_age: Tensor, stepped: Tensor) -> Tensor:
-    """How long ago the first step was after which each receiver's belief is outdated, [V, B] steps.
+    """How long ago the first step was after which each receiver's belief is outdated, or -1, [V, B] steps.
 
-    It is -1 where no belief is. A UAV has the server's belief as long as it had it in the step before and the
-    server has all that the UAV has reported since; this is noted in place. ``slot_age`` tells how long ago
-    the step of each slot was, [S, B]; read the other way, it is the slot of the step that was so long ago.
+    A UAV has the server's belief as long as it had it in the step before and the server has all that the UAV
+    has reported since; this is noted in place. ``slot_age`` tells how long ago the step of each slot was,
+    [S, B]; read the other way, it is the slot of the step that was so long ago.
     """
     sent, age = window.report != grid.no_report, slot_age.unsqueeze(1)
     arrives = (sent & (window.delay == age)).amax(1)
@@ -522,13 +510,6 @@ def _to_compute(
     grid: SourceGrid, window: Window, slot_age: Tensor, outdated: Tensor, region: Tensor
 ) -> Iterator[tuple[Tensor, ...]]:
     """The C beliefs to compute from those of the step before, step by step, the oldest step first.
-
-    Args:
-        grid: cells and tables.
-        window: beliefs of the latest steps.
-        slot_age: how long ago the step of each slot was, or the slot of the step so long ago, [S, B].
-        outdated: ``_first_outdated``, [V, B] steps.
-        region: index of the region of each world, [B].
 
     Yields:
         For each step the rows in the flattened ring of the beliefs of the step before [C], those of the
@@ -557,10 +538,7 @@ def _to_compute(
 
 
 def _row(window: Window, slot: Tensor, viewer: Tensor | int, world: Tensor) -> Tensor:
-    """Rows of the flattened ring in which the beliefs of receivers lie, or the server's if they are the same.
-
-    Slot, number of the receiver and number of the world are [*] each.
-    """
+    """Rows [*] of the flattened ring in which the beliefs of receivers lie; the server's where the same."""
     n_viewers, n_worlds = window.same_as_server.shape[1:]
     server = slot * n_viewers * n_worlds + world
     if n_viewers == 1:

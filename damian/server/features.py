@@ -24,7 +24,7 @@ from damian.server.belief import (
     first_belief,
     report_rows,
 )
-from damian.settings.server import ObservationConfig
+from damian.settings.server import GLOBAL_FEATURES, LOCAL_FEATURES, ObservationConfig
 from damian.world.battery import BatteryConfig, observed
 from damian.world.coverage import (
     FootprintTables,
@@ -37,11 +37,7 @@ from damian.world.messages import Messages
 
 
 class ServerContext(NamedTuple):
-    """What the server knows besides the messages.
-
-    Fields for features: ``now`` [s] and ``scale`` [m], [*], ``time_scale`` and ``age_scale`` [s], and
-    ``points`` [m], [R*L, 2].
-    """
+    """What the server knows besides the messages."""
 
     now: Tensor
     """Current time [s], [*]."""
@@ -100,8 +96,7 @@ class FeatureCache:
     def wanted(self, field: Tensor) -> Tensor:
         """A field [*, N, ...] of the UAVs whose values are wanted: of all, or of one for each *, [*, 1, ...].
 
-        A feature that compares every UAV with every other one computes only these, as [*, N, ...] or
-        [*, 1, ...]; any other may compute all.
+        A feature that compares every UAV with every other one computes only these; any other may compute all.
         """
         if not self.own_only:
             return field
@@ -129,11 +124,7 @@ class FeatureCache:
 
     @property
     def grid(self) -> SourceGrid:
-        """Cells in which the source may be.
-
-        Raises:
-            InputError: there are none, because no feature declares that it reads the belief.
-        """
+        """Cells in which the source may be."""
         if self.context.grid is None:
             raise InputError('belief: only a feature of scope "belief" may read it')
         return self.context.grid
@@ -184,16 +175,13 @@ def feature(
     features.
 
     Args:
-        scope: ``local`` (follows from the UAV's own message), ``global`` (from the messages of all UAVs) or
-            ``belief`` (from all messages so far, by ``cache.belief`` and ``cache.grid``).
+        scope: ``local`` (follows from the UAV's own message alone: its actor sees that without delay where it
+            knows its own messages), ``global`` (from the messages of all UAVs) or ``belief`` (from all
+            messages so far, by ``cache.belief`` and ``cache.grid``).
         width: number of values for each UAV. With 1 the function returns [*, N], with more [*, N, width];
             None if the number depends on the number of UAVs, as with the distances to the other UAVs.
         low: lowest possible value.
         high: highest possible value. Networks learn best from values about 1 in size.
-
-    Raises:
-        InputError: there is no such scope, the range is empty or not finite, or the decorator has no
-            parentheses.
 
     Examples:
         >>> @feature("local")
@@ -202,8 +190,6 @@ def feature(
     """
     require_parentheses(scope, '@damian.feature("local")')
     checks.one_of("scope of a feature", scope, ("local", "global", "belief", "actor"))
-    good = math.isfinite(low) and math.isfinite(high) and low < high
-    checks.require(good, "range of a feature", f"low={low}, high={high}", "are not finite with low < high")
     return lambda compute: Feature(compute, scope, width, low, high)
 
 
@@ -221,31 +207,12 @@ def feature_of(name: str) -> Feature:
 
 
 def check_features(config: ObservationConfig) -> None:
-    """Require that every feature of an observation exists and has the scope in which it is used.
-
-    Raises:
-        InputError: there is no such feature, or it has another scope.
-    """
+    """Require that every feature of an observation exists and has the scope in which it is used."""
     for scope, key in (("local", "local_features"), ("global", "global_features"), ("belief", "belief")):
         for name in getattr(config, key):
-            check_feature(f"observation.{key}", name, scope)
-
-
-def check_feature(key: str, name: str, scope: str) -> None:
-    """Require a feature of a scope.
-
-    Raises:
-        InputError: there is no such feature, or it has another scope.
-    """
-    if name in FEATURES or ":" not in str(name):
-        checks.one_of(key, name, feature_names(scope))
-    found = FEATURES.get(name, key)
-    checks.require(found.scope == scope, key, name, f"is a {found.scope} feature, not a {scope} one")
-
-
-def feature_names(scope: str) -> list[str]:
-    """Names of the registered features of a scope, in the order of Table 2."""
-    return [name for name, found in FEATURES.items() if found.scope == scope]
+            found = FEATURES.get(name, f"observation.{key}")
+            problem = f"is a {found.scope} feature, not a {scope} one"
+            checks.require(found.scope == scope, f"observation.{key}", name, problem)
 
 
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
@@ -259,9 +226,6 @@ def observe(messages: Messages, context: ServerContext, names: list[str]) -> dic
     Returns:
         Each feature [*, N], in [0, 1] if it is one of Table 2; but ``agent_distances`` [*, N, N-1], to the
         other UAVs in index order, and others in the shape and range that they declare.
-
-    Raises:
-        InputError: a feature reads a sensor that does not exist.
     """
     cache = FeatureCache(messages, context)
     return {name: feature_of(name).compute(cache) for name in names}
@@ -498,11 +462,7 @@ def _belief_moments(v: FeatureCache) -> Tensor:
 @FEATURES.register("belief_map")
 @feature("belief", width=(len(RINGS) + 1) * SECTORS)
 def _belief_map(v: FeatureCache) -> Tensor:
-    """Probability that the source is in each part of three rings about the UAV, [*, N, 24].
-
-    The parts are ``SECTORS`` sectors of each ring, the innermost ring first. A cell counts where its centre
-    is.
-    """
+    """Probability that the source is in each sector of three rings about the UAV, [*, N, 24]."""
     position = v.wanted(v.messages.position)
     east, north = (v.grid.centres - position.unsqueeze(-2)).unbind(-1)  # [*, N, K]
     distance = torch.hypot(east, north) / v.context.radius
@@ -514,5 +474,5 @@ def _belief_map(v: FeatureCache) -> Tensor:
     return bins.scatter_add(-1, part, share).clamp(max=1)
 
 
-LOCAL, GLOBAL = tuple(feature_names("local")), tuple(feature_names("global"))
+LOCAL, GLOBAL = tuple(LOCAL_FEATURES), tuple(GLOBAL_FEATURES)
 """Names of the built-in features of the UAV itself, and of all UAVs (Table 2)."""

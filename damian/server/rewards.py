@@ -53,9 +53,6 @@ def reward_term(
         reads: names of the features that it reads, built-in or your own (``package.module:name``).
         scope: ``individual`` or ``system``.
 
-    Raises:
-        InputError: ``reads`` is no list, there is no such scope, or the decorator has no parentheses.
-
     Examples:
         >>> # in lab.py, used as reward.custom=[{term: lab:low_battery, weight: -1, below: 0.5}]
         >>> @reward_term(reads=["battery"])
@@ -63,8 +60,6 @@ def reward_term(
         ...     return (features["battery"] < below).float()
     """
     require_parentheses(reads, "@damian.reward_term(reads=[...])")
-    problem = f"is not a list of names: write reads=[{reads!r}]"
-    checks.require(not isinstance(reads, str), "reads of a reward term", reads, problem)
     checks.one_of("scope of a reward term", scope, ("individual", "system"))
     return lambda compute: RewardTerm(compute, tuple(reads), scope)
 
@@ -92,16 +87,7 @@ class CustomTerm(NamedTuple):
 
 
 def custom_term(written: Any, key: str) -> CustomTerm:
-    """Read ``{term: package.module:name, weight: 0.1, ...}``; a ``name`` tells terms of one function apart.
-
-    Args:
-        written: what the configuration says.
-        key: of the setting, for errors.
-
-    Raises:
-        InputError: the term or a feature that it reads does not exist, it has no such parameter, or its
-            weight is no finite number.
-    """
+    """Read ``{term: package.module:name, weight: 0.1, ...}``; ``name`` tells terms of one function apart."""
     path, term, parameters = REWARD_TERMS.read(written, key, "term")
     for read in term.reads:
         FEATURES.get(read, f"{key}.term: reads of {path}")
@@ -113,11 +99,7 @@ def custom_term(written: Any, key: str) -> CustomTerm:
 
 
 def own_terms(config: RewardConfig) -> dict[str, CustomTerm]:
-    """The user's own terms by name, read once from the settings.
-
-    Raises:
-        InputError: a term does not exist or has no such parameter, or two terms have the same name.
-    """
+    """The user's own terms by name, read once from the settings."""
     found: dict[str, CustomTerm] | None = getattr(config, "_own_terms", None)
     if found is None:
         terms = [custom_term(written, f"reward.custom[{i}]") for i, written in enumerate(config.custom)]
@@ -128,11 +110,6 @@ def own_terms(config: RewardConfig) -> dict[str, CustomTerm]:
         checks.require(once, "reward.custom", names, problem + remedy)
         config._own_terms = found  # type: ignore[attr-defined]
     return found
-
-
-def used_terms(config: RewardConfig) -> list[CustomTerm]:
-    """The user's own terms whose weight is not 0."""
-    return [term for name, term in own_terms(config).items() if name in config.terms]
 
 
 def features_read(config: RewardConfig) -> list[str]:

@@ -13,39 +13,33 @@ import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.errors import naming_errors
-from damian.common.tensors import gather_rows, tree_map
+from damian.common.tensors import gather_rows
 from damian.server.belief import SourceGrid, build_source_grid, certain_belief
 from damian.server.features import (
     ObservationConfig,
     ServerContext,
     check_features,
-    feature_of,
     observe,
     observe_own,
     stack,
 )
-from damian.server.rewards import Counters, RewardConfig, features_read, final_reward, reward, used_terms
+from damian.server.rewards import Counters, RewardConfig, features_read, final_reward, reward
 from damian.server.termination import EpisodeConfig, Status, status
 from damian.world.airspace import Airspace
 from damian.world.battery import BatteryConfig
 from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
 from damian.world.signal_source import SourceConfig
-from damian.world.uav_values import check_uav_values
 
 Features = dict[str, Tensor]
 
 
 class RewardAndStatus(NamedTuple):
-    """The UAVs' rewards and the status of the task."""
+    """The UAVs' rewards and the status of the task; fields as in ``ServerOutputs``."""
 
     reward: Tensor
-    """Rewards (paper, eq. 8) with bonus and penalty, [*, N]."""
     terms: dict[str, Tensor]
-    """Weighted terms of the rewards by name, [*, N] each."""
     status: Status
-    """Success and the end of the episode, [*]."""
 
 
 class ServerOutputs(NamedTuple):
@@ -86,9 +80,6 @@ class Server:
         stops: whether UAVs stay at a landing point for more than a step, so that coverage changes seldom.
         source: settings of the source, of which the belief knows how it moves and emits.
         goals: for ``belief_gain``, as in ``ServerContext``.
-
-    Raises:
-        InputError: there are more landing points than a message can number.
     """
 
     def __init__(
@@ -150,10 +141,7 @@ class Server:
         return Messages.unpack(rows, self._n_readings)
 
     def action_columns(self, features: Features) -> slice | None:
-        """The columns of the actors' observations that hold ``belief_gain``; None if they do not observe it.
-
-        The features may be those of any messages.
-        """
+        """The columns of the actors' observations that hold ``belief_gain``; None if there are none."""
         names = self.observation.actor
         if "belief_gain" not in names:
             return None
@@ -172,7 +160,7 @@ class Server:
         coverage: KnownCoverage | None = None,
         belief: Tensor | None = None,
     ) -> ServerOutputs:
-        """Observations, rewards and status of messages; without ``source_over`` the source never ends."""
+        """Observations, rewards and status; without ``source_over`` the source never ends."""
         over = torch.zeros_like(steps, dtype=torch.bool) if source_over is None else source_over
         features = self.features(messages, steps, coverage=coverage, belief=belief)
         result = self.reward_and_status(features, messages, steps, over.view(steps.shape))
@@ -195,30 +183,6 @@ class Server:
         """The features of somebody who knows where the source is, [*, 2] metres."""
         belief = None if self.grid is None else certain_belief(self.grid, source)
         return self.features(messages, steps, belief=belief)
-
-    def checked_features(self, messages: Messages, steps: Tensor) -> Features:
-        """The features of ``features``, after those and the reward terms from outside the package ran once.
-
-        Raises:
-            InputError: one of them raises an error, or does not return finite values in the shape that it
-                declares, which would be broadcast without a word.
-        """
-        context, shape = self._context(messages, steps), messages.track.shape
-        for name in (name for name in self._names if ":" in name):
-            with naming_errors(f"feature {name}"):
-                values = observe(messages, context, [name])[name]
-            check_uav_values(f"feature {name}", values, shape, feature_of(name).width)
-            if feature_of(name).scope == "local":  # else an actor would see without delay what others report
-                alike = tree_map(lambda field: field[:, :1].expand_as(field), messages)
-                alone = observe(alike, context, [name])[name][:, :1]
-                should = "but depends on the messages of other UAVs: make it global"
-                checks.require(alone.allclose(values[:, :1]), f"feature {name}", "is local,", should)
-        features, counters = observe(messages, context, self._names), Counters(steps, messages.motions)
-        for term in used_terms(self.reward):
-            with naming_errors(f"reward term {term.name}"):
-                values = term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
-            check_uav_values(f"reward term {term.name}", values, shape)
-        return features
 
     def observations(self, features: Features) -> tuple[Tensor, Tensor]:
         """Observations of the actors [*, N, F] and of the critic [*, N, G]."""

@@ -35,7 +35,7 @@ def status(
     dt: float,
     config: EpisodeConfig,
 ) -> Status:
-    """Success and the end of the episode, as the server knows them (paper, section 4.1).
+    """Success and the end of the episode, as the server knows them.
 
     A time limit truncates, every other end terminates. A success in the last step counts as a success.
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Polygon
 from torch import Tensor
 
-from damian.common.errors import InputError
+from damian.common import checks
 from damian.common.tensors import gather_rows, tree_map
+from damian.settings.world import RegionConfig
 from damian.world.regions.polygon import RESOLUTION, Floats, landing_lattice, largest_vertex_distance
 from damian.world.regions.region import Region
 
@@ -28,7 +29,7 @@ _SLOTS = 2**18
 class Cells(NamedTuple):
     """The landing points that may be among the nearest ones of a place, by the square cell in which it lies.
 
-    Cells of R regions, C in all, lie side by side; U of them are used, because they meet the polygon.
+    There are C cells in all R regions; U of them are used, because they meet the polygon.
     """
 
     point: Tensor
@@ -83,31 +84,13 @@ class Airspace:
         return replace(self, cells=cells, **{name: tensor.to(device) for name, tensor in moved.items()})
 
 
-def build_airspace(
-    regions: list[Region], step_m: float, degrees: float, n_points: int | None, n_agents: int
-) -> Airspace:
-    """Lay the lattice of landing points over each region.
-
-    Args:
-        regions: operative regions.
-        step_m: distance between neighbouring points of a row [m].
-        degrees: slant of the lattice [deg].
-        n_points: number of landing points to keep in each region, nearest its centroid; all if None.
-        n_agents: number of UAVs.
-
-    Raises:
-        InputError: a region has fewer landing points than there are UAVs.
-    """
-    lattices = [landing_lattice(r.polygon, step_m, degrees, n_points) for r in regions]
+def build_airspace(regions: list[Region], config: RegionConfig, n_agents: int) -> Airspace:
+    """Lay the lattice of landing points over each region, as the settings of regions say."""
+    step, degrees, n_points = config.lattice_step, config.lattice_angle, config.n_landing_points
+    lattices = [landing_lattice(r.polygon, step, degrees, n_points) for r in regions]
     for region, lattice in zip(regions, lattices, strict=True):
-        if len(lattice) < n_agents:
-            remedy = f"lower agents or region.lattice_step ({step_m:g} m)"
-            if n_points is not None:
-                remedy = f"lower agents, or raise region.n_landing_points ({n_points})"
-            raise InputError(
-                f"agents: {n_agents} UAVs need as many landing points, but {region.name} has "
-                f"{len(lattice)}; {remedy}"
-            )
+        problem = f"UAVs are more than the {len(lattice)} landing points of {region.name}"
+        checks.require(len(lattice) >= n_agents, "agents", n_agents, problem)
     edges = [_edges(region.polygon) for region in regions]
     points = _padded(lattices, torch.inf)
     return Airspace(
@@ -145,8 +128,7 @@ def nearest_points(cells: Cells, points: Tensor, region: Tensor, target: Tensor,
     """The ``n`` landing points nearest to each target, nearest first.
 
     The nearest landing point is the one at the smallest distance in whole centimetres and, of several, the
-    one with the lowest id. Distances are computed in double precision about the region's own centre, so that
-    which points are equally near depends neither on rounding errors nor on where the coordinates begin.
+    one with the lowest id, so that ties depend neither on rounding errors nor on the origin.
 
     Args:
         cells: of the airspace.
@@ -220,11 +202,7 @@ def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], 
 
 
 def _within_reach(lattice: Floats, place: Floats, n: int, side: float, farther: float) -> NDArray[np.int64]:
-    """Pairs of places and landing points: for each place the n nearest points and all that are a bit farther.
-
-    Returns:
-        Indices of the places, in ascending order, and of the points, [2, P].
-    """
+    """Pairs, [2, P]: for each place the n nearest points and all that are up to ``farther`` behind them."""
     tree, targets = shapely.STRtree(np.asarray(shapely.points(lattice))), shapely.points(place)
     reach = np.full(len(place), side * math.sqrt(n / math.pi))
     while True:

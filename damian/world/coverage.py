@@ -119,10 +119,7 @@ def updated_share(tables: FootprintTables, point_ids: Tensor, points: Tensor, kn
 def _update_share(
     masks: Tensor, cells_per_metre: float, ids: Tensor, points: Tensor, share: Tensor, changed: Tensor
 ) -> Tensor:
-    """The shares ``[b, N]``, computed again for the worlds of ``changed [b]``.
-
-    This is a custom operator because the number of worlds depends on the data, which a compiler cannot trace.
-    """
+    """The shares ``[b, N]``, computed again for the worlds of ``changed [b]``."""
     updated, worlds = share.clone(), changed.nonzero().squeeze(-1)
     if len(worlds):
         ids = ids.index_select(0, worlds)
@@ -176,13 +173,7 @@ def _covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor
 
 
 def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleet: Tensor) -> Tensor:
-    """Coverage of the first UAV of each fleet, ``[b, N]``.
-
-    Args:
-        tables: from :func:`build_tables`.
-        point_ids: of the first UAVs, ``[b, N, n]``.
-        fleet: positions of the first UAV and the others in cells, ``[b, N, n, 2, N]``.
-    """
+    """Coverage of the first UAV of each fleet, ``[b, N]``."""
     rows = torch.cat([(point_ids + _GRID**2).unsqueeze(0), _overlap_rows(fleet).movedim(-1, 0)])
     excluded = _or_rows(tables.masks, rows.flatten(1)).view(*point_ids.shape[:-1], -1)
     counts = _bit_count(excluded)
@@ -191,18 +182,7 @@ def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleet: Tensor) -
 
 
 def _overlap_rows(fleet: Tensor) -> Tensor:
-    """Table rows of the discs that may overlap a footprint of the first UAV of each fleet.
-
-    First come the other UAVs at the same index, then the UAV itself at the indices k + 1, k + 2, ...; beyond
-    the window it is infinitely far away. A window that slides over the indices leaves out all other pairs,
-    without index tensors.
-
-    Args:
-        fleet: ``[b, N, n, 2, N]``, in cells.
-
-    Returns:
-        ``[b, N, n, N + n - 2]``.
-    """
+    """Table rows of the discs that may overlap a footprint of the first UAV of each fleet."""
     cells, n_last = fleet[..., 0], fleet.shape[-3]
     past = F.pad(cells, (0, 0, 0, n_last - 1), value=math.inf).unfold(-2, n_last, 1)
     other = torch.cat([fleet[..., 1:], past[..., 1:]], -1)
@@ -212,10 +192,7 @@ def _overlap_rows(fleet: Tensor) -> Tensor:
 
 
 def _or_rows(table: Tensor, rows: Tensor) -> Tensor:
-    """Bitwise OR of M rows of a table [R, words] for each of K sets of them: ``[M, K]`` -> ``[K, words]``.
-
-    The rows are looked up one after the other, so that they stay in the cache until they are used.
-    """
+    """Bitwise OR of M rows of a table [R, words] for each of K sets of them: ``[M, K]`` -> ``[K, words]``."""
     first, *others = rows.unbind(0)
     combined = table.index_select(0, first)
     for row in others:
@@ -224,12 +201,7 @@ def _or_rows(table: Tensor, rows: Tensor) -> Tensor:
 
 
 def _bit_count(words: Tensor) -> Tensor:
-    """Number of 1 bits of each int64, same shape and dtype.
-
-    Counts side by side in fields of 2, 4 and 8 bits, then adds the bytes up with a product (H. S.
-    Warren, Hacker's Delight, 2nd ed., 5-1). ``>>`` repeats the sign bit, hence a mask after each;
-    the last needs none, as its top byte is at most 64. New tensors are changed in place, to save allocations.
-    """
+    """Number of 1 bits of each int64, same shape and dtype."""
     twos = words - (words >> 1).bitwise_and_(0x5555555555555555)
     fours = (twos >> 2).bitwise_and_(0x3333333333333333).add_(twos & 0x3333333333333333)
     eights = (fours >> 4).add_(fours).bitwise_and_(0x0F0F0F0F0F0F0F0F)
@@ -237,10 +209,7 @@ def _bit_count(words: Tensor) -> Tensor:
 
 
 def _unit_disc_samples(count: int) -> np.ndarray:
-    """Well-spread points of equal weight in the unit disc, ``[count, 2]`` (H. Vogel, 1979).
-
-    Sunflower pattern: r = sqrt((k + 1/2) / count), each point turned by the golden angle from the last.
-    """
+    """Well-spread points of equal weight in the unit disc, ``[count, 2]`` (H. Vogel, 1979)."""
     k = np.arange(count)
     r, angle = np.sqrt((k + 0.5) / count), k * np.pi * (3 - math.sqrt(5))
     return np.stack([r * np.cos(angle), r * np.sin(angle)], -1)

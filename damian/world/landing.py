@@ -6,7 +6,6 @@ from typing import NamedTuple
 import shapely
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from damian.common import devices
 from damian.common.tensors import gather_rows
@@ -74,7 +73,7 @@ class Candidates:
             action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
 
         Returns:
-            Candidates, and the row of each UAV among them, [B, N].
+            Candidates as M lists, and the row of each UAV among them, [B, N].
         """
         if self.config.kind == "discrete":
             return self.ranking, flat * self.config.n_actions + action
@@ -103,21 +102,16 @@ class Candidates:
         return point[..., :2].movedim(-1, 0).long().contiguous()
 
     def _rank_all(self) -> None:
-        """Tabulate the candidates of every (landing point, action).
-
-        ``ranking`` has R*L*A lists; ``distance`` [R*L, A] is that to the nearest candidate, 0 if the action
-        holds, infinite if its target lies outside; ``hold`` [A] marks one action that holds (the first
-        action, if no listed distance is 0).
-        """
+        """Tabulate the candidates of every (landing point, action): R*L*A lists."""
         table = action_table(self.config, torch.float64)
         shape = (*self.airspace.points.shape[:2], len(table))
-        self.distance = torch.zeros(shape)
+        self.distance = torch.zeros(shape)  # to the nearest candidate; infinite if the target lies outside
         self.ranking = Ranking(
             torch.zeros(*shape, self.n_candidates, dtype=torch.int32), torch.zeros(*shape, self.n_candidates)
         )
         counts = self.airspace.n_points.tolist()
         parts = [(r, own) for r, n in enumerate(counts) for own in torch.arange(n).split(_POINTS_AT_ONCE)]
-        for region, own in tqdm(parts, desc="landing points", delay=1, leave=False):
+        for region, own in parts:
             ranked, within = self._rank_from(region, own, displacement(table[:, 0], table[:, 1]))
             for table_of_all, part in zip(self.ranking, ranked, strict=True):
                 table_of_all[region, own] = part.to(table_of_all.dtype)
@@ -126,19 +120,12 @@ class Candidates:
         self.distance = self.distance.flatten(0, 1)
         holds = table[:, 0] == 0
         self.can_hold = bool(holds.any())
-        self.hold = torch.arange(len(table)) == int(holds.int().argmax())
+        self.hold = torch.arange(len(table)) == int(
+            holds.int().argmax()
+        )  # one action that holds, if any does
 
     def _rank_from(self, region: int, own: Tensor, move: Tensor) -> tuple[Ranking, Tensor]:
-        """Rank the landing points for flights within a region; a UAV holds if its target lies outside.
-
-        Args:
-            region: index of the region.
-            own: landing points where UAVs stand, [P].
-            move: displacements east and north, [A, 2] metres.
-
-        Returns:
-            Candidates, [P, A, K], and whether each target lies inside, [P, A].
-        """
+        """Candidates [P, A, K] of moves from the points ``own`` [P], and whether these end inside [P, A]."""
         polygon, points = self.airspace.regions[region].polygon, self.airspace.points[region]
         target = self.airspace.exact_points[region, own].unsqueeze(1) + move
         shapely.prepare(polygon)
@@ -168,19 +155,9 @@ class Candidates:
 def _nearest_inside(
     edges: Tensor, cells: list[Tensor], points: Tensor, region: Tensor, target: Tensor, own: Tensor, n: int
 ) -> Tensor:
-    """Landing points nearest to targets, [M, n]; ``own`` instead of missing ones, and if a target is outside.
+    """Landing points nearest to targets [M, 2], [M, n]; ``own`` [M] instead of missing ones or outside.
 
-    This is a custom operator because the number of targets inside depends on the data, which a compiler
-    cannot trace.
-
-    Args:
-        edges: of the polygons, [R, E, 4] metres.
-        cells: the fields of ``Airspace.cells``.
-        points: ``Airspace.exact_points``.
-        region: indices of the regions, [M].
-        target: [M, 2] metres.
-        own: landing points where the UAVs stand, [M].
-        n: number of points.
+    A custom operator, because the number of targets inside depends on data, which a compiler cannot trace.
     """
     at_once = max(_EDGES_AT_ONCE // edges.shape[1], 1)
     parts = zip(region.split(at_once), target.split(at_once), strict=True)
@@ -230,10 +207,7 @@ def assign_landing_points(
 
 
 def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor) -> Tensor:
-    """Each UAV takes its first free candidate, one after the other in all worlds; nothing depends on data.
-
-    A candidate out of reach means holding.
-    """
+    """Each UAV takes its first free candidate, one after the other in all worlds."""
     reached = gather_rows(ranking.distance, row) <= reach.unsqueeze(-1)
     wishes = torch.where(reached, gather_rows(ranking.point, row).long(), standing.unsqueeze(-1))
     taken, goals = standing.t().unsqueeze(-1), []
@@ -248,14 +222,11 @@ def _assign_one_by_one(ranking: Ranking, row: Tensor, standing: Tensor, reach: T
 def _assign_in_rounds(
     point: Tensor, distance: Tensor, row: Tensor, standing: Tensor, reach: Tensor, n_points: int
 ) -> Tensor:
-    """The same by deferred acceptance (Gale and Shapley, 1962); the fields of the ranking come first.
+    """The same by deferred acceptance (Gale and Shapley, 1962), as a custom operator.
 
     All UAVs ask for their best candidate. Each point keeps the earliest UAV that has asked for it; all others
     ask for their next one, and so does a UAV that has to yield to an earlier one. As the earliest UAV that
-    ever asks for a free point keeps it, this ends with what the UAVs would take one after the other. A round
-    costs as much as there are UAVs that ask.
-
-    This is a custom operator because the number of rounds depends on the data, which a compiler cannot trace.
+    ever asks for a free point keeps it, this ends with what the UAVs would take one after the other.
     """
     at_once, points, distances = max(BOOKING_CHUNK // n_points, 1), point.flatten(), distance.flatten()
     first = row * point.shape[1]
@@ -271,14 +242,7 @@ def _(point, distance, row, standing, reach, n_points):  # compilers need only t
 def _rounds(
     points: Tensor, distances: Tensor, first: Tensor, standing: Tensor, reach: Tensor, n_points: int
 ) -> Tensor:
-    """The rounds of some worlds.
-
-    Args:
-        points: of all lists behind each other, [M*K].
-        distances: as ``points``.
-        first: index of each UAV's first candidate among them, [B, N].
-        standing: as in ``assign_landing_points``, like the other arguments.
-    """
+    """The rounds of some worlds; ``first`` [B, N] indexes each UAV's first one of all candidates [M*K]."""
     asked, stands, reach = first.flatten().clone(), standing.flatten(), reach.flatten()
     # A world's first point, and the UAV that each point keeps, as a flat number; those of a world count up in
     # index order.

@@ -35,9 +35,6 @@ def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> 
         n_agents: number of UAVs.
         shared: where the levels are too few, begin with the lowest one again, as for UAVs that never meet in
             the air.
-
-    Raises:
-        InputError: the levels do not fit under the highest one, and are not shared.
     """
     room = (config.max_level - config.min_level) / config.level_separation
     n_fit = math.floor(room + _TINY) + 1

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.errors import InputError
 from damian.common.registry import Registry, check_parameters, name_of, require_parentheses
 from damian.world.messages import Messages
 from damian.world.state import State
@@ -24,19 +23,8 @@ class Sensor(NamedTuple):
     """Name of the reading: ``name`` in the settings, or else the function's name."""
 
     def read(self, state: State, world: Any) -> Tensor:
-        """The values as columns, [B, N, width] float32.
-
-        Raises:
-            InputError: the values have another shape than the sensor declares.
-        """
-        values = self.compute(state, world)
-        expected = state.track.shape if self.width == 1 else (*state.track.shape, self.width)
-        if values.shape != expected:
-            raise InputError(
-                f"sensors: {self.name} returns values of shape {list(values.shape)}, "
-                f"not {list(expected)}, as width={self.width} asks for"
-            )
-        return values.float().view(*state.track.shape, self.width)
+        """The values as columns, [B, N, width] float32."""
+        return self.compute(state, world).float().view(*state.track.shape, self.width)
 
 
 def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
@@ -50,12 +38,6 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
 
     Every message carries the reading of the time at which it was generated, as float32. Features read it as
     ``cache.reading("name")``, by the name of the function.
-
-    Args:
-        width: number of values for each UAV.
-
-    Raises:
-        InputError: the width is not a positive integer, or the decorator has no parentheses.
 
     Examples:
         >>> # in lab.py, used as sensors=[{sensor: lab:loudness, reach: 50}]
@@ -84,10 +66,6 @@ def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
 
     Returns:
         The sensors with their parameters, by the names of their readings.
-
-    Raises:
-        InputError: a sensor does not exist, has no such parameter, or has the name of another one or of a
-            field of the messages.
     """
     found: dict[str, Sensor] = {}
     for number, each in enumerate(written):

@@ -84,37 +84,17 @@ def draw_walks(
     n_walks: int,
     rng: np.random.Generator,
 ) -> Walk:
-    """Draw the walks of ``W = n_walks`` sources, float32 on the CPU.
+    """Draw the walks of ``W = n_walks`` sources in a polygon of local metres, float32 on the CPU.
 
     Hotspots are uniform in the polygon (hence in random order), inner points uniform in the part of
     the disc around their hotspot that lies in the polygon. Where that part is very thin (under
     about 1 % of the disc), inner points lie nearer their hotspot than uniform ones would.
-
-    Args:
-        polygon: operative region, local metres.
-        config: settings of the source; a given position is inside the polygon.
-        n_walks: number of walks.
-        rng: random generator.
     """
     shapely.prepare(polygon)
     if config.motion == "static":
         return _static_walk(_hotspots(polygon, config, n_walks, 1, rng))
     stops = _draw_stops(polygon, config, n_walks, rng)
     return _timed_walk(stops, config, rng)
-
-
-def leg_duration(length: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
-    """Duration of a rest-to-rest leg: trapezoidal speed profile, triangular if too short to reach ``speed``.
-
-    Args:
-        length: [*] metres.
-        speed: largest speed, [*] m/s.
-        acceleration: acceleration and deceleration, [*] m/s^2.
-
-    Returns:
-        Seconds, [*]; 0 for length 0.
-    """
-    return _profile(length, speed, acceleration)[1]
 
 
 def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
@@ -148,8 +128,16 @@ def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
     return Located(torch.lerp(origin, target, share.unsqueeze(-1)), stop, tour, finished)
 
 
-def _profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-    """Duration of the acceleration, and of the whole leg [s], [*]."""
+def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
+    """Duration of the acceleration, and of a whole rest-to-rest leg [s], [*].
+
+    The speed profile is trapezoidal, or triangular if the leg is too short to reach ``speed``.
+
+    Args:
+        length: [*] metres.
+        speed: largest speed, [*] m/s.
+        acceleration: acceleration and deceleration, [*] m/s^2.
+    """
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration
     return ramp, length / peak.clamp_min(torch.finfo(peak.dtype).tiny) + ramp
@@ -157,7 +145,7 @@ def _profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tenso
 
 def _covered(length: Tensor, speed: Tensor, acceleration: Tensor, elapsed: Tensor) -> Tensor:
     """Distance covered on a leg, [*] metres; 0 before it begins, ``length`` once it is over."""
-    ramp, duration = _profile(length, speed, acceleration)
+    ramp, duration = leg_profile(length, speed, acceleration)
     # The profile is symmetric: measured from the nearer end, speed has only risen or stayed the same.
     from_end = torch.minimum(elapsed, duration - elapsed).clamp_min(0.0)
     rising = torch.minimum(from_end, ramp)
@@ -206,11 +194,8 @@ def _inner_points(
     config: SourceConfig,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2] metres.
-
-    Rejection sampling from the disc. Points still outside after the first rounds are drawn from ever
-    smaller discs, at last at the hotspot itself, so that sampling ends however thin the polygon is.
-    """
+    """``max_stops`` points near each hotspot and inside the polygon, [W, H, max_stops, 2] metres."""
+    # Points outside after the first rounds are drawn from ever smaller discs, so that this ends.
     radii = config.local_distance / 2.0 ** np.maximum(np.arange(_ROUNDS) - _FULL_DISC_ROUNDS, 0)
     points = np.repeat(hotspots[:, :, None], config.max_stops, axis=2)
     flat, centre = points.reshape(-1, 2), points.reshape(-1, 2).copy()
@@ -250,7 +235,7 @@ def _timed_walk(stops: _Stops, config: SourceConfig, rng: np.random.Generator) -
     speed = np.where(to_hotspot, config.speed, config.local_speed)
     acceleration = np.where(to_hotspot, config.acceleration, config.local_acceleration)
     length = np.linalg.norm(np.diff(place, axis=1), axis=2)
-    leg = leg_duration(*(torch.as_tensor(x) for x in (length, speed[:, :-1], acceleration[:, :-1])))
+    _, leg = leg_profile(*(torch.as_tensor(x) for x in (length, speed[:, :-1], acceleration[:, :-1])))
     arrive = np.zeros(hotspot.shape)
     arrive[:, 1:] = np.cumsum(wait[:, :-1] + leg.numpy(), axis=1)
     depart = arrive + wait

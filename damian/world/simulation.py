@@ -15,11 +15,11 @@ from torch import Tensor
 from damian.common import checks, counter_rng
 from damian.common.tensors import gather_rows, tree_map
 from damian.settings.world import WorldConfig
-from damian.world.airspace import Airspace, nearest_points
+from damian.world.airspace import Airspace, build_airspace, nearest_points
 from damian.world.battery import observed
-from damian.world.config import airspace_of
 from damian.world.landing import Candidates, assign_landing_points
 from damian.world.messages import Messages
+from damian.world.regions.config import regions_of
 from damian.world.regions.places import local_places
 from damian.world.regions.region import Region
 from damian.world.sensors import sensors_of
@@ -47,20 +47,14 @@ class Simulation:
         dt: length of a simulation step [s].
         trail: number of its latest landing points that a UAV reports.
         seed: seed of the regions, start points and walks, which are drawn here, on the CPU.
-
-    Raises:
-        InputError: the configuration asks for something impossible.
     """
 
     def __init__(self, config: WorldConfig, dt: float, trail: int, seed: int) -> None:
-        dtype, remedy = torch.get_default_dtype(), "call torch.set_default_dtype(torch.float32) first"
-        problem = f"is not torch.float32, in which the worlds compute: {remedy}"
-        checks.require(dtype == torch.float32, "torch.get_default_dtype()", dtype, problem)
         rng = np.random.default_rng(seed)
         self.config, self.dt = config, dt
         self.sensors = sensors_of(config.sensors)
         self.radius = footprint_radius(config.source)
-        self.airspace = airspace_of(config, rng)
+        self.airspace = build_airspace(regions_of(config.region, rng), config.region, config.agents)
         self.candidates = Candidates(self.airspace, config.actions, config.agents)
         drawn = _draw_initial_conditions(config, self.airspace, rng)
         self.walk = drawn.walk
@@ -126,10 +120,7 @@ class Simulation:
         return self.vehicles.ready(state)
 
     def action_mask(self, state: State) -> Tensor:
-        """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds.
-
-        A single legal action has log-probability 0 and no gradient, so a policy does not learn from it.
-        """
+        """Legal discrete actions, [B, N, A] bool; a UAV that is not ready has one, which holds."""
         distance = gather_rows(self.candidates.distance, state.goal)
         reach = self.vehicles.reach(state).unsqueeze(-1)
         valid = distance <= reach
@@ -200,10 +191,7 @@ class Simulation:
         return stuck | (observed(state.battery, self.config.battery) <= 0)
 
     def _shortest_flights(self) -> Tensor:
-        """Length of the shortest flight from each landing point to which an action leads [m], [R*L].
-
-        It is 0 where no action leads to another landing point, which no battery can change.
-        """
+        """Length of the shortest flight from each landing point [m], 0 if no action flies, [R*L]."""
         if self.config.actions.kind == "discrete":
             length = self.candidates.distance  # if this point is out of reach, the UAV holds
             length = length.where(length > 0, torch.inf).amin(-1)
@@ -212,19 +200,12 @@ class Simulation:
         return length.where(length.isfinite(), 0.0)
 
     def _require_moves(self, shortest: Tensor) -> None:
-        """Refuse actions if none of them leads from any landing point to another one.
-
-        Args:
-            shortest: as ``_shortest_flights`` returns it.
-        """
+        """Refuse actions if none of them leads from any landing point to another one, [R*L] metres away."""
         actions = self.config.actions
         moves = shortest > 0
         if actions.kind == "continuous":  # a landing point is nearest beyond half of the way to it
             moves = moves & (shortest < 2 * self.candidates.max_distance)
-        problem = (
-            "[m] lead from no landing point to another one: rows of these have a point every "
-            f"{self.config.region.lattice_step:g} m (region.lattice_step), and no target may lie outside"
-        )
+        problem = "[m] lead from no landing point to another one: take larger ones, or a finer lattice"
         alone = self.airspace.max_points == 1
         checks.require(alone or bool(moves.any()), "actions.distances", actions.distances, problem)
 
@@ -295,12 +276,7 @@ class Simulation:
 def _draw_initial_conditions(
     config: WorldConfig, airspace: Airspace, rng: np.random.Generator
 ) -> InitialConditions:
-    """Draw the start points of the UAVs and the walks of the source, on the CPU.
-
-    Raises:
-        InputError: a given start position or source position lies outside the region, or two start
-            positions lead to one landing point.
-    """
+    """Draw the start points of the UAVs and the walks of the source, on the CPU."""
     per_region = config.region.initial_conditions // len(airspace.regions)
     walks, starts = [], []
     for index, region in enumerate(airspace.regions):
@@ -359,8 +335,7 @@ def _given_starts(config: WorldConfig, airspace: Airspace, region: int) -> Tenso
             first == i or config.region.start_together,
             "region.start_positions",
             f"{given[first]} and {given[i]}",
-            f"lead to the same landing point of {name}: take places farther apart, or let UAVs share it by "
-            "region.start_together=true",
+            f"lead to the same landing point of {name}: take others, or region.start_together=true",
         )
     return points
 

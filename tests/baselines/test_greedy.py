@@ -12,7 +12,6 @@ from torch import Tensor
 
 from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
 from damian.baselines.random import random_policy
-from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -110,21 +109,6 @@ def test_without_a_reward_for_the_source_no_uav_flies_to_it(sections, seeks):
     assert torch.equal(*ends) is not seeks
 
 
-def test_fresh_ground_is_nearest_to_the_uav_and_outside_its_latest_footprints():
-    env = make_env(everything(), 4, extras=["message"])
-    policy, held = Greedy(env.uav_env), sent_messages(env.rollout(4, random_policy(env))["next"][:, -1])
-    assert (held.trail[..., 0] != held.trail[..., 1]).any()
-    points, trails = policy.points.flatten(0, 1).tolist(), held.trail.tolist()
-    ground = policy.points[held.trail[:, 0, 0] // policy.points.shape[1]]
-    fresh = policy.fresh(held, ground).tolist()
-    for world, targets in enumerate(held.target.tolist()):
-        for place, *is_fresh in zip(ground[world].tolist(), *fresh[world], strict=True):
-            distance = [math.dist(target, place) for target in targets]
-            for uav, trail in enumerate(trails[world]):
-                covered = any(math.dist(points[flat], place) <= policy.radius for flat in trail)
-                assert is_fresh[uav] == (distance[uav] == min(distance) and not covered)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
     env = field(source=walking(emission="per_step", emission_probability=0.7))
@@ -212,15 +196,6 @@ def test_the_policy_reads_received_messages_and_not_sent_ones():
     assert not torch.equal(policy(td)["agents", "action"], without_detection)
 
 
-def test_the_age_of_messages_makes_detections_older():
-    env = field(delay=DelayConfig(obs=9), source=SourceConfig(level_db=135.0, motion="dynamic", speed=20.0))
-    td, policy = detection(env, [200.0, 200.0]), greedy_policy(env)
-    td["agents", "received"] = td["agents", "message"]
-    recent = policy(td.clone())["agents", "action"]
-    td["agents", "age"] += 9
-    assert not torch.equal(policy(td)["agents", "action"], recent)
-
-
 @pytest.mark.slow
 def test_with_any_number_of_uavs_the_policy_is_clearly_better_than_the_random_one():
     torch.manual_seed(0)
@@ -233,9 +208,3 @@ def test_with_any_number_of_uavs_the_policy_is_clearly_better_than_the_random_on
             env.set_seed(5)
             scores.append(evaluate(env, policy, 50).return_)
         assert scores[0] > 2 * scores[1]
-
-
-def test_a_region_with_too_many_landing_points_is_refused_in_one_line(monkeypatch):
-    monkeypatch.setattr("damian.baselines.greedy.MAX_PAIRS", 100)
-    with pytest.raises(InputError, match=r"region.lattice_step: \d+ landing points are too many"):
-        greedy_policy(field())

@@ -10,7 +10,6 @@ from torch import Tensor
 from damian.common import counter_rng
 from damian.delays.laws import LONGEST, Burst, Constant, Geometric, Law, Trace, Uniform, in_steps, law_of
 from damian.delays.samplers import Sampler
-from damian.transforms import RewardDelay
 
 STREAMS, STEPS = 1000, 100
 """Size of a sample: 10^5 messages."""
@@ -87,14 +86,6 @@ def test_each_delay_is_independent_of_the_one_before(name):
     check_chances(sampler, chances, delays[:, :-1][delays[:, 1:] == max(chances)])
 
 
-def test_a_sender_draws_the_same_delays_in_a_batch_as_alone():
-    sampler = Burst(bad=PAPER).sampler()
-    streams = counter_rng.world_seeds(5, 8)
-    alone = [sampler(one, torch.tensor(9), torch.ones(1, dtype=torch.long))[0] for one in streams.split(1)]
-    together, _ = sampler(streams, torch.tensor(9), torch.ones(8, dtype=torch.long))
-    assert together.equal(torch.cat(alone))
-
-
 def within(found: float, exact: float, deviation: float) -> bool:
     """Is the sample mean within five standard deviations of the exact one?"""
     return abs(found - exact) <= 5 * deviation
@@ -150,11 +141,6 @@ def test_a_trace_may_hold_times_losses_and_other_columns(tmp_path):
     assert {tuple(row) for row in first} == {tuple(([2, 5, 3, 0, 4] * 2)[k : k + 5]) for k in range(5)}
 
 
-def test_general_losses_add_to_those_of_a_trace(tmp_path):
-    sampler = trace(tmp_path, "1", "1", "2", "lost").sampler(loss=0.25)
-    check_chances(sampler, {1: 0.375, 2: 0.1875}, sample(sampler, 4000, 25))
-
-
 @pytest.mark.parametrize(
     ("setting", "law"),
     [
@@ -190,10 +176,3 @@ def test_a_law_is_given_as_steps_a_time_or_a_mapping(setting, law):
 )
 def test_a_time_is_rounded_up_to_whole_steps(delay, dt, steps):
     assert in_steps("delay", delay, dt) == steps
-
-
-@pytest.mark.parametrize("longest", [24, 29, 31, 41, 50])
-def test_rounding_never_makes_a_law_without_losses_lose_messages(longest):
-    sampler = Uniform(0, longest).sampler()
-    assert not sampler.loses
-    RewardDelay(Uniform(0, longest))

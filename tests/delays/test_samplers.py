@@ -1,6 +1,5 @@
 """Samplers of laws that hold delays or read the context: frequencies, rounding, and what they tell."""
 
-import dataclasses
 import math
 
 import pytest
@@ -17,13 +16,12 @@ from transform_cases import (
     WORLDS,
     choices,
     delayed,
-    trace,
 )
 
 from damian.common import counter_rng
-from damian.delays.laws import Burst, Distance, Geometric, Held, Lag, Law, Uniform
+from damian.delays.laws import Distance, Held, Lag, Uniform
 from damian.delays.line import BroadcastLine, DelayLine
-from damian.delays.samplers import ContextSampler, MessageContext, Recorded, Sampler
+from damian.delays.samplers import ContextSampler, MessageContext, Recorded
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 LAW, SENDERS = Uniform(1, 5), 20_000
@@ -67,11 +65,6 @@ def sample(lag: Lag, n_senders: int, n_steps: int, loss: float = 0.0) -> Tensor:
     return drawn(lag.sampler(loss=loss), counter_rng.world_seeds(5, n_senders), n_steps)
 
 
-def test_without_holding_the_lags_are_the_delays_of_the_other_law():
-    for law in (LAW, Geometric(2, 6), Uniform("3s", "7s", 0.15)):
-        assert sample(Lag(law), 500, 50).equal(drawn(law.sampler(), counter_rng.world_seeds(5, 500), 50))
-
-
 @pytest.mark.parametrize("probability", [0.0, 0.3, 0.95])
 def test_an_update_keeps_the_lag_with_the_hold_probability(probability):
     delays = sample(Lag(Uniform(0, 999), 2, hold_probability=probability), 2000, 41)
@@ -102,51 +95,7 @@ def test_the_agents_of_a_world_have_the_same_lags_exactly_if_they_share_them(mak
     assert len(set(streams.flatten().tolist())) == (len(WORLDS) if shared else len(ROWS))
 
 
-@dataclasses.dataclass(frozen=True)
-class Lossy(Law):
-    """A law that loses some messages itself."""
-
-    chances: tuple[float, ...] = (0.25, 0.25)
-
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return Sampler([[*self.chances]], loss=loss)
-
-
-@pytest.mark.parametrize(("law", "loss"), [(Uniform(0, 1), 0.5), (Lossy(), 0.0), (Lossy((0.4, 0.4)), 0.375)])
-def test_losses_are_drawn_for_each_message_and_lags_are_held(law, loss):
-    lag = Lag(law, "episode")
-    delays = sample(lag, 2000, 20, loss)
-    lost = delays == lag.sampler().lost
-    require_share(lost, 0.5)
-    require_share(lost[1:] & lost[:-1], 0.25)
-    ones = (delays == 1).any(0)
-    require_share(ones, 0.5)
-    assert not (ones & (delays == 0).any(0)).any()
-
-
 # Runs of losses.
-
-
-def test_a_trace_plays_its_runs_of_losses_back_and_other_losses_add_to_them(tmp_path):
-    rows = [0, 1, "lost", "lost", "lost", 2, 0, "lost", "lost", 3, 0, 0]
-    found = []
-    for loss in (0.0, 0.3):
-        transform = ObservationDelay(trace(tmp_path, *rows), [OBSERVATION], loss=loss, delay_key="delay")
-        outputs = play(delayed(transform), choices())[1::2]
-        found.append(torch.stack([td["agents", "delay"].flatten() for td in outputs], -1))
-    codes = [-1 if row == "lost" else row for row in rows]
-    rotations = [(codes * 5)[start : start + found[0].shape[1]] for start in range(len(codes))]
-    assert all(row in rotations for row in found[0].tolist())
-    assert found[1].equal(torch.where(found[1] == -1, found[1], found[0]))
-    require_share(found[1][found[0] >= 0] == -1, 0.3)
-
-
-def test_a_burst_loses_runs_of_messages_of_the_mean_length_1_over_leave():
-    sampler = Burst(enter=0.1, leave=0.25, good=0, bad=0, bad_loss=1.0).sampler()
-    lost = drawn(sampler, counter_rng.world_seeds(5, 2000), 200) == sampler.lost
-    ended = lost[:-1] & ~lost[1:]
-    length = lost[:-1].sum().item() / ended.sum().item()  # lost messages per run
-    assert abs(length - 4) < 5 * math.sqrt(12 / ended.sum().item())  # the variance is (1 - leave) / leave^2
 
 
 # Contexts.
@@ -175,15 +124,6 @@ def test_the_rounding_errors_of_a_float_cost_no_step():
         sampler = ContextSampler(lambda _, values=values: values, 100)
         delay, _ = sampler(senders, torch.tensor(1), senders, context_of(torch.rand(4)))
         assert delay.equal(expected)
-
-
-def test_losses_whatever_the_delay_do_not_depend_on_the_random_number_of_the_context():
-    sampler = ContextSampler(lambda context: (context.uniform < 0.5).long(), 1, loss=0.3, loses=False)
-    streams, clock = counter_rng.world_seeds(5, 2 * SENDERS), torch.tensor(3)
-    uniform = counter_rng.uniform(streams, clock)
-    delay, _ = sampler(streams, clock, torch.zeros_like(streams), context_of(uniform))
-    for some in (uniform < 0.5, uniform >= 0.5):
-        require_share(delay[some] == sampler.lost, 0.3)
 
 
 # Distances.

@@ -9,7 +9,7 @@ import torch
 from context_law import LONGEST, Crowd, twin_delay
 from delay_twin import Counting, Purse, Receiver
 from delayed_envs import choices as uav_choices
-from helpers import all_same, everything, play, square
+from helpers import all_same, everything, play
 from transform_cases import (
     ACTION,
     N_AGENTS,
@@ -27,9 +27,8 @@ from transform_cases import (
 
 from damian.common import counter_rng
 from damian.delays.config import DelayConfig
-from damian.delays.laws import Geometric, Lag, Law, Uniform
+from damian.delays.laws import Lag, Law, Uniform
 from damian.envs.pipeline import make_env
-from damian.keys import POSITION
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 DT = 2.0
@@ -194,11 +193,6 @@ def test_in_a_scenario_a_law_reads_the_true_position_at_the_instant_of_sending()
     assert numbers == {0, 1, 2, 3}
 
 
-def test_without_a_law_that_reads_it_no_position_is_output():
-    env = make_env(square(delay=DelayConfig(obs=3, act=Lag(2))), 2)
-    assert POSITION not in env.rollout(3).keys(True)
-
-
 def test_a_held_law_loses_the_same_messages_and_delays_the_others_equally():
     free, held = (
         play(env := make_env(everything(delay=delay), 4, extras=["message"]), uav_choices(env, 20))
@@ -240,20 +234,6 @@ def test_a_copy_and_a_loaded_state_go_on_with_the_same_delays(name):
         runs.append(steps)
     assert all_same(*runs[:2])
     assert all_same(*runs[1:])
-
-
-@pytest.mark.slow
-def test_a_compiled_environment_has_the_same_delays():
-    delay = DelayConfig(
-        obs={"law": "lag", "lag": {"law": "uniform", "high": 4}, "update_period": "2s", "stagger": True},
-        act={"law": "distance", "speed": 30, "range": 90},
-        rew=Lag(Geometric(1, 4), 2, hold_probability=0.5),
-        loss=0.1,
-    )
-    eager, compiled = (make_env(square(delay=delay), 4, seed=5, extras=["message"]) for _ in range(2))
-    compiled.compile(backend="eager")
-    one, other = (play(env, uav_choices(eager, 20)) for env in (eager, compiled))
-    assert all_same(one, other)
 
 
 def test_a_lag_of_0_is_the_identity():

@@ -105,15 +105,6 @@ def test_a_learner_trains_the_actor_that_evaluations_make(kind):
 
 
 @both_learners
-def test_a_replay_buffer_has_room_for_the_longest_batch_and_twice_the_longest_delay(name):
-    clock = ClockConfig(trigger="4s", longest="24s")
-    config = replace(LEARNERS[name], **{"buffer_steps": 123} if name == "sac" else {})
-    learner, env = build_learner(name, clock=clock, learner=config)
-    assert learner.buffer.storage.max_size == 4 * (24 + 2 * 3)
-    learner.learn(env.rollout(24, learner.actor, break_when_any_done=False))
-
-
-@both_learners
 @pytest.mark.parametrize("obs", [0, 3])
 def test_a_learner_also_waits_for_late_rewards_and_its_replay_buffer_has_room_for_the_corrections(name, obs):
     delay, clock = DelayConfig(obs=obs, rew=7, reward_window=4), ClockConfig(server="2s")

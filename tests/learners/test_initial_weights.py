@@ -2,14 +2,13 @@
 
 import math
 
-import pytest
 import torch
 from helpers import both_kinds, everything, learning
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from damian.envs.uav_env import UavEnv
-from damian.learners.networks import ModelConfig, make_actor, make_critic, make_mlp
+from damian.learners.networks import ModelConfig, make_actor, make_critic
 from damian.learners.sac import Sac, SacConfig
 from damian.replay.time_storage import TimeStorage
 
@@ -41,13 +40,6 @@ def test_orthogonal_weights_have_a_gain_by_the_place_of_their_layer(kind):
         check_gains(make_critic(env, config, normalize=normalize), [hidden, hidden, 1.0])
 
 
-@pytest.mark.parametrize("widths", [[8], [16, 8]])
-def test_a_recurrent_layer_has_a_gain_of_1(widths):
-    config = ModelConfig(hidden=widths, rnn="gru", init="orthogonal")
-    encoder = [math.sqrt(2)] * (len(widths) - 1)
-    check_gains(make_actor(ENV, config), [*encoder, 1.0, 1.0, 0.01])
-
-
 def test_both_critics_of_sac_and_their_targets_begin_with_orthogonal_weights_of_their_own():
     model = ModelConfig(hidden=[16], init="orthogonal")
     learner = Sac(ENV, SacConfig(), learning(model), ReplayBuffer(storage=TimeStorage(100)))
@@ -57,10 +49,3 @@ def test_both_critics_of_sac_and_their_targets_begin_with_orthogonal_weights_of_
         for weights, gain in ((first, math.sqrt(2)), (second, 1.0)):
             torch.testing.assert_close(gains(weights), torch.full([2, min(weights.shape[1:])], gain))
             assert not weights[0].equal(weights[1])
-
-
-def test_the_default_is_pytorchs():
-    torch.manual_seed(0)
-    weights = make_mlp(ModelConfig(hidden=[16]), 5, 3, None)[0].weight
-    torch.manual_seed(0)
-    assert weights.equal(nn.Linear(5, 16).weight)

@@ -48,20 +48,6 @@ def test_a_policy_made_for_three_uavs_works_with_ten(kind):
     assert rollout["agents", "action_log_prob"].shape == (2, 4, 10)
 
 
-def test_all_uavs_share_one_policy_so_that_swapping_uavs_swaps_their_actions():
-    env = UavEnv(scenario(), 4)
-    actor, critic = make_actor(env, SMALL), make_critic(env, SMALL)
-    observed = env.rollout(3)[:, -1].select(("agents", "observation"), ("agents", "global_observation"))
-    order = torch.tensor([2, 0, 1])
-    swapped = observed.clone()
-    for key in ("observation", "global_observation"):
-        swapped["agents", key] = observed["agents", key][:, order]
-    logits = actor.module[0](observed.clone())["agents", "logits"]
-    assert torch.equal(actor.module[0](swapped)["agents", "logits"], logits[:, order])
-    values = critic(observed.clone())["agents", "state_value"]
-    assert torch.equal(critic(swapped)["agents", "state_value"], values[:, order])
-
-
 @pytest.mark.parametrize("make", [lambda env: make_actor(env, SMALL), random_policy])
 @pytest.mark.parametrize("motion", ["instant", "polynomial"])
 def test_masked_policies_never_choose_an_illegal_action(make, motion):

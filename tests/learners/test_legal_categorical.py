@@ -53,11 +53,3 @@ def test_draws_are_those_of_other_libraries_and_always_legal(shape, masked):
     assert illegal.any() == masked
     assert (ours.probs[illegal] == 0).all()
     assert len(set(ours.sample(torch.Size([50])).flatten().tolist())) == 7
-
-
-def test_a_single_legal_action_is_certain():
-    mask = torch.tensor([False, True, False])
-    policy = LegalCategorical(torch.tensor([[5.0, -5.0, 1.0]]), mask)
-    assert policy.sample().tolist() == policy.deterministic_sample.tolist() == [1]
-    assert policy.log_prob(torch.tensor([1])).item() == 0
-    assert policy.entropy().item() == 0

@@ -21,7 +21,6 @@ from damian.learners.mappo import (
     Mappo,
     MappoConfig,
     add_advantages,
-    explained_variance,
     mappo_losses,
     policy_terms,
     state_values,
@@ -149,34 +148,6 @@ def test_the_compiled_losses_are_those_of_the_uncompiled_function_for_any_number
         gradients = [torch.autograd.grad(terms.sum(), learner.weights) for terms in (found, expected)]
         torch.testing.assert_close((found, numbers), (expected, expected_numbers), rtol=1e-4, atol=1e-6)
         torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("case", ["discrete", "recurrent"])
-def test_every_pass_goes_once_over_all_steps_in_the_order_of_a_permutation(case):
-    _, learner, batch = flown(case)
-    recurrent = learner.setup.model.recurrent
-    samples = batch if recurrent else batch.reshape(-1)
-    torch.manual_seed(0)
-    minibatches = [*learner._minibatches(batch)]
-    assert len(minibatches) == 4  # two passes over two minibatches
-    torch.manual_seed(0)
-    drawn = [i for _ in range(2) for i in torch.randperm(len(samples)).tensor_split(2)]
-    for entries, index in zip(minibatches, drawn, strict=True):
-        assert entries.keys() == loss_entries(learner, batch).keys() - {
-            *(() if recurrent else RECURRENT_KEYS)
-        }
-        for key, value in entries.items():
-            assert value.equal(samples[key][index]), key
-
-
-def test_the_explained_variance_is_1_for_exact_values_and_0_for_a_constant():
-    _, _, batch = flown("discrete")
-    target = batch[keys.VALUE_TARGET]
-    for value, share in ((target + 2.0, 1.0), (torch.ones_like(target), 0.0), (2 * target, 0.0)):
-        batch[keys.STATE_VALUE] = value
-        assert explained_variance(batch).item() == pytest.approx(share, abs=1e-5)
-    batch[keys.VALUE_TARGET] = torch.ones_like(target)
-    assert explained_variance(batch).isnan()
 
 
 # Values.

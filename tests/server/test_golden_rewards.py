@@ -29,8 +29,7 @@ from golden_records import (
 from helpers import GOLDEN, act, usecase
 
 from damian.server.features import observe
-from damian.server.rewards import RewardConfig, final_reward, reward
-from damian.server.termination import status
+from damian.server.rewards import RewardConfig, reward
 
 
 def reason_for_other_feature(name: str, transition: Transition, uav: int, value: float) -> str | None:
@@ -144,29 +143,6 @@ def test_recorded_features_give_the_recorded_reward_terms(case, compared, reason
                     assert ours[name][world][uav] == pytest.approx(value, abs=TOLERANCE)
     assert counts.pop(None) == compared
     assert counts == reasons
-
-
-ENDS = {"TASK SUCCESS": "success", "TIME FAILURE": "timeout", "MAXIMUM EPISODE TIME EXPIRED": "timeout"}
-"""How an episode ends, by the text that the original records."""
-
-
-@pytest.mark.parametrize(("case", "ends"), [(1, (4, 2)), (2, (3, 3))])
-def test_recorded_episodes_give_the_recorded_rewards_and_ends(case, ends):
-    records, config = recorded(case, EPISODES), usecase(case)
-    messages, server, counters = server_inputs(case, records)
-    never = torch.zeros(len(records), dtype=torch.bool)
-    ended = status(messages, counters.steps, never, 1.0, config.episode)
-    terms = reward(observe(messages, server, config.reward.terms), counters, config.reward)
-    total = torch.stack([*terms.values()]).sum(0)
-    total += final_reward(ended, counters, config.reward)[:, None]
-    torch.testing.assert_close(total, column(records, "reward"), atol=TOLERANCE, rtol=0)
-    assert total.numel() == {1: 48, 2: 204}[case]
-    outcomes = [ENDS.get(transition.after["info"]) for transition in records]
-    assert ended.success.tolist() == [outcome == "success" for outcome in outcomes]
-    assert ended.terminated.equal(ended.success)
-    assert ended.truncated.tolist() == [outcome == "timeout" for outcome in outcomes]
-    assert (ended.success | ended.truncated).tolist() == [m.after["done"] for m in records]
-    assert (outcomes.count("success"), outcomes.count("timeout")) == ends
 
 
 @pytest.mark.parametrize("case", [1, 2])

@@ -7,17 +7,12 @@ from torch import Tensor
 
 from damian.common.tensors import tree_map
 from damian.envs.scenario import make_server, make_simulation
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig, feature, observe, observe_own
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.server import Server
 from damian.world.messages import Messages
 from damian.world.regions.config import RegionConfig
 
 B = 3
-
-lag = feature("global", low=-1e3, high=1e3)(
-    lambda cache: cache.messages.time.amax(-1, True) - cache.messages.time
-)
-"""A feature of one's own that compares UAVs: how much older a message is than the newest one."""
 
 
 def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
@@ -56,11 +51,3 @@ def test_every_uav_computes_of_itself_what_the_server_would(n_agents):
             server.features(one, steps, server.observation.actor + server.observation.critic)
         )
         assert found[:, i].equal(expected[:, i])
-
-
-def test_a_feature_of_ones_own_that_knows_nothing_of_this_is_right_too(monkeypatch):
-    server, known, steps = known_messages(4)
-    context = server._context(known, steps.unsqueeze(-1).expand(B, 4))
-    monkeypatch.setattr("damian.server.features.FEATURES.get", lambda *_: lag)
-    expected = observe(known, context, ["lag"])["lag"]
-    assert observe_own(known, context, ["lag"])["lag"].equal(expected.diagonal(0, 1, 2))

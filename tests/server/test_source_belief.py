@@ -18,7 +18,6 @@ from damian.server.belief import (
     _begin,
     _parts,
     build_source_grid,
-    chance_of_staying,
     detection_chance,
     empty_window,
     latest,
@@ -236,37 +235,6 @@ def test_the_chance_of_a_detection_equals_the_slow_twins(grid):
         for p in (0, 3, n_points - 1):
             expected = chance_at(grid, r, beliefs[r], r * n_points + p)
             assert chance[r, p].item() == pytest.approx(expected, rel=1e-4)
-
-
-def test_who_stays_where_it_has_just_detected_nothing_detects_a_source_that_rests_only_by_its_emission():
-    grid = grids["static"]
-    detects = detection_table(grid)
-    point = int(detects.sum(-1).argmax())
-    predicted = torch.nn.functional.one_hot((detects[point] - 0.5).abs().argmin(), grid.prior.shape[-1])
-    rows = torch.tensor([2 * point, 2 * point + 1, grid.no_report])
-    silent, detected, unknown = chance_of_staying(grid, predicted.float(), rows).tolist()
-    assert silent == pytest.approx(0, abs=1e-6)
-    assert detected == pytest.approx(1)
-    assert unknown == pytest.approx(0)
-    half = make_grid(0.5, moves=False)
-    silent, detected, _ = chance_of_staying(half, predicted.float(), rows).tolist()
-    share = float(detection_table(half)[point] @ predicted.float())
-    # By Bayes: it is in the footprint, but did not emit; then it emits with the same probability again.
-    assert silent == pytest.approx(0.5 * share * 0.5 / (1 - 0.5 * share), rel=1e-3)
-    assert detected == pytest.approx(0.5)
-
-
-@every_grid
-def test_a_grid_has_probabilities(grid):
-    torch.testing.assert_close(grid.prior.sum(-1), torch.ones(len(grid.prior)))
-    silent, detected = grid.log_reports[0 : grid.no_report // 2 : 2].exp(), detection_table(grid)
-    assert detected.min() > 0
-    assert detected.max() < 1
-    torch.testing.assert_close(silent + detected, torch.ones_like(silent))
-    assert (grid.log_reports[grid.no_report] == 0).all()
-    if grid.moves is not None:
-        inside = grid.moves @ (grid.prior > 0).float().T / (grid.staying.T if len(grid.prior) > 1 else 1)
-        torch.testing.assert_close(inside, torch.ones_like(inside))
 
 
 def test_a_report_is_as_likely_as_a_source_in_the_cell_is_in_the_footprint():

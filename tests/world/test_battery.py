@@ -1,7 +1,6 @@
-"""Battery: recorded figures of the original implementation, and its one run that departs from the model."""
+"""Battery: recorded figures of the original implementation."""
 
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -9,7 +8,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from damian.common.errors import InputError
 from damian.world.battery import (
     BatteryConfig,
     charge_gain,
@@ -22,8 +20,6 @@ from damian.world.motion import fly, minimum_time
 
 DATA = Path(__file__).parents[1] / "data"
 ENERGY = json.loads((DATA / "motion_energy_coverage.json").read_text())["energy"]
-ODD_RUN = ENERGY["instantaneous_env_run_usecase1"]
-START = json.loads((DATA / "usecase1.json").read_text())["scenario"]["uav_start_positions"][0]
 BATTERY = BatteryConfig()
 
 
@@ -71,28 +67,6 @@ def test_float_error_does_not_change_the_observed_level(multiple, error):
     assert observed(level, BATTERY).item() == 5.0 * multiple
 
 
-def test_the_odd_recorded_run_is_left_out_because_it_subtracts_charging():
-    # In this run, the original drains a flight by three parts: takeoff and landing, as in this
-    # project; a cruise whose speed is the length over 10 000 s (its placeholder for the duration of
-    # an instant motion); and the gain of *charging* for the whole flight, which it subtracts. Then it
-    # adds one step of charging. So no transition agrees with this project; this test pins the formula
-    # of the original, and the parts that both share.
-    left_out, level, place = 0, 100.0, START
-    for _, _, x, y, after, recorded_level, vertical, cruise in ODD_RUN["rows"]:
-        length = math.dist(place, (x, y))
-        ours = flight_drain(tensor(vertical), tensor(length), BATTERY).item()
-        theirs = (
-            flight_drain(tensor(vertical), tensor(length / 10_000 * cruise), BATTERY)
-            + charge_gain(tensor(2 * vertical + cruise), BATTERY)
-            - charge_gain(tensor(1.0), BATTERY)
-        ).item()
-        assert level - after == pytest.approx(theirs, abs=2e-7)
-        assert observed(tensor(after), BATTERY).item() == recorded_level
-        left_out += level - after > 2 * ours
-        level, place = after, (x, y)
-    assert left_out == len(ODD_RUN["rows"]) == 40
-
-
 @pytest.mark.parametrize("degree", [3, 5, 7])
 @pytest.mark.parametrize("n_steps", [3, 17, 400])
 def test_the_drain_of_a_flight_does_not_depend_on_the_time_step(degree, n_steps):
@@ -129,17 +103,3 @@ def test_the_drain_so_far_is_the_sum_over_the_phases_of_a_flight(share, vertical
     expected = flown * 100 * 10 / (9 * 12 * 0.9) / 3600 + cruised / 20 * 100 * 10 / (9 * 12) / 3600
     values = (tensor(x) for x in (elapsed, vertical, cruise, cruised))
     assert used_so_far(*values, BATTERY).item() == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"capacity_kwh": 0.0},
-        {"resolution": 101.0},
-        {"charging_points": []},
-        {"charging_points": [[1.0, 2.0]]},
-    ],
-)
-def test_a_wrong_battery_setting_is_refused_by_its_key(wrong):
-    with pytest.raises(InputError, match=f"^battery.{next(iter(wrong))}: "):
-        BatteryConfig(**wrong)

@@ -36,15 +36,6 @@ def first_step(env: UavEnv, holds, near: int, **changed) -> int:
     return steps[flags.index(True)]
 
 
-@given(period=periods, tenths=st.integers(0, 10**7))
-@settings(max_examples=settings.default.max_examples // 2)
-def test_a_uav_that_holds_is_ready_after_exactly_its_sensing_time(period, tenths):
-    motion = MotionConfig("polynomial", sensing_time=tenths / 10)
-    env = fresh(one_uav(motion=motion, clock=clock(f"{period}s")))
-    expected = math.ceil(Fraction(tenths, 10) / Fraction(period))
-    assert first_step(env, env.simulation.ready, expected, vertical=0.0, cruise=0.0) == expected
-
-
 @given(
     period=periods,
     vertical=st.floats(0.125, 1024.0, width=32),
@@ -66,23 +57,6 @@ def test_a_flight_ends_after_exactly_its_duration_but_for_its_float_error(period
             assert least <= first_step(env, holds, most, vertical=vertical, cruise=cruise) <= most
 
 
-def test_the_position_on_a_long_flight_is_as_exact_as_on_a_short_one():
-    env = fresh(one_uav(motion=MotionConfig("polynomial", max_speed=0.001), clock=clock("0.1s")))
-    state, simulation = one_state(env, goal=1, vertical=1.0, cruise=1e6, elapsed=0), env.simulation
-    origin, goal = (simulation.points[point.item()].double() for point in (state.origin, state.goal))
-
-    def share(tau: float) -> float:
-        tau = min(max(tau, 0.0), 1.0)
-        return 10 * tau**3 - 15 * tau**4 + 6 * tau**5
-
-    for steps in (3, 10**6, 5 * 10**6 + 1, 9_999_999, 10_000_017):  # the last one is landing
-        seconds = steps * 0.1
-        position = simulation.vehicles.move(state._replace(elapsed=state.elapsed + steps - 1)).position
-        place = (origin + share((seconds - 1) / 1e6) * (goal - origin)).tolist()
-        height = simulation.vehicles.levels[0].item() * share(min(seconds, 1e6 + 2 - seconds))
-        assert position[0, 0].tolist() == pytest.approx([*place, height], rel=1e-5)
-
-
 def test_charging_for_many_short_steps_gains_as_much_as_for_few_long_ones():
     # A step gains so little that a sum over the steps in float32 would be wrong by a tenth.
     motion = MotionConfig("polynomial", sensing_time=1e5)
@@ -90,10 +64,10 @@ def test_charging_for_many_short_steps_gains_as_much_as_for_few_long_ones():
     env = fresh(one_uav(motion=motion, battery=battery, clock=clock("0.001s")))
     state = one_state(env, battery=50.0, battery_before=50.0, vertical=0.0, cruise=0.0, elapsed=0)
     levels = []
-    for _ in range(3000):
+    for _ in range(1000):
         state = env.simulation.vehicles.move(state)
         levels.append(state.battery.item())
-    gain = 100 * 3 / (3600 * battery.capacity_kwh / battery.charging_power_kw)
+    gain = 100 * 1 / (3600 * battery.capacity_kwh / battery.charging_power_kw)
     assert levels[-1] == pytest.approx(50 + gain, abs=1e-5)
     assert levels == sorted(levels)
 

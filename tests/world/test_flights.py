@@ -32,7 +32,7 @@ from helpers import (
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.termination import EpisodeConfig
-from damian.world.battery import BatteryConfig, flight_drain
+from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
@@ -218,23 +218,3 @@ def test_each_decision_adds_one_point_to_the_trail_however_long_the_uav_senses(s
             landings += 1
         assert env.state.sent.trail.tolist() == expected
     assert landings > 50
-
-
-def test_a_point_out_of_reach_of_one_uav_stays_free_for_others():
-    actions = ActionConfig(kind="continuous")
-    env = fresh(square(agents=2, battery=BatteryConfig(enabled=True), actions=actions))
-    aim, *pair = (env.simulation.points - 100.0).norm(dim=-1).argsort()[:3].tolist()
-    east, north = (env.simulation.points[aim] - env.simulation.points[pair]).unbind(-1)
-    bearing = torch.atan2(east, north) / math.tau % 1
-    action = torch.stack([torch.hypot(east, north) / max(actions.distances), bearing], -1)
-    state, goal = env.state, torch.tensor([pair])
-    cost = flight_drain(
-        env.simulation.vehicles.vertical[0], torch.hypot(east, north)[0], env.scenario.battery
-    ).item()
-    for level, booked in ((100.0, [aim, None]), (0.99 * cost, [pair[0], aim]), (0.0, [pair[0], aim])):
-        battery = torch.tensor([[level, 100.0]])
-        env.state = state._replace(goal=goal, origin=goal, battery=battery)
-        act(env, action[None])
-        first, second = env.state.goal[0].tolist()
-        assert first == booked[0]
-        assert (second == aim) == (booked[1] == aim)

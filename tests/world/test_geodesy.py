@@ -43,14 +43,6 @@ def test_local_metres_within_50_km_survive_the_round_trip_over_degrees(lat, lon,
     np.testing.assert_allclose(to_local(*place, (lat, lon)), [x, y], atol=1e-6)
 
 
-@given(st.floats(-60, 60), st.floats(1, 50_000))
-def test_a_place_east_of_the_antimeridian_has_a_wrapped_longitude_and_the_same_distance(lat, x):
-    origin = (lat, 179.99999)
-    place = to_latlon(x + 10, 0.0, origin)
-    assert -180 <= place[1] < -179
-    assert to_local(*place, origin)[0] == pytest.approx(x + 10, abs=1e-6)
-
-
 # --- the centroid of an area --------------------------------------------------------------------
 
 

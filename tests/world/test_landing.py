@@ -15,19 +15,17 @@ from shapely.affinity import scale, translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
+from damian.settings.world import RegionConfig, WorldConfig
 from damian.world import airspace as search
 from damian.world import landing
 from damian.world.airspace import build_airspace, build_cells, inside, nearest_points
-from damian.world.config import WorldConfig
 from damian.world.landing import (
     ActionConfig,
     Candidates,
     Ranking,
     action_table,
     assign_landing_points,
-    displacement,
 )
-from damian.world.regions.config import RegionConfig
 from damian.world.regions.region import Region
 from damian.world.simulation import Simulation
 
@@ -80,19 +78,6 @@ def test_booking_at_once_and_one_by_one_equals_a_sequential_loop(few, seed, n_ag
     assert ours.tolist() == booked_by_twin(*case)
     assert together or all(len({*world}) == n_agents for world in ours.tolist())
     assert ours[case[-1] < 0].equal(case[2][case[-1] < 0])
-
-
-def test_a_point_that_a_uav_leaves_in_this_step_is_not_free_yet():
-    ranking = Ranking(torch.tensor([[5, 7, 1], [1, 6, 2]]), torch.zeros(2, 3))
-    row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
-    assert assign_landing_points(ranking, row, standing, torch.zeros(1, 2), 8).tolist() == [[5, 6]]
-
-
-def test_a_point_out_of_reach_of_one_uav_goes_to_another_that_can_fly_there():
-    ranking = Ranking(torch.tensor([[5, 7, 1], [5, 2, 0]]), torch.tensor([[9.0, 4.0, 0.0], [9.0, 0.0, 4.0]]))
-    row, standing = torch.tensor([[0, 1]]), torch.tensor([[1, 2]])
-    assert assign_landing_points(ranking, row, standing, torch.tensor([[8.0, 9.0]]), 8).tolist() == [[1, 5]]
-    assert assign_landing_points(ranking, row, standing, torch.tensor([[9.0, 9.0]]), 8).tolist() == [[5, 2]]
 
 
 # Nearest points.
@@ -174,7 +159,7 @@ def star(rng):
 @pytest.mark.parametrize("polygon", [*POLYGONS.values(), *map(star, map(np.random.default_rng, range(5)))])
 def test_inside_equals_shapelys_contains(polygon):
     rng = np.random.default_rng(3)
-    airspace = build_airspace([Region(polygon, "test")], 1.0, 45.0, None, 1)
+    airspace = build_airspace([Region(polygon, "test")], RegionConfig(lattice_step=1.0), 1)
     west, south, east, north = polygon.bounds
     target = rng.uniform([west - 1, south - 1], [east + 1, north + 1], (2000, 2))
     # A quarter of the targets have the y of some corner, so that their rays meet the ends of edges.
@@ -196,7 +181,7 @@ def candidates(kind):
     """Candidates and action settings for two regions, the first with a notch, and one kind of actions."""
     notch = Polygon([(0, 0), (210, 0), (210, 190), (120, 190), (100, 60), (80, 190), (0, 190)])
     regions = [Region(notch, "notch"), Region(HORSESHOE.buffer(40), "oval")]
-    airspace = build_airspace(regions, 30.0, 45.0, None, 3)
+    airspace = build_airspace(regions, RegionConfig(), 3)
     config = ActionConfig(
         kind=kind, distances=[0.0, 41.7, 97.3, 153.9], headings=[-130.0, -31.0, 5.0, 77.0, 180.0]
     )
@@ -226,7 +211,7 @@ def test_discrete_and_continuous_actions_have_the_same_candidates():
 @pytest.mark.parametrize("name", POLYGONS)
 def test_the_landing_points_of_actions_are_ranked_as_by_a_loop_in_exact_arithmetic(name):
     polygon, actions = scale(POLYGONS[name], 20, 20), ActionConfig(distances=[0.0, 50.0, 97.0])
-    airspace = build_airspace([Region(polygon, name)], 30.0, 45.0, None, 3)
+    airspace = build_airspace([Region(polygon, name)], RegionConfig(), 3)
     ranking = Candidates(airspace, actions, 3).ranking
     points = airspace.exact_points[0].tolist()
     moves = [(d, math.radians(h)) for d in actions.distances for h in actions.headings]
@@ -242,19 +227,6 @@ def test_the_landing_points_of_actions_are_ranked_as_by_a_loop_in_exact_arithmet
         assert ranking.point[row].tolist() == expected
         outside += not inside_polygon
     assert 10 < outside < 80
-
-
-def test_headings_are_clockwise_from_north():
-    displaced = displacement(torch.tensor([10.0] * 4), torch.tensor([0.0, 90, 180, 270]).deg2rad())
-    expected = [[0.0, 10.0], [10.0, 0.0], [0.0, -10.0], [-10.0, 0.0]]
-    assert displaced.tolist() == [pytest.approx(pair, abs=1e-5) for pair in expected]
-
-
-def test_the_table_holds_every_heading_of_the_first_distance_then_of_the_next():
-    config = ActionConfig(distances=[0.0, 10.0], headings=[0.0, 90.0, -90.0])
-    expected = [[d, math.radians(h)] for d in (0.0, 10.0) for h in (0.0, 90.0, -90.0)]
-    assert config.n_actions == 6
-    assert action_table(config).tolist() == [pytest.approx(row) for row in expected]
 
 
 @both_kinds

@@ -94,12 +94,6 @@ def test_landing_points_are_strictly_inside_distinct_and_ordered_by_direction(se
     assert (np.diff(angles) > -1e-9).all()
 
 
-def test_lattice_points_on_the_boundary_are_not_landing_points():
-    points = landing_lattice(SQUARE, 25, 90)
-    assert len(points) == 9
-    assert {tuple(p) for p in points.round(9)} == {(x, y) for x in (25, 50, 75) for y in (25, 50, 75)}
-
-
 def test_n_points_keeps_those_nearest_to_the_centroid_in_unchanged_order():
     points = landing_lattice(L_SHAPE, 20, 45)
     kept = landing_lattice(L_SHAPE, 20, 45, 10)
@@ -129,7 +123,7 @@ def test_an_impossible_lattice_raises_one_line(step, degrees, n, message):
 
 def test_random_polygons_have_the_statistics_of_the_original():
     stats, rng = GOLDEN["random_polygon_stats"], np.random.default_rng(0)
-    polygons = [random_polygon(rng, stats["min_area"], stats["max_area"]) for _ in range(1000)]
+    polygons = [random_polygon(rng, stats["min_area"], stats["max_area"]) for _ in range(300)]
     areas = np.array([p.area for p in polygons])
     n_vertices = np.array([len(p.exterior.coords) - 1 for p in polygons])
     lattices = np.array([len(landing_lattice(p, 30, 45)) for p in polygons])
@@ -141,8 +135,8 @@ def test_random_polygons_have_the_statistics_of_the_original():
         "diameter": diameters,
     }
     for name, sample in samples.items():
-        # Four standard errors of the difference of two means over a thousand polygons each.
-        error = 4 * sample.std() * math.sqrt(2 / 1000)
+        # Four standard errors of the difference of two means over 300 and 1000 polygons.
+        error = 4 * sample.std() * math.sqrt(1 / 300 + 1 / 1000)
         assert sample.mean() == pytest.approx(stats[name]["mean"], abs=error), name
     assert areas.std() == pytest.approx(stats["area"]["std"], rel=0.25)
 
@@ -170,25 +164,14 @@ def test_a_concave_polygon_stays_concave_whether_its_vertices_are_open_or_closed
         ([[0, 0], [1, 1]], "2 distinct points"),
         ([[0, 0], [1, 1], [2, 2], [3, 3]], "no area"),
         ([[0, 0], [1, 1], [1, 0], [0, 1]], "edges cross at [0.5, 0.5] m"),
-        ([[0, 0], [1, math.nan], [1, 0]], "vertex 1 [1.0, nan] m is not within"),
-        ([[0, 0], [1, 1], [1e300, 0]], "vertex 2 [1e+300, 0.0] m"),
-        ([[0, 0], [1, 1], [2, "north"]], "not a list of [x, y] numbers"),
-        ([[0, 0, 0], [1, 1, 0], [2, 0, 0]], "shape [3, 3]"),
+        ([[0, 0], [1, math.nan], [1, 0]], "[1, nan] is not [x, y] in metres"),
     ],
 )
 def test_vertices_that_form_no_polygon_raise_one_line(vertices, message):
     with pytest.raises(InputError) as error:
         polygon_from_vertices(vertices, "region.vertices")
-    assert str(error.value).startswith("region.vertices: ")
-    assert message in str(error.value)
+    assert str(error.value).startswith(f"region.vertices: {message}")
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_the_largest_vertex_distance_agrees_with_a_slow_loop(shape):
-    corners = shapely.get_coordinates(shape)
-    expected = max(math.dist(a, b) for a in corners for b in corners)
-    assert largest_vertex_distance(shape) == pytest.approx(expected)
 
 
 # --- points inside ------------------------------------------------------------------------------
@@ -214,11 +197,3 @@ def test_points_are_drawn_in_a_very_narrow_polygon_too():
     points = sample_interior(narrow, 500, np.random.default_rng(0))
     assert shapely.contains_xy(narrow, points).all()
     assert len(np.unique(points, axis=0)) == 500
-
-
-def test_a_polygon_without_interior_raises_an_error_instead_of_an_endless_loop():
-    # The smallest triangle of floating-point numbers: no number lies between its corners.
-    smallest = Polygon([(1, 1), (1, np.nextafter(1, 2)), (np.nextafter(1, 2), 1)])
-    for polygon in (Polygon(), MultiPolygon(), smallest):
-        with pytest.raises(InputError, match="no inside"):
-            sample_interior(polygon, 5, np.random.default_rng(0))

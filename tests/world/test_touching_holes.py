@@ -30,7 +30,7 @@ def read(tmp_path, *rings):
 
 
 @pytest.mark.parametrize("hole", HOLES.values(), ids=HOLES)
-@pytest.mark.parametrize("latitude", [-30.0, 0.0, 50.0, 80.0])
+@pytest.mark.parametrize("latitude", [-30.0, 80.0])
 def test_a_hole_may_touch_the_shell(tmp_path, hole, latitude):
     shell, hole = ([[x, y - 50 + latitude] for x, y in ring] for ring in (SHELL, hole))
     region = read(tmp_path, shell, hole)

@@ -11,10 +11,8 @@ from hypothesis import strategies as st
 from shapely.affinity import translate
 
 from damian.common.tensors import tree_map
-from damian.envs.scenario import ScenarioConfig
-from damian.envs.uav_env import UavEnv
+from damian.settings.world import WorldConfig
 from damian.world.battery import BatteryConfig
-from damian.world.config import WorldConfig
 from damian.world.landing import ActionConfig
 from damian.world.regions.config import RegionConfig
 from damian.world.regions.region import Region, centred
@@ -115,15 +113,3 @@ def test_a_centred_region_has_its_centroid_at_the_origin_and_knows_where_it_was(
     back = shapely.get_coordinates(translate(region.polygon, *region.offset))
     np.testing.assert_allclose(back, shapely.get_coordinates(polygon), atol=2e-5)
     assert len(region.polygon.interiors) == 1
-
-
-def test_positions_that_delay_laws_read_are_in_the_coordinates_of_the_settings():
-    region = RegionConfig(
-        kind="vertices",
-        vertices=[[500.0, 500.0], [900.0, 500.0], [900.0, 800.0]],
-        start_positions=[[700.0, 560.0]] * 3,
-        start_together=True,
-    )
-    env = UavEnv(ScenarioConfig(region=region), extras=("position",))
-    position = env.reset()["agents", "position"]
-    assert (position[0] - torch.tensor([700.0, 560.0])).norm(dim=-1).max() < 30

@@ -2,11 +2,11 @@
 
 import inspect
 from collections.abc import Callable
+from contextlib import nullcontext
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
-import shapely
 
 from damian.common import checks
 from damian.common.errors import naming_errors
@@ -51,25 +51,13 @@ def _region_of_geojson(config: RegionConfig, rng: np.random.Generator) -> list[R
 
 
 def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
-    """Read the region from its file or vertices, or draw ``pool`` random regions.
-
-    Raises:
-        InputError: the file cannot be read, the vertices form no valid polygon, or the given function
-            raises an error or returns no list of regions with valid polygons.
-    """
-    source, name = REGION_SOURCES.get(config.kind, "region.kind"), f"region.kind: {config.kind}"
-    if ":" not in config.kind:
-        return [centred(region) for region in source(config, rng)]
-    with naming_errors(name):
-        found = source(config, rng)
-    listed = isinstance(found, list) and found and all(isinstance(each, Region) for each in found)
-    checks.require(bool(listed), name, f"a {type(found).__name__}", "is not a list of at least one Region")
-    for region in found:
-        reason = shapely.is_valid_reason(region.polygon)
-        checks.require(region.polygon.is_valid, f"{name}: {region.name}", reason, "[m]: edges must not cross")
+    """Read the region from its file or vertices, or draw ``pool`` random regions."""
+    source = REGION_SOURCES.get(config.kind, "region.kind")
+    with naming_errors(f"region.kind: {config.kind}") if ":" in config.kind else nullcontext():
+        found = [centred(region) for region in source(config, rng)]
     most, problem = config.initial_conditions, "regions: each needs at least one initial condition"
     checks.require(len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem)
-    return [centred(region) for region in found]
+    return found
 
 
 def _file(path: str) -> str:

@@ -10,13 +10,11 @@ from damian.common.text_files import Row, named, near, parse_table, read_text, s
 from damian.world.regions.region import Region, local_region
 
 _ID, _SEQUENCE = "Airspace ID", "Sequence Number"
-_LOWEST, _HIGHEST = "Min Flight Level", "Max Flight Level"
-_LATITUDE, _LONGITUDE = "Latitude", "Longitude"
 _BOUNDS = {
-    _LATITUDE: (-90.0, 90.0, "deg"),
-    _LONGITUDE: (-180.0, 180.0, "deg"),
-    _LOWEST: (0.0, 1000.0, "FL"),
-    _HIGHEST: (0.0, 1000.0, "FL"),
+    "Latitude": (-90.0, 90.0, "deg"),
+    "Longitude": (-180.0, 180.0, "deg"),
+    "Min Flight Level": (0.0, 1000.0, "FL"),
+    "Max Flight Level": (0.0, 1000.0, "FL"),
     _SEQUENCE: (0.0, 1e6, ""),
 }
 
@@ -35,24 +33,17 @@ def read_fir(path: str | os.PathLike[str], airspace_id: str) -> Region:
         table = parse_table(read_text(Path(path)), [_ID, *_BOUNDS])
         rows = [row for row in table if row.cells[_ID] == airspace_id]
         if not rows:
-            known_ids = {row.cells[_ID] for row in table}
-            raise InputError(f"no {_ID} {show(airspace_id)}; {near(airspace_id, known_ids)}")
-        numbered = sorted((_number(row, _SEQUENCE), row) for row in rows)
-        for expected, (number, row) in enumerate(numbered):
-            if number != expected:
-                raise InputError(
-                    f"line {row.line}: {_SEQUENCE} {number:g} where {expected} is next; number the points "
-                    "0, 1, 2, ..."
-                )
-        levels = [(_number(row, _LOWEST), _number(row, _HIGHEST)) for row in rows]
-        low, high = levels[0]
-        if len({*levels}) > 1 or low > high:
-            raise InputError(
-                f"{show(airspace_id)}: {_LOWEST} and {_HIGHEST} are {low:g} and {high:g} FL in line "
-                f"{rows[0].line}; give the lowest and the highest one, the same in every line"
-            )
-        corners = [[_number(row, column) for column in (_LONGITUDE, _LATITUDE)] for _, row in numbered]
-        return local_region([[np.array(corners)]], airspace_id, (low, high), airspace_id)
+            hint = near(airspace_id, {row.cells[_ID] for row in table})
+            raise InputError(f"no {_ID} {show(airspace_id)}; {hint}")
+        rows.sort(key=lambda row: _number(row, _SEQUENCE))
+        numbers = [_number(row, _SEQUENCE) for row in rows]
+        if numbers != [*range(len(rows))]:
+            raise InputError(f"{show(airspace_id)}: {_SEQUENCE} {numbers} do not count from 0 upwards")
+        levels = {(_number(row, "Min Flight Level"), _number(row, "Max Flight Level")) for row in rows}
+        if len(levels) > 1:
+            raise InputError(f"{show(airspace_id)}: its rows differ in their flight levels [FL], {levels}")
+        corners = [[_number(row, "Longitude"), _number(row, "Latitude")] for row in rows]
+        return local_region([[np.array(corners)]], airspace_id, levels.pop(), airspace_id)
 
 
 def _number(row: Row, column: str) -> float:
@@ -63,7 +54,6 @@ def _number(row: Row, column: str) -> float:
     except ValueError:
         raise InputError(f"line {row.line}: {column} {show(text)} is not a number") from None
     if not low <= value <= high:
-        raise InputError(
-            f"line {row.line}: {column} {value:g} {unit} is not between {low:g} and {high:g} {unit}"
-        )
+        bounds = f"{low:g} and {high:g} {unit}"
+        raise InputError(f"line {row.line}: {column} {value:g} {unit} is not between {bounds}")
     return value

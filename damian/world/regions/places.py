@@ -1,4 +1,4 @@
-"""Places that settings give, as metres or as latitude and longitude: checked, and in a region's local metres.
+"""Places that settings give, as metres or as latitude and longitude, in a region's local metres.
 
 A place is ``[x, y]``, metres east and north in the coordinates in which the region is given (those of
 ``region.vertices``; of a FIR table or GeoJSON file: about the area's centroid), or, for these two kinds of
@@ -11,38 +11,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from damian.common import checks
 from damian.common.errors import InputError
 from damian.world.regions.geodesy import Floats, to_local
 from damian.world.regions.region import Region, to_grid
-
-_DEGREES = {"lat": 90.0, "lon": 180.0}
-"""Keys of a place in degrees, with their largest value."""
-
-
-def check_place(key: str, place: Any) -> None:
-    """Require ``[x, y]`` of two finite numbers [m], or ``{lat: ..., lon: ...}`` in range [deg].
-
-    Args:
-        key: of the setting, for errors.
-        place: what the setting says.
-
-    Raises:
-        InputError: it is something else.
-    """
-    if not isinstance(place, Mapping):
-        return checks.place(key, place)
-    good = set(place) == set(_DEGREES)
-    checks.require(good, key, place, "is not {lat: ..., lon: ...} in degrees, such as {lat: 53.1, lon: -4.5}")
-    for name, largest in _DEGREES.items():
-        checks.in_range(f"{key}.{name}", place[name], -largest, largest, "deg")
-    return None
-
-
-def check_places(key: str, places: Sequence[Any]) -> None:
-    """Require places, each as ``check_place`` has it."""
-    for place in places:
-        check_place(key, place)
 
 
 def local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
@@ -50,11 +21,8 @@ def local_places(key: str, places: Sequence[Any], region: Region) -> Floats:
 
     Args:
         key: of the setting, for errors.
-        places: each as ``check_place`` requires it.
+        places: each ``[x, y]`` or ``{lat: ..., lon: ...}``.
         region: all of them must lie inside.
-
-    Raises:
-        InputError: a place lies outside, or is in degrees while the region has no position on Earth.
     """
     local = np.array([_local(key, place, region) for place in places])
     inside = shapely.contains_xy(region.polygon, local)

@@ -6,11 +6,11 @@ several parts.
 
 import itertools
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from shapely.geometry import MultiPoint, MultiPolygon, Polygon
 
 from damian.common import checks
@@ -30,30 +30,16 @@ _MAX_ROUNDS = 100
 """Attempts to draw points inside a polygon."""
 
 
-def polygon_from_vertices(vertices: ArrayLike, source: str) -> Polygon:
+def polygon_from_vertices(vertices: Sequence[Any], source: str) -> Polygon:
     """Build a polygon, convex or concave, from its corners in order around it.
 
     Args:
         vertices: [V, 2] metres; the first may be repeated at the end.
         source: prefix of error messages: a file, a line or a key.
-
-    Raises:
-        InputError: not [V, 2] finite metres, fewer than three distinct points, crossing edges, or
-            no area.
     """
-    try:
-        corners = np.asarray(vertices, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{source}: vertices are not a list of [x, y] numbers") from None
-    if corners.ndim != 2 or corners.shape[1] != 2:
-        raise InputError(f"{source}: vertices of shape {list(corners.shape)} are not a list of [x, y]")
-    far = np.flatnonzero(~(np.abs(corners) <= MAX_COORDINATE_M).all(axis=1))
-    if len(far):
-        raise InputError(
-            f"{source}: vertex {far[0]} {corners[far[0]].tolist()} m is not within {MAX_COORDINATE_M:g} m of "
-            "the origin; give local metres"
-        )
-    return polygon_from_rings([corners], source, "m")
+    for vertex in vertices:
+        checks.place(source, vertex)
+    return polygon_from_rings([np.array(vertices, dtype=np.float64)], source, "m")
 
 
 def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polygon:
@@ -63,9 +49,6 @@ def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polyg
         rings: the shell, then the holes; each [V, 2] in ``unit``.
         source: prefix of error messages.
         unit: unit of the coordinates, for error messages.
-
-    Raises:
-        InputError: a ring without area, crossing edges, or a hole that is not inside the shell.
     """
     shell, *holes = [_require_area(ring, source) for ring in rings]
     polygon = Polygon(shell, holes)
@@ -82,9 +65,8 @@ def polygon_from_rings(rings: Sequence[Floats], source: str, unit: str) -> Polyg
 def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: float) -> Polygon:
     """Draw a random convex polygon: the hull of points uniform in the disc of area ``max_area_m2``.
 
-    The hull grows by one point at a time until its area reaches ``min_area_m2``. It lies in the disc, so its
-    area cannot exceed ``max_area_m2``. If the two areas are so close that a thousand points do not suffice,
-    the hull is scaled up to the mean of the two areas.
+    The hull grows by one point at a time until its area reaches ``min_area_m2``; if a thousand points do not
+    suffice, it is scaled up to the mean of the two areas.
     """
     points = _disc(rng, max_area_m2, _MAX_POINTS)
     hull = _hull(points[:3])
@@ -101,7 +83,6 @@ def random_polygon(rng: np.random.Generator, min_area_m2: float, max_area_m2: fl
 def largest_vertex_distance(polygon: Polygon | MultiPolygon) -> float:
     """Largest distance between two vertices [m], by which features divide distances."""
     corners = shapely.get_coordinates(shapely.convex_hull(polygon))
-    # One corner at a time: the distance matrix of a hull with many corners may not fit in memory.
     return max(float(np.hypot(*(corners - corner).T).max()) for corner in corners)
 
 
@@ -122,9 +103,6 @@ def landing_lattice(
 
     Returns:
         [L, 2] metres.
-
-    Raises:
-        InputError: no point, or fewer than ``n_points``, inside.
     """
     lattice = _lattice(polygon.bounds, step_m, np.radians(degrees))
     shapely.prepare(polygon)
@@ -143,14 +121,11 @@ def sample_interior(polygon: Polygon | MultiPolygon, n: int, rng: np.random.Gene
     """Draw points uniformly in the polygon, strictly inside.
 
     First a triangle of its constrained Delaunay triangulation is drawn by area, then a point in it (Osada
-    et al., "Shape Distributions", 2002, eq. 1). So a narrow polygon takes no longer than a square, and only
-    points that rounding has put on the boundary are drawn again.
+    et al., "Shape Distributions", 2002, eq. 1). Only points that rounding has put on the boundary are drawn
+    again.
 
     Returns:
         [n, 2] metres.
-
-    Raises:
-        InputError: the polygon is empty, or so narrow that rounding leaves no point inside.
     """
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
@@ -192,11 +167,7 @@ def _disc(rng: np.random.Generator, area_m2: float, n: int) -> Floats:
 
 
 def _lattice(bounds: tuple[float, float, float, float], step: float, slant: float) -> Floats:
-    """All lattice points in the bounding box and a margin around it, row by row, [P, 2].
-
-    Rows alternate between rightward and leftward. Each ends with the first point at or past the opposite
-    bound, and the next starts ``2 step cos(slant)`` past that point.
-    """
+    """All lattice points in the bounding box and a margin around it, row by row, [P, 2]."""
     min_x, min_y, max_x, max_y = bounds
     width, height, rise = max_x - min_x, max_y - min_y, step * np.sin(slant)
     # Compared as products, since a quotient by a tiny step could overflow.
@@ -216,11 +187,8 @@ def _lattice(bounds: tuple[float, float, float, float], step: float, slant: floa
 
 
 def _by_direction(points: Floats, centre: Floats, n: int | None) -> Floats:
-    """Select the ``n`` points nearest to the centre (all if not given), ordered by direction, [n, 2].
-
-    The order is counter-clockwise from due west. Coordinates are rounded first, so that ties are ties on
-    every machine; adding 0.0 removes negative zeros, which would move due west from last to first.
-    """
+    """The ``n`` points nearest to the centre (all if not given), counter-clockwise from due west, [n, 2]."""
+    # Rounded, so that ties are ties on every machine; 0.0 removes negative zeros, which would move due west.
     x, y = (np.round(points - centre, 9) + 0.0).T
     distance, angle = np.round(np.hypot(x, y), 6), np.round(np.arctan2(y, x), 12)
     order = np.lexsort([distance, angle])

@@ -40,14 +40,10 @@ class Region:
 
 
 def centred(region: Region) -> Region:
-    """The region in metres about its centroid.
+    """The region in metres about its centroid; one with a position on Earth is so already.
 
-    Corners are rounded to a grid of 1/65536 m about the lower left one. So the same shape has the same local
-    coordinates, bit for bit, wherever its origin lies: coordinates of 10 000 km carry rounding errors of
-    2e-9 m. A region with a position on Earth has local coordinates already.
-
-    Raises:
-        InputError: edges cross or areas vanish once rounded.
+    Corners are rounded to a grid of 1/65536 m about the lower left one, so that the same shape has the same
+    local coordinates, bit for bit, wherever its origin lies.
     """
     if region.origin is not None:
         return region
@@ -81,9 +77,6 @@ def local_region(
         name: of the region.
         levels: lowest and highest flight level [FL], if known.
         source: prefix of error messages.
-
-    Raises:
-        InputError: a ring is invalid, or the region is too large for a local map.
     """
     reference = parts[0][0][0, 0]
     unwrapped = [[_unwrap_longitude(ring, reference) for ring in rings] for rings in parts]
@@ -100,13 +93,7 @@ def local_region(
 
 
 def _made_valid(local: Polygon | MultiPolygon, source: str) -> Polygon | MultiPolygon:
-    """A polygon in metres without the little by which corners of holes cross the edges that they touch.
-
-    On the map an edge stays straight between its ends, while the corner that touches it may move off it.
-
-    Raises:
-        InputError: so much of it crosses that this changes its area by a millionth or more.
-    """
+    """A polygon in metres without the little by which holes cross the edges that they touch in degrees."""
     if local.is_valid:
         return local
     valid = shapely.make_valid(local, method="structure", keep_collapsed=False)
