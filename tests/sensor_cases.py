@@ -15,7 +15,6 @@ from damian.world.state import State
 
 SENSORS = [{"sensor": "sensor_cases:gust", "strength": 2.0}, "sensor_cases:gap"]
 LOCAL, GLOBAL = ["sensor_cases:gust_felt"], ["sensor_cases:widest_gap", "sensor_cases:gaps"]
-WIDTHS = {"gust": 2, "gap": 1}
 
 
 @sensor(width=2)
