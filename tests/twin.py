@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import shapely
 
 from damian.server.rewards import INDIVIDUAL, RewardConfig
@@ -232,3 +233,16 @@ class World:
         if uav.spots:
             uav.heard_at, uav.heard_from = self.steps * self.dt, uav.place
             uav.moved = 0
+
+
+def exact_share(polygon, positions, radius):
+    """Exact coverage of one world by shapely, UAV by UAV: positions ``[N, n, 2]`` [m] -> ``[N]``."""
+    discs = [[shapely.Point(p).buffer(radius, quad_segs=128) for p in uav] for uav in positions]
+    shares = []
+    for i, own in enumerate(discs):
+        areas = []
+        for k, disc in enumerate(own):
+            excluded = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
+            areas.append(disc.intersection(polygon).difference(shapely.union_all(excluded)).area)
+        shares.append(np.mean(areas) / (math.pi * radius**2))
+    return np.array(shares)

@@ -124,20 +124,12 @@ class Greedy:
         return (own & (from_trail > self.radius).all(-2)).float()
 
     def believe(self, held: Messages, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-        """How likely the source is at each landing point.
+        """How likely the source is at each landing point [B, L, 2], relative to the best one, [B, 1, L].
 
         The place of a detection grows uncertain with its age: the way of the source at full speed counts as
-        two standard deviations. A footprint in which a UAV on the ground hears nothing now makes the source
-        less likely there, but by less if the source may be there without emitting.
-
-        Args:
-            held: messages [B, N].
-            ground: landing points of each world's region, east, north [m], [B, L, 2].
-            now: current time, as far as the messages tell it [s], [B, 1].
-
-        Returns:
-            Likelihood relative to the best landing point, in [0, 1], [B, 1, L]; whether the latest detection
-            is recent, [B, 1, 1].
+        two standard deviations. A footprint in which a UAV on the ground hears nothing ``now`` [s], [B, 1],
+        makes the source less likely there, but by less if the source may be there without emitting. Also
+        returns whether the latest detection is recent, [B, 1, 1].
         """
         has_detection = held.detected_time >= 0
         since = torch.where(has_detection, now - held.detected_time, torch.inf).unsqueeze(-1)

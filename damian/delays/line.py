@@ -45,18 +45,12 @@ class DelayLine:
     - t = 4: m1 arrives. By ``generation`` the receiver keeps the newer m3, now of age 1; by ``arrival`` it
       holds m1, of age 3. m4 is written into the slot of t = 6.
 
-    The memory:
-
-    - ``clock``: number of steps so far, and ``place``: the place of the current slot of each sender among
-      all slots of all senders (slot times M, plus the sender's number), [M] each;
-    - ``streams``: random stream of each sender, [M], and ``channel``: state of its channel, [M, ...];
-    - ``reset_at``: clock at the sender's latest reset, [M], and ``generated_at``: clock at which the held
-      message was generated, [M];
-    - ``senders``: 0, 1, ..., M - 1;
-    - ``stamps``: clock at which the message in a slot was generated, [K + 1, M]: K slots for the current and
-      the coming steps, and one for messages that never arrive;
-    - ``slots_i``: values of the messages in the slots, [K + 1, M, ...], and ``held_i``: values of the held
-      messages, [M, ...].
+    The memory, [M] each if nothing else is said: ``clock``, the number of steps so far; ``place`` of the
+    current slot among all slots (slot times M, plus the sender's number); random ``streams``; state of the
+    ``channel``, [M, ...]; clock of the latest reset, ``reset_at``, and of the held message, ``generated_at``;
+    ``senders``, 0 to M - 1; ``stamps``, the clock of the message in a slot, [K + 1, M]: K slots for the
+    current and the coming steps, and one for messages that never arrive; values of the messages in the slots,
+    ``slots_i`` [K + 1, M, ...], and of the held ones, ``held_i`` [M, ...].
 
     Args:
         sampler: draws the delays.
@@ -178,12 +172,9 @@ class BroadcastLine:
     link to A, which copies m0 from the ring; at t = 3 it arrives on the link to B, which copies it too. At
     t = 4 the sender's next message takes the slot of m0, as the ring has 3 + 1 slots.
 
-    The memory has that of the ``DelayLine``, and
-
-    - ``sender``: sender of each link, [L], and ``link``: a link of each sender, [S];
-    - ``contents_i``: contents of the latest K messages of each sender, [K, S, ...], where K is the longest
-      delay plus 1, and ``held_i``: contents of the message that each link's receiver holds, [L, ...]; zeros
-      before a message has arrived.
+    The memory has that of the ``DelayLine``; the ``sender`` of each link, [L]; a ``link`` of each sender,
+    [S]; contents of the latest K messages of each sender, ``contents_i`` [K, S, ...], where K is the longest
+    delay plus 1; and of the message that each link's receiver holds, ``held_i`` [L, ...], zeros at first.
 
     Args:
         sampler: draws the delays.

@@ -97,13 +97,7 @@ def build_source_grid(
 
     How it moves is counted from walks as the settings draw them, which are not those of any episode. Whether
     it emits is taken as drawn anew at every step: with ``emission=per_stop``, silence counts for too much.
-
-    Args:
-        airspace: regions and landing points.
-        source: settings of the source.
-        radius: radius of a UAV's footprint [m].
-        dt: length of a step [s].
-        cell: edge of a cell [m].
+    Lengths (``radius`` of a footprint, edge of a ``cell``) are in metres, ``dt`` in seconds.
     """
     polygons = [region.polygon for region in airspace.regions]
     area = max(polygon.area for polygon in polygons)
@@ -376,15 +370,7 @@ class Beliefs(NamedTuple):
 
 
 def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, mask: Tensor) -> Beliefs:
-    """Begin new episodes in the worlds of the mask, in place.
-
-    Args:
-        grid: cells and tables.
-        window: beliefs of the latest steps.
-        messages: the first messages [B, N], which all receivers know at once.
-        region: of each world, [B].
-        mask: worlds that begin an episode, [B] bool.
-    """
+    """Begin new episodes in the worlds of the mask [B], in place; all receivers know the first messages."""
     report = report_rows(grid, messages, torch.ones_like(messages.spotted))
     _begin(*_parts(grid, window), report, region, mask)
     return latest(window, window.slot)
@@ -402,9 +388,6 @@ def advance(
         delay: their delays [steps], negative if they never arrive, [B, N].
         region: of each world, [B].
         stepped: worlds that take the step, [B] bool; nothing of the others changes.
-
-    Returns:
-        The window after the step, and the beliefs of the latest step.
     """
     slot, *beliefs = _advance(*_parts(grid, window), report, delay, region, stepped)
     return window._replace(slot=slot), Beliefs(*beliefs)

@@ -30,23 +30,14 @@ def vertical_drain(seconds: Tensor, battery: BatteryConfig) -> Tensor:
 
 
 def flight_drain(vertical: Tensor, distance: Tensor, battery: BatteryConfig) -> Tensor:
-    """Battery drain of a whole flight: takeoff, cruise and landing.
-
-    Args:
-        vertical: duration of the takeoff, the same as of the landing, [*] seconds.
-        distance: length of the cruise, [*] metres.
-        battery: parameters of the battery.
-
-    Returns:
-        Percent, [*].
-    """
+    """Battery drain of a takeoff, cruise and landing: [*] seconds (of the takeoff) and metres to percent."""
     return vertical_drain(2 * vertical, battery) + cruise_drain(distance, battery)
 
 
 def used_so_far(
     elapsed: Tensor, vertical: Tensor, cruise: Tensor, cruised: Tensor, battery: BatteryConfig
 ) -> Tensor:
-    """Battery drain of a flight up to a time.
+    """Battery drain of a flight so far, [*] percent; ``flight_drain`` from its end on.
 
     Args:
         elapsed: time since takeoff, [*] seconds.
@@ -54,9 +45,6 @@ def used_so_far(
         cruise: duration of the cruise, [*] seconds.
         cruised: distance cruised so far, [*] metres.
         battery: parameters of the battery.
-
-    Returns:
-        Percent, [*]; equals ``flight_drain`` from the end of the flight on.
     """
     took_off = torch.minimum(elapsed, vertical)
     landing = torch.minimum((elapsed - vertical - cruise).clamp(min=0), vertical)

@@ -101,13 +101,9 @@ class KnownCoverage(NamedTuple):
 
 
 def updated_share(tables: FootprintTables, point_ids: Tensor, points: Tensor, known: KnownCoverage) -> Tensor:
-    """As :func:`covered_share`, but computed only for the worlds that have changed, ``[*, N]``.
+    """As :func:`covered_share`, but computed only for worlds that have changed since ``known``, ``[*, N]``.
 
-    Args:
-        tables: from :func:`build_tables`.
-        point_ids: ``[*, N, n]`` int64, flat ids of the landing points where the UAVs stood.
-        points: positions of all landing points, ``[R * L, 2]`` [m].
-        known: coverage of the same worlds at an earlier step.
+    ``points`` are the positions of all landing points, ``[R * L, 2]`` [m].
     """
     changed = (point_ids != known.trail).flatten(-2).any(-1) | (known.share[..., 0] < 0)
     n_uavs, n_last = point_ids.shape[-2:]
@@ -144,13 +140,8 @@ def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:
 def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
     """Coverage c_a in [0, 1], ``[*, N]``, of each UAV as far as it knows the footprints of the others.
 
-    The result is the diagonal of :func:`covered_share`, of what every UAV knows.
-
-    Args:
-        tables: from :func:`build_tables`, on the same device as the positions.
-        point_ids: ``[*, N, N, n]`` int64 (receiver, sender): landing points where the senders stood, as far
-            as the receiver knows.
-        positions: ``[*, N, N, n, 2]`` [m], positions of these landing points; finite (not checked).
+    The arguments are those of :func:`covered_share`, with dimensions ``[*, N, N, ...]`` (receiver, sender);
+    the result is its diagonal.
     """
     lead, (n_uavs, n_last) = point_ids.shape[:-3], point_ids.shape[-2:]
     uav = torch.arange(n_uavs, device=point_ids.device)
@@ -173,7 +164,7 @@ def _covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor
 
 
 def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleet: Tensor) -> Tensor:
-    """Coverage of the first UAV of each fleet, ``[b, N]``."""
+    """Coverage of the first UAV of each fleet, ``[b, N]``, from positions in cells, ``[b, N, n, 2, N]``."""
     rows = torch.cat([(point_ids + _GRID**2).unsqueeze(0), _overlap_rows(fleet).movedim(-1, 0)])
     excluded = _or_rows(tables.masks, rows.flatten(1)).view(*point_ids.shape[:-1], -1)
     counts = _bit_count(excluded)
@@ -182,7 +173,9 @@ def _share_of_first(tables: FootprintTables, point_ids: Tensor, fleet: Tensor) -
 
 
 def _overlap_rows(fleet: Tensor) -> Tensor:
-    """Table rows of the discs that may overlap a footprint of the first UAV of each fleet."""
+    """Table rows of the discs that may overlap a footprint of the first UAV, ``[b, N, n, N + n - 2]``."""
+    # First the other UAVs at the same index, then the UAV itself at later ones; a window that slides over the
+    # indices leaves out all other pairs, without index tensors.
     cells, n_last = fleet[..., 0], fleet.shape[-3]
     past = F.pad(cells, (0, 0, 0, n_last - 1), value=math.inf).unfold(-2, n_last, 1)
     other = torch.cat([fleet[..., 1:], past[..., 1:]], -1)
@@ -201,7 +194,8 @@ def _or_rows(table: Tensor, rows: Tensor) -> Tensor:
 
 
 def _bit_count(words: Tensor) -> Tensor:
-    """Number of 1 bits of each int64, same shape and dtype."""
+    """Number of 1 bits of each int64 (H. S. Warren, Hacker's Delight, 2nd ed., 5-1)."""
+    # The shift repeats the sign bit, hence a mask after each.
     twos = words - (words >> 1).bitwise_and_(0x5555555555555555)
     fours = (twos >> 2).bitwise_and_(0x3333333333333333).add_(twos & 0x3333333333333333)
     eights = (fours >> 4).add_(fours).bitwise_and_(0x0F0F0F0F0F0F0F0F)

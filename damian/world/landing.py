@@ -44,16 +44,11 @@ class Ranking(NamedTuple):
 
 
 class Candidates:
-    """Landing points to which an action may lead, nearest its target first.
+    """Landing points to which an action of one of N UAVs may lead, nearest its target first.
 
     UAVs choose only while they stand on a landing point, so for discrete actions the candidates of every
     (landing point, action) are computed once. Among ``2N - 1`` candidates, one is always free: the other
     UAVs stand on at most ``N - 1`` points and have booked at most ``N - 1`` more.
-
-    Args:
-        airspace: regions and their landing points.
-        config: settings of the actions.
-        n_agents: number of UAVs N.
     """
 
     def __init__(self, airspace: Airspace, config: ActionConfig, n_agents: int) -> None:
@@ -186,7 +181,7 @@ def _nearest_or_own(
 def assign_landing_points(
     ranking: Ranking, row: Tensor, standing: Tensor, reach: Tensor, n_points: int
 ) -> Tensor:
-    """Give every UAV its best free candidate, in index order, so that no two book one point.
+    """Give every UAV its best free candidate, in index order, so that no two book one point, [B, N].
 
     A point is free to a UAV if no other UAV stands on it or flies to it; its own point always is.
 
@@ -197,9 +192,6 @@ def assign_landing_points(
         reach: largest distance that the UAV may fly now [m], negative if it may not choose, [B, N]. A
             candidate farther away does not count, and stays free for other UAVs.
         n_points: largest number of landing points of a region.
-
-    Returns:
-        Point that each UAV books, [B, N].
     """
     if row.shape[1] <= _FEW_AGENTS or not devices.data_dependent(row.device):
         return _assign_one_by_one(ranking, row, standing, reach)

@@ -125,14 +125,7 @@ class MotionModel(ABC):
         return minimum_time(length, motion.degree, motion.max_speed, motion.max_acceleration)
 
     def battery_after(self, level: Tensor, drain: Tensor, rested: Tensor, goal: Tensor) -> Tensor:
-        """Battery levels [%] after a flight and a rest, [B, N].
-
-        Args:
-            level: before the flight, [B, N] percent.
-            drain: of the flight, [B, N] percent.
-            rested: steps at rest since the flight, [B, N].
-            goal: flat id of the landing point of the rest, [B, N].
-        """
+        """Battery levels [%] after a flight and ``rested`` steps on the landing point ``goal``, [B, N]."""
         gain = self.charge * (rested * gather_rows(self.chargers, goal))
         return (level - drain + gain).clamp(0, 100)
 

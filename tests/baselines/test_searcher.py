@@ -59,16 +59,6 @@ def test_all_uavs_fly_to_where_they_detect_the_source():
         assert (distance < env.uav_env.simulation.radius).all()
 
 
-def test_no_uav_aims_at_a_landing_point_on_which_another_one_stands():
-    env = believing()
-    held = env.server.messages(env.reset()[keys.MESSAGE])
-    taken, point = Searcher(env.uav_env).taken(held)[0], held.trail[0, :, 0]
-    assert [[bool(taken[i, p]) for p in point] for i in range(3)] == [
-        [i != j for j in range(3)] for i in range(3)
-    ]
-    assert taken.sum() == 6
-
-
 def test_without_a_belief_or_a_reward_for_the_source_the_script_keeps_its_own_map():
     scripts = {
         "belief": believing(),

@@ -76,16 +76,6 @@ def test_delays_and_losses_are_as_frequent_as_the_law_says(name, loss):
         assert sampler.constant_delay == only
 
 
-@pytest.mark.parametrize("name", ["uniform steps", "the paper's", "geometric"])
-def test_each_delay_is_independent_of_the_one_before(name):
-    law, dt, chances = LAWS[name]
-    sampler = law.sampler(dt)
-    delays = sample(sampler)
-    before = delays[:-1][delays[1:] == max(chances)]
-    check_chances(sampler, chances, before)
-    check_chances(sampler, chances, delays[:, :-1][delays[:, 1:] == max(chances)])
-
-
 def within(found: float, exact: float, deviation: float) -> bool:
     """Is the sample mean within five standard deviations of the exact one?"""
     return abs(found - exact) <= 5 * deviation

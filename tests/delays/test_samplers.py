@@ -5,24 +5,12 @@ import math
 import pytest
 import torch
 from delay_twin import drawn
-from helpers import play
 from torch import Tensor
-from transform_cases import (
-    ACTION,
-    N_AGENTS,
-    OBSERVATION,
-    REWARD,
-    ROWS,
-    WORLDS,
-    choices,
-    delayed,
-)
 
 from damian.common import counter_rng
-from damian.delays.laws import Distance, Held, Lag, Uniform
+from damian.delays.laws import Distance, Lag, Uniform
 from damian.delays.line import BroadcastLine, DelayLine
 from damian.delays.samplers import ContextSampler, MessageContext, Recorded
-from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
 LAW, SENDERS = Uniform(1, 5), 20_000
 
@@ -71,28 +59,6 @@ def test_an_update_keeps_the_lag_with_the_hold_probability(probability):
     kept = delays[1:] == delays[:-1]
     assert kept[::2].all()
     require_share(kept[1::2], probability + (1 - probability) / 1000)
-
-
-def test_staggered_senders_update_at_times_spread_evenly_over_the_period():
-    period = 5
-    changed = sample(Lag(Uniform(0, 9999), period, stagger=True), 5000, 26).diff(dim=0) != 0
-    first = changed[:period].int().argmax(0)  # 0: in the step after the first
-    for phase in range(period):
-        require_share(first == phase, 1 / period)
-    due = torch.arange(25).unsqueeze(-1) % period == first
-    assert changed[~due].double().mean() < 0.001  # the first update may have drawn the same lag again
-    assert changed[due].double().mean() > 0.999
-
-
-@pytest.mark.parametrize("shared", [True, False])
-@pytest.mark.parametrize("make", [ObservationDelay, ActionDelay, RewardDelay])
-def test_the_agents_of_a_world_have_the_same_lags_exactly_if_they_share_them(make, shared):
-    key = {ObservationDelay: [OBSERVATION], ActionDelay: ACTION, RewardDelay: REWARD}[make]
-    transform = make(Lag(LAW, shared=shared), key)
-    play(delayed(transform), choices(n_steps=2))
-    streams = transform.memory["streams"].view(len(WORLDS), N_AGENTS)
-    assert (streams == streams[:, :1]).all() == shared
-    assert len(set(streams.flatten().tolist())) == (len(WORLDS) if shared else len(ROWS))
 
 
 # Runs of losses.
@@ -165,11 +131,3 @@ def test_half_of_the_messages_are_lost_at_the_range_and_more_beyond_it():
 )
 def test_the_delay_is_the_base_plus_the_distance_over_the_speed_rounded_up(law, dt, steps):
     assert (at_distance(law, 100.0, dt=dt) == steps).all()
-
-
-def test_the_place_of_the_receiver_in_the_context_replaces_that_of_the_settings():
-    place = torch.tensor([[100.0, -40.0]]).expand(SENDERS, 2)
-    assert (at_distance(Distance(speed=10.0), 100.0, receiver_position=place) == 4).all()
-    keys = {"position": "observation", "receiver_position": "observation"}
-    transform = ObservationDelay(Held(Distance(speed=1.0)), [OBSERVATION], context_keys=keys)
-    assert set(transform.contexts.keys) == set(keys)

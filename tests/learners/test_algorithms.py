@@ -7,17 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import everything
-from torchrl.data import ReplayBuffer
 
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
-from damian.recipes.shared.settings import learning_setup
 from damian.recipes.train import learning_env, make_learner, replay_buffer, train
-from damian.replay.time_storage import TimeStorage
-from damian.settings import BpqlConfig, ClockConfig, LoggerConfig, TrainConfig
+from damian.settings import ClockConfig, LoggerConfig, TrainConfig
 
 AWARE = {
     "none": {},
@@ -86,22 +83,6 @@ def build_learner(name: str, aware: str = "backupdate", **changed) -> tuple[Mapp
     settings = replace(config(name, "none", "discrete", "instant", aware), **changed)
     env = learning_env(settings)
     return make_learner(settings, env, replay_buffer(settings, env)), env
-
-
-@pytest.mark.parametrize("kind", [MappoConfig, SacConfig, BpqlConfig])
-def test_a_learner_trains_the_actor_that_evaluations_make(kind):
-    class OwnActor(kind):
-        """Settings with an actor of one's own."""
-
-        def make_actor(self, env, model):
-            return super().make_actor(env, replace(model, activation="relu"))
-
-    settings = replace(config("mappo", "none", "discrete", "instant", "none"), delay=DelayConfig())
-    env = learning_env(settings)
-    buffer = ReplayBuffer(storage=TimeStorage(400))
-    learner = OwnActor().make(env, learning_setup(settings), None if kind is MappoConfig else buffer)
-    activations = {type(module) for module in learner.actor.modules()} & {torch.nn.ReLU, torch.nn.Tanh}
-    assert activations == {torch.nn.ReLU}
 
 
 @both_learners

@@ -3,16 +3,11 @@
 import math
 
 import torch
-from helpers import both_kinds, everything, learning
+from helpers import both_kinds, everything
 from torch import Tensor, nn
-from torchrl.data import ReplayBuffer
 
 from damian.envs.uav_env import UavEnv
 from damian.learners.networks import ModelConfig, make_actor, make_critic
-from damian.learners.sac import Sac, SacConfig
-from damian.replay.time_storage import TimeStorage
-
-ENV = UavEnv(everything(), 2)
 
 
 def gains(weights: Tensor) -> Tensor:
@@ -38,14 +33,3 @@ def test_orthogonal_weights_have_a_gain_by_the_place_of_their_layer(kind):
     for shared, normalize in ((False, False), (True, True)):
         config.shared_value = shared
         check_gains(make_critic(env, config, normalize=normalize), [hidden, hidden, 1.0])
-
-
-def test_both_critics_of_sac_and_their_targets_begin_with_orthogonal_weights_of_their_own():
-    model = ModelConfig(hidden=[16], init="orthogonal")
-    learner = Sac(ENV, SacConfig(), learning(model), ReplayBuffer(storage=TimeStorage(100)))
-    for name in ("qvalue_network_params", "target_qvalue_network_params"):
-        params = getattr(learner.loss, name)
-        first, second = (params["module", layer, "weight"] for layer in ("0", "2"))
-        for weights, gain in ((first, math.sqrt(2)), (second, 1.0)):
-            torch.testing.assert_close(gains(weights), torch.full([2, min(weights.shape[1:])], gain))
-            assert not weights[0].equal(weights[1])

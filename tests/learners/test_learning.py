@@ -5,15 +5,13 @@ import itertools
 import pytest
 import torch
 from helpers import both_kinds, both_motions, everything, learning
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
-from damian.baselines.random import random_policy
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
@@ -46,16 +44,6 @@ def test_a_policy_made_for_three_uavs_works_with_ten(kind):
     rollout = ten.rollout(4, actor)
     assert rollout["agents", "action"].shape[:3] == (2, 4, 10)
     assert rollout["agents", "action_log_prob"].shape == (2, 4, 10)
-
-
-@pytest.mark.parametrize("make", [lambda env: make_actor(env, SMALL), random_policy])
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
-def test_masked_policies_never_choose_an_illegal_action(make, motion):
-    env = UavEnv(scenario(motion=MotionConfig(kind=motion)), 32)
-    rollout = env.rollout(20, make(env), break_when_any_done=False)
-    legal = rollout["agents", "action_mask"].gather(-1, rollout["agents", "action"].unsqueeze(-1))
-    assert not rollout["agents", "action_mask"].all()
-    assert legal.all()
 
 
 def collect(motion: str, kind: str):
@@ -106,35 +94,6 @@ def test_advantages_are_the_generalised_estimate_over_the_decisions_of_each_uav(
     assert compared > 100
 
 
-def test_a_flight_of_three_steps_earns_their_rewards_and_the_value_after_landing():
-    """Computed by hand: gamma 1/2, rewards 1, 2, 4, and values 8 before the flight, 16 after it."""
-    agents = {
-        "ready": torch.tensor([True, False, False]).view(1, 3, 1),
-        "global_observation": torch.tensor([8.0, 100.0, -100.0]).view(1, 3, 1, 1),
-    }
-    after = {
-        "ready": torch.tensor([False, False, True]).view(1, 3, 1),
-        "global_observation": torch.tensor([100.0, -100.0, 16.0]).view(1, 3, 1, 1),
-        "reward": torch.tensor([1.0, 2.0, 4.0]).view(1, 3, 1, 1),
-    }
-    no = torch.zeros(1, 3, 1, dtype=torch.bool)
-    flight = TensorDict({"agents": agents, "next": {"agents": after, "done": no, "terminated": no}}, [1, 3])
-    critic = TensorDictModule(
-        torch.nn.Identity(), [("agents", "global_observation")], [("agents", "state_value")]
-    )
-    add_advantages(flight, critic, MappoConfig(gamma=0.5, lmbda=0.7, normalize_advantage=False))
-    assert flight["agents", "advantage"].flatten().tolist() == [1 + 2 / 2 + 4 / 4 + 16 / 8 - 8, 0.0, 0.0]
-    targets = [1 + 2 / 2 + 4 / 4 + 16 / 8, 2 + 4 / 2 + 16 / 4, 4 + 16 / 2]
-    assert flight["agents", "value_target"].flatten().tolist() == targets
-    add_advantages(flight, critic, MappoConfig(gamma=0.5, lmbda=0.7))
-    assert flight["agents", "advantage"].flatten().tolist() == [
-        0.0,
-        0.0,
-        0.0,
-    ]  # a single decision is the mean
-    assert flight["agents", "value_target"].flatten().tolist() == targets
-
-
 # How back-updating changes the importance ratios of the first pass.
 
 ROUNDING = 1e-4
@@ -173,17 +132,6 @@ def test_with_backupdating_the_first_importance_ratios_are_one_as_actor_observat
     assert corrected["agents", "action_log_prob"].equal(behaviour)
     assert corrected["agents", "backupdated"].any()
     assert log_ratios(learner, corrected, behaviour).abs().max() < ROUNDING
-
-
-def test_an_observation_is_corrected_only_if_a_message_of_the_previous_step_was_late():
-    learner, batch = collect_delayed("discrete", recompute_actor=True)
-    corrected = learner.backupdated_batch(batch)
-    differs = (corrected["agents", "observation"] != batch["agents", "observation"]).any(-1).any(-1)
-    backupdated = corrected["agents", "backupdated"].squeeze(-1).any(-1)
-    begins = batch["step_count"].squeeze(-1) == 0
-    assert begins[:, 1:].any()
-    assert not differs[begins].any()
-    assert not (differs[:, 1:] & ~backupdated[:, :-1]).any()
 
 
 def test_with_settle_steps_are_learnt_from_later_and_then_as_if_without_delay():

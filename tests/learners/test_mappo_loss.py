@@ -170,18 +170,3 @@ def test_values_are_those_of_two_passes_over_the_batch(case):
     assert evaluated == [
         batch.numel() + 4 + int(ends[:, :-1].sum()) + 1
     ]  # last steps, ends, and the correction
-
-
-def test_a_shared_value_is_one_for_all_uavs_from_the_observations_of_all_of_them():
-    env, learner, batch = flown("shared value")
-    step = batch[:, 3]
-    value = learner.critic(step.copy())[keys.STATE_VALUE]
-    assert value.shape == (4, 3, 1)
-    assert (value == value[:, :1]).all()
-    assert (value[0, 0] != value[1:, 0]).all()
-    for uav in range(3):  # each UAV's observation counts
-        other = step.clone()
-        other[keys.GLOBAL_OBSERVATION][:, uav] += 1.0
-        assert (learner.critic(other)[keys.STATE_VALUE] != value).all()
-    n_features = env.observation_spec[keys.GLOBAL_OBSERVATION].shape[-1]
-    assert learner.weights[len([*learner.actor.parameters()])].shape == (16, 3 * n_features)

@@ -19,7 +19,6 @@ from damian.learners.predictive_mappo import (
     PredictiveMappo,
     PredictiveMappoConfig,
     TargetScale,
-    prediction_loss,
 )
 from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.replay.backupdate import BackupdateStorage
@@ -95,20 +94,6 @@ def test_the_attention_is_that_of_a_loop_over_heads_and_known_messages():
             for q in range(3):
                 expected = twin(encoder, observation[i, j], history[i, j], codes[i, j, q])
                 torch.testing.assert_close(encoded[i, j, q], expected, atol=1e-5, rtol=1e-4)
-
-
-def test_the_loss_is_the_mean_over_what_counts_whatever_the_rest_is():
-    torch.manual_seed(2)
-    predicted, target, counts = torch.rand(5, 3, 2, 4), torch.rand(5, 3, 1, 4), torch.rand(5, 3, 1, 1) < 0.5
-    target = target.masked_fill(~counts, torch.nan)
-    errors = [
-        (predicted[i, j, q, g] - target[i, j, 0, g]) ** 2
-        for i, j in counts.view(5, 3).nonzero().tolist()
-        for q in range(2)
-        for g in range(4)
-    ]
-    torch.testing.assert_close(prediction_loss(predicted, target, counts), torch.stack(errors).mean())
-    assert prediction_loss(predicted, target, torch.zeros_like(counts)) == 0
 
 
 def test_the_scale_of_the_targets_does_not_matter_and_those_that_do_not_count_are_left_out():

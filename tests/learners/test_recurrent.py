@@ -9,7 +9,6 @@ from helpers import everything, learning
 from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import EnvBase, StepCounter
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
@@ -20,7 +19,6 @@ from damian.learners.networks import ModelConfig, make_actor
 from damian.recipes.shared.collectors import make_collector
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
-from damian.runs.metrics import evaluate
 from damian.server.termination import EpisodeConfig
 
 GRU = ModelConfig(hidden=[16, 8], rnn="gru")
@@ -107,32 +105,3 @@ def test_gradients_reach_back_to_the_beginning_of_the_episode_and_no_further():
     has_gradient = (features.grad != 0).any(-1).all(-1)
     assert has_gradient.tolist() == [[False] * 2 + [True] * 4, [True] * 6]
     assert (features.grad[0, :2] == 0).all()
-
-
-def test_an_evaluation_carries_hidden_states_and_starts_from_zeros():
-    env = delayed_env()
-    actor = make_actor(env, ModelConfig(hidden=[8], rnn="gru"))
-    with torch.no_grad():
-        for weight in actor.parameters():
-            weight.mul_(4)  # so that actions depend on the hidden states
-    first = evaluate(env, actor, 9, sample=False)
-    env.set_seed(1)
-    assert evaluate(env, actor, 9, sample=False) == first
-    carried, forgotten = (return_by_hand(delayed_env(), actor, forgets) for forgets in (False, True))
-    assert first.perceived_return == pytest.approx(carried, rel=1e-6)
-    assert carried != pytest.approx(forgotten, rel=1e-3)
-
-
-@torch.no_grad()
-def return_by_hand(env: DelayedEnv, actor: torch.nn.Module, forgets: bool) -> float:
-    """Mean return of the first episodes, with hidden states kept outside of the environment."""
-    env.set_seed(1)
-    step, total, running = env.reset(), 0.0, torch.ones(4, 1)
-    hidden = torch.zeros(4, 3, 8)
-    for _ in range(9):
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            chosen = actor(step.clone().set(HIDDEN, hidden * (not forgets)))
-        hidden, next_step = chosen[HIDDEN], env.step(step.set(ACTION, chosen[ACTION]))["next"]
-        total += (next_step["agents", "reward"].squeeze(-1) * running).mean().item()
-        running, step = running * ~next_step["done"], next_step
-    return total

@@ -52,17 +52,6 @@ def test_a_round_of_updates_changes_actor_critics_and_temperature(kind, motion):
         assert any(name.startswith(part) for name in changed), part
 
 
-def test_nothing_is_learnt_before_the_warm_up():
-    env = UavEnv(everything(), 8)
-    learner = learner_of(env, SacConfig(warm_up=304))
-    assert math.isnan(learner.learn(fly(env, learner.actor))["loss_actor"])
-    before = learner.loss.log_alpha.item()
-    learner.learn(fly(env, learner.actor, 13))  # 37 steps of 8 worlds: 296
-    assert learner.loss.log_alpha.item() == before
-    learner.learn(fly(env, learner.actor, 1))
-    assert learner.loss.log_alpha.item() != before
-
-
 def test_the_target_entropy_is_a_share_of_the_entropy_of_a_uniform_choice_among_legal_actions():
     env = UavEnv(everything(kind="discrete"), 8)
     learner = learner_of(env, SacConfig(target_entropy=0.5))
@@ -95,15 +84,6 @@ def test_the_discrete_losses_and_their_gradients_are_torchrls(mask):
         torch.testing.assert_close(found[name], expected[name])
         torch.testing.assert_close(*gradients)
         assert any((gradient != 0).any() for gradient in gradients[0]), name
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-1.0, 1.0)])
-def test_the_target_entropy_of_continuous_actions_is_that_of_one_uav_within_its_bounds(low, high):
-    env = UavEnv(everything(kind="continuous"), 4)
-    bounds = env.full_action_spec["agents", "action"].space
-    bounds.low, bounds.high = torch.full_like(bounds.low, low), torch.full_like(bounds.high, high)
-    target = learner_of(env).loss.target_entropy.item()
-    assert target == pytest.approx(2 * (torch.tensor((high - low) / 2).log().item() - 1), abs=1e-6)
 
 
 class RecordingSac(Sac):
@@ -193,20 +173,6 @@ def recording_learner(env: UavEnv | None = None, **changed) -> RecordingSac:
     learner = RecordingSac(env, config, learning(SMALL), ReplayBuffer(storage=TimeStorage(100)))
     learner.learn(fly(env, learner.actor, 8))
     return learner
-
-
-def test_an_update_moves_critics_by_the_learning_rate_and_their_targets_by_tau_times_that():
-    learner = recording_learner(lr=1e-2, alpha_lr=0.3, tau=0.25)
-    loss = learner.loss
-    learnt, target = (
-        torch.cat([weight.flatten() for weight in getattr(loss, name).data.values(True, True)])
-        for name in ("qvalue_network_params", "target_qvalue_network_params")
-    )
-    # Critics and targets had the same initial weights.
-    initial = (target - 0.25 * learnt) / 0.75
-    assert (learnt - initial).abs().max().item() == pytest.approx(1e-2, rel=1e-2)  # Adam's first step
-    moved = loss.log_alpha.item() - math.log(learner.config.alpha_init)
-    assert abs(moved) == pytest.approx(0.3, rel=1e-2)  # the temperature has its own rate
 
 
 def test_a_checkpoint_restores_the_networks_but_not_the_discount():

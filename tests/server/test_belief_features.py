@@ -123,22 +123,11 @@ def test_a_uavs_own_features_are_those_of_its_own_belief():
         torch.testing.assert_close(td["agents", "observation"][:, uav, 1:], own)
 
 
-def test_the_columns_with_a_value_for_each_action_are_those_of_the_gain():
-    env = make_env(believing(), 2, extras=["message"])
-    columns = env.uav_env.action_columns
-    td = env.reset()
-    messages = env.server.messages(td["agents", "message"])
-    gain = env.server.features(messages, torch.zeros(2, dtype=torch.long), ["belief_gain"])["belief_gain"]
-    torch.testing.assert_close(td["agents", "observation"][..., columns], gain)
-    assert make_env(everything(), 2).uav_env.action_columns is None
-
-
 def certain(cache):
     return cache.belief.amax(-1, keepdim=True).expand_as(cache.messages.time)
 
 
 surest = feature("belief")(certain)
-thief = feature("global")(certain)
 
 
 def test_a_feature_of_ones_own_may_read_the_belief():
@@ -148,12 +137,6 @@ def test_a_feature_of_ones_own_may_read_the_belief():
     torch.testing.assert_close(
         td["agents", "observation"][..., -1], td["belief"].amax(-1, keepdim=True).expand(2, 3)
     )
-
-
-def test_a_feature_that_does_not_declare_the_belief_cannot_read_it():
-    observation = ObservationConfig(global_features=[f"{__name__}:thief"])
-    with pytest.raises(InputError, match='only a feature of scope "belief" may read it'):
-        make_env(square(observation=observation), 2)
 
 
 def test_beliefs_that_nothing_computes_are_refused():

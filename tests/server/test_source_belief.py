@@ -154,30 +154,6 @@ def test_a_message_changes_nothing_before_it_arrives():
         assert torch.equal(flights[0].beliefs, flights[1].beliefs) == (age < 3)
 
 
-def test_a_uav_shares_the_servers_belief_from_where_the_server_knows_its_reports():
-    grid, everyone = grids["one region"], torch.ones(1, dtype=torch.bool)
-    flight = Flight(grid, 1, own=True)
-
-    def step(delay_of_the_first_uav: int) -> list[bool]:
-        """Which UAVs share the belief after a step in which the first one hears the source."""
-        sent, delay = torch.tensor([[1, 4, 6]]), torch.tensor([[delay_of_the_first_uav, 0, 0]])
-        slot, *beliefs = _advance(*_parts(grid, flight.window), sent, delay, flight.region, everyone)
-        flight.window, flight.beliefs = flight.window._replace(slot=slot), together(beliefs)
-        shared = flight.window.same_as_server[slot, 1:, 0].flatten().tolist()
-        assert shared == [torch.equal(own, beliefs[0][0]) for own in beliefs[1][0]]
-        return shared
-
-    assert step(0) == [True, True, True]
-    assert step(2) == [False, True, True]
-    assert step(0) == [False, True, True]
-    assert step(0) == [True, True, True]  # it arrives
-    assert flight.window.same_as_server[:, 1:].all()  # so that the steps in between are shared too
-    assert all(step(-1) == [False, True, True] for _ in range(2))
-    assert all(step(0) == [False, True, True] for _ in range(LONGEST + 3))  # it never arrives
-    flight.begin(everyone)
-    assert step(0) == [True, True, True]
-
-
 def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Tensor]:
     """Beliefs, and whether the source is in the cell, where all happens as the grid assumes."""
     torch.manual_seed(0)
@@ -235,17 +211,6 @@ def test_the_chance_of_a_detection_equals_the_slow_twins(grid):
         for p in (0, 3, n_points - 1):
             expected = chance_at(grid, r, beliefs[r], r * n_points + p)
             assert chance[r, p].item() == pytest.approx(expected, rel=1e-4)
-
-
-def test_a_report_is_as_likely_as_a_source_in_the_cell_is_in_the_footprint():
-    airspace = make_simulation(square(), 0).airspace
-    grid = build_source_grid(airspace, SourceConfig(), radius=50.0, dt=1.0, cell=45.0)
-    place = grid.centres.unsqueeze(1) + (torch.rand(len(grid.centres), 4000, 2) - 0.5) * 45.0
-    inside = (place.abs() < 100).all(-1)  # the local origin is the square's centre
-    for point, at in enumerate(airspace.points[0][:10]):
-        heard = (place - at).norm(dim=-1) < 50.0
-        share = (heard & inside).sum(-1) / inside.sum(-1).clamp(min=1)
-        torch.testing.assert_close(detection_table(grid)[point], share, atol=0.08, rtol=0)
 
 
 def test_a_grid_that_does_not_fit_is_refused():

@@ -16,14 +16,6 @@ from damian.world.signal_source import SourceConfig, Walk, locate
 LOOP = {"after_walk": "loop"}
 
 
-def test_a_walk_that_begins_anew_is_the_same_until_it_ends():
-    once, anew = dynamic_walks(n=20, emission="per_stop"), dynamic_walks(n=20, emission="per_stop", **LOOP)
-    for w, n in enumerate(n_stops(once).tolist()):
-        for name in ("stop", "arrive", "depart", "emits"):
-            assert getattr(once, name)[w, :n].equal(getattr(anew, name)[w, :n]), name
-        assert once.speed[w, : n - 1].equal(anew.speed[w, : n - 1])
-
-
 @given(
     seed=st.integers(0, 10**6),
     steps=st.integers(0, 10**9),

@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 from damian.world.battery import (
     BatteryConfig,
     charge_gain,
-    cruise_drain,
     flight_drain,
     observed,
     used_so_far,
 )
-from damian.world.motion import fly, minimum_time
 
 DATA = Path(__file__).parents[1] / "data"
 ENERGY = json.loads((DATA / "motion_energy_coverage.json").read_text())["energy"]
@@ -25,18 +23,6 @@ BATTERY = BatteryConfig()
 
 def tensor(value):
     return torch.tensor(value, dtype=torch.float64)
-
-
-def test_the_defaults_equal_the_recorded_parameters():
-    golden = ENERGY["params"]
-    assert (BATTERY.engine_power_kw, BATTERY.reference_speed) == (golden["p_eng"], golden["v_ref"])
-    assert (BATTERY.capacity_kwh, BATTERY.efficiency) == (golden["p_bat"], golden["b_efficiency"])
-    assert (BATTERY.charging_power_kw, BATTERY.resolution) == (
-        golden["p_bat_charging"],
-        golden["b_res"],
-    )
-    full = charge_gain(tensor(golden["T_empty_to_full_s"]), BATTERY)
-    assert full.item() == pytest.approx(100.0)
 
 
 def test_recorded_flights_have_the_same_drain():
@@ -59,30 +45,6 @@ def test_recorded_charging_has_the_same_gain():
 def test_recorded_levels_are_observed_as_the_same_levels(dtype):
     levels, expected = zip(*ENERGY["observable_level"], strict=True)
     assert observed(torch.tensor(levels, dtype=dtype), BATTERY).tolist() == list(expected)
-
-
-@given(multiple=st.integers(0, 20), error=st.floats(-4e-4, 4e-4))
-def test_float_error_does_not_change_the_observed_level(multiple, error):
-    level = torch.tensor(5.0 * multiple + error)
-    assert observed(level, BATTERY).item() == 5.0 * multiple
-
-
-@pytest.mark.parametrize("degree", [3, 5, 7])
-@pytest.mark.parametrize("n_steps", [3, 17, 400])
-def test_the_drain_of_a_flight_does_not_depend_on_the_time_step(degree, n_steps):
-    # The expected drain integrates the rate 100 (p_eng v / v_ref) / (p_bat eff) per hour over time.
-    origin, target, level = tensor([[0.0, 0.0]]), tensor([[30.0, 40.0]]), tensor([2.0])
-    vertical, cruise = minimum_time(tensor([2.0, 50.0]), degree, max_speed=5.0, max_acceleration=2.0)
-
-    def cruised(n):
-        elapsed = torch.linspace(0, 1, n + 1, dtype=torch.float64) * (2 * vertical + cruise)
-        return elapsed, fly(origin, target, level, elapsed, vertical, cruise, degree).cruised
-
-    elapsed, fine = cruised(20_000)
-    speed = fine.diff() / elapsed.diff()
-    rate = 100 * (10 * speed / 20) / (9 * 12) / 3600
-    steps = cruise_drain(cruised(n_steps)[1].diff(), BATTERY).sum()
-    assert steps.item() == pytest.approx((rate * elapsed.diff()).sum().item(), rel=1e-9)
 
 
 @given(

@@ -11,25 +11,12 @@ import shapely
 import torch
 from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Point, Polygon
+from twin import exact_share
 
-from damian.world import coverage
 from damian.world.coverage import KnownCoverage, build_tables, covered_share, updated_share
 
 DATA = Path(__file__).parents[1] / "data"
 R = 56.2341
-
-
-def exact_share(polygon, positions, radius=R):
-    """Exact coverage of one world by shapely, UAV by UAV: positions ``[N, n, 2]`` [m] -> ``[N]``."""
-    discs = [[Point(p).buffer(radius, quad_segs=128) for p in uav] for uav in positions]
-    shares = []
-    for i, own in enumerate(discs):
-        areas = []
-        for k, disc in enumerate(own):
-            excluded = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
-            areas.append(disc.intersection(polygon).difference(shapely.union_all(excluded)).area)
-        shares.append(np.mean(areas) / (math.pi * radius**2))
-    return np.array(shares)
 
 
 def star(rng, low, high):
@@ -97,7 +84,7 @@ def test_coverage_is_within_one_percent_of_the_exact_area(kind, spread):
         polygon = random_polygon(rng, kind)
         positions = random_points(rng, polygon, n_uavs * n_last, spread)
         positions = positions.reshape(n_uavs, n_last, 2)
-        got, exact = share_at(polygon, positions), exact_share(polygon, positions)
+        got, exact = share_at(polygon, positions), exact_share(polygon, positions, R)
         np.testing.assert_allclose(got, exact, rtol=0, atol=0.01)
 
 
@@ -111,27 +98,6 @@ def test_the_authors_areas_are_reproduced_within_one_percent_of_the_disc():
         expected = np.array(case["clean_current_disc_minus_polygon_and_others_m2"])
         got = share_at(polygon, newest, radius) * math.pi * radius**2
         np.testing.assert_allclose(got, expected, rtol=0, atol=0.01 * golden["disc_area"])
-
-
-def test_samples_far_from_the_boundary_are_outside_as_often_as_a_test_of_each_finds():
-    polygon = Polygon([(0, 0), (400, 0), (400, 300), (0, 300)], [[(150, 100), (250, 100), (200, 200)]])
-    points = np.random.default_rng(0).uniform(-100, 450, (1200, 2))
-    tables = build_tables([polygon], points[None], 30.0, words=2)
-    k = np.arange(128)
-    r, angle = 30 * np.sqrt((k + 0.5) / 128), k * np.pi * (3 - math.sqrt(5))
-    samples = points[:, None] + np.stack([r * np.cos(angle), r * np.sin(angle)], -1)
-    outside = ~shapely.contains_xy(polygon, samples[..., 0], samples[..., 1])
-    words = tables.masks[-1200:].numpy().view(np.uint8)
-    np.testing.assert_array_equal(np.unpackbits(words, axis=-1, bitorder="little"), outside)
-
-
-def test_splitting_the_worlds_into_chunks_does_not_change_the_shares(square, monkeypatch):
-    tables, _, points = square
-    ids, positions = at_random(points, (11, 3, 2))
-    whole = covered_share(tables, ids, positions)
-    for words in (1, (16 + 4) * 3 * 2 * 3):  # one world, and three worlds, at a time
-        monkeypatch.setattr(coverage, "_CHUNK_WORDS", words)
-        assert torch.equal(covered_share(tables, ids, positions), whole)
 
 
 def test_a_sequence_of_steps_equals_each_step_by_itself(square):

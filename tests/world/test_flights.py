@@ -1,15 +1,11 @@
 """Positions, legal actions and readiness of UAVs, and the times at which they send messages."""
 
 import copy
-import math
 
 import pytest
 import shapely
 import torch
 from helpers import (
-    EAST,
-    FLYING,
-    HERE,
     KEEPS_GOING,
     MOTIONS,
     SQUARE,
@@ -18,10 +14,7 @@ from helpers import (
     both_motions,
     check_equal,
     everything,
-    flight,
     fresh,
-    go,
-    one_uav,
     random_actions,
     same,
     sent_messages,
@@ -34,9 +27,7 @@ from damian.envs.uav_env import UavEnv
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
-from damian.world.motion import MotionConfig
 from damian.world.regions.config import RegionConfig
-from damian.world.signal_source import SourceConfig
 from damian.world.state import State
 
 # Positions on landing points.
@@ -122,48 +113,6 @@ def test_the_action_of_a_uav_that_is_not_ready_changes_nothing():
         waited += int((~ready & (other != action)).sum())
         assert state.motions.le(before.motions + ready).all()
     assert waited > 100
-
-
-def test_a_uav_sends_a_message_at_its_takeoff_and_the_next_one_when_it_lands():
-    env = fresh(one_uav(motion=FLYING))
-    before = sent_messages(env.reset())
-    output = go(env, EAST)
-    assert output["agents", "message_sent"].item()
-    takeoff, duration = output["agents", "message"].clone(), flight(env)
-    message = sent_messages(output)
-    assert message.in_flight.item()
-    assert message.time.item() == 1.0
-    assert message.position.equal(before.position)
-    assert message.target[0, 0].equal(env.simulation.points[env.state.goal.item()])
-    assert message.trail.equal(before.trail)
-    for _ in range(math.ceil(duration) - 1):
-        assert output["agents", "message"].equal(takeoff)
-        output = go(env, HERE)
-        assert output["agents", "message_sent"].item() == env.simulation.vehicles.on_ground(env.state).item()
-    message = sent_messages(output)
-    assert output["agents", "message_sent"].item()
-    assert not message.in_flight.item()
-    assert message.time.item() == math.ceil(duration)
-    assert message.position[0, 0].equal(env.simulation.points[env.state.goal.item()])
-    assert message.position.equal(message.target)
-    assert message.track.item() == pytest.approx(math.pi / 2, abs=0.3)
-
-
-def test_a_uav_in_flight_does_not_detect_the_source():
-    source = SourceConfig(level_db=130.0, position=[110.0, 100.0])  # on the way; its radius is 17.8 m
-    scenario = one_uav(motion=MotionConfig("polynomial"), source=source)
-    scenario.region.start_positions = [[20.0, 100.0]]
-    scenario.actions.distances = [0.0, 200.0]
-    env = fresh(scenario)
-    go(env, EAST)
-    near = False
-    for _ in range(math.ceil(flight(env)) - 2):
-        output = go(env, HERE)
-        distance = torch.linalg.vector_norm(env.state.position[0, 0, :2] - env.state.source[0])
-        near |= bool(distance < 10)
-        assert not sent_messages(output).spotted.item()
-    assert near
-    assert env.state.motions.item() == 1  # a detection would have set it to 0
 
 
 # Action masks.

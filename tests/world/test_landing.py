@@ -11,7 +11,7 @@ from exact_distance import nearest_by_loop
 from helpers import SQUARE, both_kinds, heading
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.affinity import scale, translate
+from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from damian.common.errors import InputError
@@ -206,27 +206,6 @@ def test_discrete_and_continuous_actions_have_the_same_candidates():
         assert ranking.point[row][..., :1].long().equal(expected.point[expected_row][..., :1])
         compared += row.numel()
     assert compared == 20 * int(airspace.n_points.sum())
-
-
-@pytest.mark.parametrize("name", POLYGONS)
-def test_the_landing_points_of_actions_are_ranked_as_by_a_loop_in_exact_arithmetic(name):
-    polygon, actions = scale(POLYGONS[name], 20, 20), ActionConfig(distances=[0.0, 50.0, 97.0])
-    airspace = build_airspace([Region(polygon, name)], RegionConfig(), 3)
-    ranking = Candidates(airspace, actions, 3).ranking
-    points = airspace.exact_points[0].tolist()
-    moves = [(d, math.radians(h)) for d in actions.distances for h in actions.headings]
-    outside = 0
-    for row in np.random.default_rng(0).integers(len(points) * len(moves), size=100).tolist():
-        own, (distance, bearing) = row // len(moves), moves[row % len(moves)]
-        target = [
-            points[own][0] + distance * math.sin(bearing),
-            points[own][1] + distance * math.cos(bearing),
-        ]
-        inside_polygon = shapely.contains_xy(polygon, *target)
-        expected = nearest_by_loop(points, target, 5) if inside_polygon else [own] * 5
-        assert ranking.point[row].tolist() == expected
-        outside += not inside_polygon
-    assert 10 < outside < 80
 
 
 @both_kinds

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry import Polygon
 
 import damian
 from damian.common.errors import InputError
@@ -64,26 +64,12 @@ def test_the_origin_of_a_large_region_is_its_centroid_on_the_sphere(tmp_path):
         assert read_geojson(file).origin == pytest.approx(area_centroid(area), abs=1e-9)
 
 
-def test_a_region_across_the_antimeridian_is_one_small_polygon():
-    region = read_fir(FIR, "Strait")
-    assert abs(region.origin[1]) == pytest.approx(180)
-    width = 0.2 * DEGREE_M * np.cos(np.radians(16.45))
-    assert region.polygon.area == pytest.approx(width * 0.1 * DEGREE_M, rel=1e-4)
-
-
 def test_a_hole_stays_a_hole_and_heights_are_ignored():
     region = read_geojson(ZONES, where="name=lake")
     assert len(region.polygon.interiors) == 1
     outer_area = Polygon(region.polygon.exterior).area
     assert region.polygon.area == pytest.approx(outer_area * 8 / 9, rel=1e-3)
     assert not region.polygon.contains(region.polygon.centroid)
-
-
-def test_a_multipolygon_keeps_its_parts():
-    region = read_geojson(ZONES, index=2)
-    assert isinstance(region.polygon, MultiPolygon)
-    assert len(region.polygon.geoms) == 2
-    assert region.name == "zones features[2]"
 
 
 @pytest.mark.parametrize(("where", "name"), [("zone=1", "ell"), ("zone=2", "lake")])

@@ -40,15 +40,6 @@ def test_readings_equal_those_of_a_loop_and_uavs_in_flight_keep_those_of_their_l
     assert (kept > 50) == (motion == "polynomial")
 
 
-def test_one_function_is_used_twice_under_two_names():
-    twice = [*SENSORS, {"sensor": "sensor_cases:gust", "name": "breeze", "strength": 1.0}]
-    env = UavEnv(everything(sensors=twice), num_worlds=2, seed=2)
-    read = env.server.messages(env.reset()["agents", "message"]).readings
-    torch.testing.assert_close(read[..., 3:], readings_of(env, strength=1.0)[..., :2])
-    torch.testing.assert_close(read[..., :3], readings_of(env))
-    assert list(env.simulation.sensors) == ["gust", "gap", "breeze"]
-
-
 @given(
     seed=st.integers(0, 2**32 - 1),
     window=st.integers(1, 5),

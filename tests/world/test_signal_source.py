@@ -4,7 +4,6 @@ import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import shapely
 import torch
@@ -20,7 +19,7 @@ from walks import (
     twin_position,
 )
 
-from damian.world.signal_source import SourceConfig, draw_walks, footprint_radius, leg_profile, locate
+from damian.world.signal_source import SourceConfig, footprint_radius, leg_profile, locate
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
 
@@ -86,14 +85,6 @@ def test_recorded_legs_take_the_same_time():
             compared += 1
         before = theirs
     assert (compared, triangular, stale) == (8, 2, 3)
-
-
-@pytest.mark.parametrize("name", POLYGONS)
-def test_static_sources_are_drawn_inside_the_polygon(name):
-    walk = draw_walks(POLYGONS[name], SourceConfig(), 200, np.random.default_rng(1))
-    inside = shapely.dwithin(POLYGONS[name], shapely.points(walk.stop[:, 0].numpy()), 1e-3)
-    assert inside.all()
-    assert len(walk.stop.unique(dim=0)) > 150
 
 
 @pytest.mark.parametrize("name", POLYGONS)
@@ -177,15 +168,3 @@ def test_a_position_equals_the_integrated_speed_profile(
         position, stop = twin_position(walk, w, time[w].item())
         assert located.position[w].tolist() == pytest.approx(position, abs=2e-2)
         assert located.stop[w].item() == stop
-
-
-def test_a_walk_is_over_after_its_last_wait_and_the_source_stays_there():
-    walk = dynamic_walks(n=20)
-    end = walk.depart[:, -1]
-    assert end.isfinite().all()
-    assert not locate(walk, 0.999 * end).finished.any()
-    for time in (end, end + 1, end + 1e6):
-        located = locate(walk, time)
-        assert located.finished.all()
-        assert (located.position == walk.stop[:, -1]).all()
-        assert (located.stop == n_stops(walk) - 1).all()

@@ -8,7 +8,6 @@ import shapely
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from shapely.affinity import translate
 
 from damian.common.tensors import tree_map
 from damian.settings.world import WorldConfig
@@ -102,14 +101,3 @@ def test_a_centred_region_does_not_depend_on_where_it_was(seed, east, north):
     there = centred(Region(shapely.MultiPoint(np.add(corners, [east, north])).convex_hull, "there"))
     corners, moved = ({*map(tuple, shapely.get_coordinates(r.polygon))} for r in (here, there))
     assert corners == moved
-
-
-@pytest.mark.parametrize("offset", [(0.0, 0.0), (-3.5e6, 1e7)])
-def test_a_centred_region_has_its_centroid_at_the_origin_and_knows_where_it_was(offset):
-    hole = [[(10, 10), (30, 10), (30, 35)]]
-    polygon = translate(shapely.Polygon([(0, 0), (90, 0), (80, 70), (11.25, 60)], hole), *offset)
-    region = centred(Region(polygon, "test"))
-    assert region.polygon.centroid.coords[0] == pytest.approx((0, 0), abs=2e-5)
-    back = shapely.get_coordinates(translate(region.polygon, *region.offset))
-    np.testing.assert_allclose(back, shapely.get_coordinates(polygon), atol=2e-5)
-    assert len(region.polygon.interiors) == 1

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-import shapely
 import torch
 import twin
 from helpers import (
@@ -146,18 +145,5 @@ def test_the_coverage_of_the_last_landing_points_is_exact_within_one_percent():
         trails = torch.cat([newest, trails[:, :, :-1]], 2)
         for b, region in enumerate(env.state.region.tolist()):
             polygon = env.simulation.airspace.regions[region].polygon
-            expected = exact_coverage(polygon, trails[b].double().numpy(), radius)
+            expected = twin.exact_share(polygon, trails[b].double().numpy(), radius)
             assert output["agents", "reward"][b, :, 0].tolist() == pytest.approx(expected, abs=0.01)
-
-
-def exact_coverage(polygon, trails, radius):
-    """Coverage of each UAV by shapely; the newest landing point of a trail comes first."""
-    discs = [[shapely.Point(p).buffer(radius, quad_segs=64) for p in trail] for trail in trails]
-    shares = []
-    for i, own in enumerate(discs):
-        areas = []
-        for k, disc in enumerate(own):
-            excluded = [other[k] for j, other in enumerate(discs) if j != i] + own[k + 1 :]
-            areas.append((disc & polygon).difference(shapely.union_all(excluded)).area)
-        shares.append(np.mean(areas) / (math.pi * radius**2))
-    return shares
