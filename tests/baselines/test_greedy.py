@@ -16,7 +16,6 @@ from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
-from damian.runs.metrics import evaluate
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
@@ -194,17 +193,3 @@ def test_the_policy_reads_received_messages_and_not_sent_ones():
     assert torch.equal(policy(td.clone())["agents", "action"], without_detection)
     td["agents", "received"] = td["agents", "message"]
     assert not torch.equal(policy(td)["agents", "action"], without_detection)
-
-
-@pytest.mark.slow
-def test_with_any_number_of_uavs_the_policy_is_clearly_better_than_the_random_one():
-    torch.manual_seed(0)
-    region = RegionConfig(min_area=60_000, max_area=90_000, pool=2, initial_conditions=16)
-    for agents in (1, 3, 7):
-        scenario = ScenarioConfig(agents=agents, region=region, source=walking(), reward=SEARCH)
-        env = make_env(scenario, 32, 5, extras=["message"])
-        scores = []
-        for policy in (greedy_policy(env), random_policy(env)):
-            env.set_seed(5)
-            scores.append(evaluate(env, policy, 50).return_)
-        assert scores[0] > 2 * scores[1]

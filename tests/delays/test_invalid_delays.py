@@ -42,7 +42,6 @@ def test_an_invalid_law_raises_one_line_that_names_its_key(setting, error):
     ("settings", "error"),
     [
         ({"delay": 3}, "links.delay: 3 means nothing with links=server"),
-        ({"kind": "matrix", "range": 50.0, "hears": [[True]]}, "links.range: 50.0 does not go with links.he"),
         (
             {"kind": "matrix", "delay": [[0, 1], [1, 0]]},
             "links.delay: it is not 3 lists (receivers) of 3 entries",

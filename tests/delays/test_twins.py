@@ -212,7 +212,7 @@ def one_of_each(name: str) -> list[Any]:
     ]
 
 
-@pytest.mark.parametrize("name", ["episode", "all", "context"])
+@pytest.mark.parametrize("name", ["all", "context"])
 def test_a_world_alone_has_the_same_delays_as_in_a_batch(name):
     batch = play(delayed(*one_of_each(name)), choices(n_steps=20))
     for w, world in enumerate(WORLDS):

@@ -49,7 +49,7 @@ def config(learner: str, rnn: str, kind: str, motion: str, aware: str) -> TrainC
 KINDS, MOTIONS = ("discrete", "continuous"), ("instant", "polynomial")
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("aware", AWARE)
 @pytest.mark.parametrize("kind", [KINDS[0], pytest.param(KINDS[1], marks=pytest.mark.slow)])
 @pytest.mark.parametrize(

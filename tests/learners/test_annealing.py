@@ -9,7 +9,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from damian.envs.uav_env import UavEnv
 from damian.learners.mappo import Mappo, MappoConfig
 from damian.learners.networks import ModelConfig
-from damian.runs.checkpoint import restore
 
 
 def annealing(frames: int, **settings: float) -> tuple[Mappo, TensorDictBase]:
@@ -32,13 +31,3 @@ def test_the_entropy_bonus_goes_linearly_to_its_end_over_the_frames_of_the_run()
     assert weights_of_the_entropy(learner, batch, 6) == pytest.approx(
         [0.4, 0.3, 0.2, 0.1, 0.0, 0.0], abs=1e-6
     )
-
-
-def test_a_resumed_learner_goes_on_with_the_same_weight(tmp_path):
-    settings = {"entropy_coeff": 0.4, "entropy_coeff_end": 0.1}
-    (whole, batch), (other, _) = annealing(100, **settings), annealing(100, **settings)
-    whole.learn(batch)
-    states = {name: part.state_dict() for name, part in whole.components().items()}
-    restore(other.components(), states, tmp_path, "resume")
-    assert other.entropy_coeff.value.equal(whole.entropy_coeff.value)
-    assert other.entropy_coeff.value.item() == pytest.approx(0.4 - 0.3 * 24 / 100)

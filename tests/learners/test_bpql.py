@@ -3,7 +3,7 @@
 import pytest
 import torch
 from helpers import both_kinds, everything, learning
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import StepCounter
@@ -74,43 +74,6 @@ def test_critics_learn_from_undelayed_states_which_have_arrived_and_the_actor_fr
     differences = (found.unsqueeze(1) - torch.stack(expected)).abs().amax(-1)
     assert differences.amin(1).max() < 1e-5  # every drawn transition has undelayed states of a settled step
     assert (torch.stack(late) - torch.stack(expected)).abs().max() > 0.1  # as collected, they were late
-
-
-def test_the_losses_are_those_of_bpql():
-    learner, _, drawn = learnt()
-    batch, loss = drawn[:7], learner.loss
-
-    def values(params: TensorDictBase, state: Tensor) -> Tensor:
-        """Values of all actions by each of both critics in one state, [2, A]."""
-        found = []
-        for i in range(2):
-            with params[i].to_module(loss.qvalue_network):
-                read = TensorDict({keys.GLOBAL_OBSERVATION: state})
-                found.append(loss.qvalue_network(read)["action_value"])
-        return torch.stack(found)
-
-    def policy(agents: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Probabilities and their logarithms, [A], of the policy at what the actor observed."""
-        known = {keys.OBSERVATION: agents["observation"], keys.ACTION_MASK: agents["action_mask"]}
-        chosen = learner.actor.get_dist(TensorDict(known))
-        return chosen.probs, chosen.logits
-
-    alpha, actor, critic = loss.log_alpha.exp(), 0.0, 0.0
-    for row in batch:
-        agents, after = row["agents"], row["next", "agents"]
-        probs, logs = policy(after)
-        least = values(loss.target_qvalue_network_params, after["global_observation"]).amin(0)
-        value = (probs * (least - alpha * logs)).sum()
-        if row["next", "terminated"]:
-            value = 0.0
-        target = after["reward"] + 0.95 ** row["steps_to_next_obs"] * value
-        both = values(loss.qvalue_network_params, agents["global_observation"])
-        critic += (both[:, agents["action"]] - target).square().sum() / len(batch)
-        probs, logs = policy(agents)
-        actor += (probs * (alpha * logs - both.amin(0))).sum() / len(batch)
-    losses = loss(batch)
-    torch.testing.assert_close(losses["loss_qvalue"], critic.detach(), check_dtype=False)
-    torch.testing.assert_close(losses["loss_actor"], actor, check_dtype=False)
 
 
 def test_bpql_waits_for_states_and_refuses_to_learn_without_back_updating():

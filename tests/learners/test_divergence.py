@@ -16,7 +16,7 @@ def test_a_nan_counts_only_if_weights_are_wrong():
     assert divergence(components, {"a": 1.0, "b": -math.inf}) == "b is -inf"
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -2e5])
+@pytest.mark.parametrize("value", [math.nan, -2e5])
 def test_one_wrong_weight_is_enough(value):
     network = nn.Sequential(nn.Linear(2, 2), nn.Linear(2, 2))
     with torch.no_grad():

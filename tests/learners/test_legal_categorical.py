@@ -19,7 +19,7 @@ def both(shape: tuple[int, ...], masked: bool) -> tuple[LegalCategorical, Catego
     return LegalCategorical(logits), Categorical(logits=logits), logits
 
 
-every_shape = pytest.mark.parametrize("shape", [(50,), (20, 3), (5, 4, 3)])
+every_shape = pytest.mark.parametrize("shape", [(50,), (5, 4, 3)])
 masked_or_not = pytest.mark.parametrize("masked", [True, False])
 
 

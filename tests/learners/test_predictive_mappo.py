@@ -163,7 +163,7 @@ def ends_of_completed(storage: BackupdateStorage, act: int) -> dict[tuple[int, i
     return found
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(("flights", "act"), [(False, 2), (True, 0), (True, 2)])
 def test_a_decision_counts_if_its_action_was_completed_and_the_last_message_of_it_has_arrived(flights, act):
     learner, env, _ = build(flights=flights, act=act, prediction_batch=3000)
@@ -187,16 +187,6 @@ def test_a_decision_counts_if_its_action_was_completed_and_the_last_message_of_i
     }
     assert sampled <= expected
     assert len(sampled) > 0.9 * len(expected)
-
-
-@pytest.mark.parametrize("kind", ["discrete", "continuous"])
-def test_the_gradient_of_the_prediction_reaches_all_of_the_head_and_the_errors_fall(kind):
-    learner, env, _ = build(kind, prediction_lr=1e-2, prediction_batch=64)
-    learner.learn(collected(learner, env))
-    learner.head_optimizer.zero_grad()
-    errors = [learner.learn_prediction(learner.last_steps()) for _ in range(60)]
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in learner.head.parameters())
-    assert torch.stack(errors[-10:]).mean() < 0.8 * torch.stack(errors[:10]).mean()
 
 
 @pytest.mark.parametrize("kind", ["discrete", "continuous"])

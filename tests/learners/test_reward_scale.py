@@ -1,6 +1,5 @@
 """Learning does not depend on the scale of the rewards: normalised values of MAPPO, scaled rewards of SAC."""
 
-import copy
 import functools
 from typing import Any
 
@@ -23,7 +22,6 @@ from damian.learners.recurrent import add_recurrent_state
 from damian.learners.reward_scale import ReturnScale
 from damian.learners.sac import Sac, SacConfig
 from damian.replay.time_storage import TimeStorage
-from damian.runs.checkpoint import plain, restore
 from damian.server.termination import EpisodeConfig
 
 REWARD = keys.next_key(keys.REWARD)
@@ -141,20 +139,3 @@ def test_rewards_are_divided_by_the_root_mean_square_of_discounted_returns_over_
 
 
 # Checkpoints.
-
-
-def stored(learner: Learner) -> dict[str, Any]:
-    states = {name: part.state_dict() for name, part in learner.components().items()}
-    return copy.deepcopy(plain(states))
-
-
-@pytest.mark.parametrize("make", [lambda: mappo(True), lambda: sac(True, "discrete")], ids=["mappo", "sac"])
-def test_running_statistics_are_among_what_a_checkpoint_stores(make, tmp_path):
-    (whole, env), (other, _) = make(), make()
-    first, second, third = flights(env, whole.actor, 3)
-    learnt(whole, [first, second], 100.0)
-    restore(other.components(), stored(whole), tmp_path, "resume")
-    if isinstance(whole, Sac):  # a checkpoint stores the replay buffer beside the components
-        other.buffer = whole.buffer = copy.deepcopy(whole.buffer)
-        other.buffer = copy.deepcopy(whole.buffer)
-    assert learnt(other, [third], 100.0).equal(learnt(whole, [third], 100.0))

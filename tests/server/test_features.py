@@ -6,7 +6,7 @@ import pytest
 import torch
 import twin
 from helpers import SCALE, TIME_SCALE, messages_of, random_worlds
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from damian.common.errors import InputError
@@ -31,6 +31,7 @@ def check_features(worlds, newest=False):
             assert ((ours[name] >= 0) & (ours[name] <= 1)).all(), name
 
 
+@settings(max_examples=settings.default.max_examples // 2)
 @given(seed=seeds, n_agents=fleets, heard=shares, spots=shares, newest=st.booleans())
 def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
     seed, n_agents, heard, spots, newest

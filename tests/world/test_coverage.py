@@ -117,12 +117,3 @@ def test_a_sequence_of_steps_equals_each_step_by_itself(square):
         computed.append((ids != known.trail).any())
         known = KnownCoverage(ids, share)
     assert all(computed)
-
-
-def test_flat_ids_run_over_regions_and_padding_covers_nothing():
-    regions = [shapely.box(-500, -500, 500, 500), shapely.box(-500, -500, 0, 500)]
-    points = np.array([[[100.0, 0], [200.0, 0]], [[0.0, 0], [np.nan, np.nan]]])
-    tables = build_tables(regions, points, R)
-    ids, positions = torch.arange(4).view(4, 1, 1), torch.zeros(4, 1, 1, 2)
-    share = covered_share(tables, ids, positions).squeeze(-1)
-    np.testing.assert_allclose(share, [1, 1, 0.5, 0], atol=0.005)

@@ -62,6 +62,7 @@ def booked_by_twin(ranking, row, standing, reach):
 
 
 @pytest.mark.parametrize("few", [0, 25])
+@settings(max_examples=settings.default.max_examples // 3)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n_agents=st.integers(1, 25),
@@ -92,7 +93,7 @@ def some_points(rng, kind, n) -> np.ndarray:
     return points + 5000.0 * (kind == "clusters") * rng.integers(0, 2, (n, 1))
 
 
-@settings(max_examples=60)
+@settings(max_examples=settings.default.max_examples // 4)
 @given(
     seed=st.integers(0, 2**32 - 1),
     kinds=st.lists(st.sampled_from(["scattered", "clusters", "lattice"]), min_size=1, max_size=3),
@@ -126,16 +127,6 @@ def test_the_nearest_points_are_those_of_a_loop_in_exact_arithmetic(seed, kinds,
     assert ours.tolist() == expected
 
 
-@pytest.mark.parametrize("distance", [10.0, 12.345, 0.005, 77.775, 100 * math.sqrt(2)])
-def test_of_points_at_one_distance_in_any_direction_the_lowest_id_is_nearest(distance):
-    angles = np.radians(np.arange(1, 360))
-    points = distance * np.stack([np.sin(angles), np.cos(angles)], -1)
-    cells = build_cells([points], [shapely.Point(0, 0).buffer(2 * distance)], 359)
-    origin = torch.zeros(1, 2, dtype=torch.float64)
-    ours = nearest_points(cells, torch.as_tensor(points[None]), torch.zeros(1).long(), origin, 359)
-    assert ours.tolist() == [list(range(359))]
-
-
 # Inside tests.
 
 HORSESHOE = Polygon([(0, 0), (10, 0), (10, 8), (7, 8), (7, 3), (3, 3), (3, 8), (0, 8)])
@@ -147,16 +138,7 @@ POLYGONS = {
 }
 
 
-def star(rng):
-    """A jagged polygon with a hole near its middle."""
-    angle = np.sort(rng.uniform(0, 2 * np.pi, 14))
-    radius = rng.uniform(4, 12, 14)
-    shell = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
-    hole = np.stack([np.cos(angle), np.sin(angle)], -1) * 1.5
-    return Polygon(shell).buffer(0).difference(Polygon(hole))
-
-
-@pytest.mark.parametrize("polygon", [*POLYGONS.values(), *map(star, map(np.random.default_rng, range(5)))])
+@pytest.mark.parametrize("polygon", POLYGONS.values(), ids=POLYGONS)
 def test_inside_equals_shapelys_contains(polygon):
     rng = np.random.default_rng(3)
     airspace = build_airspace([Region(polygon, "test")], RegionConfig(lattice_step=1.0), 1)

@@ -79,22 +79,6 @@ def test_places_are_in_the_coordinates_in_which_the_vertices_are_given():
     assert offset.tolist() == [100.0, 100.0]
 
 
-def test_every_region_of_a_pool_must_contain_a_given_place():
-    pool = RegionConfig(pool=3, initial_conditions=6)
-    middle = [0.0, 0.0]
-    worlds = build(
-        pool,
-        source=SourceConfig(position=middle),
-        battery=BatteryConfig(enabled=True, charging_points=[middle]),
-    )
-    for index, region in enumerate(worlds.airspace.regions):
-        local = -torch.tensor(region.offset)
-        assert worlds.initial.source[2 * index].tolist() == pytest.approx(local.tolist(), abs=2e-5)
-    assert int(worlds.vehicles.chargers.sum()) == 3
-    with pytest.raises(InputError, match=r"^source.position: .* m is not inside random region \d "):
-        build(RegionConfig(pool=10), source=SourceConfig(position=[0.0, 190.0]))
-
-
 @pytest.mark.parametrize(
     "place",
     [[math.nan, 1.0], {"lat": 1.0, "lng": 2.0}, [0.0, 100.0], {"lat": 53.1, "lon": -4.5}],

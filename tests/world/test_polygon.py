@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Point, Polygon
 
@@ -64,7 +64,7 @@ def _slow_lattice(polygon, step, degrees):
 
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-@pytest.mark.parametrize(("step", "degrees"), [(17.3, 45), (29.7, 30), (11.1, 80)])
+@pytest.mark.parametrize(("step", "degrees"), [(29.7, 30), (11.1, 80)])
 def test_the_lattice_agrees_with_a_slow_loop_on_concave_holed_and_multipart_polygons(shape, step, degrees):
     polygon = shapely.affinity.translate(shapely.affinity.rotate(shape, 7.7), 31.7, -11.3)
     points = landing_lattice(polygon, step, degrees)
@@ -72,6 +72,7 @@ def test_the_lattice_agrees_with_a_slow_loop_on_concave_holed_and_multipart_poly
     np.testing.assert_allclose(points, _slow_lattice(polygon, step, degrees), atol=1e-6)
 
 
+@settings(max_examples=settings.default.max_examples // 4)
 @given(st.integers(0, 2**32 - 1), st.floats(10, 60), st.floats(5, 90))
 def test_landing_points_are_strictly_inside_distinct_and_ordered_by_direction(seed, step, degrees):
     polygon = random_polygon(np.random.default_rng(seed), 30_000, 60_000)
@@ -121,6 +122,7 @@ def test_random_polygons_have_the_statistics_of_the_original():
     assert areas.std() == pytest.approx(stats["area"]["std"], rel=0.25)
 
 
+@settings(max_examples=settings.default.max_examples // 4)
 @given(st.integers(0, 2**32 - 1), st.floats(1, 1e10), st.floats(0, 1))
 def test_a_random_polygon_is_convex_and_has_an_area_between_the_limits(seed, max_area, share):
     min_area = max(max_area * share, max_area * 1e-6)

@@ -11,7 +11,7 @@ from shapely.geometry import Polygon
 import damian
 from damian.common.errors import InputError
 from damian.world.regions.fir import read_fir
-from damian.world.regions.geodesy import EARTH_RADIUS_M, area_centroid, to_latlon
+from damian.world.regions.geodesy import EARTH_RADIUS_M, to_latlon
 from damian.world.regions.geojson import read_geojson
 from damian.world.regions.region import Region
 
@@ -50,18 +50,6 @@ def test_rows_of_a_table_are_ordered_by_sequence_number():
     np.testing.assert_allclose(_places(region), corners, atol=1e-9)
     width = 0.01 * DEGREE_M * np.cos(np.radians(52.805))
     assert region.polygon.area == pytest.approx(width * 0.01 * DEGREE_M, rel=1e-4)
-
-
-def test_the_origin_of_a_large_region_is_its_centroid_on_the_sphere(tmp_path):
-    shell, hole = (
-        [[0, 60], [10, 60], [10, 61], [0, 61], [0, 60]],
-        [[1, 60.4], [3, 60.4], [2, 60.6], [1, 60.4]],
-    )
-    file = tmp_path / "cell.geojson"
-    for rings in ([shell], [shell[::-1]], [shell, hole]):
-        file.write_text(json.dumps(_polygon(*rings)))
-        area = [np.array(ring, float) for ring in (shell, hole[::-1])[: len(rings)]]
-        assert read_geojson(file).origin == pytest.approx(area_centroid(area), abs=1e-9)
 
 
 def test_a_hole_stays_a_hole_and_heights_are_ignored():
@@ -111,6 +99,19 @@ def test_each_kind_of_geojson_yields_its_only_area(tmp_path, document):
     area = (0.01 * DEGREE_M) ** 2 * np.cos(np.radians(45.005))
     assert region.polygon.area == pytest.approx(area, rel=1e-4)
     assert sorted(_places(region).round(9).tolist()) == sorted(corners)
+
+
+@pytest.mark.parametrize("latitude", [-30.0, 80.0])
+def test_a_hole_may_touch_the_shell(tmp_path, latitude):
+    shell = [[9.996, -0.004], [10.004, -0.004], [10.004, 0.004], [9.996, 0.004], [9.996, -0.004]]
+    hole = [[10.004, 0.0], [10.002, -0.001], [10.002, 0.001], [10.004, 0.0]]
+    shell, hole = ([[x, y + latitude] for x, y in ring] for ring in (shell, hole))
+    file = tmp_path / "touching.geojson"
+    file.write_text(json.dumps(_polygon(shell, hole)))
+    region = read_geojson(file)
+    assert region.polygon.is_valid
+    expected = Polygon(shell, [hole]).area * DEGREE_M**2 * np.cos(np.radians(latitude))
+    assert region.polygon.area == pytest.approx(expected, rel=1e-3)
 
 
 def test_parts_cut_at_the_antimeridian_are_united(tmp_path):

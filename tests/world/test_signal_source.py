@@ -120,24 +120,6 @@ def test_waits_and_legs_alternate_without_gaps():
             assert arrive[k + 1] - depart[k] == pytest.approx(leg, abs=1e-2)
 
 
-@pytest.mark.parametrize("loops", [False, True])
-def test_padded_stops_lie_where_the_walk_ends_and_are_never_reached(loops):
-    walk = dynamic_walks(n=20, after_walk="loop" if loops else "stop")
-    assert len(n_stops(walk).unique()) > 1
-    assert n_stops(walk).max() == walk.arrive.shape[1] - loops
-    for w, n in enumerate(n_stops(walk).tolist()):
-        last, leg = n - 1, 0.0
-        if loops:
-            length = math.dist(walk.stop[w, last].tolist(), walk.stop[w, 0].tolist())
-            leg = twin_duration(length, DYNAMIC.speed, DYNAMIC.acceleration)
-            assert walk.speed[w, last] == DYNAMIC.speed
-            assert walk.acceleration[w, last] == DYNAMIC.acceleration
-        end = walk.depart[w, last].item() + leg
-        assert walk.arrive[w, n:].isinf().all()
-        assert walk.depart[w, n:].tolist() == pytest.approx([end] * len(walk.depart[w, n:]), abs=1e-3)
-        assert (walk.stop[w, n:] == walk.stop[w, 0 if loops else last]).all()
-
-
 @given(
     seed=st.integers(0, 10**6),
     speed=st.floats(0.5, 40),

