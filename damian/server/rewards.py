@@ -130,7 +130,8 @@ def weight_of(config: RewardConfig, name: str) -> float:
 def value_of(config: RewardConfig, name: str, features: dict[str, Tensor], counters: Counters) -> Tensor:
     """A term before it is weighted, [*, N]."""
     if term := own_terms(config).get(name):
-        return term.compute({n: features[n] for n in term.reads}, counters, **term.parameters).float()
+        value = term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
+        return value.float().view_as(counters.motions)  # another shape would be broadcast without a word
     return _TERMS[name](features[name], counters, config)
 
 

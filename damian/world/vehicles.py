@@ -1,14 +1,12 @@
 """Motion models: how UAVs move between landing points, how long this takes, and how batteries change."""
 
 from abc import ABC, abstractmethod
-from contextlib import nullcontext
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from damian.common import checks
-from damian.common.errors import naming_errors
 from damian.common.registry import Registry
 from damian.common.tensors import expand_mask, gather_rows, tree_where
 from damian.settings.world import WorldConfig
@@ -141,10 +139,7 @@ MOTION_MODELS = Registry[type[MotionModel]]("motion model", _not_a_model)
 
 def make_model(config: WorldConfig, airspace: Airspace, dt: float) -> MotionModel:
     """Build the motion model of the settings; the arguments are those of ``MotionModel``."""
-    kind = config.motion.kind
-    model = MOTION_MODELS.get(kind, "motion.kind")
-    with naming_errors(f"motion.kind: {kind}") if ":" in kind else nullcontext():
-        return model(config, airspace, dt)
+    return MOTION_MODELS.get(config.motion.kind, "motion.kind")(config, airspace, dt)
 
 
 @MOTION_MODELS.register("instant")

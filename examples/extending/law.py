@@ -18,6 +18,7 @@ from damian import ContextSampler, Law, MessageContext
 from damian.common import checks
 from damian.delays.laws import Delay, in_steps
 from damian.delays.samplers import Sampler
+from damian.settings.fields import setting
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,10 @@ class Satellite(Law):
 
     hop: Delay = 2
     """Delay of a hop: steps, or a time such as ``2s``."""
-    extra: float = 0.1
+    extra: float = setting(0.1, low=0, high=1)
     """Probability of a second hop."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        checks.in_range(f"{key}.extra", self.extra, 0.0, 1.0)
         hop = in_steps(f"{key}.hop", self.hop, dt)
         chances = [0.0] * (2 * hop + 1)
         chances[hop] += 1 - self.extra
@@ -44,20 +44,17 @@ class Distance(Law):
 
     antenna: Sequence[float] = (0.0, 0.0)
     """Place of the antenna, east and north [m]."""
-    speed: float = 50.0
+    speed: float = setting(50.0, above=0, unit="m/s")
     """Distance over which a message is relayed per second [m/s]."""
-    capacity: int = 4
+    capacity: int = setting(4, low=1, unit="messages")
     """As many messages at once delay each other by one step."""
-    reach: float = 1000.0
+    reach: float = setting(1000.0, above=0, unit="m")
     """Distance beyond which half of the messages are lost [m]."""
     longest: Delay = 20
     """Longest delay: steps, or a time such as ``20s``."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         checks.place(f"{key}.antenna", self.antenna)
-        checks.above(f"{key}.speed", self.speed, 0.0, "m/s")
-        checks.whole(f"{key}.capacity", self.capacity, 1, unit="messages")
-        checks.above(f"{key}.reach", self.reach, 0.0, "m")
         return ContextSampler(
             self.delays, in_steps(f"{key}.longest", self.longest, dt), loss, reads=["position"]
         )

@@ -2,14 +2,12 @@
 
 import inspect
 from collections.abc import Callable
-from contextlib import nullcontext
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
 from damian.common import checks
-from damian.common.errors import naming_errors
 from damian.common.registry import Registry
 from damian.settings.world import RegionConfig
 from damian.world.regions.fir import read_fir
@@ -53,8 +51,7 @@ def _region_of_geojson(config: RegionConfig, rng: np.random.Generator) -> list[R
 def regions_of(config: RegionConfig, rng: np.random.Generator) -> list[Region]:
     """Read the region from its file or vertices, or draw ``pool`` random regions."""
     source = REGION_SOURCES.get(config.kind, "region.kind")
-    with naming_errors(f"region.kind: {config.kind}") if ":" in config.kind else nullcontext():
-        found = [centred(region) for region in source(config, rng)]
+    found = [centred(region) for region in source(config, rng)]
     most, problem = config.initial_conditions, "regions: each needs at least one initial condition"
     checks.require(len(found) <= most, "region.initial_conditions", f"{most} for {len(found)}", problem)
     return found
