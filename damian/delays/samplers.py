@@ -101,12 +101,7 @@ class Sampler(nn.Module):
         return (counter_rng.uniform(streams) < self._bad_share).long()
 
     def begin_episode(self, memory: Tensor, mask: Tensor) -> Tensor:
-        """The states [M, ...] of the channels before the first message of an episode.
-
-        Args:
-            memory: the states before, [M, ...].
-            mask: senders whose episode begins, [M] bool.
-        """
+        """The channels' states [M, ...], where the mask [M] is true before an episode's first message."""
         return memory
 
     def forward(

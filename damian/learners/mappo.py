@@ -188,7 +188,7 @@ def mappo_losses(
 def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
     """Logarithms of the importance ratios, and entropies of the policy, both [*, N], on steps [*].
 
-    The entropy of continuous actions is estimated by one draw, as there is no formula for it.
+    The entropy of continuous actions is estimated by one draw.
     """
     with set_recurrent_mode(True):
         policy = actor.get_dist(steps)
@@ -201,8 +201,6 @@ def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tens
 @torch.no_grad()
 def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: MappoConfig) -> None:
     """Write values, advantages and value targets into a batch [B, T], in place.
-
-    A critic that normalises its values adds the targets to its running statistics.
 
     The return of a decision sums the rewards until the UAV's next decision, k steps later, whose value is
     discounted by gamma^k (a semi-Markov decision process; Sutton, Precup and Singh 1999). Values at the steps
@@ -241,8 +239,7 @@ def explained_variance(batch: TensorDictBase) -> Tensor:
 def state_values(batch: TensorDictBase, critic: TensorDictModule) -> tuple[Tensor, Tensor]:
     """Values before and after each step of a batch [B, T], both [B, T, N, 1].
 
-    What the critic observes after a step is mostly what it observes before the next one: such an observation
-    is evaluated once.
+    An observation after a step that is also the one before the next step is evaluated once.
     """
     (key,) = critic.in_keys
     before, after = (cast(Tensor, batch[at]) for at in (key, keys.next_key(key)))

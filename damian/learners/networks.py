@@ -114,8 +114,7 @@ class LegalCategorical(Distribution):
 def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
     """Make the policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``.
 
-    Discrete actions [*, N] have a categorical distribution over the legal actions. Continuous actions
-    [*, N, 2] have a tanh-normal distribution within their bounds.
+    Discrete actions [*, N] are categorical over the legal ones, continuous ones [*, N, 2] tanh-normal.
     """
     return with_distribution(env, lambda *out: _actor_network(env, config, *out))
 
@@ -123,10 +122,8 @@ def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
 def with_distribution(env: EnvBase, make_network: Callable[..., TensorDictModule]) -> ProbabilisticActor:
     """Make a policy of a network that writes the parameters of the actions' distribution.
 
-    Args:
-        env: its specs tell the kind and the number of the actions.
-        make_network: gets the number of outputs for an agent, and the keys under which they are written:
-            logits, or means and scales (half of the outputs each).
+    ``make_network`` gets the number of outputs for an agent, and the keys under which they are written:
+    logits, or means and scales (half of the outputs each).
     """
     spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
@@ -203,10 +200,7 @@ def make_critic(
     critic_key: NestedKey = keys.GLOBAL_OBSERVATION,
     normalize: bool = False,
 ) -> TensorDictModule:
-    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1].
-
-    With ``normalize`` its network learns normalised values (``NormalizedValue``).
-    """
+    """Make the critic, from its observation [*, N, G] to values ``("agents", "state_value")`` [*, N, 1]."""
     n_agents, n_features = env.observation_spec[critic_key].shape[-2:]
     if config.shared_value:
         network: nn.Module = SharedValue(make_mlp(config, n_agents * n_features, 1, env.device))

@@ -45,9 +45,6 @@ class PredictiveMappo(Mappo):
     def __init__(
         self, env: EnvBase, config: PredictiveMappoConfig, setup: LearningSetup, buffer: ReplayBuffer | None
     ) -> None:
-        late = keys.DELAY in env.observation_spec.keys(True, True)  # rewards alone may be late
-        problem = "needs a message delay (delay.obs): what arrives late is what it predicts"
-        checks.require(late, "learner", "predictive_mappo", problem)
         super().__init__(env, config, setup, buffer)
         self.head = next(each for each in self.actor.modules() if isinstance(each, BeliefHead))
         self.head_optimizer = torch.optim.Adam(self.head.parameters(), lr=config.prediction_lr, fused=True)

@@ -54,10 +54,8 @@ class AgentGRU(TensorDictModuleBase):
     def replay(self, features: Tensor, hidden: Tensor, begins: Tensor) -> Tensor:
         """Recompute the hidden states after every step of a sequence, [B, T, N, H].
 
-        Args:
-            features: features of the observations, [B, T, N, E].
-            hidden: hidden state before the first step, [B, N, H].
-            begins: whether an episode begins with the step, [B, T, 1] bool.
+        From features [B, T, N, E], the hidden state before the first step [B, N, H], and whether an episode
+        begins with a step [B, T, 1].
         """
         states: list[Tensor] = []
         # This loop is as fast as nn.GRU, which cannot restart within a sequence. TorchRL's GRUModule can,
@@ -69,10 +67,7 @@ class AgentGRU(TensorDictModuleBase):
 
 
 def add_recurrent_state(env: TransformedEnv, policy: nn.Module) -> None:
-    """Make an environment carry the hidden states of a policy, with zeros at a reset.
-
-    The environment stays as it is if the policy is not recurrent, or if hidden states are there already.
-    """
+    """Make an environment carry the hidden states of a policy, if it is recurrent, with zeros at a reset."""
     cells = [module.cell for module in policy.modules() if isinstance(module, AgentGRU)]
     if not cells or keys.HIDDEN in env.observation_spec.keys(True, True):
         return

@@ -32,8 +32,7 @@ N_CRITICS = 2
 class Sac:
     """Soft actor-critic: stores steps as they are collected, and learns from decisions drawn from these.
 
-    Each decision of a UAV is one sample for the policy that all UAVs share; steps at which a UAV is not ready
-    never enter a loss.
+    Each decision of a UAV is one sample; steps at which a UAV is not ready never enter a loss.
 
     Args:
         env: its specs give the sizes of the networks.
@@ -139,9 +138,7 @@ _UNREAD: list[NestedKey] = [
 def make_action_value(env: EnvBase, model: ModelConfig, read: list[NestedKey]) -> TensorDictModule:
     """Make a critic of actions (Q-function), which reads the entries ``read``.
 
-    Returns:
-        with discrete actions, a module that writes ``action_value`` [*, A], the value of each action; with
-        continuous ones, ``state_action_value`` [*, 1], the value of ``("agents", "action")``.
+    It writes ``action_value`` [*, A] of all discrete actions, or ``state_action_value`` [*, 1] of the one.
     """
     n_features = sum(env.observation_spec[key].shape[-1] for key in read)
     spec = env.full_action_spec_unbatched[keys.ACTION]

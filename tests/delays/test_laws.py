@@ -45,22 +45,11 @@ LAWS: dict[str, tuple[Law, float, dict[int, float]]] = {
     "none": (Constant(), 1.0, {0: 1.0}),
     "steps": (Constant(3), 1.0, {3: 1.0}),
     "a time, rounded up": (Constant("0.5m"), 20.0, {2: 1.0}),
-    "a time of whole steps": (Constant("0.3s"), 0.1, {3: 1.0}),
     "uniform steps": (Uniform(2, 5), 1.0, dict.fromkeys((2, 3, 4, 5), 0.25)),
-    "uniform steps, rarely": (Uniform(0, 4, 0.5), 1.0, {0: 0.6} | dict.fromkeys((1, 2, 3, 4), 0.1)),
     "the paper's": (PAPER, 1.0, {0: 0.85} | dict.fromkeys((4, 5, 6, 7), 0.0375)),
     "the paper's at a coarser step": (PAPER, 2.0, {0: 0.85, 2: 0.0375, 3: 0.075, 4: 0.0375}),
     "uniform within a step": (Uniform("0.5s", "2s"), 1.0, {1: 1 / 3, 2: 2 / 3}),
-    "a single time": (Uniform("2s", "2s", 0.25), 1.0, {0: 0.75, 2: 0.25}),
-    "uniform, never": (Uniform(3, 7, 0.0), 1.0, {0: 1.0}),
     "geometric": (Geometric(2, 6), 1.0, {k: 2**k / 3 ** (k + 1) for k in range(6)} | {6: (2 / 3) ** 6}),
-    "geometric in time": (
-        Geometric("1s", "2s"),
-        0.5,
-        {k: 2**k / 3 ** (k + 1) for k in range(4)} | {4: 16 / 81},
-    ),
-    "geometric of mean 0": (Geometric(0), 1.0, {0: 1.0}),
-    "a burst that never begins": (Burst(enter=0.0), 1.0, {0: 1.0}),
     "a burst that never ends": (Burst(leave=0.0, bad=2, bad_loss=0.25), 1.0, {2: 0.75}),
 }
 

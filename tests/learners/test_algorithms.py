@@ -2,19 +2,16 @@
 
 import csv
 import math
-from dataclasses import replace
 
 import pytest
-import torch
 from helpers import everything
 
 from damian.delays.config import DelayConfig
-from damian.envs.delayed_env import DelayedEnv
-from damian.learners.mappo import Mappo, MappoConfig
+from damian.learners.mappo import MappoConfig
 from damian.learners.networks import ModelConfig
-from damian.learners.sac import Sac, SacConfig
-from damian.recipes.train import learning_env, make_learner, replay_buffer, train
-from damian.settings import ClockConfig, LoggerConfig, TrainConfig
+from damian.learners.sac import SacConfig
+from damian.recipes.train import train
+from damian.settings import LoggerConfig, TrainConfig
 
 AWARE = {
     "none": {},
@@ -74,29 +71,3 @@ def test_every_learner_trains_with_every_kind_of_action_and_awareness_and_is_eva
 
 
 # The parts of a learner.
-
-both_learners = pytest.mark.parametrize("name", LEARNERS)
-
-
-def build_learner(name: str, aware: str = "backupdate", **changed) -> tuple[Mappo | Sac, DelayedEnv]:
-    """A learner and its environment, in which messages are up to 3 steps late."""
-    settings = replace(config(name, "none", "discrete", "instant", aware), **changed)
-    env = learning_env(settings)
-    return make_learner(settings, env, replay_buffer(settings, env)), env
-
-
-@both_learners
-@pytest.mark.parametrize("obs", [0, 3])
-def test_a_learner_also_waits_for_late_rewards_and_its_replay_buffer_has_room_for_the_corrections(name, obs):
-    delay, clock = DelayConfig(obs=obs, rew=7, reward_window=4), ClockConfig(server="2s")
-    learner, env = build_learner(name, settle=True, delay=delay, clock=clock)
-    storage, setup = learner.buffer.storage, learner.setup
-    assert (setup.settle_steps, storage.longest, storage.recompute is None) == (7, 7, obs == 0)
-    assert storage.lookback == 3 + (1 if obs else 0)  # without late messages no observation is corrected
-    assert storage.max_size == (env.batch_size[0] * storage.lookback) + (400 if name == "sac" else 4 * 26)
-    torch.manual_seed(0)
-    learner.learn(env.rollout(12, learner.actor, break_when_any_done=False))
-    losses = learner.learn(env.rollout(12, learner.actor, break_when_any_done=False))
-    assert all(map(math.isfinite, losses.values()))
-    naive, _ = build_learner(name, "history", delay=delay, clock=clock)
-    assert naive.setup.longest_delay == obs

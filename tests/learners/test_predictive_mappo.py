@@ -18,7 +18,6 @@ from damian.learners.predictive_mappo import (
     MessageEncoder,
     PredictiveMappo,
     PredictiveMappoConfig,
-    TargetScale,
 )
 from damian.recipes.train import learning_env, make_learner, replay_buffer
 from damian.replay.backupdate import BackupdateStorage
@@ -94,23 +93,6 @@ def test_the_attention_is_that_of_a_loop_over_heads_and_known_messages():
             for q in range(3):
                 expected = twin(encoder, observation[i, j], history[i, j], codes[i, j, q])
                 torch.testing.assert_close(encoded[i, j, q], expected, atol=1e-5, rtol=1e-4)
-
-
-def test_the_scale_of_the_targets_does_not_matter_and_those_that_do_not_count_are_left_out():
-    torch.manual_seed(3)
-    scale, far = TargetScale(2), torch.tensor([[3e6, 1e-4]])
-    for _ in range(50):
-        target = far * (5 + torch.randn(200, 2))
-        counts = torch.rand(200, 1) < 0.7
-        scale.update(torch.where(counts, target, 1e9), counts)
-    scale.update(torch.full((9, 2), 1e9), torch.zeros(9, 1, dtype=torch.bool))
-    normal = scale.normalize(far * (5 + torch.randn(5000, 2)))
-    assert normal.mean(0).abs().max() < 0.1
-    assert (normal.std(0) - 1).abs().max() < 0.1
-    assert TargetScale(2).normalize(far).abs().max() == 0
-    constant = TargetScale(1)
-    constant.update(torch.full((4, 1), 0.3), torch.ones(4, 1, dtype=torch.bool))
-    assert constant.normalize(torch.full((4, 1), 0.3)).abs().max() < 1e-3
 
 
 def test_targets_use_nothing_that_has_not_arrived_by_now():

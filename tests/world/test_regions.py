@@ -161,7 +161,11 @@ TWO_FEATURES = _collection(_feature(_polygon(RING), zone="a"), _feature(_polygon
 INVALID_GEOJSON = {
     "not JSON": ('{"type":\n oops}', {}, "is not GeoJSON: JSONDecodeError"),
     "wrong type": (POINT["geometry"], {}, "type 'Point' is not one of Polygon, MultiPolygon, Feat"),
-    "no choice": (TWO_FEATURES, {}, "choose one of 2 areas by index or property=value: features[0] {'zo"),
+    "no choice": (
+        TWO_FEATURES,
+        {},
+        "2 features are areas: choose one by index or property=value: features[0]",
+    ),
     "both choices": (TWO_FEATURES, {"index": 0, "where": "zone=a"}, "index 0 and where 'zone=a' both"),
     "index 2 of 2": (TWO_FEATURES, {"index": 2}, "index 2 is not between 0 and 1"),
     "where unknown": (TWO_FEATURES, {"where": "zome=a"}, "fits 0 features, not one; did you mean"),

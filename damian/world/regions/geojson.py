@@ -87,7 +87,7 @@ def _choose(features: list[_Feature], index: int | None, where: str | None) -> _
     areas = [each for each in features if each.is_area]
     if len(areas) != 1:
         choice = listed(f"{each.place} {show(each.properties)}" for each in areas)
-        raise InputError(f"choose one of {len(areas)} areas by index or property=value: {choice}")
+        raise InputError(f"{len(areas)} features are areas: choose one by index or property=value: {choice}")
     return areas[0]
 
 
