@@ -25,7 +25,7 @@ from damian.common import checks
 from damian.delays.config import CONTEXT_KEYS, check_laws, delay_law, delay_reads, delay_sampler, link_reads
 from damian.delays.laws import law_of, sampler_of
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
+from damian.envs.scenario import ScenarioConfig, make_simulation
 from damian.envs.uav_env import ALL_EXTRAS, UavEnv
 from damian.server.server import Server
 from damian.transforms import (
@@ -79,7 +79,7 @@ def make_env(
     needed |= {"position"} if delay_reads(scenario.delay, dt) | link_reads(scenario.links, dt) else set()
     check_laws(scenario.delay, scenario.clock.dt)
     simulation = make_simulation(scenario, seed)
-    server = make_server(scenario, simulation)
+    server = Server(scenario, simulation)
     env = UavEnv(
         scenario,
         num_worlds,

@@ -15,7 +15,7 @@ from damian import keys
 from damian.common import checks, counter_rng, devices
 from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
-from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
+from damian.envs.scenario import ScenarioConfig, make_simulation
 from damian.server.features import feature_bounds
 from damian.server.server import Features, Server
 from damian.world.coverage import KnownCoverage
@@ -98,7 +98,7 @@ class UavEnv(EnvBase):
         checks.device("device", str(device))
         self.extras, self.messages_only = checks.names("extras", extras, ALL_EXTRAS), messages_only
         self.simulation = simulation or make_simulation(self.scenario, seed)
-        self.server = server or make_server(self.scenario, self.simulation)
+        self.server = server or Server(self.scenario, self.simulation)
         problem = "needs the transform Belief before a ServerNode: build the environment by damian.make_env"
         known = messages_only or self.server.grid is None
         checks.require(known, "observation.belief", self.server.observation.belief, problem)

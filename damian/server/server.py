@@ -6,8 +6,8 @@ time of learning.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,20 +16,18 @@ from damian.common import checks
 from damian.common.tensors import gather_rows
 from damian.server.belief import SourceGrid, build_source_grid, certain_belief
 from damian.server.features import (
-    ObservationConfig,
     ServerContext,
     check_features,
     observe,
     observe_own,
     stack,
 )
-from damian.server.rewards import Counters, RewardConfig, features_read, final_reward, reward
-from damian.server.termination import EpisodeConfig, Status, status
-from damian.world.airspace import Airspace
-from damian.world.battery import BatteryConfig
+from damian.server.rewards import Counters, features_read, final_reward, reward
+from damian.server.termination import Status, status
+from damian.settings.scenario import ScenarioConfig
 from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
 from damian.world.messages import MAX_EXACT_INTEGER, Messages
-from damian.world.signal_source import SourceConfig
+from damian.world.simulation import Simulation
 
 Features = dict[str, Tensor]
 
@@ -68,72 +66,59 @@ class Server:
     each cell of ``grid`` [*, K]; without it, these are the first messages of the episode.
 
     Args:
-        observation: which features the actor and the critic observe.
-        reward: weights of the reward terms.
-        episode: when an episode ends.
-        battery: gives the resolution with which battery levels are observed.
-        airspace: regions and landing points.
-        radius: radius of a UAV's footprint [m].
-        dt: length of a step [s].
-        time_scale: times are divided by this [s].
-        readings: width of each reading that messages carry, by name, in their order; none if not given.
-        stops: whether UAVs stay at a landing point for more than a step, so that coverage changes seldom.
-        source: settings of the source, of which the belief knows how it moves and emits.
-        goals: for ``belief_gain``, as in ``ServerContext``.
+        scenario: its settings of observations, rewards, ends of episodes, batteries and the source.
+        simulation: its regions, landing points, sensors and kind of motion.
     """
 
-    def __init__(
-        self,
-        observation: ObservationConfig,
-        reward: RewardConfig,
-        episode: EpisodeConfig,
-        battery: BatteryConfig,
-        airspace: Airspace,
-        *,
-        radius: float,
-        dt: float,
-        time_scale: float,
-        readings: Mapping[str, int] | None = None,
-        stops: bool = False,
-        source: SourceConfig | None = None,
-        goals: Tensor | None = None,
-    ) -> None:
+    def __init__(self, scenario: ScenarioConfig, simulation: Simulation) -> None:
+        airspace, observation = simulation.airspace, scenario.observation
         n_points = airspace.points.shape[:2].numel()
         should = "are more landing points than a message can number: take a larger step"
         checks.require(n_points < MAX_EXACT_INTEGER, "region.lattice_step", n_points, should)
         check_features(observation)
-        self.observation, self.reward, self.episode, self.battery = observation, reward, episode, battery
-        self.dt, self.time_scale = dt, time_scale
-        widths = readings or {}
+        self.observation, self.reward, self.episode = observation, scenario.reward, scenario.episode
+        self.battery, self.dt, self._scale = scenario.battery, simulation.dt, airspace.scale
+        self._names = sorted({*observation.actor, *observation.critic, *features_read(scenario.reward)})
+        widths = {name: sensor.width for name, sensor in simulation.sensors.items()}
         firsts = itertools.accumulate(widths.values(), initial=0)
-        self._readings = {name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)}
         self._n_readings = sum(widths.values())
-        self._names = sorted({*observation.actor, *observation.critic, *features_read(reward)})
-        self._scale = airspace.scale
-        self._max_points = airspace.max_points
-        self._points = airspace.points.flatten(0, 1)
-        self._footprints: FootprintTables | None = None
+        footprints: FootprintTables | None = None
         if "coverage" in self._names:
             polygons = [region.polygon for region in airspace.regions]
-            places = airspace.points.double().cpu().numpy()
-            self._footprints = build_tables(polygons, places, radius)
-        self.grid: SourceGrid | None = None
-        """Cells of the belief; None if no feature reads it."""
+            footprints = build_tables(polygons, airspace.points.double().cpu().numpy(), simulation.radius)
+        grid: SourceGrid | None = None
         if observation.belief:
             cell = observation.belief_cell
-            self.grid = build_source_grid(airspace, source or SourceConfig(), radius, dt, cell)
-        self._radius, self._goals = radius, goals
-        self.remembers_coverage = stops and self._footprints is not None
+            grid = build_source_grid(airspace, scenario.source, simulation.radius, self.dt, cell)
+        gains = "belief_gain" in observation.belief
+        self._constants: dict[str, Any] = {
+            "time_scale": scenario.time_scale,
+            "battery": scenario.battery,
+            "footprints": footprints,
+            "points": airspace.points.flatten(0, 1),
+            "age_scale": observation.age_scale,
+            "newest": observation.estimate == "newest",
+            "readings": {name: (first, widths[name]) for name, first in zip(widths, firsts, strict=False)},
+            "radius": simulation.radius,
+            "n_points": airspace.max_points,
+            "goals": simulation.candidates.goals() if gains else None,
+            "grid": grid,
+        }
+        """The fields of ``ServerContext`` that never change."""
+        # UAVs that fly stay at a landing point for more than a step, so that coverage changes seldom.
+        self.remembers_coverage = footprints is not None and not simulation.vehicles.instant
+
+    @property
+    def grid(self) -> SourceGrid | None:
+        """Cells of the belief; None if no feature reads it."""
+        return self._constants["grid"]
 
     def to(self, device: torch.device) -> "Server":
         """Move the tables to a device, in place."""
-        self._scale, self._points = self._scale.to(device), self._points.to(device)
-        if self._footprints is not None:
-            self._footprints = self._footprints.to(device)
-        if self.grid is not None:
-            self.grid = self.grid.to(device)
-        if self._goals is not None:
-            self._goals = self._goals.to(device)
+        self._scale = self._scale.to(device)
+        for name, each in self._constants.items():
+            if isinstance(each, Tensor | FootprintTables | SourceGrid):
+                self._constants[name] = each.to(device)
         return self
 
     def messages(self, rows: Tensor) -> Messages:
@@ -150,7 +135,7 @@ class Server:
 
     def region_of(self, messages: Messages) -> Tensor:
         """Index of the region to which each world's landing points belong, [*]."""
-        return messages.region(self._max_points)
+        return messages.region(self._constants["n_points"])
 
     def __call__(
         self,
@@ -240,21 +225,7 @@ class Server:
 
     def _context(self, messages: Messages, steps: Tensor) -> ServerContext:
         """What the server knows besides the messages."""
-        return ServerContext(
-            now=steps * self.dt,
-            scale=self.scales(messages),
-            time_scale=self.time_scale,
-            battery=self.battery,
-            footprints=self._footprints,
-            points=self._points,
-            age_scale=self.observation.age_scale,
-            newest=self.observation.estimate == "newest",
-            readings=self._readings,
-            radius=self._radius,
-            n_points=self._max_points,
-            goals=self._goals,
-            grid=self.grid,
-        )
+        return ServerContext(now=steps * self.dt, scale=self.scales(messages), **self._constants)
 
     def scales(self, messages: Messages) -> Tensor:
         """Largest vertex distance of the region to which each world's landing points belong [m], [*]."""

@@ -9,10 +9,11 @@ from helpers import everything, square, walking
 
 from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
-from damian.envs.scenario import ScenarioConfig, make_server, make_simulation
+from damian.envs.scenario import ScenarioConfig, make_simulation
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import predict
 from damian.server.features import RINGS, SECTORS, ObservationConfig, feature
+from damian.server.server import Server
 from damian.world.landing import ActionConfig
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
@@ -28,7 +29,7 @@ def flown():
     """A server, and messages [B, N], elapsed steps [B] and beliefs [B, K] of worlds in several regions."""
     scenario = believing()
     simulation = make_simulation(scenario, 0)
-    server = make_server(scenario, simulation)
+    server = Server(scenario, simulation)
     messages, steps = simulation.initial.sent, simulation.initial.steps
     torch.manual_seed(0)
     weight = torch.rand(len(steps), server.grid.prior.shape[-1]).square() * (

@@ -6,7 +6,7 @@ from helpers import SQUARE, everything
 from torch import Tensor
 
 from damian.common.tensors import tree_map
-from damian.envs.scenario import make_server, make_simulation
+from damian.envs.scenario import make_simulation
 from damian.server.features import GLOBAL, LOCAL, ObservationConfig
 from damian.server.server import Server
 from damian.world.messages import Messages
@@ -38,7 +38,7 @@ def known_messages(n_agents: int) -> tuple[Server, Messages, Tensor]:
         detected_time=draw(-10, 20).round().clamp(min=-1),
         detected_position=draw(-100, 100, 2),
     )
-    return make_server(scenario, simulation), known, torch.tensor([20, 30, 40])
+    return Server(scenario, simulation), known, torch.tensor([20, 30, 40])
 
 
 @pytest.mark.parametrize("n_agents", [1, 2, 5])
