@@ -36,11 +36,12 @@ from damian.baselines.greedy import greedy_policy
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import named
-from damian.runs.run_lock import is_folder, locked
+from damian.runs.run_lock import locked
 from damian.settings.programs import AdviseConfig, check_token
 
 from . import cli
 from .evaluate import stored_actor
+from .known import key_of
 from .shared.runs import save_config
 
 FLEET = "main"
@@ -50,7 +51,7 @@ FLEET = "main"
 def without_token(config: AdviseConfig) -> AdviseConfig:
     """The settings, as files may keep them."""
     kept = copy.copy(config)
-    kept.token, kept.overrides = None, [word for word in config.overrides if not cli.is_secret(word)]
+    kept.token, kept.overrides = None, [word for word in config.overrides if key_of(word) != cli.SECRET]
     return kept
 
 
@@ -141,7 +142,7 @@ def advise(config: AdviseConfig, folder: Path) -> None:
     save_config(without_token(config), folder)
     journals = Path(config.journal) if config.journal else folder / "journals"
     inbox = None if config.folder is None else Path(config.folder)
-    if inbox is not None and not is_folder(inbox):
+    if inbox is not None and not inbox.is_dir():
         raise InputError(f"folder: {inbox} is not there")
     if inbox is not None and is_same(inbox, journals):
         raise InputError(f"journal: {journals} is the folder of the tables too: name another one")

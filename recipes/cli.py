@@ -5,19 +5,17 @@ Nothing here imports torch, so that help and a misspelt word are answered at onc
 """
 
 import os
-import re
 import shlex
 import signal
 import sys
 import traceback
-import zlib
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra raises its errors, and ``one_line_errors`` prints them
 
@@ -26,26 +24,37 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigNode, ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import YAMLError
 
 from damian.common.errors import RUN_ERROR, InputError, RunError
-from damian.common.text_files import one_line, show
+from damian.common.text_files import one_line
 from damian.runs.interrupt import exit_code
-from damian.runs.run_lock import is_folder, locked
+from damian.runs.run_lock import locked
 from damian.settings import LEARNERS, TrainConfig
 from damian.settings.fields import rules
 from damian.settings.programs import SEARCHES
 
-from .known import CHOSEN, CONF, FILELESS, LOGGERS, PLAIN, SCHEMAS, check_words, no_such_key
-from .words import SECRET, key_of, parsed, quoted, whole_laws
+from .known import (
+    CHOSEN,
+    CONF,
+    FILELESS,
+    LOGGERS,
+    PLAIN,
+    SCHEMAS,
+    check_words,
+    key_of,
+    no_such_key,
+    parsed,
+    whole_laws,
+)
 
 Work = Callable[[Any, Path], None]
 """The work of a program: takes checked settings and the run folder to fill."""
+SECRET = "token"
+"""Key of the setting that is a password, which no file should keep."""
 
 
 # ------------------------------------------------------------------------------------------ schemas
@@ -66,23 +75,16 @@ def _pruned(settings: Any, kind: str | None = None) -> DictConfig:
 
 def _node(group: str, option: str) -> DictConfig:
     """What an option of ``PLAIN`` sets."""
-    base = TrainConfig()
     if group == "learner":
         return _pruned(LEARNERS.get(option, "learner")(name=option))
-    if group in ("region", "motion", "links"):
-        node = _pruned(getattr(base, group), option)
-        node.kind = option
-        if option == "random":
-            node.pool = 16  # a single random region would be learnt by heart
-        return node
-    if group == "source":
-        node = _pruned(base.source, option)
-        node.motion = option
-        return node
-    if group == "battery":
-        node = _pruned(base.battery, option)
+    if group in ("region", "motion", "links", "source", "battery"):
+        node = _pruned(getattr(TrainConfig(), group), option)
+        if group != "battery":
+            node["motion" if group == "source" else "kind"] = option
         if option == "charging":
             node.enabled = True
+        if option == "random":
+            node.pool = 16  # a single random region would be learnt by heart
         return node
     if group == "logger":
         own = {name: [path] for name, path in LOGGERS.items()}
@@ -132,49 +134,26 @@ def _register() -> None:
             package = "_global_" if group == "aware" else None
             store.store(group=group, name=option, node=_node(group, option), package=package)
     store.store(group="kind", name="polynomial", node=_pruned(TrainConfig().motion, "polynomial"))
-    OmegaConf.register_new_resolver("plain", _plain)
-
-
-def _plain(name: str) -> str:
-    """A folder's name without quotes, brackets and slashes, short enough for a file system."""
-    plain = re.sub(r"[^\w.=,-]", "", name.replace("/", "-"))
-    return plain if len(plain) <= 100 else f"{plain[:90]}_{zlib.crc32(plain.encode()):08x}"
 
 
 _register()
 
 
-def overrides_of(words: Sequence[str]) -> list[Override]:
-    """Words as Hydra's parser reads them.
-
-    Raises:
-        InputError: a word cannot be read.
-    """
-    found = []
-    for word in words:
-        key, _, value = word.partition("=")
-        try:
-            found.append(OverridesParser.create().parse_override(word))
-        except (HydraException, ValueError, RecursionError):
-            remedy = "a mapping or a value with special characters needs quotes, as in \"KEY='VALUE'\""
-            raise InputError(f"{key[:80]}: {show(value)} cannot be read: {remedy}") from None
-    return found
-
-
 # ------------------------------------------------------------------------------------------ composition
 
+ERRORS = (HydraException, OmegaConfBaseException, YAMLError)
+"""What Hydra raises for overrides and files that it cannot compose."""
 
-def composed(
-    program: str, overrides: Sequence[str], own_folder: str | None = None, multirun: bool = False
-) -> DictConfig:
+
+def composed(program: str, overrides: Sequence[str], own_folder: str | None = None) -> DictConfig:
     """The configuration that Hydra composes from overrides, with its own section ``hydra``.
 
     Raises:
         InputError: the overrides or a file cannot be composed.
     """
-    words = list(overrides)
+    words = whole_laws(overrides)
     if own_folder:
-        words.append(f"hydra.searchpath=[{quoted(f'resume=file://{Path(own_folder).resolve()}')[7:]}]")
+        words.append(f"hydra.searchpath=['file://{Path(own_folder).resolve()}']")
     running = GlobalHydra.instance().hydra  # of a sweep, or of a Hydra application that calls this
     GlobalHydra.instance().clear()
     try:
@@ -187,19 +166,6 @@ def composed(
         GlobalHydra.instance().hydra = running
 
 
-def configuration(program: str, given: Namespace) -> str:
-    """What ``--cfg job`` prints: the composed settings."""
-    found = composed(program, given.overrides, given.config_dir)
-    return OmegaConf.to_yaml(_without_hydra(found))
-
-
-def _without_hydra(found: DictConfig) -> DictConfig:
-    copied = found.copy()
-    with open_dict(copied):
-        copied.pop("hydra", None)
-    return copied
-
-
 def _tuned(found: DictConfig, given: set[str]) -> DictConfig:
     """Apply what the scenario says of the chosen learner (``tuning``), unless the command line says else."""
     with open_dict(found):
@@ -208,6 +174,13 @@ def _tuned(found: DictConfig, given: set[str]) -> DictConfig:
         if value is not None and f"learner.{name}" not in given:
             found.learner[name] = value
     return found
+
+
+def _without_hydra(found: DictConfig) -> DictConfig:
+    copied = found.copy()
+    with open_dict(copied):
+        copied.pop("hydra", None)
+    return copied
 
 
 def checked(found: DictConfig, program: str = "train") -> Any:
@@ -243,17 +216,23 @@ def settings(*overrides: str, program: str = "train", own_folder: str | None = N
     Raises:
         InputError: an override is misspelt, or its value is impossible.
     """
-    if wrong := [each for each in overrides if not isinstance(each, str)]:
-        raise InputError(f"override: {wrong[0]} is not a text such as agents=5")
-    words = whole_laws(overrides)
-    check_words(program, words, own_folder)
-    return checked(composed(program, words, own_folder), program)
+    check_words(program, overrides, own_folder)
+    return checked(composed(program, overrides, own_folder), program)
+
+
+def check(program: str, given: Namespace) -> str:
+    """Check a command line as far as that goes without torch; returns its settings as YAML.
+
+    The settings of a sweep are checked run by run, and those beside stored ones when these have been read.
+    """
+    if given.multirun or {"checkpoint", "resume"} & set(map(key_of, given.overrides)):
+        return ""
+    found = composed(program, given.overrides, given.config_dir)
+    checked(found, program)
+    return OmegaConf.to_yaml(_without_hydra(found))
 
 
 # ------------------------------------------------------------------------------------------ errors
-
-ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionError)
-"""What Hydra raises for overrides and files that it cannot compose."""
 
 
 def reason(error: BaseException, program: str = "train") -> str:
@@ -265,11 +244,9 @@ def reason(error: BaseException, program: str = "train") -> str:
         section = key.rpartition(".")[0]
         beside = [f"{section}.{name}" for name in getattr(error, "parent_node", None) or ()]
         return no_such_key(str(key), program, beside)
-    if isinstance(error, RecursionError):
-        return "a word or a file of the settings is nested too deeply"
-    text, first = str(error), str(error).partition("\n")[0]
-    if not (isinstance(error, YAMLError | InputError) or first.endswith(":")):
-        text = first  # the others name types of OmegaConf
+    text = str(error)
+    if isinstance(error, OmegaConfBaseException) and not text.partition("\n")[0].endswith(":"):
+        text = text.partition("\n")[0]  # the others name types of OmegaConf
     return one_line(f"{key}: {text}" if key else text)
 
 
@@ -279,32 +256,16 @@ def one_line_errors() -> Iterator[None]:
     try:
         yield
     except (InputError, RunError, OSError, *ERRORS) as error:
-        if is_interrupt(error):
-            _end_interrupted()
-        line, wrong = reason(error), not isinstance(error, RunError | OSError)
-        foreign = isinstance(error.__cause__, Exception) and not isinstance(
-            error.__cause__, (*ERRORS, InputError)
-        )
+        line, cause = reason(error), error.__cause__
         if os.environ.get("DAMIAN_TRACEBACK"):
             traceback.print_exception(error)
-        elif foreign:
+        elif cause is not None and not isinstance(cause, (*ERRORS, InputError)):
             line += " (DAMIAN_TRACEBACK=1 shows the traceback)"
         print(f"error: {line}", file=sys.stderr)
-        sys.exit(2 if wrong else RUN_ERROR)
+        sys.exit(RUN_ERROR if isinstance(error, RunError | OSError) else 2)
     except KeyboardInterrupt:
-        _end_interrupted()
-
-
-def is_interrupt(error: BaseException | None) -> bool:
-    """Was the error raised by Ctrl-C, or while a library cleaned up after it?"""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
-
-
-def _end_interrupted() -> NoReturn:
-    print("interrupted", file=sys.stderr)
-    sys.exit(exit_code(signal.SIGINT))
+        print("interrupted", file=sys.stderr)
+        sys.exit(exit_code(signal.SIGINT))
 
 
 # ------------------------------------------------------------------------------------------ running
@@ -318,83 +279,43 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
         program: one of ``SCHEMAS``.
         again: the same command in the same folder goes on with what is there, as a comparison does.
     """
-    typed_words[:] = sys.argv[1:]
     with one_line_errors():
         given = parsed(sys.argv[1:])
-        check(program, given, again)
+        check_words(program, given.overrides, given.config_dir)
         if not given.multirun:
             found = composed(program, given.overrides, given.config_dir)
             _start(work, program, given.overrides, given.config_dir, Path(found.hydra.run.dir), again)
             return
-        words, folder = given.overrides, given.config_dir
-        sys.argv[1:] = ["--multirun", *([f"--config-dir={folder}"] if folder else []), *words]
+        if again:
+            raise InputError("-m: not with programs that carry out many runs anyway")
 
         @hydra.main(version_base=None, config_path=str(CONF), config_name=program)
         def job(_: DictConfig) -> None:
             output, own = HydraConfig.get().runtime.output_dir, list(HydraConfig.get().overrides.task)
             with one_line_errors():
-                _start(work, program, own, folder, Path(output), again)
+                _start(work, program, own, given.config_dir, Path(output))
 
         job()
 
 
-def check(program: str, given: Namespace, again: bool = False) -> None:
-    """Check a command line as far as that goes without torch; of a sweep, every value once.
-
-    Raises:
-        InputError: a word or a value is wrong.
-    """
-    check_words(program, given.overrides, given.config_dir)
-    overrides = overrides_of(given.overrides)
-    first, swept = [], []
-    for word, override in zip(given.overrides, overrides, strict=True):
-        several = list(override.sweep_string_iterator()) if override.is_sweep_override() else []
-        if several and not given.multirun:
-            raise InputError(
-                f"{override.key_or_group}: several values need -m; a list needs brackets, as [1,2]"
-            )
-        words = [f"{override.get_key_element()}={value}" for value in several] or [word]
-        swept += [(len(first), other) for other in words[1:]]
-        first.append(words[0])
-    if given.multirun and (again or "resume" in map(key_of, given.overrides)):
-        raise InputError("-m: not with resume, and not with programs that carry out many runs anyway")
-    for place, word in [(0, first[0] if first else ""), *swept]:
-        words = [*first[:place], word, *first[place + 1 :]] if word else []
-        if not {"checkpoint", "resume"} & set(map(key_of, words)):  # else the stored settings count
-            checked(composed(program, words, given.config_dir), program)
-
-
 def _start(
-    work: Work, program: str, words: list[str], own_folder: str | None, folder: Path, again: bool
+    work: Work, program: str, words: list[str], own_folder: str | None, folder: Path, again: bool = False
 ) -> None:
     """Run a program once; a run that is refused before it writes anything leaves no folder."""
     runs = import_module(".shared.runs", __package__)  # it imports torch
     config, folder = runs.prepared(program, words, own_folder, shown(folder), again)
-    with used(folder, "resume" if getattr(config, "resume", None) else "hydra.run.dir", program, config):
-        if again:
-            work(config, folder)
-        else:
-            runs.perform(config, folder, work)
-
-
-@contextmanager
-def used(folder: Path, key: str, program: str, config: Any) -> Iterator[None]:
-    """Make and lock a folder for what is done inside; folders that stay empty are removed again."""
-    made = [each for each in (folder, *folder.parents) if not is_folder(each)]
-    if file := next((each for each in (folder, *folder.parents) if each.is_file()), None):
-        raise InputError(f"{key}: {show(str(file))} is a file: name a folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{key}: {show(str(folder))}: {error.strerror}") from None
+    folder.mkdir(parents=True, exist_ok=True)
+    key = "resume" if getattr(config, "resume", None) else "hydra.run.dir"
     only_reads = getattr(config, "report_only", False)  # a comparison may be reported on while it runs
     try:
         with nullcontext() if only_reads else locked(folder, key):
-            yield
+            if again:
+                work(config, folder)
+            else:
+                runs.perform(config, folder, work)
     finally:
-        for each in [folder, *made[1:]]:
-            if each.is_dir() and not any(each.iterdir()):
-                each.rmdir()
+        with suppress(OSError):  # it is not empty
+            os.removedirs(folder)
 
 
 def shown(folder: Path) -> Path:
@@ -402,20 +323,7 @@ def shown(folder: Path) -> Path:
     return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
-typed_words: list[str] = []
-"""The words of the command line as they were typed."""
-
-
-def is_secret(word: str) -> bool:
-    """Does an override set a password, however it is written?"""
-    return key_of(word) == SECRET
-
-
-def typed_command() -> str:
-    """The command line as it was typed, without the password of a service."""
-    return command([f"{SECRET}=..." if is_secret(word) else word for word in typed_words or sys.argv[1:]])
-
-
-def command(words: Sequence[str]) -> str:
-    """The command that runs this program with words, to be typed in a shell."""
-    return f"{Path(sys.argv[0]).name} {shlex.join(words)}".strip()
+def command() -> str:
+    """The command line as it was typed, to be run again in a shell; without the password of a service."""
+    words = [f"{SECRET}=..." if key_of(word) == SECRET else word for word in sys.argv[1:]]
+    return f"{Path(sys.argv[0]).name} {shlex.join(words)}"

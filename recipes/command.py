@@ -14,8 +14,7 @@ from importlib import import_module
 from damian.common.errors import InputError
 from damian.common.text_files import one_line
 
-from .known import check_words, help_text
-from .words import parsed
+from .known import check_words, help_text, parsed
 
 PROGRAMS = {
     "train": "train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one",
@@ -27,13 +26,8 @@ PROGRAMS = {
     "oracle": "fly a policy or the script with ever more known on time: which delay costs how much",
 }
 """What each program does, by its name; the program is the module of this name."""
-SETTINGS = {
-    **dict.fromkeys(("train", "evaluate", "oracle"), "train"),
-    **{name: name for name in ("compare", "fly", "tune", "advise")},
-}
-"""Programs with settings of the form KEY=VALUE, and whose settings these are."""
-AGAIN = ("compare", "tune")
-"""Programs that go on in their folder with the same command."""
+SETTINGS = {name: name for name in PROGRAMS} | {"evaluate": "train", "oracle": "train"}
+"""Whose settings each program has."""
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -48,39 +42,33 @@ def main(words: Sequence[str] | None = None) -> None:
     name, *words = (sys.argv[1:] if words is None else words) or ["--help"]
     if name in ("-h", "--help"):
         _show(usage())
-        return
-    if name == "--version":
+    elif name == "--version":
         print(import_module("damian").__version__)
-        return
+    else:
+        try:
+            _run(name, words)
+        except InputError as error:
+            print(f"error: {one_line(str(error))}", file=sys.stderr)
+            sys.exit(2)
+
+
+def _run(name: str, words: Sequence[str]) -> None:
     if name not in PROGRAMS:
-        sys.exit(refuse(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}"))
-    if name in SETTINGS and _answered(name, SETTINGS[name], words):
+        raise InputError(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}")
+    program, given = SETTINGS[name], parsed(words)
+    if given.help:
+        keys = [word for word in given.overrides if "=" not in word]
+        _show(help_text(name, program, keys, given.config_dir))
         return
-    sys.argv = [f"damian {name}", *words]
-    try:
-        program = import_module(f".{name}", __package__)
-    except InputError as error:  # it needs a package that is not installed
-        sys.exit(refuse(str(error)))
-    program.run()
-
-
-def _answered(name: str, program: str, words: Sequence[str]) -> bool:
-    """Answer a question for help and a wrong word, without loading the program."""
-    try:
-        given = parsed(words)
-        if given.help:
-            keys = [word for word in given.overrides if "=" not in word]
-            _show(help_text(name, program, keys, given.config_dir))
-            return True
-        check_words(program, given.overrides, given.config_dir)
-    except InputError as error:
-        sys.exit(refuse(str(error)))
+    check_words(program, given.overrides, given.config_dir)
     cli = import_module(".cli", __package__)  # with Hydra, which takes a while to import
     with cli.one_line_errors():
-        cli.check(program, given, name in AGAIN)
+        found = cli.check(program, given)
         if given.cfg:
-            _show(cli.configuration(program, given))
-    return bool(given.cfg)
+            _show(found)
+            return
+    sys.argv = [f"damian {name}", *words]
+    import_module(f".{name}", __package__).run()
 
 
 def _show(text: str) -> None:
@@ -99,9 +87,3 @@ def usage() -> str:
 
 
 MORE = "damian PROGRAM --help explains a program's settings, damian --version prints the version."
-
-
-def refuse(problem: str) -> int:
-    """Print an error, and return the exit code of wrong input."""
-    print(f"error: {one_line(problem)}", file=sys.stderr)
-    return 2

@@ -16,6 +16,7 @@ figure.png and curves.png. With report_only=true these are made again, from the 
 any, from results.csv and curves.csv.
 """
 
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -37,17 +38,17 @@ from damian.compare.figures import plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.envs.pipeline import has_message_delay
+from damian.runs.interrupt import exit_code
 from damian.settings import TrainConfig
 from damian.settings.programs import SEEDS, CompareConfig
 
 from . import cli, oracle
 from .evaluate import fly, fly_untrained
 from .shared.comparison_results import ROWS, Results, results_of, stored_results, write_csv
-from .shared.many_runs import LOG, RayTasks, Run, SlurmJobs, check_stored, perform_all, stop_code
+from .shared.many_runs import LOG, Run, SlurmJobs, check_stored, perform_all
 from .shared.runs import check_policy_fits
 from .shared.settings import check_learning, late
 from .train import train
-from .words import whole_laws
 
 TABLE, MARKDOWN, FIGURE, CURVES = "table.csv", "table.md", "figure.png", "curves.png"
 EPISODES = 100
@@ -82,11 +83,7 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
 
 
 def _check_policies(runs: Sequence[Run]) -> None:
-    """Check that every policy fits where other arms, or held-out tasks, fly it.
-
-    Raises:
-        InputError: it has other features, actions or layers.
-    """
+    """Check that every policy fits where other arms, or held-out tasks, fly it."""
     by_folder = {run.folder: run.config for run in runs}
     for run in runs:
         if run.policy is not None:
@@ -109,7 +106,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     arm, arms = config.experiment.arms[name], config.experiment.arms
     flies_alone = arm.oracle or arm.untrained
     source = arm.policy_of or (name if task != trained_in and not flies_alone else None)
-    overrides = whole_laws(["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides])
+    overrides = ["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides]
     try:
         unseeded = _composed(*overrides)
         late_by = [] if arm.delayed else late(unseeded)
@@ -150,14 +147,7 @@ def includes(config: CompareConfig, row: Row) -> bool:
 
 
 def report(config: CompareConfig, results: Results, missing: Sequence[str], folder: Path) -> None:
-    """Write the tables and the figures.
-
-    Args:
-        config: settings of the comparison.
-        results: of the finished runs.
-        missing: names of the runs that are not finished.
-        folder: where to write.
-    """
+    """Write the tables and the figures."""
     comparison = Comparison(results.rows, config.chosen("arms"), config.score, POLICIES[config.policy])
     write_csv(folder / TABLE, [line.cells() for line in comparison.lines])
     write_atomically(folder / MARKDOWN, markdown(comparison, _notes(config, results, missing)))
@@ -174,9 +164,8 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
     for row in rows:
         by_arm.setdefault((row["task"], row["delay"], row["arm"]), set()).add(row["seed"])
     seeds, episodes = sorted(set().union(*by_arm.values())), sorted({int(row["episodes"]) for row in rows})
-    words = [word for word in cli.typed_words if not word.startswith("report_only")]
     notes = [
-        f"`{cli.command(words)}`",
+        f"`{cli.command()}`",
         f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}), {' or '.join(map(str, episodes))} episodes each",
         "Mean over seeds [95 % interval: stratified bootstrap over seeds, widened for few seeds; none below "
         f"{FEWEST}]; J: {config.score} of the {config.policy} policy; perceived: as far as the server knew, "
@@ -227,24 +216,18 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
     """Carry out the runs, unless only a report is asked for.
 
     Returns:
-        the results of the finished runs, which are written to files too; the names of those that are not
-        finished; and those that failed.
+        the results of the finished runs; the names of those that are not finished; and those that failed.
     """
     runs, failed = plan(config, folder), []
     for run in runs:
         check_stored(run)
     try:
         if not config.report_only:
-            launcher = None
-            if config.launcher == "ray":
-                launcher = RayTasks(config.processes)
-            elif config.launcher == "slurm":
-                launcher = SlurmJobs(folder / "slurm", config.slurm or {})
-            told = POLICIES[config.policy], config.score
-            failed = perform_all(runs, config.processes, told, launcher)
-    except KeyboardInterrupt as error:
+            slurm = SlurmJobs(folder / "slurm", config.slurm or {}) if config.launcher == "slurm" else None
+            failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score), slurm)
+    except KeyboardInterrupt:
         print("interrupted; run the same command again to continue", file=sys.stderr)
-        sys.exit(stop_code(error))
+        sys.exit(exit_code(signal.SIGINT))
     for run in failed:
         print(f"failed: {run.name}; see {run.folder / LOG}", file=sys.stderr)
     done = [run for run in runs if run.finished]

@@ -49,12 +49,7 @@ def fly_untrained(config: TrainConfig, folder: Path) -> None:
 
 
 def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
-    """The evaluation environment, and the actor of ``config.checkpoint``.
-
-    Raises:
-        InputError: no checkpoint is given, or its actor has other observations, actions or layers.
-    """
-    checkpoint_of(config)  # a missing one is refused before an environment is made
+    """The evaluation environment, and the actor of ``config.checkpoint``."""
     env = make_eval_env(config)
     return env, stored_actor(config, env)
 
@@ -65,20 +60,11 @@ def stored_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
     Raises:
         InputError: no checkpoint is given, or its actor has other observations, actions or layers.
     """
-    actor = config.learner.make_actor(env, config.model)
-    load_networks(checkpoint_of(config), "checkpoint", {"actor": actor})
-    return actor
-
-
-def checkpoint_of(config: TrainConfig) -> Path:
-    """The run folder, or checkpoint file, with the policy to fly.
-
-    Raises:
-        InputError: no checkpoint is given.
-    """
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
-    return Path(config.checkpoint)
+    actor = config.learner.make_actor(env, config.model)
+    load_networks(Path(config.checkpoint), "checkpoint", {"actor": actor})
+    return actor
 
 
 def make_eval_env(config: TrainConfig) -> DelayedEnv:
@@ -114,8 +100,8 @@ def report(
     except InputError as error:  # the region is too large for the script, but not for the networks
         print(f"no {SCRIPT}: {error}")
     rows[RANDOM] = random
-    can_succeed, late = config.episode.success_share is not None, has_message_delay(config)
-    table = save_results(rows, folder, can_succeed, late, MEANING)
+    succeeds = config.episode.success_share is not None
+    table = save_results(rows, folder, succeeds, has_message_delay(config), MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
     return random
 

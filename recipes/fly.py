@@ -44,8 +44,8 @@ from damian.show.replay_page import save_page
 
 from . import cli
 from .evaluate import stored_actor
+from .known import key_of
 from .shared.runs import require_trust, save_config, without
-from .words import key_of
 
 
 def fly(config: FlyConfig) -> list[Episode]:

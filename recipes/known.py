@@ -1,4 +1,4 @@
-"""What can be said on a command line: keys, groups and options, with help, and hints for what is not there.
+"""What can be said on a command line: its words, the known keys and options, help, and hints for typos.
 
 Nothing here imports torch or Hydra, so that help and a misspelt word are answered at once.
 """
@@ -6,11 +6,12 @@ Nothing here imports torch or Hydra, so that help and a misspelt word are answer
 import dataclasses
 import difflib
 import functools
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 
@@ -50,27 +51,69 @@ PLAIN = {
 """Options of the groups that need no file, because they only choose a kind."""
 LOGGERS = {name: f"damian.runs.loggers:{name}" for name in ("wandb", "mlflow")}
 """Loggers of DAMIAN that stand in settings by their paths."""
-SYNONYMS = {
-    "lr": "learner.lr",
-    "learning_rate": "learner.lr",
-    "gamma": "learner.gamma",
-    "belief": "aware=belief",
-    "history": "delay.history",
-    "num_envs": "worlds",
-    "n_envs": "worlds",
-    "total_frames": "frames",
-    "total_timesteps": "frames",
-    "timesteps": "frames",
-    "n_agents": "agents",
-    "num_agents": "agents",
-    "uavs": "agents",
-    "algo": "learner",
-    "task": "scenario",
-    "env": "scenario",
-    "gpu": "device",
-    "cuda": "device",
-}
-"""What people type who know other programs, and what it is called here."""
+
+
+# ------------------------------------------------------------------------------------------ words
+
+
+class Parser(ArgumentParser):
+    """Raises an ``InputError`` instead of printing its usage."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message)
+
+
+def parsed(words: Sequence[str]) -> Namespace:
+    """The options and the ``overrides`` of a command line; options may stand anywhere."""
+    parser = Parser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-h", "--help", action="store_true")
+    parser.add_argument("-m", "--multirun", action="store_true")
+    parser.add_argument("-cd", "--config-dir")
+    parser.add_argument("--cfg", choices=["job"])
+    parser.add_argument("overrides", nargs="*")
+    given = parser.parse_intermixed_args(list(words))
+    if given.config_dir and not Path(given.config_dir).is_dir():
+        raise InputError(f"--config-dir: {show(given.config_dir)} is no folder")
+    return given
+
+
+def key_of(word: str) -> str:
+    """The key or group that an override sets."""
+    return word.lstrip("+~").partition("=")[0]
+
+
+def whole_laws(words: Sequence[str]) -> list[str]:
+    """The words with a number before each delay law, because Hydra would merge it with the law before it."""
+    laws = ("delay.obs={", "delay.act={", "delay.rew={")
+    return [new for word in words for new in ([f"{key_of(word)}=0"] * word.startswith(laws) + [word])]
+
+
+def check_words(program: str, words: Sequence[str], own_folder: str | None = None) -> None:
+    """Refuse unknown keys and options, as far as a look at the words can tell; the schemas tell the rest."""
+    known, options = known_settings(program), groups(own_folder)
+    for word in words:
+        key, equals, value = word.partition("=")
+        first = value.partition(",")[0]
+        if not equals and not word.startswith("~"):
+            raise InputError(f"{show(word)}: this word is not of the form KEY=VALUE")
+        if key in options:
+            if key == "delay" and first[:1].isdigit():
+                raise InputError(f"delay: {value} is no option of this group; write delay.obs={value}")
+            if first.replace("/", "").isidentifier() and first not in (*options[key], "null"):
+                raise InputError(f"{key}: {first} is not one of {', '.join(options[key])}")
+        elif not (_is_known(key, known) or own_folder or key.startswith(("hydra", "+", "~"))):
+            raise InputError(no_such_key(key, program))
+
+
+def _is_known(key: str, known: "dict[str, Setting]") -> bool:
+    """Is a key that of a setting, or below one that holds anything, or of a learner of the user's own?"""
+    parts = key.partition("@")[0].split(".")
+    above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]
+    is_open = any(each and each.kind.startswith(("Any", "list", "dict")) for each in above)
+    return key in known or is_open or parts[0] == "learner"
+
+
+# ------------------------------------------------------------------------------------------ settings
 
 
 @dataclass(frozen=True)
@@ -102,14 +145,12 @@ def _described(kind: type, path: str) -> dict[str, Setting]:
         rule, default = every[each.name], default_of(each)
         if rule.fixed:
             continue
-        kept: Any = (
-            each.type if is_dataclass(each.type) else None
-        )  # such as an experiment, which must be chosen
-        section: Any = type(default) if is_dataclass(default) else kept
+        # Such as an experiment, which must be chosen.
+        chosen: Any = each.type if is_dataclass(each.type) else None
+        section: Any = type(default) if is_dataclass(default) else chosen
         text = "" if section or default is dataclasses.MISSING else f"{default!r}"
-        named = (
-            getattr(each.type, "__name__", str(each.type)) if "[" not in str(each.type) else str(each.type)
-        )
+        written = str(each.type)
+        named = written if "[" in written else getattr(each.type, "__name__", written)
         found[f"{path}{each.name}"] = Setting(named, text, rule.meaning)
         if section:
             found |= _described(section, f"{path}{each.name}.")
@@ -154,10 +195,7 @@ def no_such_key(key: str, program: str = "train", section: Sequence[str] = ()) -
         program: one of ``SCHEMAS``.
         section: keys beside it, where they are known; a learner of the user's own has its own keys.
     """
-    if key in SYNONYMS:
-        return f"{key}: no such key; did you mean {SYNONYMS[key]}?"
-    known = {**known_settings(program), **(known_settings("train") if program != "compare" else {})}
-    group = key.partition(".")[0]
+    known, group = known_settings(program), key.partition(".")[0]
     if key in known and group in CHOSEN:
         return f"{key}: no such key of the chosen {group}; another {group}=OPTION has it"
     if program == "compare" and (key in known_settings("train") or key in default_options("train")):
@@ -168,35 +206,7 @@ def no_such_key(key: str, program: str = "train", section: Sequence[str] = ()) -
     return f"{key}: no such key" + "".join(f"; did you mean {name}?" for name in near)
 
 
-def check_words(program: str, words: Sequence[str], own_folder: str | None = None) -> None:
-    """Refuse unknown keys and options, as far as a look at the words can tell; the schemas tell the rest.
-
-    Raises:
-        InputError: a word names what does not exist.
-    """
-    known, options = known_settings(program), groups(own_folder)
-    for word in words:
-        key, equals, value = word.partition("=")
-        if not equals:
-            if not word.startswith("~"):
-                raise InputError(f"{show(word)}: this word is not of the form KEY=VALUE")
-        elif key.partition("@")[0] in options and not key.startswith(("+", "~")):
-            first = value.partition(",")[0]
-            plain = all(part.isidentifier() for part in first.split("/"))
-            if key == "delay" and first[:1].isdigit():
-                raise InputError(f"delay: {value} is no option of this group; write delay.obs={value}")
-            if plain and first not in (*options[key], "null"):
-                raise InputError(f"{key}: {first} is not one of {', '.join(options[key])}")
-        elif not (_is_known(key, known) or own_folder or key.startswith(("hydra", "+", "~"))):
-            raise InputError(no_such_key(key, program))
-
-
-def _is_known(key: str, known: dict[str, Setting]) -> bool:
-    """Is a key that of a setting, or below one that holds anything, or of a learner of the user's own?"""
-    parts = key.split(".")
-    above = [known.get(".".join(parts[:n])) for n in range(1, len(parts))]
-    is_open = any(each and each.kind.startswith(("Any", "list", "dict")) for each in above)
-    return key in known or is_open or parts[0] == "learner"
+# ------------------------------------------------------------------------------------------ help
 
 
 def help_text(name: str, program: str, keys: Sequence[str] = (), own_folder: str | None = None) -> str:
@@ -226,22 +236,17 @@ Meaning, type, default and unit: damian {name} --help KEY | GROUP ...   All sett
 
 
 def _options(program: str, group: str, own_folder: str | None) -> list[str]:
-    """How to choose an option of a group, with all options, the default one in brackets; or nothing."""
+    """How to choose an option of a group, with what the comment at the top of its file says; or nothing."""
     if group not in default_options(program):
         return []
-    default, options = default_options(program)[group], groups(own_folder)[group]
-    shown_options = [f"[{option}]" if option == default else option for option in options]
-    said = {option: _comment(group, option, own_folder) for option in options}
-    lines = [f"    {option}: {text}" for option, text in said.items() if text]
-    return [f"choose one with {group}=OPTION: {', '.join(shown_options)}", *lines]
-
-
-def _comment(group: str, option: str, own_folder: str | None) -> str:
-    """What the comment at the top of an option's file says."""
-    files = (Path(root, group, f"{option}.yaml") for root in filter(None, (own_folder, CONF)))
-    text = next((read_text(file) for file in files if file.is_file()), "")
-    lines = takewhile(lambda line: line.startswith("#"), text.splitlines())
-    return " ".join(line.lstrip("# ") for line in lines if "@package" not in line)
+    default, lines = default_options(program)[group], [f"choose one with {group}=OPTION:"]
+    for option in groups(own_folder)[group]:
+        files = (Path(root, group, f"{option}.yaml") for root in filter(None, (own_folder, CONF)))
+        text = next((read_text(file) for file in files if file.is_file()), "")
+        comments = takewhile(lambda line: line.startswith("#"), text.splitlines())
+        said = " ".join(line.lstrip("# ") for line in comments if "@package" not in line)
+        lines.append(f"    {f'[{option}]' if option == default else option}: {said}".rstrip(": "))
+    return lines
 
 
 def _meaning(program: str, key: str) -> list[str]:

@@ -14,8 +14,8 @@ and the evaluation as result.csv and result.md (docs/runs.md).
 """
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,7 +29,6 @@ from damian import keys
 from damian.common import checks
 from damian.common.errors import RunError
 from damian.common.threads import using_threads
-from damian.delays.config import settings_longer_than
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay
 from damian.keys import next_key
@@ -48,42 +47,32 @@ from damian.settings.fields import leaves
 
 from . import cli
 from .evaluate import make_eval_env, own_code, report
-from .shared.collectors import WorkerLost, collecting, collector_parts, learning_env, ticks
+from .shared.collectors import learning_env, make_collector, ticks
 from .shared.runs import interrupted, run_folder, save_config, stored_config
 from .shared.settings import backupdates, check_learning, learning_setup, longest_wait
-from .shared.training_film import film_policy
 
 Watch = Callable[[int, dict[str, float]], None]
 """Gets the environment steps so far and the numbers of each update; what it raises stops the training."""
 
 
 def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None:
-    """Train, evaluate, and fill the run folder.
-
-    Raises:
-        InputError: the settings do not allow training, or the checkpoint cannot be loaded.
-        RunError: the learner has diverged, or a file cannot be written.
-    """
+    """Train, evaluate, and fill the run folder; after each update ``watch`` gets its numbers."""
     check_learning(config)
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
-    with collecting(config, env, learner.actor) as collector:
-        state = TrainingState(folder, learner.components(), collector_parts(collector), clock, buffer)
-        begin(config, state)
-        print(f"threads: {config.learning_threads} for learning, 1 for the worlds")
-        note_what_never_happens(config)
-        log = open_log(config, state)
-        with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
-            batches = ticks(collector, clock, env.server)
-            with saved_if_lost(state, log, interrupt):
-                for batch in batches if not enough(config, state) else ():
-                    numbers = update(config, learner, state, log, batch)
-                    if watch:
-                        watch(state.progress.frames, numbers)
-                    show(bar, config, state)
-                    if save_or_stop(config, state, log, interrupt):
-                        break
+    collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
+    state = TrainingState(folder, learner.components(), collector, clock, buffer)
+    begin(config, state)
+    log = open_log(config, state)
+    with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
+        for batch in ticks(collector, clock, env.server) if not enough(config, state) else ():
+            numbers = update(config, learner, state, log, batch)
+            if watch:
+                watch(state.progress.frames, numbers)
+            show(bar, config, state)
+            if save_or_stop(config, state, log, interrupt):
+                break
     if interrupt.asked:
         sys.exit(interrupted(folder, interrupt.asked))
     random = report(config, folder, make_eval_env(config), learner.actor)
@@ -157,11 +146,7 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
 def update(
     config: TrainConfig, learner: Learner, state: TrainingState, log: MetricsLog, batch: TensorDictBase
 ) -> dict[str, float]:
-    """Make one update from a batch [B, T], and log its numbers.
-
-    Raises:
-        RunError: the learner has diverged.
-    """
+    """Make one update from a batch [B, T], and log its numbers."""
     progress, episodes = state.progress, state.episodes
     episodes.add(batch)
     progress.frames += batch.numel()
@@ -178,22 +163,16 @@ def update(
     for name, values in distributions(batch).items():
         log.add_histogram(progress.frames, name, values)
     check_convergence(config, state, losses)
-    if config.logger.film_every and progress.updates % config.logger.film_every == 0:
-        log.add_film(progress.frames, film_policy(config, learner.actor, progress.frames, state.folder))
     return numbers
 
 
 def check_convergence(config: TrainConfig, state: TrainingState, losses: dict[str, float]) -> None:
-    """Stop a run whose learner has diverged, before its checkpoint is replaced.
-
-    Raises:
-        RunError: a loss or a weight is not finite, or too large.
-    """
+    """Stop a run whose learner has diverged, before its checkpoint is replaced."""
     if problem := divergence(state.components, losses):
+        remedy = f"choose a smaller learner.lr than {config.learner.lr:g}"
+        saved = f"{state.folder / CHECKPOINT} is of update {state.saved} and intact"
         raise RunError(
-            f"update {state.progress.updates}: {problem}: the learner has diverged; choose a smaller "
-            f"learner.lr than {config.learner.lr:g}; {state.folder / CHECKPOINT} is of update {state.saved} "
-            "and intact"
+            f"update {state.progress.updates}: {problem}: the learner has diverged; {remedy}; {saved}"
         )
 
 
@@ -250,33 +229,6 @@ def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, int
             state.save_best()
         state.save()
     return finished or asked
-
-
-@contextmanager
-def saved_if_lost(state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> Iterator[None]:
-    """If a worker is lost, write the checkpoint of the latest update, and say how to go on.
-
-    Raises:
-        RunError: a worker was lost; not if the run was asked to stop, as a batch system asks all processes.
-    """
-    try:
-        yield
-    except WorkerLost as error:
-        log.sync()
-        state.save()
-        if not interrupt.asked:
-            saved = f"{state.folder / CHECKPOINT} is of update {state.saved}, the latest"
-            raise RunError(f"{error}; {saved}; continue with resume={state.folder}") from error
-
-
-def note_what_never_happens(config: TrainConfig) -> None:
-    """Say which delays are so long that nothing arrives in an episode, and whether nothing is learnt."""
-    warm_up = getattr(config.learner, "warm_up", 0)
-    if warm_up > config.frames:
-        print(f"note: learner.warm_up: all {config.frames} steps are fewer than {warm_up}: nothing is learnt")
-    n_steps = config.episode.max_steps
-    for key in settings_longer_than(config.delay, n_steps, config.clock.dt) if n_steps else ():
-        print(f"note: {key} is at least as long as an episode of {n_steps} steps: nothing arrives in it")
 
 
 def run() -> None:

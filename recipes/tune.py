@@ -19,6 +19,7 @@ import functools
 import json
 import math
 import shlex
+import signal
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
@@ -34,16 +35,16 @@ from damian.common.atomic_files import write_atomically
 from damian.common.csv_table import csv_table
 from damian.common.errors import InputError, RunError
 from damian.common.markdown import markdown_table
+from damian.runs.interrupt import exit_code
 from damian.settings import TrainConfig
 from damian.settings.programs import TuneConfig
 
 from . import cli
 from .compare import POLICIES
-from .known import known_settings, no_such_key
-from .shared.many_runs import Run, perform_each, stop_code
+from .known import key_of, known_settings, no_such_key
+from .shared.many_runs import Run, perform_each
 from .shared.settings import check_learning
 from .train import train
-from .words import key_of
 
 try:
     import optuna
@@ -287,7 +288,7 @@ def report(found: Search) -> None:
     head = ["trial", "state", found.config.score, *found.space]
     write_atomically(found.folder / TRIALS, csv_table([head, *(row(trial) for trial in trials)]))
     lines = [
-        f"`{cli.command(cli.typed_words)}`",
+        f"`{cli.command()}`",
         f"{len(trials)} trials: {len(complete)} with a value, "
         f"{sum(trial.state == TrialState.PRUNED for trial in trials)} pruned, "
         f"{sum(trial.state == TrialState.FAIL for trial in trials)} failed or interrupted. All have the seed "
@@ -330,9 +331,9 @@ def search_all(config: TuneConfig, folder: Path) -> None:
     overrides = [word for word in config.overrides if key_of(word).split(".")[0] not in OWN]
     try:
         search(config, overrides, folder)
-    except KeyboardInterrupt as error:
+    except KeyboardInterrupt:
         print("interrupted; run the same command again to continue", file=sys.stderr)
-        sys.exit(stop_code(error))
+        sys.exit(exit_code(signal.SIGINT))
     print(f"results: {folder}")
 
 

@@ -33,7 +33,7 @@ from damian.advice.rows import (
 from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import named, show
-from damian.runs.run_lock import LOCK, is_empty, is_folder, locked
+from damian.runs.run_lock import LOCK, is_empty, locked
 
 MAX_FLEETS = 1000
 MAY_DIFFER = {
@@ -231,7 +231,7 @@ class AdviceSession:
 
     def _open(self, folder: Path, is_locked: bool) -> None:
         """Take a folder of journals, and restore the fleets in it."""
-        is_new = not is_folder(folder)
+        is_new = not folder.is_dir()
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
         if not is_locked:

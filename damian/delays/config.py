@@ -37,12 +37,6 @@ def check_laws(delay: DelayConfig, dt: float) -> None:
     checks.require(not delay_sampler(delay, "rew", dt).loses, "delay.rew", delay.rew, LOSES)
 
 
-def settings_longer_than(delay: DelayConfig, n_steps: int, dt: float) -> list[str]:
-    """Names of the settings whose delay is always at least ``n_steps``: in so many, nothing arrives."""
-    shortest = {name: delay_sampler(delay, name, dt).constant_delay or 0 for name in DELAYED}
-    return [f"delay.{name}" for name, steps in shortest.items() if steps >= n_steps]
-
-
 def link_reads(links: LinkConfig, dt: float) -> set[str]:
     """Names of the entries that the links read: what their laws do, and positions for a range."""
     written = {"links.delay": links.delay}

@@ -19,7 +19,6 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, RunError
 from damian.common.text_files import one_line
 
-_BATCH_SIZE, _ENTRIES = "batch_size", "entries"
 _PLAIN = (bool, int, float, str, bytes, torch.Size, torch.device, torch.dtype, type(None))
 
 
@@ -50,27 +49,21 @@ def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
         InputError: the file is missing, damaged, or no checkpoint.
     """
     try:
-        data = path.read_bytes()
+        # torch does not compare checksums, so that a changed bit would be a silently wrong weight.
+        whole = zipfile.ZipFile(path).testzip() is None
+        content = torch.load(path, map_location="cpu", weights_only=True) if whole else None
     except OSError as error:
         raise InputError(f"{key}: {path}: it cannot be read: {error.strerror}") from None
-    try:
-        # torch does not compare checksums, so that a changed bit would be a silently wrong weight.
-        whole = zipfile.ZipFile(io.BytesIO(data)).testzip() is None
-        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True) if whole else None
     except Exception:  # a damaged file can raise anything
         content = None
     if not isinstance(content, dict):
-        problem = "it is damaged, or no checkpoint of a training"
-        raise InputError(f"{key}: {path}: {problem}: take another copy, or another checkpoint of the run")
+        raise InputError(f"{key}: {path}: it is damaged, or no checkpoint of a training")
     return content
 
 
 def digest(path: Path) -> str | None:
-    """The SHA-256 of a file; None if there is none that can be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        return None
+    """The SHA-256 of a file; None if there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
 
 
 def plain(value: Any) -> Any:
@@ -89,7 +82,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, _PLAIN):
         return value
     if isinstance(value, TensorDictBase):
-        return {_BATCH_SIZE: value.batch_size, _ENTRIES: plain(dict(value.items()))}
+        return {"batch_size": value.batch_size, "entries": plain(dict(value.items()))}
     if isinstance(value, Mapping):
         return {key: plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -103,9 +96,9 @@ def to_tensordict(stored: Mapping[str, Any]) -> TensorDict:
     """The TensorDict that ``plain`` has made a dictionary."""
     entries = {
         name: to_tensordict(value) if isinstance(value, Mapping) else value
-        for name, value in stored[_ENTRIES].items()
+        for name, value in stored["entries"].items()
     }
-    return TensorDict(entries, stored[_BATCH_SIZE])
+    return TensorDict(entries, stored["batch_size"])
 
 
 def restore(components: Mapping[str, Any], stored: Mapping[str, Any], path: Path, key: str) -> None:
@@ -122,8 +115,7 @@ def restore(components: Mapping[str, Any], stored: Mapping[str, Any], path: Path
     """
     for name, component in components.items():
         if name not in stored:
-            found = ", ".join(map(str, stored)) or "nothing"
-            raise InputError(f"{key}: {path}: it has no {name}, only {found}: another learner wrote it")
+            raise InputError(f"{key}: {path}: it has no {name}, only {', '.join(map(str, stored))}")
         try:
             component.load_state_dict(stored[name])
         except (InputError, RunError):

@@ -2,6 +2,7 @@
 
 import secrets
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,8 +13,6 @@ from damian.common.registry import Registry, check_parameters
 
 BINS = 64
 """Bins of a histogram."""
-WANDB_ID = "wandb_id.txt"
-"""File in a run folder with the id of its W&B run, which a resumed run continues."""
 
 
 class Logger(Protocol):
@@ -47,8 +46,7 @@ LOGGERS = Registry[Callable[..., Logger]]("logger", _not_a_logger)
 def make_loggers(written: Sequence[Any], folder: Path) -> list[Logger]:
     """Make loggers for a run folder; the arguments are as for ``check_loggers``."""
     loggers = []
-    for each in written:
-        path, make, parameters = _read(each)
+    for path, make, parameters in map(_read, written):
         with naming_errors(f"logger.custom: {path}"):
             logger = make(folder, **parameters)
             should = "is no logger: it has no method log_scalar(name, value, step)"
@@ -104,17 +102,15 @@ def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> To
         folder: the run folder, which gets ``wandb/``.
         project: the run's project.
         offline: keep everything in the folder, for ``wandb sync``; so does the variable WANDB_MODE=offline.
-
-    Raises:
-        InputError: wandb is not installed.
     """
+    library, stored = _installed("wandb"), folder / "wandb_id.txt"
     from torchrl.record.loggers import WandbLogger  # noqa: PLC0415 (takes seconds to import)
 
-    library, stored = _installed("wandb"), folder / WANDB_ID
     if not stored.exists():
         write_atomically(stored, secrets.token_hex(8))
-    number = stored.read_text().strip()
-    logger = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
+    logger = WandbLogger(
+        folder.name, offline, str(folder), stored.read_text(), project, log_env_packages=False
+    )
     return TorchrlLogger(logger, library.finish, histograms=True)
 
 
@@ -127,25 +123,17 @@ def mlflow(
         folder: the run folder.
         tracking_uri: MLflow's store or server.
         experiment: the run's experiment.
-
-    Raises:
-        InputError: mlflow is not installed.
     """
+    library = _installed("mlflow")
     from torchrl.record.loggers import MLFlowLogger  # noqa: PLC0415 (takes seconds to import)
 
-    library = _installed("mlflow")
     logger = MLFlowLogger(experiment, tracking_uri)
     library.set_tag("mlflow.runName", folder.name)
     return TorchrlLogger(logger, library.end_run, histograms=False)
 
 
 def _installed(package: str) -> Any:
-    """A package that not everyone needs.
-
-    Raises:
-        InputError: it is not installed.
-    """
     try:
-        return __import__(package)
+        return import_module(package)
     except ImportError:
         raise InputError(f"logger: {package} is not installed; pip install {package}") from None

@@ -143,8 +143,8 @@ class EpisodeLog:
     """Exponential means over the episodes that ended in the training batches.
 
     Args:
-        factor: smoothing factor, by which each new episode multiplies the weight of all earlier ones; 0.991
-            in the paper's Figures 5 and 6.
+        factor: by which each new episode multiplies the weight of all earlier ones; 0.991 in the paper's
+            Figures 5 and 6.
     """
 
     NAMES = ("perceived_return", "perceived_success_rate", "perceived_steps")
@@ -165,11 +165,9 @@ class EpisodeLog:
             self.finished += 1
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state that a checkpoint stores."""
         return {"finished": self.finished, "weight": self._weight, "sums": list(self._sums)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the state that a checkpoint has stored."""
         self.finished, self._weight = int(state["finished"]), float(state["weight"])
         self._sums = [float(total) for total in state["sums"]]
 

@@ -4,13 +4,12 @@ import csv
 import io
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
@@ -20,8 +19,6 @@ from damian.runs.loggers import BINS, Logger
 
 METRICS = "metrics.csv"
 _FIRST_COLUMN = "frames"
-EVENTS = "events.out.tfevents."
-"""Beginning of the names of TensorBoard's files."""
 
 
 class MetricsLog:
@@ -37,10 +34,6 @@ class MetricsLog:
             later steps are dropped.
         loggers: further loggers, which get every number.
         settings: all settings by dotted key; hyperparameters for TensorBoard and the other loggers.
-
-    Raises:
-        InputError: the rows of the run cannot be read.
-        RunError: a file cannot be written.
     """
 
     def __init__(
@@ -56,19 +49,12 @@ class MetricsLog:
         self._path = folder / METRICS if to_csv else None
         self.rows = [row for row in read_metrics(folder) if row["frames"] <= frames]
         self._columns = [*self.rows[0]] if self.rows else []
-        if self._path and self.rows:
-            write_atomically(self._path, self._text(self.rows, head=True))
-        elif self._path:
-            with writing(self._path):
-                self._path.unlink(missing_ok=True)
-        self._events = None
-        if tensorboard:
-            with writing(folder):
-                # TensorBoard does not show what older files hold of steps from ``purge_step`` on.
-                self._events = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
-        for logger, log_hparams in self._methods("log_hparams"):
-            with naming_errors(f"logger {type(logger).__name__}"):
-                log_hparams(self._settings)
+        if self._path:
+            write_atomically(self._path, self._text(self.rows, head=True) if self.rows else "")
+        # TensorBoard does not show what older files hold of steps from ``purge_step`` on.
+        purge_step = frames + 1 if frames else None
+        self._events = SummaryWriter(str(folder), purge_step=purge_step) if tensorboard else None
+        self._call("log_hparams", self._settings)
 
     def add(self, frames: int, numbers: Mapping[str, float]) -> None:
         """Log numbers by name, after so many environment steps over all worlds.
@@ -77,14 +63,7 @@ class MetricsLog:
             RunError: a file cannot be written.
         """
         for name, number in numbers.items():
-            for logger in self._loggers:
-                with naming_errors(f"logger {type(logger).__name__}"):
-                    logger.log_scalar(name, number, frames)
-        if self._events:
-            with writing(self._folder):
-                self._add_settings(numbers)
-                for name, number in numbers.items():
-                    self._events.add_scalar(name, number, frames)
+            self._call("log_scalar", name, number, frames)
         row = {_FIRST_COLUMN: float(frames), **numbers}
         self.rows.append(row)
         new = [name for name in row if name not in self._columns]
@@ -94,44 +73,37 @@ class MetricsLog:
         elif self._path:
             with writing(self._path), self._path.open("a", newline="") as file:
                 file.write(self._text([row]))
+        if self._events:
+            self._add_settings(numbers)
+            for name, number in numbers.items():
+                self._events.add_scalar(name, number, frames)
 
     def add_histogram(self, frames: int, name: str, values: NDArray[np.floating]) -> None:
         """Log a distribution of values [K], after so many environment steps over all worlds."""
         if self._events:
-            with writing(self._folder):
-                self._events.add_histogram(name, values, frames, bins=BINS)  # type: ignore[arg-type]
-        for logger, log_histogram in self._methods("log_histogram"):
-            with naming_errors(f"logger {type(logger).__name__}"):
-                log_histogram(name, values, frames)
-
-    def add_film(self, frames: int, path: Path) -> None:
-        """Show a film, a GIF, among TensorBoard's images, after so many environment steps."""
-        if self._events:
-            image = Summary.Image(colorspace=3, encoded_image_string=path.read_bytes())
-            # ``add_video`` would encode the film again, and needs another library for it.
-            self._add_summary(Summary(value=[Summary.Value(tag="evaluation", image=image)]), frames)
+            self._events.add_histogram(name, values, frames, bins=BINS)  # type: ignore[arg-type]
+        self._call("log_histogram", name, values, frames)
 
     def sync(self) -> None:
         """Make the rows last, even if the machine stops; a checkpoint comes after its rows."""
         if self._events:
-            with writing(self._folder):
-                self._events.flush()
-        if self._path and self.rows:
+            self._events.flush()
+        if self._path:
             with writing(self._path), self._path.open("rb") as file:
                 os.fsync(file.fileno())
 
     def close(self) -> None:
         """Close all files, and all loggers that can be closed."""
         if self._events:
-            with writing(self._folder):
-                self._events.close()
-        for logger, close in self._methods("close"):
-            with naming_errors(f"logger {type(logger).__name__}"):
-                close()
+            self._events.close()
+        self._call("close")
 
-    def _methods(self, name: str) -> Iterator[tuple[Logger, Any]]:
-        """The loggers that have a method of this name, with the method."""
-        return ((logger, getattr(logger, name)) for logger in self._loggers if hasattr(logger, name))
+    def _call(self, method: str, *arguments: Any) -> None:
+        """Call a method of each logger that has it."""
+        for logger in self._loggers:
+            if hasattr(logger, method):
+                with naming_errors(f"logger {type(logger).__name__}"):
+                    getattr(logger, method)(*arguments)
 
     def _add_settings(self, numbers: Mapping[str, float]) -> None:
         """Give TensorBoard the settings, once; its table of runs needs the names of the numbers too."""
@@ -141,12 +113,7 @@ class MetricsLog:
             self._settings = {}
             # ``add_hparams`` would write them into a folder of their own.
             for summary in hparams(plain, dict.fromkeys(numbers, 0.0)):
-                self._add_summary(summary)
-
-    def _add_summary(self, summary: Summary, frames: int | None = None) -> None:
-        assert self._events is not None
-        with writing(self._folder):
-            self._events.file_writer.add_summary(summary, frames)  # type: ignore[union-attr]
+                self._events.file_writer.add_summary(summary)  # type: ignore[union-attr]
 
     def _text(self, rows: Sequence[Mapping[str, float]], head: bool = False) -> str:
         """Rows as CSV, with the line of the names above them if ``head``."""
@@ -170,8 +137,8 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     if not path.exists():
         return []
     try:
-        text = path.read_bytes().decode()
-        reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+        text = path.read_text()
+        reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
         rows = [{name: float(number) for name, number in row.items()} for row in reader]
     except OSError as error:
         raise InputError(f"{path}: it cannot be read: {error.strerror}") from None

@@ -26,28 +26,24 @@ class ReplayMemory:
     rows, however large the memory is.
 
     Args:
-        buffer: on a ``TimeStorage``, with a round-robin writer (TorchRL's default).
+        buffer: on a ``TimeStorage``, with a round-robin writer (TorchRL's default); None: there is no memory.
         folder: of the segments.
     """
 
-    def __init__(self, buffer: ReplayBuffer, folder: Path) -> None:
+    def __init__(self, buffer: ReplayBuffer | None, folder: Path) -> None:
         self._buffer, self._folder = buffer, folder
         self._segments: list[int] = []
         """Numbers of the segments that the latest state needs."""
 
     @property
     def _storage(self) -> TimeStorage:
-        return cast(TimeStorage, self._buffer.storage)
+        return cast(TimeStorage, cast(ReplayBuffer, self._buffer).storage)
 
     def state_dict(self) -> dict[str, Any]:
-        """Write the segments that are complete by now, and return what else there is to store.
-
-        Raises:
-            RunError: a segment cannot be written.
-        """
-        storage, written = self._storage, cast(int, self._buffer.write_count)
-        if not written:
+        """Write the segments that are complete by now, and return what else there is to store."""
+        if self._buffer is None or not self._buffer.write_count:
             return {"written": 0}
+        storage, written = self._storage, cast(int, self._buffer.write_count)
         oldest, per_segment = written - len(storage.latest()), self._rows_per_segment()
         # Late messages correct rows after these (``BackupdateStorage``).
         final = written - cast(int, getattr(storage, "longest", -1)) - 1
@@ -65,12 +61,8 @@ class ReplayMemory:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Fill the empty buffer with the rows of a state and of its segments.
-
-        Raises:
-            InputError: a segment is missing or damaged.
-        """
-        if not state["written"]:
+        """Fill the empty buffer with the rows of a state and of its segments."""
+        if self._buffer is None or not state["written"]:
             return
         parts = [read_checkpoint(self._path(segment), "resume")["rows"] for segment in state["segments"]]
         rows = torch.cat([to_tensordict(part) for part in (*parts, state["rows"])])  # type: ignore[arg-type]
@@ -87,13 +79,10 @@ class ReplayMemory:
 
     def remove_old(self) -> None:
         """Delete the segments that the latest state does not need."""
-        if not self._folder.is_dir():
-            return
         remove_unfinished(self._folder)
         needed = {self._path(segment) for segment in self._segments}
         for path in sorted({*self._folder.glob("*.pt")} - needed):
-            with writing(path):
-                path.unlink()
+            path.unlink()
 
     def _rows_per_segment(self) -> int:
         steps = self._storage.steps

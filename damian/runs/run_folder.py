@@ -1,11 +1,11 @@
 """Files of a run folder: their names, the learning curve, and the table of results."""
 
-import csv
 import io
 import math
 from pathlib import Path
 
 from damian.common.atomic_files import write_atomically
+from damian.common.csv_table import csv_table
 from damian.common.markdown import markdown_table
 from damian.runs.metrics import EVALUATED, Evaluation
 
@@ -70,22 +70,17 @@ def save_results(
     below = "\n".join(filter(None, [note, LATE if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
-    results = io.StringIO(newline="")
-    writer = csv.DictWriter(results, ["policy", *EVALUATED])
-    writer.writeheader()
-    writer.writerows({"policy": name, **evaluation.row()} for name, evaluation in rows.items())
-    write_atomically(folder / RESULTS, results.getvalue())  # last: with it, a run counts as finished
+    cells = [["policy", *EVALUATED], *([name, *each.row().values()] for name, each in rows.items())]
+    write_atomically(folder / RESULTS, csv_table(cells))  # last: with it, a run counts as finished
     return table
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
     """Evaluations of several policies as a Markdown table, with a line for each policy.
 
-    The same policy with its most likely actions, NAME``, deterministic`` in ``rows``, has two columns of the
-    line of NAME.
-
     Args:
-        rows: evaluations by name of the policy.
+        rows: evaluations by name of the policy; those of NAME``, deterministic`` get columns of the line of
+            NAME.
         can_succeed: whether the task can succeed; if so, success rate and steps are shown.
         late: whether messages are delayed; if so, the return that the server perceived, the age of
             information and the shares of late and lost messages are shown too.

@@ -1,6 +1,5 @@
 """A lock on a run folder, so that two runs never write into the same one."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -26,7 +25,7 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
         InputError: another process has locked it.
         RunError: nothing can be written there.
     """
-    if not is_folder(folder):
+    if not folder.is_dir():
         yield
         return
     lock = FileLock(folder / LOCK, blocking=False, thread_local=False)
@@ -45,22 +44,6 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
         lock.release()
 
 
-def is_locked(folder: Path) -> bool:
-    """Has another process, or another run of this one, locked the folder?"""
-    if not (folder / LOCK).exists():
-        return False
-    try:
-        with locked(folder):
-            return False
-    except InputError:
-        return True
-
-
-def is_folder(path: Path) -> bool:
-    """Is the path a folder? False for what can be no path at all, such as one of 5000 characters."""
-    return os.path.isdir(path)
-
-
 def is_empty(folder: Path) -> bool:
     """Is there no folder, or one with nothing in it but the file of its lock?"""
-    return not is_folder(folder) or all(path.name == LOCK for path in folder.iterdir())
+    return not folder.is_dir() or all(path.name == LOCK for path in folder.iterdir())

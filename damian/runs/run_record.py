@@ -17,39 +17,33 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 
 RECORD = "run.json"
-OF_FIRST_PART = ("command", "started")
-"""Entries of ``new_record`` that the list ``resumed`` repeats each time that a run is resumed."""
-POLICY = "policy_sha256"
-"""Entry of a run that begins with a stored policy: the SHA-256 of its checkpoint."""
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy", "shapely")
 """Packages whose versions a record names."""
 
 
-def new_record(command: str, device: str, threads: int, config_dir: str | None) -> dict[str, Any]:
-    """What is known when a run begins.
+def write_record(folder: Path, command: str, **entries: Any) -> None:
+    """Write the record of a run that begins; that of a resumed one gets the command in its list ``resumed``.
 
     Args:
+        folder: the run folder.
         command: the command line, to be run again in a shell.
-        device: name of the device of all tensors.
-        threads: number of torch's threads.
-        config_dir: folder with configuration files of the user's own, if there is one.
+        entries: what else to keep of the first part of the run.
     """
-    return {
-        "command": command,
-        "config_dir": config_dir and str(Path(config_dir).resolve()),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "damian": damian.__version__,
-        "commit": commit(),
-        "python": platform.python_version(),
-        "packages": {name: version(name) for name in PACKAGES},
-        "machine": {
-            "system": platform.platform(),
-            "processor": processor(),
-            "cores": os.cpu_count(),
-            "threads": threads,
-            "device": device,
-        },
-    }
+    part = {"command": command, "started": datetime.now(UTC).isoformat(timespec="seconds")}
+    if record := read_record(folder):
+        record["resumed"] = [*record.get("resumed", []), part]
+    else:
+        record = {
+            **part,
+            "damian": damian.__version__,
+            "commit": commit(),
+            "python": platform.python_version(),
+            "packages": {name: version(name) for name in PACKAGES},
+            "machine": {"system": platform.platform(), "cores": os.cpu_count()},
+            **entries,
+            "wall_time_s": 0.0,
+        }
+    _write(folder, record)
 
 
 def commit() -> str | None:
@@ -62,28 +56,6 @@ def commit() -> str | None:
         return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def processor() -> str:
-    """The name of the processor."""
-    cpus = Path("/proc/cpuinfo")
-    lines = cpus.read_text().splitlines() if cpus.exists() else []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor())
-
-
-def write_record(folder: Path, record: dict[str, Any]) -> None:
-    """Write the record into a run folder.
-
-    A resumed run keeps the command, the configuration files and the wall time of its first part; the list
-    ``resumed`` gets the command and the time of each further part.
-    """
-    first = read_record(folder)
-    if first:
-        part = {name: record[name] for name in OF_FIRST_PART}
-        record |= {name: first[name] for name in (*OF_FIRST_PART, "config_dir", POLICY) if first.get(name)}
-        record["resumed"] = [*first.get("resumed", []), part]
-    _write(folder, {**record, "wall_time_s": first.get("wall_time_s", 0.0)})
 
 
 @contextmanager

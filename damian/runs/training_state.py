@@ -1,7 +1,6 @@
 """What a training needs to continue exactly where it was: learner, environment, progress, random numbers."""
 
 import math
-import os
 import random
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -47,7 +46,7 @@ class TrainingState:
     Args:
         folder: the run folder.
         components: of the learner, by name.
-        collector: what changes while worlds step, by name; it has reset the environment.
+        collector: has reset its environment.
         clock: the system clock.
         buffer: replay buffer on a ``TimeStorage``, if there is one.
     """
@@ -56,7 +55,7 @@ class TrainingState:
         self,
         folder: Path,
         components: Mapping[str, Any],
-        collector: Mapping[str, Any],
+        collector: Collector,
         clock: SystemClock,
         buffer: ReplayBuffer | None = None,
     ) -> None:
@@ -64,43 +63,33 @@ class TrainingState:
         self.progress, self.episodes = Progress(), EpisodeLog()
         self.saved = 0
         """The update after which the checkpoint of the run was written."""
-        self._replay = ReplayMemory(buffer, folder / REPLAY) if buffer is not None else None
-        replay = {} if self._replay is None else {"replay": self._replay}
+        self._replay = ReplayMemory(buffer, folder / REPLAY)
         self._parts = {
             "progress": self.progress,
             "episodes": self.episodes,
             "clock": clock,
-            **collector,
-            **replay,
+            "environment": collector.env,
+            "collector": CarriedStep(collector),
+            "replay": self._replay,
             "random": RandomState(),  # last, because loading the others may draw numbers
         }
 
     def save(self) -> None:
-        """Replace the checkpoint of the run.
-
-        Raises:
-            RunError: it cannot be written; the older one is intact.
-        """
+        """Replace the checkpoint of the run; if that fails, the older one is intact."""
         # The states of the parts first: that of the replay memory writes files, which the checkpoint names.
         parts, networks = _states(self._parts), _states(self.components)
         write_checkpoint(self.folder / CHECKPOINT, {"components": networks, "training": parts})
         self.saved = self.progress.updates
-        if self._replay is not None:
-            self._replay.remove_old()
+        self._replay.remove_old()
 
     def save_best(self) -> None:
-        """Store the learner if the mean episode return is the best so far; ``save`` must follow.
-
-        Raises:
-            RunError: it cannot be written; the older one is intact.
-        """
+        """Store the learner if the mean episode return is the best so far; ``save`` must follow."""
         mean = self.episodes.means()["perceived_return"]
         if mean > self.progress.best:
             self.progress.best = mean
             training = _states({"progress": self.progress})
-            write_checkpoint(
-                self.folder / BEST, {"components": _states(self.components), "training": training}
-            )
+            content = {"components": _states(self.components), "training": training}
+            write_checkpoint(self.folder / BEST, content)
 
     def load(self) -> None:
         """Continue from the checkpoint of the run, and remove what a killed run has left beside it.
@@ -113,8 +102,7 @@ class TrainingState:
         restore(self.components, content["components"], path, "resume")
         restore(self._parts, content["training"], path, "resume")
         self.saved = self.progress.updates
-        if self._replay is not None:
-            self._replay.remove_old()
+        self._replay.remove_old()
 
 
 def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> None:
@@ -124,25 +112,14 @@ def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> Non
         written: a run folder, or a checkpoint file in it.
         key: the setting that names it, for errors.
         components: by name.
-
-    Raises:
-        InputError: the checkpoint is missing or damaged, or has other sizes.
     """
     path = checkpoint_file(written, key)
     restore(components, _content(path, key)["components"], path, key)
 
 
 def stored_progress(folder: Path) -> dict[str, Any]:
-    """How far the stored training of a run folder has come, as its checkpoint says.
-
-    Raises:
-        InputError: the checkpoint is missing or damaged.
-    """
-    path = checkpoint_file(folder, "resume")
-    training = _content(path, "resume")["training"]
-    if "episodes" not in training:  # as in the file of the best policy
-        raise InputError(f"resume: {path}: a training cannot continue from it: give the folder of the run")
-    return {name: training[name] for name in ("progress", "episodes")}
+    """How far the stored training of a run folder has come: the parts of its checkpoint."""
+    return _content(checkpoint_file(folder, "resume"), "resume")["training"]
 
 
 def checkpoint_file(written: Path, key: str) -> Path:
@@ -151,7 +128,7 @@ def checkpoint_file(written: Path, key: str) -> Path:
     Raises:
         InputError: there is none.
     """
-    path = written if os.path.isfile(written) else written / CHECKPOINT
+    path = written if written.is_file() else written / CHECKPOINT
     if not path.exists():
         raise InputError(f"{key}: {path}: there is no such file, so there is nothing to load")
     return path
@@ -169,10 +146,7 @@ def _content(path: Path, key: str) -> dict[str, Any]:
 
 
 class CarriedStep:
-    """The TensorDict with which a collector takes its next step: observations, hidden states, counters.
-
-    TorchRL keeps it in private attributes, and has no public way to restore it.
-    """
+    """What a collector takes its next step from, which TorchRL has no public way to restore."""
 
     def __init__(self, collector: Collector) -> None:
         self._collector = collector

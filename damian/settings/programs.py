@@ -28,7 +28,7 @@ FILMS = FORMATS[:2]
 VIEWS = ("2d", "3d")
 MOST_EPISODES = 12
 """Episodes that one page can play side by side."""
-LAUNCHERS = ("local", "ray", "slurm")
+LAUNCHERS = ("local", "slurm")
 _HIDDEN = {"hidden": {"choices": [[64, 64], [128, 128], [256, 256]]}}
 _GAMMA = {"choices": [0.8, 0.9, 0.95, 0.98, 0.99]}
 _MAPPO = {
@@ -452,9 +452,8 @@ class CompareConfig(Settings):
     )
     launcher: str = setting(
         "local",
-        "Where the runs are carried out: in processes of this machine (``local``), as Ray tasks (``ray``) "
-        "on the cluster of ``RAY_ADDRESS`` or else on this machine, or as Slurm jobs (``slurm``). All "
-        "machines must see the folder of the comparison (docs/scaling.md).",
+        "Where the runs are carried out: in processes of this machine (``local``), or as Slurm jobs "
+        "(``slurm``). All machines must see the folder of the comparison (docs/scaling.md).",
         choices=LAUNCHERS,
     )
     slurm: Any = setting(

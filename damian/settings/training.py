@@ -9,8 +9,6 @@ from damian.settings.fields import Settings, constant, setting
 from damian.settings.learners import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
 from damian.settings.scenario import ScenarioConfig
 
-COLLECTORS = ("sync", "process", "ray")
-
 
 @dataclass
 class LoggerConfig(Settings):
@@ -25,13 +23,6 @@ class LoggerConfig(Settings):
     csv: bool = setting(
         True,
         "Write ``metrics.csv``.",
-    )
-    film_every: int = setting(
-        0,
-        "Updates from one film of an evaluation's episode to the next, in ``films/`` and TensorBoard; 0: "
-        "none. A film takes several seconds.",
-        low=0,
-        high=1e12,
     )
     custom: list[Any] = setting(
         [],
@@ -113,21 +104,6 @@ class TrainConfig(ScenarioConfig):
         "Number of threads with which the networks learn; all cores if not given. The worlds always step "
         "with one, because their tensors are small. Another number of threads gives other rounding "
         "errors.",
-        low=1,
-        high=1024,
-    )
-    collector: str = setting(
-        "sync",
-        "Where the worlds step: in this process (``sync``), in ``workers`` processes of this machine "
-        "(``process``), or in ``workers`` Ray actors (``ray``), on the cluster of ``RAY_ADDRESS`` or else "
-        "on this machine. The workers get the weights of the actor before every batch (docs/scaling.md).",
-        choices=COLLECTORS,
-    )
-    workers: int = setting(
-        1,
-        "Number of workers, among which the worlds are divided evenly, with ``collector=process`` or "
-        "``ray``; each needs a core. The worlds are those of ``collector=sync``; actions are drawn from a "
-        "generator for each worker, whose seed follows from ``seed`` and the worker's number.",
         low=1,
         high=1024,
     )

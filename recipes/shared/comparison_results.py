@@ -16,7 +16,7 @@ from damian.common.csv_table import csv_table
 from damian.common.errors import InputError
 from damian.compare.comparison import MEASURES, OF_ARM, Arm, Row, regime
 from damian.compare.figures import LABELS
-from damian.runs.metrics_log import METRICS, read_metrics
+from damian.runs.metrics_log import read_metrics
 from damian.runs.run_record import read_record
 
 from ..cli import reason
@@ -64,8 +64,6 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
         succeeds = run.config.episode.success_share is not None
         label = {"task": run.task, "delay": run.delay, "arm": run.arm, "seed": run.config.seed}
         metrics = read_metrics(run.folder) if run.trains else []
-        if missing := [name for name in ("episodes", *LABELS) if metrics and name not in metrics[0]]:
-            raise InputError(f"{run.folder / METRICS}, line 1: no column {missing[0]}; delete the folder")
         points += [label | _point(row, succeeds) for row in _thinned(metrics)]
         of_run = {
             "regime": regime(arms, run.arm),
@@ -80,11 +78,7 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
 
 
 def stored_results(folder: Path) -> Results:
-    """Read the results that a folder stores.
-
-    Raises:
-        InputError: a file cannot be read.
-    """
+    """Read the results that a folder stores."""
     labels = ("task", "delay", "arm", "seed", "episodes")
     rows = _read(folder / ROWS, [*labels, "regime", "policy", "frames", "seconds", *MEASURES])
     return Results(rows, _read(folder / CURVES, [*labels, *LABELS]))

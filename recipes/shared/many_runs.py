@@ -1,7 +1,7 @@
 """Carry out many runs, several at a time, each in its own folder with its output in log.txt.
 
 Finished runs are not repeated, and interrupted ones continue from their checkpoints. The runs are carried out
-in processes of this machine, as Ray tasks, or as Slurm jobs.
+in processes of this machine, or as Slurm jobs.
 """
 
 import csv
@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -20,48 +20,28 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import islice
-from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
 from damian.runs.checkpoint import digest
-from damian.runs.interrupt import exit_code
-from damian.runs.metrics import EVALUATED
 from damian.runs.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.runs.run_lock import locked
-from damian.runs.run_record import POLICY, read_record
+from damian.runs.run_record import read_record
 from damian.settings import TrainConfig
 from damian.settings.fields import leaves
 
 from ..cli import Work, reason
-from .ray_cluster import connected_ray
-from .runs import perform, stored_config
+from .runs import POLICY, perform, stored_config
 
 LOG = "log.txt"
-STOP_LIMIT = 120
-"""Seconds that interrupted Ray tasks have to write their checkpoints."""
-_SPAWN = multiprocessing.get_context("spawn")
-_stop = _SPAWN.Event()
-"""Set after Ctrl-C: no further run begins. Worker processes share the event of the main process."""
-_idle = threading.Event()
-"""Not set while this process carries out a run."""
-
-
-class Stopped(KeyboardInterrupt):
-    """A signal has stopped the runs; its only argument is the exit code."""
-
-
-def stop_code(error: KeyboardInterrupt) -> int:
-    """The exit code of a program whose runs were stopped: 130 after Ctrl-C, 143 after SIGTERM."""
-    return error.args[0] if isinstance(error, Stopped) else exit_code(signal.SIGINT)
 
 
 @dataclass(frozen=True)
@@ -90,8 +70,9 @@ class Run:
     @property
     def finished(self) -> bool:
         """Has the run results, and if it flies another's policy, are they of that policy as it is now?"""
-        if self.policy is None or not (self.folder / RESULTS).exists():
-            return (self.folder / RESULTS).exists()
+        has_results = (self.folder / RESULTS).exists()
+        if self.policy is None or not has_results:
+            return has_results
         same = read_record(self.folder).get(POLICY) == digest(self.policy / CHECKPOINT)
         return same and (self.policy / RESULTS).exists()
 
@@ -101,24 +82,12 @@ class Run:
         return rows.get(policy, next(iter(rows.values())))[measure]
 
     def results(self) -> list[dict[str, Any]]:
-        """The results of a finished run, a row for each policy.
-
-        Raises:
-            InputError: the file does not hold the results of a run.
-        """
-        file = self.folder / RESULTS
-        try:
-            with file.open(newline="") as lines:
-                rows = [
-                    {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
-                    for row in csv.DictReader(lines)
-                ]
-            if missing := [name for name in EVALUATED if not rows or name not in rows[0]]:
-                raise ValueError(f"no {missing[0]}")
-            return rows
-        except (KeyError, TypeError, ValueError) as error:
-            problem = f"it does not hold the results of a run ({reason(error)})"
-            raise InputError(f"{file}: {problem}; delete the folder") from error
+        """The results of a finished run, a row for each policy."""
+        with (self.folder / RESULTS).open(newline="") as lines:
+            return [
+                {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
+                for row in csv.DictReader(lines)
+            ]
 
 
 def check_stored(run: Run) -> None:
@@ -134,48 +103,12 @@ def check_stored(run: Run) -> None:
     except InputError as error:
         raise InputError(f"{error}; delete the folder") from error
     old, new = dict(leaves(stored)), dict(leaves(run.config))
-    for key in new | old:
-        if key == "checkpoint" and _same_run(old.get(key), new.get(key)):
-            continue
-        if key not in ("resume", "overrides") and old.get(key) != new.get(key):
+    for key in (new | old).keys() - {"resume", "overrides", "checkpoint"}:
+        if old.get(key) != new.get(key):
             raise InputError(
                 f"{run.folder}: {key} is {old.get(key)} in this stored run, and {new.get(key)} is asked "
                 "for: delete the folder, or choose another one with hydra.run.dir"
             )
-
-
-def _same_run(folder: str | None, other: str | None) -> bool:
-    """Do two paths name the same delay, arm and seed, wherever their experiment lies?"""
-    return folder is not None and other is not None and Path(folder).parts[-3:] == Path(other).parts[-3:]
-
-
-# Where runs are carried out.
-
-
-class RayTasks:
-    """Carries out runs as Ray tasks with one CPU each (``connected_ray`` says where).
-
-    Args:
-        processes: number of tasks at the same time for which a Ray of this machine has room.
-
-    Raises:
-        InputError: Ray is not installed, or there is no cluster.
-    """
-
-    def __init__(self, processes: int) -> None:
-        self._ray, _ = connected_ray("launcher", processes)  # which ends with this program
-        self._tasks: list[Any] = []
-
-    def carry_out(self, run: Run) -> None:
-        """Carry out a run, and wait for its end."""
-        self._tasks.append(self._ray.remote(num_cpus=1, max_retries=0)(perform_run).remote(run))
-        self._ray.get(self._tasks[-1])
-
-    def cancel(self) -> None:
-        """Interrupt all runs as Ctrl-C, so that trainings write their checkpoints."""
-        for task in self._tasks:
-            self._ray.cancel(task)
-        self._ray.wait(self._tasks, num_returns=len(self._tasks), timeout=STOP_LIMIT)
 
 
 class SlurmJobs:
@@ -190,17 +123,13 @@ class SlurmJobs:
     """
 
     def __init__(self, folder: Path, parameters: Mapping[str, Any]) -> None:
+        options = {"cluster": "slurm", "cpus_per_task": 1, "name": "damian", **parameters}
         try:
             submitit = import_module("submitit")
-        except ImportError:
-            problem = "submitit is not installed; pip install 'damian[cluster]'"
-            raise InputError(f"launcher: {problem}") from None
-        options = {"cpus_per_task": 1, "name": "damian", **parameters}
-        try:
-            self._executor = submitit.AutoExecutor(folder, cluster=options.pop("cluster", "slurm"))
+            self._executor = submitit.AutoExecutor(folder, cluster=options.pop("cluster"))
             self._executor.update_parameters(**options)
-        except (NameError, RuntimeError, TypeError, ValueError) as error:
-            raise InputError(f"slurm: {reason(error)}") from error
+        except (ImportError, NameError, RuntimeError, TypeError, ValueError) as error:
+            raise InputError(f"slurm: {reason(error)} (submitit: pip install 'damian[cluster]')") from error
         self._jobs: list[Any] = []
 
     def carry_out(self, run: Run) -> None:
@@ -215,23 +144,23 @@ class SlurmJobs:
 
 
 def perform_all(
-    runs: Sequence[Run], processes: int, told: tuple[str, str], launcher: RayTasks | SlurmJobs | None = None
+    runs: Sequence[Run], processes: int, told: tuple[str, str], slurm: SlurmJobs | None = None
 ) -> list[Run]:
     """Carry out the runs that are not finished; returns those that failed.
 
     Args:
-        runs: a run that flies the policy of another one must come after it.
+        runs: those that train come first, and then those that fly the policies.
         processes: number of runs at the same time.
         told: policy and measure of the latest run that the progress bar shows.
-        launcher: for runs that are not carried out in processes of this machine.
+        slurm: carries out the runs, if they are not carried out on this machine.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
     """
     todo, failed = [run for run in runs if not run.finished], []
     with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
-        for trains in (True, False):  # two pools, because a pool whose worker was killed accepts no more runs
-            for run, error in perform_each([r for r in todo if r.trains == trains], processes, launcher):
+        for trains in (True, False):
+            for run, error in perform_each([r for r in todo if r.trains == trains], processes, slurm):
                 bar.update()
                 if error:
                     failed.append(run)
@@ -241,24 +170,27 @@ def perform_all(
 
 
 def perform_each(
-    runs: Iterable[Run], processes: int, launcher: RayTasks | SlurmJobs | None = None
+    runs: Iterable[Run], processes: int, slurm: SlurmJobs | None = None
 ) -> Iterator[tuple[Run, BaseException | None]]:
     """Carry out runs; yields each, when it has ended, with its error, or None.
 
     Args:
         runs: taken from an iterator one by one, as processes become free.
         processes: number of runs at the same time; a single one is this process.
-        launcher: for runs that are not carried out in processes of this machine.
+        slurm: carries out the runs, if they are not carried out on this machine.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
+        RunError: a worker process was killed.
     """
-    _stop.clear()
-    with _stopped_by_sigterm():
-        if launcher is not None:
-            yield from _in_pool(runs, processes, ThreadPoolExecutor(processes), launcher)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems send it
+    try:
+        if slurm is not None:
+            yield from _in_pool(runs, processes, ThreadPoolExecutor(processes), slurm.carry_out, slurm.cancel)
         elif processes > 1:
-            yield from _in_pool(runs, processes, ProcessPoolExecutor(processes, _SPAWN, _begin, (_stop,)))
+            spawn = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(processes, spawn, _begin)
+            yield from _in_pool(runs, processes, pool, perform_run, _interrupt_workers)
         else:
             for run in runs:
                 try:
@@ -267,91 +199,57 @@ def perform_each(
                     yield run, error
                 else:
                     yield run, None
-
-
-@contextmanager
-def _stopped_by_sigterm() -> Iterator[None]:
-    """Stop the runs inside at SIGTERM, which batch systems send, as at Ctrl-C."""
-
-    def stop(number: int, _: object) -> NoReturn:
-        raise Stopped(exit_code(number))
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
+    except BrokenExecutor as error:
+        raise RunError("a worker process was killed; the same command continues all runs") from error
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
 def _in_pool(
-    runs: Iterable[Run], processes: int, pool: Executor, launcher: RayTasks | SlurmJobs | None = None
+    runs: Iterable[Run],
+    processes: int,
+    pool: Executor,
+    carry_out: Callable[[Run], None],
+    cancel: Callable[[], None],
 ) -> Iterator[tuple[Run, BaseException | None]]:
-    """Carry out runs with a pool: of worker processes, or of threads that wait for a launcher."""
-    carry_out = launcher.carry_out if launcher else perform_run
     waiting, futures = iter(runs), dict[Future[None], Run]()
     with pool:
         try:
             while True:
                 for run in islice(waiting, processes - len(futures)):
-                    futures[_submitted(pool, carry_out, run)] = run
+                    futures[pool.submit(carry_out, run)] = run
                 if not futures:
                     return
                 for future in wait(futures, return_when=FIRST_COMPLETED).done:
                     error = future.exception()
-                    if isinstance(error, KeyboardInterrupt):  # the signal reached the worker first
+                    if isinstance(error, KeyboardInterrupt | BrokenExecutor):
                         raise error
                     yield futures.pop(future), error
         except KeyboardInterrupt:
-            _stop.set()
-            if launcher:
-                launcher.cancel()
-            # Ctrl-C in a terminal reaches the workers, but a signal sent to this process alone does not.
-            for worker in multiprocessing.active_children():
-                os.kill(worker.pid or 0, signal.SIGINT)
-            pool.shutdown(cancel_futures=True)
+            cancel()
             raise
 
 
-def _submitted(pool: Executor, carry_out: Any, run: Run) -> Future[None]:
-    """What becomes of a run; an error if a worker of the pool was killed before it could begin."""
-    # A worker begins with Ctrl-C ignored: only a training handles it, and not while modules are imported.
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        return pool.submit(carry_out, run)
-    except BrokenExecutor as error:
-        broken: Future[None] = Future()
-        broken.set_exception(error)
-        return broken
-    finally:
-        signal.signal(signal.SIGINT, before)
+def _interrupt_workers() -> None:
+    """Stop trainings in workers, which a signal to this process alone does not reach."""
+    for worker in multiprocessing.active_children():
+        os.kill(worker.pid or 0, signal.SIGINT)
 
 
-def _begin(stop: Event) -> None:
-    """Initialise a worker process: it shares the stop event of the main process."""
-    global _stop  # noqa: PLW0603 (the event cannot be passed to ``perform_run`` with a run)
-    _stop = stop
-    _idle.set()
+def _begin() -> None:
+    """Initialise a worker: only a training handles Ctrl-C, and a worker ends with its main process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End a worker process whose main process was killed; a training writes its checkpoint before.
-
-    Else it would go on with its run, whose folder it locks, and then wait for another one for ever.
-    """
-    parent = multiprocessing.parent_process()
-    if parent is not None:
+    if parent := multiprocessing.parent_process():
         parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)  # ends at once what does not handle it
-        _idle.wait()
-        os._exit(exit_code(signal.SIGTERM))
+        os._exit(1)
 
 
 def perform_run(run: Run) -> None:
     """Carry out one run, resuming it if it has a checkpoint."""
-    if _stop.is_set():
-        raise KeyboardInterrupt
-    _idle.clear()
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
@@ -361,8 +259,8 @@ def perform_run(run: Run) -> None:
                 resumes = run.trains and (run.folder / CHECKPOINT).exists()
                 config = replace(run.config, resume=str(run.folder)) if resumes else run.config
                 perform(config, run.folder, run.program)
-        except SystemExit as interrupted:
-            raise Stopped(interrupted.code) from interrupted
+        except SystemExit:  # a signal has stopped the training
+            raise KeyboardInterrupt from None
         except (InputError, RunError) as error:
             print(f"error: {error}")
             raise
@@ -373,4 +271,3 @@ def perform_run(run: Run) -> None:
             # Torch compiles a function at most eight times in a process. Policies with different observations
             # share one, so that the ninth would be slow without saying so.
             torch.compiler.reset()
-            _idle.set()

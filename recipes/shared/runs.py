@@ -1,6 +1,5 @@
 """Runs in their folders: starting and resuming them, and taking settings and policy of a stored one."""
 
-import os
 import random
 import signal
 import sys
@@ -16,34 +15,22 @@ from omegaconf import DictConfig, OmegaConf
 from damian.common.atomic_files import remove_unfinished, write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import show
-from damian.envs.pipeline import history_since_message
 from damian.runs.checkpoint import digest
 from damian.runs.interrupt import exit_code
-from damian.runs.metrics_log import EVENTS
-from damian.runs.run_folder import CHECKPOINT, CONFIG
-from damian.runs.run_lock import LOCK, is_folder
-from damian.runs.run_record import POLICY, RECORD, check_version, new_record, read_record, timed, write_record
-from damian.runs.training_state import checkpoint_file, stored_progress
+from damian.runs.run_folder import CONFIG
+from damian.runs.run_record import check_version, read_record, timed, write_record
+from damian.runs.training_state import checkpoint_file
 from damian.settings import LEARNERS, PredictiveMappoConfig, ScenarioConfig, TrainConfig
 from damian.settings.fields import leaves
 
-from ..cli import (
-    Work,
-    checked,
-    composed,
-    reason,
-    shown,
-    typed_command,
-    typed_words,
-)
-from ..known import LOGGERS, SCHEMAS, check_words
-from ..words import key_of, parsed
+from ..cli import Work, checked, command, composed, reason, shown
+from ..known import LOGGERS, SCHEMAS, check_words, key_of
 from .settings import check_components
 
-SWEEP = "multirun.yaml"
-"""File that Hydra writes into the folder of a sweep."""
 OVERRIDES = "overrides"
 """Entry of a run's record: the words of its command line, which programs that fly its policy apply too."""
+POLICY = "policy_sha256"
+"""Entry of a run that begins with a stored policy: the SHA-256 of its checkpoint."""
 
 
 # ------------------------------------------------------------------------------------------ starting
@@ -55,8 +42,7 @@ def prepared(
     """The checked settings of a run, and its folder.
 
     A resumed run goes on in its own folder with its own settings; only ``frames`` and ``episodes`` may
-    change.
-    The overrides of the run that ``checkpoint`` names apply too, unless others are given.
+    change. The overrides of the run that ``checkpoint`` names apply too, unless others are given.
 
     Args:
         program: one of ``SCHEMAS``.
@@ -70,40 +56,41 @@ def prepared(
     """
     given = composed(program, words, own_folder)
     words = [word for word in words if not key_of(word).startswith("hydra")]
-    if again:
-        config = checked(given, program)
-        if program != "compare":
-            config.overrides = list(words)
-        return config, folder
+    if program == "compare":
+        return checked(given, program), folder
     if given.resume is not None and program == "train":
         folder = shown(Path(given.resume))
         return resumed(folder, given, words), folder
     if (folder / CONFIG).exists():
         remedy = f"choose another folder, or continue the run with resume={folder}"
         raise InputError(f"hydra.run.dir: {folder} holds a run already; {remedy}")
-    if given.checkpoint is None:
+    if given.checkpoint is None or again:
         config, overrides = checked(given, program), list(words)
     else:
-        stored_in = run_folder(Path(given.checkpoint))
-        stored = stored_config(stored_in, "checkpoint", given.trust, words)
-        before = stored_overrides(stored_in)
-        # Hydra imports a learner, and reads files that may name one, while it composes.
-        require_trust(
-            [word.partition("=")[2].strip("'\"") for word in before], "checkpoint", given.trust, words
-        )
-        own_folder = own_folder or (_folder_of_files(stored_in) if given.trust else None)
-        overrides = inherited(stored, before, words, own_defaults(SCHEMAS[program]))
-        check_words(program, overrides, own_folder)
-        found = composed(program, overrides, own_folder)
-        require_trust(found, "checkpoint", bool(given.trust), words)
-        config = checked(found, program)
-        check_policy_fits(config, stored)
-        if changed := changes(config, stored):
-            print(f"changed since the training: {changed}")
-        note_what_a_history_holds(config, stored)
+        config, overrides = with_policy_of(given, program, words, own_folder)
     config.overrides = overrides
     check_components(config)
     return config, folder
+
+
+def with_policy_of(
+    given: DictConfig, program: str, words: list[str], own_folder: str | None
+) -> tuple[Any, list[str]]:
+    """The settings and overrides of a run that flies, or begins with, the policy of a stored run."""
+    folder, trust = run_folder(Path(given.checkpoint)), bool(given.trust)
+    stored, before = stored_config(folder, "checkpoint", trust, words), stored_overrides(folder)
+    # Hydra imports a learner, and reads files that may name one, while it composes.
+    named = [word.partition("=")[2].strip("'\"") for word in before]
+    require_trust(named, "checkpoint", trust, words)
+    overrides = inherited(stored, before, words, own_defaults(SCHEMAS[program]))
+    check_words(program, overrides, own_folder)
+    found = composed(program, overrides, own_folder)
+    require_trust(found, "checkpoint", trust, words)
+    config = checked(found, program)
+    check_policy_fits(config, stored)
+    if changed := changes(config, stored):
+        print(f"changed since the training: {changed}")
+    return config, overrides
 
 
 def perform(config: TrainConfig, folder: Path, work: Work) -> None:
@@ -111,22 +98,9 @@ def perform(config: TrainConfig, folder: Path, work: Work) -> None:
     torch.set_num_threads(1)
     seed_generators(config.seed)
     remove_unfinished(folder)
-    try:
-        with timed(folder):
-            work(config, folder)
-    except InputError:
-        _drop_unused(folder)
-        raise
+    with timed(folder):
+        work(config, folder)
     print(f"results: {folder}")
-
-
-def _drop_unused(folder: Path) -> None:
-    """Remove what a refused run has written before its first update, if there is nothing else."""
-    files = [path for path in folder.iterdir() if path.name != LOCK]
-    first = all(path.name in (CONFIG, RECORD, CHECKPOINT) or path.name.startswith(EVENTS) for path in files)
-    learnt = (folder / CHECKPOINT).exists() and stored_progress(folder)["progress"]["updates"] > 0
-    for path in files if first and not learnt else ():
-        path.unlink()
 
 
 def seed_generators(seed: int) -> None:
@@ -137,8 +111,7 @@ def seed_generators(seed: int) -> None:
 
 def interrupted(folder: Path, number: int = signal.SIGINT) -> int:
     """Say that a signal has stopped a run, and how to continue it; returns the exit code."""
-    remedy = f"; continue with resume={folder}" if (folder / CHECKPOINT).exists() else ""
-    print(f"interrupted{remedy}", file=sys.stderr)
+    print(f"interrupted; continue with resume={folder}", file=sys.stderr)
     return exit_code(number)
 
 
@@ -146,25 +119,14 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     """Write the record of words, versions and machine into the run folder, then the settings."""
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    own_folder = parsed(typed_words).config_dir if typed_words else None
-    record = new_record(typed_command(), device, config.learning_threads, own_folder)
-    record[OVERRIDES] = read_record(folder).get(OVERRIDES) if config.resume else list(config.overrides)
+    entries = {OVERRIDES: list(config.overrides), "device": device, "threads": config.learning_threads}
     if config.checkpoint and not config.resume:  # a resumed run no longer needs that policy
-        record[POLICY] = digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
-    write_record(folder, record)
-    write_atomically(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(_nested(leaves(config)))))
-
-
-def _nested(settings: Iterator[tuple[str, Any]]) -> dict[str, Any]:
-    """Settings by dotted key as nested mappings."""
-    found: dict[str, Any] = {}
-    for key, value in settings:
-        *sections, name = key.split(".")
-        node = found
-        for section in sections:
-            node = node.setdefault(section, {})
-        node[name] = value
-    return found
+        entries[POLICY] = digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
+    write_record(folder, command(), **entries)
+    nested = OmegaConf.create()
+    for key, value in leaves(config):
+        OmegaConf.update(nested, key, value, force_add=True)
+    write_atomically(folder / CONFIG, OmegaConf.to_yaml(nested))
 
 
 # ------------------------------------------------------------------------------------------ stored runs
@@ -172,26 +134,11 @@ def _nested(settings: Iterator[tuple[str, Any]]) -> dict[str, Any]:
 
 def run_folder(written: Path) -> Path:
     """The run folder that a folder, or a checkpoint file in it, stands for."""
-    return written.parent if os.path.isfile(written) else written
-
-
-def check_run(folder: Path, key: str) -> None:
-    """Check that a folder holds a run.
-
-    Raises:
-        InputError: it does not, such as the folder of a sweep.
-    """
-    if not is_folder(folder):
-        raise InputError(f"{key}: {show(str(folder))}: there is no such folder")
-    if (folder / CONFIG).is_file():
-        return
-    if (folder / SWEEP).is_file():
-        raise InputError(f"{key}: {folder} is a sweep: give one of the folders in it")
-    raise InputError(f"{key}: {folder} holds no {CONFIG}, so there is no run")
+    return written.parent if written.is_file() else written
 
 
 def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[str] = ()) -> TrainConfig:
-    """The settings of the run in a folder; keys that it lacks have their defaults.
+    """The settings of the run in a folder.
 
     Args:
         folder: the run folder.
@@ -203,18 +150,16 @@ def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[s
         InputError: there is no run, it cannot be read, another minor version of damian has written it, or it
             names code that may not be imported.
     """
-    check_run(folder, key)
-    check_version(folder, key)
     file = folder / CONFIG
+    if not file.is_file():
+        raise InputError(f"{key}: {folder} holds no {CONFIG}, so there is no run")
+    check_version(folder, key)
     try:
         saved = cast(DictConfig, OmegaConf.load(file))
-        missing = [name for name in ("agents", "learner", "region", "seed", "worlds") if name not in saved]
-        if missing:
-            raise InputError(f"it has no {missing[0]}, so it is not the whole configuration of a training")
         require_trust(saved, key, trust, named)
-        learner = LEARNERS.get(saved.learner.name, "learner")(name=saved.learner.name)
         for name in sorted({*map(str, saved)} - {each.name for each in fields(TrainConfig)}):
             raise InputError(f"{name} is no setting of damian train: no policy was trained there")
+        learner = LEARNERS.get(saved.learner.name, "learner")(name=saved.learner.name)
         config = OmegaConf.merge(OmegaConf.structured(TrainConfig(learner=learner)), saved)
         return cast(TrainConfig, OmegaConf.to_object(config))
     except InputError as error:
@@ -225,10 +170,8 @@ def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[s
 
 def stored_overrides(folder: Path) -> list[str]:
     """The words of the command line with which a run was started, without those that concern its start."""
-    words = read_record(folder).get(OVERRIDES) or []
-    texts = [word for word in words if isinstance(word, str)] if isinstance(words, list) else []
-    own = ("trust", "checkpoint", "resume")
-    return [word for word in texts if key_of(word) not in own and not key_of(word).startswith("hydra")]
+    words = map(str, read_record(folder).get(OVERRIDES) or [])
+    return [word for word in words if key_of(word) not in ("trust", "checkpoint", "resume")]
 
 
 def require_trust(found: Any, key: str, trust: bool, named: Sequence[str]) -> None:
@@ -269,18 +212,8 @@ def _components(node: Any, name: str = "") -> Iterator[str]:
             yield from _components(each, name)
 
 
-def _folder_of_files(folder: Path) -> str | None:
-    """The folder with configuration files that a run was started with, if it is still there."""
-    found = read_record(folder).get("config_dir")
-    return found if isinstance(found, str) and os.path.isdir(found) else None
-
-
 def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfig:
-    """The settings of a run to resume; only ``frames`` and ``episodes`` may change.
-
-    Raises:
-        InputError: there is no run to resume, or something else is to change.
-    """
+    """The settings of a run to resume; only ``frames`` and ``episodes`` may change."""
     allowed = ("resume", "frames", "episodes", "trust")
     if refused := [word for word in words if key_of(word) not in allowed]:
         problem = "a resumed run keeps its configuration; only frames= and episodes= may change"
@@ -292,13 +225,6 @@ def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfi
         setattr(config, key, given[key])
     config.__post_init__()
     check_components(config)
-    stored = stored_progress(folder)
-    done = {"frames": stored["progress"]["frames"], "episodes": stored["episodes"]["finished"]}
-    for key, number in done.items():
-        limit = getattr(config, key)
-        if limit is not None and number >= limit:
-            print(f"{key}: {limit} are asked for, and the run has {number} already: nothing is left to train")
-            break
     return config
 
 
@@ -372,16 +298,6 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
         "number of actions.headings": discrete and len(actions.headings),
         **{f"model.{each.name}": getattr(model, each.name) for each in fields(model)},
     }
-
-
-def note_what_a_history_holds(config: TrainConfig, stored: TrainConfig) -> None:
-    """Say if a policy observes other actions in its history than in its training, which had other delays."""
-    before, now = history_since_message(stored), history_since_message(config)
-    if before == now or not (stored.delay.history and config.delay.history):
-        return
-    newer = "only actions newer than its message that the server holds"
-    held, holds = (newer if since else "all of its latest actions" for since in (before, now))
-    print(f"note: delay.history: in the training a UAV's history held {held}; now it holds {holds}")
 
 
 def changes(config: TrainConfig, stored: TrainConfig) -> str:

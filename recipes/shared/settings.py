@@ -64,11 +64,7 @@ def learning_setup(config: TrainConfig) -> LearningSetup:
 
 
 def check_components(config: TrainConfig) -> None:
-    """Check that the laws, features, terms, sensors and loggers that the settings name exist.
-
-    Raises:
-        InputError: one does not, or has no such parameter; or there is no such device.
-    """
+    """Check that the device, laws, features, terms, sensors and loggers that the settings name exist."""
     checks.device("device", config.device)
     check_laws(config.delay, config.clock.dt)
     check_features(config.observation)
@@ -78,19 +74,15 @@ def check_components(config: TrainConfig) -> None:
 
 
 def check_learning(config: TrainConfig) -> None:
-    """Check that the settings allow training; an evaluation has fewer requirements.
-
-    Raises:
-        InputError: names the key that does not fit.
-    """
+    """Check that the settings allow training; an evaluation has fewer requirements."""
     check_components(config)
     setup = learning_setup(config)
     batch, problem = setup.worlds * setup.longest_period, "environment steps between two updates"
     checks.in_range("worlds", batch, 1, MAX_BATCH, problem)
     config.learner.check(setup)
-    _check_skip(config)
+    problem = "does not go with model.rnn: hidden states change at every step, not only at decisions"
+    checks.require(not (config.model.recurrent and config.clock.skip), "clock.skip", True, problem)
     _check_backupdate(config)
-    _check_workers(config)
     _check_delay(config)
 
 
@@ -124,18 +116,3 @@ def _check_backupdate(config: TrainConfig) -> None:
     for key in ("settle", "recompute_actor"):
         alone = getattr(config, key) and not config.backupdate
         checks.require(not alone, key, True, "means nothing without backupdate=true")
-
-
-def _check_workers(config: TrainConfig) -> None:
-    sync = config.collector == "sync"
-    alone, problem = sync and config.workers > 1, "means nothing with collector=sync; choose process or ray"
-    checks.require(not alone, "workers", config.workers, problem)
-    problem = f"does not divide worlds={config.worlds}: every worker has as many worlds as the others"
-    checks.require(config.worlds % config.workers == 0, "workers", config.workers, problem)
-    problem = f"steps on processors; device={config.device} needs collector=sync"
-    checks.require(sync or config.device == "cpu", "collector", config.collector, problem)
-
-
-def _check_skip(config: TrainConfig) -> None:
-    problem = "does not go with model.rnn: hidden states change at every step, not only at decisions"
-    checks.require(not (config.model.recurrent and config.clock.skip), "clock.skip", True, problem)

@@ -17,13 +17,14 @@ from pathlib import Path
 
 import pytest
 from helpers import check_refused
+from stopped_runs import is_locked
 
 from damian.advice.session import AdviceSession, read_inbox
 from damian.common.errors import RunError
 from damian.recipes.advise import AdviseConfig, make_session
 from damian.recipes.advise import run as main
 from damian.recipes.train import run as train
-from damian.runs.run_lock import is_locked, locked
+from damian.runs.run_lock import locked
 from damian.world.regions.config import RegionConfig
 
 HEAD = "ID,source time,lat,lon,source spotted,track,takeoff-landing time,battery,AoI,FLA"

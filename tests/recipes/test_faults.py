@@ -8,15 +8,14 @@ from pathlib import Path
 
 import pytest
 from helpers import check_refused
-from stopped_runs import TINY, ended, files, forked, killed_after
+from stopped_runs import TINY, ended, files, forked, is_locked, killed_after
 
-from damian.common.errors import InputError, RunError
 from damian.learners.mappo import Mappo
 from damian.recipes import evaluate, train
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.interrupt import Interrupt
 from damian.runs.metrics_log import MetricsLog, read_metrics
-from damian.runs.run_lock import is_locked, locked
+from damian.runs.run_lock import locked
 
 
 @pytest.fixture(scope="module")
@@ -42,31 +41,11 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in files(folder)}
 
 
-def stopped_with(run, capsys, code: int, *words: str) -> str:
-    """Run the recipe, which must end with an exit code and one line on stderr; returns that line."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        run(*words, folder="unused")
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert stopped.value.code == code
-    assert len(errors) == 1
-    assert not Path("unused").exists()
-    return errors[0]
-
-
-# Two runs in one folder.
-
-
 def test_a_folder_in_use_is_refused_and_stays_as_it_is(run, capsys, copied):
     before = contents(copied)
     with locked(copied):
-        line = stopped_with(run, capsys, 2, "resume=run")
-    assert line.startswith("error: resume: run is in use by another run")
+        check_refused(lambda: run("resume=run"), "resume: run is in use by another run", capsys)
     assert contents(copied) == before
-    Path("empty").mkdir()
-    with locked(Path("empty")):
-        check_refused(lambda: run(*TINY, folder="empty"), "hydra.run.dir: empty is in use", capsys)
-        assert Path("empty").is_dir()
 
 
 def test_a_lock_ends_with_its_process(tmp_path):
@@ -103,54 +82,7 @@ def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
     assert after["checkpoint.pt"] == before["checkpoint.pt"]
 
 
-def test_a_disk_that_is_full_from_the_start_leaves_no_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert ended(forked([*TINY, "hydra.run.dir=run"], lambda: limit_files_to(500))) == 3
-    assert "error: run/checkpoint.pt: it cannot be written" in Path("output.txt").read_text()
-    assert [path.name for path in tmp_path.iterdir()] == ["output.txt"]
-
-
-def test_rows_that_cannot_be_written_are_one_error(tmp_path):
-    log = MetricsLog(tmp_path, tensorboard=False, to_csv=True)
-    log.add(1, {"loss": 2.0})
-    (tmp_path / "metrics.csv").unlink()
-    (tmp_path / "metrics.csv").symlink_to("/dev/full")
-    with pytest.raises(RunError, match=r"metrics\.csv: it cannot be written: No space left"):
-        log.add(2, {"loss": 2.0})
-
-
-@pytest.mark.parametrize(("folder", "named"), [("file/run", "'file' is a file"), ("/proc/run", "/proc/run")])
-def test_a_folder_that_cannot_be_made_is_one_line(run, capsys, tmp_path, folder, named):
-    (tmp_path / "file").touch()
-    check_refused(lambda: run(*TINY, folder=folder), named, capsys)
-
-
 # Learners that diverge.
-
-
-def test_weights_beyond_all_use_stop_the_run(run, capsys, monkeypatch):
-    learn = Mappo.learn
-
-    def explode(learner: Mappo, batch) -> dict[str, float]:
-        numbers = learn(learner, batch)
-        for weights in learner.actor.parameters():
-            weights.data.fill_(1e6)
-        return numbers
-
-    monkeypatch.setattr(Mappo, "learn", explode)
-    line = stopped_with_learner(run, capsys, "learner.lr=0.001")
-    assert line.startswith("error: update 1: a weight of actor is 1e+06, not at most 100000: the learner has")
-    assert "choose a smaller learner.lr than 0.001" in line
-    assert line.endswith("bad/checkpoint.pt is of update 0 and intact")
-    assert read_checkpoint(Path("bad/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 0
-
-
-def stopped_with_learner(run, capsys, *words: str) -> str:
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        run(*TINY, *words, folder="bad")
-    assert stopped.value.code == 3
-    return capsys.readouterr().err.splitlines()[-1]
 
 
 def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatch):
@@ -161,8 +93,11 @@ def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatc
         return learn(learner, batch) | ({"loss_critic": float("inf")} if len(calls) == 2 else {})
 
     monkeypatch.setattr(Mappo, "learn", diverge)
-    line = stopped_with_learner(run, capsys, "checkpoint_every=1")
-    assert line.startswith("error: update 2: loss_critic is inf: the learner has diverged")
+    with pytest.raises(SystemExit) as stopped:
+        run(*TINY, "checkpoint_every=1", folder="bad")
+    assert stopped.value.code == 3
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("error: update 2: loss_critic is inf: the learner has diverged; choose a smaller")
     assert line.endswith("bad/checkpoint.pt is of update 1 and intact")
     assert read_checkpoint(Path("bad/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 1
 
@@ -170,35 +105,19 @@ def test_an_infinite_loss_keeps_the_last_good_checkpoint(run, capsys, monkeypatc
 # Damaged folders.
 
 
-def make_folder(file: Path) -> None:
-    file.unlink()
-    file.mkdir()
-
-
-@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda f: make_folder(f / "metrics.csv"), "metrics.csv: it cannot be read: Is a directory"),
-        (lambda f: make_folder(f / "checkpoint.pt"), "checkpoint.pt: it cannot be read: Is a directory"),
         (lambda f: (f / "checkpoint.pt").unlink(), "checkpoint.pt: there is no such file"),
-        (lambda f: (f / "config.yaml").write_text("agents: 3\n"), "config.yaml: it has no learner"),
+        (lambda f: (f / "config.yaml").write_text("agents: [\n"), "config.yaml: "),
         (lambda f: (f / "run.json").write_text('{"damian": "0.4.0"}'), "resume: run: damian 0.4.0 wrote it"),
     ],
 )
 def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, message):
     damage(copied)
     names = files(copied)
-    assert message in stopped_with(run, capsys, 2, "resume=run")
+    check_refused(lambda: run("resume=run"), message, capsys)
     assert files(copied) == names
-
-
-@pytest.mark.parametrize("key", ["resume", "checkpoint"])
-def test_a_name_that_no_folder_can_have_is_refused_in_one_line(run, capsys, tmp_path, key):
-    line = stopped_with(run, capsys, 2, f"{key}={'x' * 5000}")
-    assert line.startswith(f"error: {key}: 'xxx")
-    assert len(line) < 400
-    assert [*tmp_path.iterdir()] == []
 
 
 def test_a_cut_last_line_is_no_row(tmp_path):
@@ -214,28 +133,6 @@ def test_a_cut_last_line_is_no_row(tmp_path):
 
 
 # Signals.
-
-
-def cut_short(*_):
-    """Ctrl-C within a library whose cleaning up then fails, as that of OmegaConf may."""
-    try:
-        try:
-            raise KeyboardInterrupt
-        finally:
-            None._invalidate_flags_cache()  # type: ignore[attr-defined]
-    except AttributeError as error:
-        raise InputError(f"resume: config.yaml: {error}") from error
-
-
-@pytest.mark.parametrize("failure", [cut_short])
-@pytest.mark.parametrize("place", ["learning_env", "check_learning"])
-def test_ctrl_c_is_no_error_whatever_it_makes_fail(run, capsys, monkeypatch, failure, place):
-    monkeypatch.setattr(train, place, failure)
-    with pytest.raises(SystemExit) as stopped:
-        run(*TINY, folder="unused")
-    assert stopped.value.code == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
-    assert not Path("unused").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

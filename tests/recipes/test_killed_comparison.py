@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-
-from damian.runs.run_lock import is_locked
+from stopped_runs import is_locked
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import check_refused
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
@@ -19,15 +20,11 @@ from damian.recipes import train as train_recipe
 from damian.recipes.cli import settings as composed_config
 from damian.recipes.shared.runs import seed_generators, stored_config
 from damian.runs.training_state import load_networks
-from damian.settings import SourceConfig, TrainConfig
+from damian.settings import SourceConfig
 
 TINY = ["frames=256", "worlds=8", "learner.steps=16", "eval_episodes=4", "model.hidden=[16]"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12"]  # quick to rank and to evaluate
 SAC = ["learner=sac", "learner.updates=2", "learner.batch_size=32", "learner.warm_up=100"]
-both_learners = pytest.mark.parametrize(
-    "learner",
-    [pytest.param(["learner=mappo"], id="mappo"), pytest.param(SAC, id="sac", marks=pytest.mark.slow)],
-)
 GOLDEN = Path(__file__).parents[1] / "data"
 
 
@@ -46,11 +43,20 @@ def weights(folder: Path, *names: str) -> dict[str, Tensor]:
     return {f"{key}.{name}": w for key, net in networks.items() for name, w in net.state_dict().items()}
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """The folder of a trained run."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["damian train", *TINY, f"hydra.run.dir={folder}"])
+        train_recipe.run()
+    return folder
+
+
 @pytest.mark.sample(6)
 @pytest.mark.parametrize(
     "overrides",
     [
-        [],
         ["scenario=tracking", "motion=polynomial", "agents=2"],
         ["scenario=coverage", "actions=continuous", "region=random", "region.pool=2"],
         ["scenario=mixed", "logger=csv", "agents=1"],
@@ -78,25 +84,31 @@ def test_a_run_folder_holds_configuration_metrics_checkpoint_and_results(run, ca
     assert bool(events) == ("logger=csv" not in overrides)
 
 
-@both_learners
-def test_the_same_seed_gives_the_same_curve_and_another_one_another(run, learner):
-    one, same = run(*TINY, *learner, folder="one"), run(*TINY, *learner, folder="same")
-    other = run(*TINY, *learner, "seed=1", folder="other")
-    assert (one / "metrics.csv").read_text() == (same / "metrics.csv").read_text()
-    assert (one / "metrics.csv").read_text() != (other / "metrics.csv").read_text()
+def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, capsys):
+    same, other = run(*TINY, folder="same"), run(*TINY, "seed=1", folder="other")
+    before, record = (same / "metrics.csv").read_text(), json.loads((same / "run.json").read_text())
+    assert (trained / "metrics.csv").read_text() == before
+    assert (other / "metrics.csv").read_text() != before
+    check_refused(lambda: run(*TINY, "seed=2", folder="same"), "same holds a run already", capsys)
+    run(f"resume={same}", "frames=100", folder="second")
+    assert (same / "metrics.csv").read_text() == before, "nothing was left to train"
+    run(f"resume={same}", "frames=512", folder="second")
+    assert (same / "metrics.csv").read_text().startswith(before)
+    assert [row["frames"] for row in metrics(same)] == [128.0, 256.0, 384.0, 512.0]
+    assert not (same.parent / "second").exists()
+    resumed = json.loads((same / "run.json").read_text())
+    assert record["command"] == resumed["command"]
+    assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
+    assert resumed["resumed"][0]["command"] == f"damian train resume={same} frames=100 hydra.run.dir=second"
 
 
-@pytest.mark.slow
-def test_films_show_the_policy_while_it_learns_and_change_nothing(run):
-    filmed = run(*TINY, "episode.max_steps=3", "logger.film_every=1", folder="filmed")
-    plain = run(*TINY, "episode.max_steps=3", folder="plain")
-    assert (filmed / "metrics.csv").read_text() == (plain / "metrics.csv").read_text()
-    films = sorted((filmed / "films").iterdir())
-    assert [film.name for film in films] == ["000000128.gif", "000000256.gif"]
-    shown = EventAccumulator(str(filmed), {"images": 0}).Reload().Images("evaluation")
-    assert [image.step for image in shown] == [128, 256]
-    assert [image.encoded_image_string for image in shown] == [film.read_bytes() for film in films]
-    assert not (plain / "films").exists()
+def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run, trained):
+    still = run(f"checkpoint={trained}", "learner.lr=1e-9", "seed=1", folder="still")
+    kept, before = weights(still, "actor", "critic"), weights(trained, "actor", "critic")
+    assert {name.partition(".")[0] for name in kept} == {"actor", "critic"}
+    assert all(torch.allclose(kept[name], before[name], atol=1e-6) for name in kept)
+    assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # frames count from 0 again
+    assert OmegaConf.load(still / "config.yaml").model.hidden == [16]
 
 
 def test_tensorboard_shows_settings_and_distributions(run):
@@ -116,59 +128,12 @@ def test_tensorboard_shows_settings_and_distributions(run):
     assert named == {*events.Tags()["scalars"]}
 
 
-@both_learners
-def test_a_resumed_run_appends_to_its_own_metrics(run, learner):
-    folder = run(*TINY, *learner, folder="first")
-    before = (folder / "metrics.csv").read_text()
-    run(f"resume={folder}", "frames=512", folder="second")
-    assert (folder / "metrics.csv").read_text().startswith(before)
-    assert [row["frames"] for row in metrics(folder)] == [128.0, 256.0, 384.0, 512.0]
-    assert not (folder.parent / "second").exists()
-
-
-def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run):
-    first = run(*TINY, "agents=2", folder="first")
-    still = run(f"checkpoint={first}", "learner.lr=1e-9", "seed=1", folder="still")
-    fresh = run(*TINY, "agents=2", "learner.lr=1e-9", "seed=1", folder="fresh")
-    trained, kept, other = (weights(folder, "actor", "critic") for folder in (first, still, fresh))
-    assert {name.partition(".")[0] for name in trained} == {"actor", "critic"}
-    assert all(torch.allclose(kept[name], trained[name], atol=1e-6) for name in trained)
-    assert not all(torch.allclose(other[name], trained[name], atol=1e-3) for name in trained)
-    assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # frames count from 0 again
-    assert OmegaConf.load(still / "config.yaml").agents == 2
-
-
 def test_every_policy_is_evaluated_in_the_same_episodes(run):
     only_hold = ["battery=charging", "battery.capacity_kwh=1e-6", "actions.mask=false", "delay=paper"]
     folder = run(*TINY, *only_hold, "frames=128", "source.level_db=150")
     with (folder / "result.csv").open(newline="") as file:
         _, one, *others = [row[1:] for row in csv.reader(file)]
     assert others == [one] * 5
-
-
-@both_learners
-def test_resuming_a_finished_run_trains_no_further(run, capsys, learner):
-    folder = run(*TINY, *learner, folder="first")
-    before, record = (folder / "metrics.csv").read_text(), json.loads((folder / "run.json").read_text())
-    assert "nothing is left" not in capsys.readouterr().out
-    run(f"resume={folder}", "frames=100", folder="second")
-    printed = capsys.readouterr().out
-    assert "frames: 100 are asked for, and the run has 256 already: nothing is left to train\n" in printed
-    assert printed.endswith("learning curve: first/learning_curve.png\nresults: first\n")
-    assert (folder / "metrics.csv").read_text() == before
-    resumed = json.loads((folder / "run.json").read_text())
-    assert record["command"] == resumed["command"]
-    assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
-    assert resumed["resumed"][0]["command"] == f"damian train resume={folder} frames=100 hydra.run.dir=second"
-
-
-def test_a_folder_that_holds_a_run_is_not_overwritten(run, capsys):
-    folder = run(*TINY)
-    before = (folder / "metrics.csv").read_text()
-    with pytest.raises(SystemExit):
-        run(*TINY, "seed=1")
-    assert "holds a run already" in capsys.readouterr().err
-    assert (folder / "metrics.csv").read_text() == before
 
 
 def test_a_sweep_fills_one_folder_per_run(run, tmp_path):
@@ -201,15 +166,7 @@ def test_the_use_case_scenarios_have_the_settings_of_the_reference_data(run, cas
     assert {heading % 360 for heading in config.actions.headings} == headings
 
 
-def test_every_default_of_the_schema_survives_saving_and_loading(tmp_path):
-    OmegaConf.save(OmegaConf.structured(TrainConfig), tmp_path / "config.yaml")
-    loaded = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.load(tmp_path / "config.yaml"))
-    assert OmegaConf.to_object(loaded) == TrainConfig()
-
-
-@pytest.mark.parametrize(
-    "overrides", [[], ["delay.obs=2", "aware=belief"], SAC], ids=["mappo", "belief", "sac"]
-)
+@pytest.mark.parametrize("overrides", [["delay.obs=2", "aware=belief"], SAC], ids=["belief", "sac"])
 def test_the_untrained_actor_of_an_evaluation_is_that_of_the_training_before_its_first_update(
     overrides, tmp_path
 ):

@@ -7,14 +7,12 @@ from pathlib import Path
 import optuna
 import pytest
 from extensions import TINY
-from helpers import check_refused
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 from stopped_runs import killed_after
 
 from damian.common.errors import InputError, RunError
 from damian.recipes import tune
-from damian.recipes.known import CONF
 from damian.recipes.tune import read_space
 
 SPACE = ["search.learner.lr={low: 1e-4, high: 1e-2, log: true}", "search.model.hidden.choices=[[8],[8,8]]"]
@@ -44,12 +42,6 @@ def trials_in(folder):
     return optuna.load_study(study_name="damian", storage=storage).get_trials()
 
 
-def test_a_search_that_is_continued_draws_new_trials(search):
-    for trials in (1, 2, 3):
-        folder = search(f"trials={trials}")
-    assert len({trial.params["learner.lr"] for trial in trials_in(folder)}) == 3
-
-
 def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys):
     folder = search("trials=2")
     printed = capsys.readouterr().out
@@ -70,6 +62,7 @@ def test_a_search_stores_what_its_trainings_measure_and_continues(search, capsys
     assert figures <= {path.name for path in folder.iterdir()}
     written = (folder / "trial_0" / "metrics.csv").stat().st_mtime_ns
     assert [row["trial"] for row in rows(search("trials=3") / "trials.csv")] == ["0", "1", "2"]
+    assert len({trial.params["learner.lr"] for trial in trials_in(folder)}) == 3
     assert (folder / "trial_0" / "metrics.csv").stat().st_mtime_ns == written
 
 
@@ -130,11 +123,7 @@ def test_settings_that_are_refused_and_trainings_that_fail_are_told_and_the_sear
         ({}, "search: it is empty"),
         ({"learner": {"lrr": {"low": 1, "high": 2}}}, "learner.lr"),
         ({"learner": {"lr": {"low": 2, "high": 1}}}, r"search.learner.lr: `low <= high` must hold"),
-        ({"learner": {"lr": {"low": 0.0, "high": 1, "log": True}}}, "`low > 0` must hold"),
-        ({"learner": {"lr": {"low": 1, "high": 2, "choices": [1]}}}, "is neither"),
         ({"learner": {"lr": 3}}, "search.learner.lr: 3 is neither"),
-        ({"delay": {"history": {"low": 1, "high": 9, "step": -1}}}, "history: `step > 0` must hold"),
-        ({"learner": {"lr": {"low": 0.1, "high": 1, "log": "maybe"}}}, "lr.log: maybe is not true or false"),
     ],
 )
 def test_a_space_that_cannot_be_searched_is_refused(search, message):
@@ -156,34 +145,3 @@ def test_ranges_and_choices_are_those_of_optuna():
         "model.hidden": CategoricalDistribution(["[8]", "[8,8]"]),
         "delay.history": IntDistribution(1, 9, step=2),
     }
-
-
-def test_every_learner_has_a_space(capsys):
-    names = {path.stem for path in Path(CONF, "learner").glob("*.yaml")}
-    assert {path.stem for path in Path(CONF, "search").glob("*.yaml")} == names
-
-
-@pytest.mark.sample(2)
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["resume=x"], "resume: x is not for a search"),
-        (["trials=0"], "trials: 0"),
-        (["checkpoint=first"], "checkpoint: first is not for a search, which trains every policy from"),
-        (
-            ["score=perceived_success_rate", "scenario=coverage"],
-            "score: perceived_success_rate is the same for every policy",
-        ),
-        (["policy=greedy"], "policy: greedy is not one of sampled, deterministic"),
-        (["+search.learner.lrr.low=1", "+search.learner.lrr.high=2"], "search: "),
-        (["-m", "seed=0,1"], "-m: "),
-    ],
-)
-def test_what_a_user_can_get_wrong_is_refused_in_one_line(search, words, message, capsys):
-    check_refused(lambda: search(*words), message, capsys)
-
-
-def test_a_storage_that_is_damaged_is_refused_in_one_line(search, tmp_path, capsys):
-    (tmp_path / "found").mkdir()
-    (tmp_path / "found" / "search.db").write_bytes(b"SQLite format 3\0 and then nonsense" * 100)
-    check_refused(lambda: search("trials=1"), "search.db: it does not hold a search", capsys)
