@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | test-browser | bench | bench-quick | bench-advise | bench-collectors | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | test-browser | bench | bench-quick | bench-advise | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -7,7 +7,7 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-order test-deep test-slow test-browser bench bench-quick bench-advise bench-collectors benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow test-browser bench bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
@@ -41,10 +41,6 @@ bench: $(VENV)/bench
 # The service of damian advise over loopback.
 bench-advise: $(VENV)/test
 	$(PY) examples/benchmarks/bench_advise.py $(ARGS)
-
-# The collectors of docs/scaling.md, in turns.
-bench-collectors: $(VENV)/slow
-	$(PY) examples/benchmarks/bench_collectors.py $(ARGS)
 
 bench-quick: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py --quick

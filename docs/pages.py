@@ -31,7 +31,9 @@ PACKAGES = (
     "learners",
     "server",
     "world",
-    "evaluation",
+    "runs",
+    "compare",
+    "show",
     "interop",
     "advice",
 )
@@ -84,8 +86,7 @@ def commands() -> str:
     hint = "Settings are overrides of [Hydra](https://hydra.cc); `damian PROGRAM --help KEY` explains one."
     parts = ["# Commands", hint]
     for name, what in PROGRAMS.items():
-        own = docstring(ROOT / "recipes" / f"{name.replace('-', '_')}.py")
-        text = help_text(name, SETTINGS[name]) if name in SETTINGS else own
+        text = help_text(name, SETTINGS[name])
         parts += [f"## damian {name}", f"{what[0].upper()}{what[1:]}.", f"```text\n{text}\n```"]
     return "\n\n".join(parts)
 

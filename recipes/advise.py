@@ -19,7 +19,6 @@ import os
 import secrets
 import socket
 import time
-from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from functools import cache
 from importlib import import_module
@@ -79,22 +78,12 @@ def make_session(config: AdviseConfig, folder: Path | None, is_locked: bool = Fa
 
 
 def make_policy(config: AdviseConfig, node: Node) -> TensorDictModuleBase:
-    """The policy that flies.
-
-    Raises:
-        InputError: the checkpoint cannot be loaded, or the script does not suit the environment.
-    """
-    if not config.learnt:
-        return greedy_policy(node.env)
-    return stored_actor(config, node.env)
+    """The policy that flies."""
+    return stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
 
 
 def answer_table(config: AdviseConfig, folder: Path) -> None:
-    """Answer one table of reports: print the advice, and write it into the run folder.
-
-    Raises:
-        InputError: the table is wrong, or does not have every UAV; or the settings are.
-    """
+    """Answer one table of reports: print the advice, and write it into the run folder."""
     path = Path(str(config.reports))
     now = time.time()
     with named(path):
@@ -122,12 +111,6 @@ def fit_delays(config: AdviseConfig, folder: Path) -> None:
     print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
 
 
-def note(config: AdviseConfig) -> None:
-    """Say where the service knows less than the policy did in its training."""
-    if config.observation.own and config.learnt:
-        print("note: the policy knew a UAV's own messages at once; the service knows them when they arrive")
-
-
 def advise(config: AdviseConfig, folder: Path) -> None:
     """Answer reports from where the settings say."""
     config.check_source()
@@ -135,36 +118,31 @@ def advise(config: AdviseConfig, folder: Path) -> None:
         fit_delays(config, folder)
         return
     scenario_of_service(config.eval_scenario)
-    note(config)
+    if config.observation.own and config.learnt:
+        print("note: the policy knew a UAV's own messages at once; the service knows them when they arrive")
     if config.reports is not None:
         answer_table(config, folder)
         return
-    save_config(without_token(config), folder)
     journals = Path(config.journal) if config.journal else folder / "journals"
     inbox = None if config.folder is None else Path(config.folder)
     if inbox is not None and not inbox.is_dir():
         raise InputError(f"folder: {inbox} is not there")
-    if inbox is not None and is_same(inbox, journals):
+    if inbox is not None and inbox.resolve() == journals.resolve():
         raise InputError(f"journal: {journals} is the folder of the tables too: name another one")
-    alone = nullcontext() if inbox is None or is_same(inbox, folder) else locked(inbox, "folder")
-    with alone, closing(make_session(config, journals, is_same(journals, folder))) as session:
+    alone = nullcontext() if inbox is None else locked(inbox, "folder")
+    in_run_folder = journals.resolve() == folder.resolve()
+    with alone, closing(make_session(config, journals, in_run_folder)) as session:
+        if inbox is not None:
+            session.create(FLEET, config.uavs)
+        save_config(without_token(config), folder)
         if inbox is None:
             serve(config, session)
         else:
-            watch(inbox, session, config.uavs)
-
-
-def is_same(one: Path, other: Path) -> bool:
-    """Do two paths name the same folder?"""
-    return os.path.realpath(one) == os.path.realpath(other)
+            watch(inbox, session)
 
 
 def serve(config: AdviseConfig, session: AdviceSession) -> None:
-    """Answer over HTTP until the program is stopped.
-
-    Raises:
-        InputError: the server library is not installed, or the address cannot be used.
-    """
+    """Answer over HTTP until the program is stopped."""
     try:
         uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
     except ImportError as error:
@@ -191,28 +169,17 @@ def serve(config: AdviseConfig, session: AdviceSession) -> None:
 
 
 def listening(config: AdviseConfig) -> socket.socket:
-    """A socket that listens to the address of the settings.
-
-    Raises:
-        InputError: the address cannot be used.
-    """
+    """A socket that listens to the address of the settings."""
     try:
         listener = socket.create_server((config.host, config.port or 0), backlog=1024)
-    except (OSError, UnicodeError) as error:
-        problem = getattr(error, "strerror", None) or "it is no address"
-        raise InputError(f"port: {config.host}:{config.port} cannot be used: {problem}") from None
+    except OSError as error:
+        raise InputError(f"port: {config.host}:{config.port} cannot be used: {error.strerror}") from None
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # or an answer in two parts takes 40 ms
     return listener
 
 
-def watch(inbox: Path, session: AdviceSession, uavs: Sequence[str]) -> None:
-    """Answer every table that comes into a folder, until the program is stopped.
-
-    Raises:
-        InputError: no UAVs are given.
-        RunError: the folder is not there any more, or cannot be written.
-    """
-    session.create(FLEET, uavs)
+def watch(inbox: Path, session: AdviceSession) -> None:
+    """Answer every table that comes into a folder, until the program is stopped."""
     print(f"watching {inbox}", flush=True)
     while True:
         if not read_inbox(session, FLEET, inbox, time.time()):

@@ -99,7 +99,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     Args:
         config: settings of the comparison.
         folder: folder of the arm.
-        trained_in: the task itself, or that in which the policies were trained that fly in a held-out one.
+        trained_in: the task, or that in which the policies were trained that fly in a held-out one.
         overrides: of the task and the delay.
     """
     task, delay, name = folder.parts[-3:]
@@ -185,8 +185,7 @@ def compare(config: CompareConfig, folder: Path) -> None:
     """Carry out the runs of a comparison that are not finished, and report on them."""
     failed: list[Run] = []
     if config.report_only and _stores_results(config, folder):
-        results, missing = stored_results(folder), []
-        results = results.only(partial(includes, config))
+        results, missing = stored_results(folder, partial(includes, config)), []
     else:
         if config.report_only and config.seeds is None:
             config = replace(config, seeds=_seeds_of_runs(config, folder))

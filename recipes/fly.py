@@ -29,7 +29,6 @@ from tqdm import tqdm
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common import checks
-from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
@@ -38,7 +37,7 @@ from damian.settings import TrainConfig
 from damian.settings.programs import FILMS, FlyConfig
 from damian.show.belief_figure import plot_beliefs
 from damian.show.episode import Episode, record
-from damian.show.film import check_gif, save_film
+from damian.show.film import save_film
 from damian.show.geojson import origin_of, save_geojson
 from damian.show.replay_page import save_page
 
@@ -62,11 +61,7 @@ def fly(config: FlyConfig) -> list[Episode]:
 
 
 def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
-    """The settings by which the fleet of the journal was advised, unless others are given now.
-
-    Raises:
-        InputError: it is no journal.
-    """
+    """The settings by which the fleet of the journal was advised, unless others are given now."""
     from damian.advice.journal import read_head  # noqa: PLC0415 (needs pydantic, which only advice does)
 
     from .advise import AdviseConfig  # noqa: PLC0415
@@ -83,11 +78,7 @@ def with_settings_of_journal(config: FlyConfig) -> FlyConfig:
 
 
 def episode_of_journal(config: FlyConfig) -> Episode:
-    """The flight that the journal tells.
-
-    Raises:
-        InputError: the journal is damaged, its fleet never began, or nothing of it lies in the span.
-    """
+    """The flight that the journal tells."""
     from damian.advice.fleet import Fleet  # noqa: PLC0415 (needs pydantic, which only advice does)
     from damian.advice.journal import read_head  # noqa: PLC0415
     from damian.advice.node import Node, for_uavs  # noqa: PLC0415
@@ -104,11 +95,7 @@ def episode_of_journal(config: FlyConfig) -> Episode:
 
 
 def make_policy(config: FlyConfig, env: DelayedEnv) -> TensorDictModuleBase:
-    """The policy that flies.
-
-    Raises:
-        InputError: the checkpoint cannot be loaded, or the script does not suit the environment.
-    """
+    """The policy that flies."""
     if not config.learnt:
         return greedy_policy(env) if config.flown == "script" else random_policy(env)
     actor = stored_actor(config, env)
@@ -126,18 +113,12 @@ def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:
 
 
 def show(config: FlyConfig, folder: Path) -> None:
-    """Fly episodes and fill the run folder.
-
-    Raises:
-        InputError: GeoJSON is asked for, and the region has no place on Earth; or an episode is too long for
-            a GIF.
-    """
+    """Fly episodes and fill the run folder."""
     episodes = kept(fly(config), config.keep)
     if "geojson" in config.formats:
-        origin_of(next(iter(episodes.values())))
-    if "gif" in config.formats:
-        check_gif(max(episodes.values(), key=lambda episode: episode.n_steps))
+        origin_of(next(iter(episodes.values())))  # refuses a region without a place on Earth
     save_config(config, folder)
+    films = [kind for kind in config.formats if kind in FILMS]
     for name, episode in tqdm(episodes.items(), unit=" episodes"):
         episode.save(folder / f"{name}.json")
         if "png" in config.formats:
@@ -146,25 +127,10 @@ def show(config: FlyConfig, folder: Path) -> None:
             save_page([episode], folder / f"{name}.html")
         if "geojson" in config.formats:
             save_geojson(episode, folder / f"{name}.geojson")
-        for kind, view in product([kind for kind in config.formats if kind in FILMS], config.views):
+        for kind, view in product(films, config.views):
             save_film(episode, folder / f"{name}{'_3d' * (view == '3d')}.{kind}", view)
     for name, episode in episodes.items():
         print(summary(name, episode))
-
-
-def replay(config: FlyConfig, folder: Path) -> None:
-    """Make a page that plays stored episodes side by side, in any browser and without a network.
-
-    Raises:
-        InputError: a file is no episode, or has what a page cannot show.
-    """
-    episodes = [Episode.load(Path(file)) for file in config.replay]
-    page = folder / "replay.html"
-    try:
-        save_page(episodes, page)
-    except ValueError as error:  # a number that JSON cannot hold
-        raise InputError(f"replay: {error}") from error
-    print(f"page: {page} ({page.stat().st_size / 1e6:.2g} MB)")
 
 
 def summary(name: str, episode: Episode) -> str:
@@ -179,17 +145,15 @@ def summary(name: str, episode: Episode) -> str:
 
 
 def fly_or_show(config: FlyConfig, folder: Path) -> None:
-    """Replay or fly episodes, or take the flight of a journal with the settings by which it was advised.
-
-    Raises:
-        InputError: a film needs a program that is not there, or the journal is none.
-    """
+    """Replay or fly episodes, or take the flight of a journal with the settings by which it was advised."""
     films = "mp4" not in config.formats or FFMpegWriter.isAvailable()
     checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
     if config.replay:
-        replay(config, folder)
-        return
-    show(config if config.journal is None else with_settings_of_journal(config), folder)
+        page = folder / "replay.html"
+        save_page([Episode.load(Path(file)) for file in config.replay], page)
+        print(f"page: {page} ({page.stat().st_size / 1e6:.2g} MB)")
+    else:
+        show(config if config.journal is None else with_settings_of_journal(config), folder)
 
 
 def run() -> None:

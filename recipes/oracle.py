@@ -59,27 +59,20 @@ def fly(config: TrainConfig, folder: Path) -> None:
 
 
 def check(config: TrainConfig) -> None:
-    """Check that the rows can differ.
-
-    Raises:
-        InputError: no message is late, or the rows would not follow from what the server broadcasts.
-    """
+    """Check that the rows can differ, and that they follow from what the server broadcasts."""
     if not has_message_delay(config):
         raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
     should = "is not supported: the rows compare what the server can know; choose links=server"
     checks.require(config.links.kind == "server", "links", config.links.kind, should)
-    if not config.checkpoint:
-        if not config.seeks_source:
-            raise InputError(
-                "reward: nothing is won by finding the source, which is all that the script does"
-            )
-        return
-    should = "is not supported: the rows replace what the server broadcasts at every step; leave it out"
-    checks.require(config.clock.steps("server") == 1, "clock.server", config.clock.server, should)
-    should = "is not supported: what a UAV believes follows from more messages than the latest ones"
-    belief, messages = config.observation.belief, config.delay.messages
-    checks.require(not belief, "observation.belief", belief, should)
-    checks.require(not messages, "delay.messages", messages, should)
+    if not config.checkpoint and not config.seeks_source:
+        raise InputError("reward: nothing is won by finding the source, which is all that the script does")
+    if config.checkpoint:
+        should = "is not supported: the rows replace what the server broadcasts at every step; leave it out"
+        checks.require(config.clock.steps("server") == 1, "clock.server", config.clock.server, should)
+        should = "is not supported: what a UAV believes follows from more messages than the latest ones"
+        belief, messages = config.observation.belief, config.delay.messages
+        checks.require(not belief, "observation.belief", belief, should)
+        checks.require(not messages, "delay.messages", messages, should)
 
 
 # A stored policy.

@@ -54,25 +54,19 @@ try:
         FloatDistribution,
         IntDistribution,
     )
-    from optuna.trial import FrozenTrial, Trial, TrialState
+    from optuna.trial import Trial, TrialState
     from optuna.visualization import matplotlib as figures
-    from sqlalchemy.exc import SQLAlchemyError
 except ImportError as error:
     raise InputError("damian tune: optuna is not installed; pip install optuna") from error
 
 NAME = "damian"
 """Of the search in Optuna's storage."""
-STORAGE, TRIALS, TABLE = "search.db", "trials.csv", "table.md"
 FOLDER, CHOSEN, OVERRIDES = "folder", "chosen", "overrides"
 """What is stored with a trial: its folder, and the settings that it varies; with a search: its overrides."""
 SHOWN = 10
 """Trials in the table."""
-WORDS = ({"choices"}, {"low", "high"}, {"low", "high", "log"}, {"low", "high", "step"})
-"""Words with which the values of a setting can be written."""
 WARM_UP = 5
 """Trials before one may be pruned."""
-
-
 OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields(TrainConfig)}
 """Settings that a training does not have."""
 
@@ -95,34 +89,24 @@ def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, BaseDistr
         checks.require(isinstance(written, Mapping), f"search.{key}", written, should)
         if not {*written} & {"low", "high", "choices"}:
             space |= read_space(written, f"{key}.")
-            continue
-        if key not in known_settings("train"):
+        elif key not in known_settings("train"):
             raise InputError(f"search: {no_such_key(key, 'train')}")
-        checks.require({*written} in WORDS, f"search.{key}", written, should)
-        space[key] = _distribution(key, **written)
+        else:
+            try:
+                space[key] = _distribution(**written)
+            except (TypeError, ValueError) as error:
+                raise InputError(f"search.{key}: {written} {should}: {cli.reason(error)}") from error
     if not space and not path:
         raise InputError("search: it is empty: name a setting, such as search.learner.lr")
     return space
 
 
-def _distribution(key: str, choices: Any = (), log: Any = False, **values: Any) -> BaseDistribution:
+def _distribution(choices: Any = None, **values: Any) -> BaseDistribution:
     """The values of a setting, for Optuna; choices are as they are written on a command line."""
+    if choices is not None and not values:
+        return CategoricalDistribution([json.dumps(each, separators=(",", ":")) for each in choices])
     whole = all(isinstance(value, int) for value in values.values())
-    checks.require(isinstance(log, bool), f"search.{key}.log", log, "is not true or false")
-    try:
-        if not values:
-            checks.require(
-                isinstance(choices, list), f"search.{key}.choices", choices, "is no list of values"
-            )
-            return CategoricalDistribution([json.dumps(each, separators=(",", ":")) for each in choices])
-        return (IntDistribution if whole else FloatDistribution)(log=log, **values)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"search.{key}: {cli.reason(error)}") from error
-
-
-def _word(value: Any) -> str:
-    """A value of a trial, as it is written on a command line."""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return (IntDistribution if whole else FloatDistribution)(**values)
 
 
 class Search:
@@ -140,36 +124,26 @@ class Search:
     def __init__(self, config: TuneConfig, overrides: list[str], folder: Path) -> None:
         self.config, self.overrides, self.folder = config, overrides, folder
         self.space = read_space(config.search)
-        self.storage = f"sqlite:///{(folder / STORAGE).resolve()}"  # Optuna opens it anew in each process
+        self.storage = f"sqlite:///{(folder / 'search.db').resolve()}"  # opened anew in each process
         median = optuna.pruners.MedianPruner(WARM_UP, n_warmup_steps=config.frames // 4)
         self.pruner = median if config.prune else optuna.pruners.NopPruner()
-        direction = "maximize" if config.sign > 0 else "minimize"
-        try:
-            self.study = optuna.create_study(
-                study_name=NAME,
-                storage=self.storage,
-                pruner=self.pruner,
-                direction=direction,
-                load_if_exists=True,
-            )
-        except (SQLAlchemyError, RuntimeError) as error:
-            problem = (
-                f"it does not hold a search ({type(error).__name__}); delete it, or choose another folder"
-            )
-            raise InputError(f"{folder / STORAGE}: {problem}") from error
+        self.study = optuna.create_study(
+            study_name=NAME,
+            storage=self.storage,
+            pruner=self.pruner,
+            direction="maximize" if config.sign > 0 else "minimize",
+            load_if_exists=True,
+        )
         # A sampler with the same seed would draw the trials again that the study has already.
         self.study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(self.study.trials))
         stored, asked = self.study.user_attrs.get(OVERRIDES), [*overrides, f"search={config.search}"]
         should = f"is not {stored}, with which {folder} was begun; choose another folder with hydra.run.dir"
         checks.require(stored in (None, asked), OVERRIDES, asked, should)
         self.study.set_user_attr(OVERRIDES, asked)
-        self.trials: dict[Path, Trial] = {}
-
-    def continue_interrupted(self) -> None:
-        """Ask for the trials again that were being trained when the search was stopped."""
-        for trial in self.study.get_trials(states=(TrialState.RUNNING,)):
+        for trial in self.study.get_trials(states=(TrialState.RUNNING,)):  # when the search was stopped
             self.study.tell(trial.number, state=TrialState.FAIL)
             self.study.enqueue_trial(trial.params, {FOLDER: trial.user_attrs.get(FOLDER)})
+        self.trials: dict[Path, Trial] = {}
 
     @property
     def n_finished(self) -> int:
@@ -182,45 +156,33 @@ class Search:
             trial = self.study.ask(self.space)
             folder = trial.user_attrs.get(FOLDER) or f"trial_{trial.number}"
             trial.set_user_attr(FOLDER, folder)
-            chosen = {key: _word(trial.params[key]) for key in self.space}
+            written = {key: trial.params[key] for key in self.space}
+            chosen = {k: f"{x:.6g}" if isinstance(x, float) else str(x) for k, x in written.items()}
             trial.set_user_attr(CHOSEN, chosen)
+            words = ["logger=csv", "threads=1", *self.words(chosen)]
             try:
-                run = self.run(folder, self.words(chosen), trial.number)
+                config = cli.settings(*words)
             except InputError as error:
-                print(f"failed: {error}", file=sys.stderr)
+                print(f"failed: {folder}: {error}", file=sys.stderr)
                 self.study.tell(trial, state=TrialState.FAIL)
                 continue
+            config.overrides = words
+            options = {"storage": self.storage, "number": trial.number, "pruner": self.pruner}
+            program = functools.partial(train_watched, **options)
+            run = Run("tune", "", "", config, self.folder / folder, program)
             self.trials[run.folder] = trial
             yield run
 
-    def words(self, chosen: dict[str, str]) -> list[str]:
+    def words(self, chosen: Mapping[str, str]) -> list[str]:
         """The overrides of a trial that has chosen these settings."""
-        others = [word for word in self.overrides if word.partition("=")[0].lstrip("+") not in chosen]
+        others = [word for word in self.overrides if key_of(word) not in chosen]
         return [*others, *(f"{key}={value}" for key, value in chosen.items())]
 
-    def run(self, name: str, overrides: list[str], number: int) -> Run:
-        """The training of the trial with a number."""
-        words = ["logger=csv", "threads=1", *overrides]
-        try:
-            config = cli.settings(*words)
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
-        config.overrides = words
-        program = functools.partial(train_watched, storage=self.storage, number=number, pruner=self.pruner)
-        return Run("tune", "", "", config, self.folder / name, program)
-
     def tell(self, run: Run, error: BaseException | None) -> float | None:
-        """Store the end of a trial.
-
-        Returns:
-            its value; None if it was pruned, or failed.
-        """
+        """Store the end of a trial; returns its value, or None if it was pruned or failed."""
         trial = self.trials.pop(run.folder)
-        if error is not None:
-            self.study.tell(trial, state=TrialState.FAIL)
-            return None
-        if not run.finished:
-            self.study.tell(trial, state=TrialState.PRUNED)
+        if error is not None or not run.finished:
+            self.study.tell(trial, state=TrialState.PRUNED if error is None else TrialState.FAIL)
             return None
         value = run.score(POLICIES[self.config.policy], self.config.score)
         self.study.tell(trial, value)
@@ -245,7 +207,7 @@ def train_watched(
     watched, sign = Trial(study, trial), 1 if study.direction == optuna.study.StudyDirection.MAXIMIZE else -1
 
     def watch(frames: int, numbers: dict[str, float]) -> None:
-        value = numbers.get("perceived_return", math.nan)
+        value = numbers["perceived_return"]
         if not math.isnan(value):
             watched.report(sign * value, frames)  # a return, whatever the score
             if watched.should_prune():
@@ -260,14 +222,11 @@ def train_watched(
 def search(config: TuneConfig, overrides: list[str], folder: Path) -> None:
     """Carry out the trials that are missing, and report on all of them."""
     found = Search(config, overrides, folder)
-    found.continue_interrupted()
-    done, best, sign = found.n_finished, math.nan, config.sign
+    done = found.n_finished
     with tqdm(total=config.trials, initial=done, unit=" trials", disable=done >= config.trials) as bar:
         for run, error in perform_each(found.runs(), config.processes):
             value = found.tell(run, error)
-            if value is not None and not sign * best >= sign * value:  # the first best is nan
-                best = value
-            bar.set_postfix({config.score: "-" if value is None else f"{value:.3g}", "best": f"{best:.3g}"})
+            bar.set_postfix({config.score: "-" if value is None else f"{value:.3g}"})
             bar.update()
             if error is not None:
                 print(f"failed: {run.folder}: {cli.reason(error)}", file=sys.stderr)
@@ -285,27 +244,26 @@ def report(found: Search) -> None:
     if not complete:
         raise RunError(f"no trial of {found.folder} has a value: see the log.txt of each")
     complete.sort(key=lambda trial: -found.config.sign * (trial.value or 0.0))
+
+    def row(trial: optuna.trial.FrozenTrial) -> list[str]:
+        value = "" if trial.state != TrialState.COMPLETE else f"{trial.value:.4g}"
+        return [str(trial.number), trial.state.name.lower(), value, *trial.user_attrs[CHOSEN].values()]
+
     head = ["trial", "state", found.config.score, *found.space]
-    write_atomically(found.folder / TRIALS, csv_table([head, *(row(trial) for trial in trials)]))
+    write_atomically(found.folder / "trials.csv", csv_table([head, *map(row, trials)]))
+    n_pruned = sum(trial.state == TrialState.PRUNED for trial in trials)
     lines = [
         f"`{cli.command()}`",
-        f"{len(trials)} trials: {len(complete)} with a value, "
-        f"{sum(trial.state == TrialState.PRUNED for trial in trials)} pruned, "
-        f"{sum(trial.state == TrialState.FAIL for trial in trials)} failed or interrupted. All have the seed "
+        f"{len(trials)} trials: {len(complete)} with a value, {n_pruned} pruned, "
+        f"{len(trials) - len(complete) - n_pruned} failed or interrupted. All have the seed "
         f"{found.config.seed}, and the value of the best is flattered by having been chosen.",
         markdown_table(head, [row(trial) for trial in complete[:SHOWN]]),
         f"The best: `damian train {shlex.join(found.words(complete[0].user_attrs[CHOSEN]))}`",
     ]
     text = "\n\n".join(lines) + "\n"
-    write_atomically(found.folder / TABLE, text)
+    write_atomically(found.folder / "table.md", text)
     plot(found)
     print(text)
-
-
-def row(trial: FrozenTrial) -> list[str]:
-    """A trial in the tables."""
-    value = "" if trial.state != TrialState.COMPLETE else f"{trial.value:.4g}"
-    return [str(trial.number), trial.state.name.lower(), value, *trial.user_attrs[CHOSEN].values()]
 
 
 def plot(found: Search) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from damian.common.atomic_files import write_atomically
 from damian.common.csv_table import csv_table
 from damian.common.errors import InputError
-from damian.compare.comparison import MEASURES, OF_ARM, Arm, Row, regime
+from damian.compare.comparison import OF_ARM, Arm, Row, regime
 from damian.compare.figures import LABELS
 from damian.runs.metrics_log import read_metrics
 from damian.runs.run_record import read_record
@@ -52,10 +52,6 @@ class Results:
         write_csv(folder / ROWS, self.rows)
         write_csv(folder / CURVES, self.points)
 
-    def only(self, included: Callable[[Row], bool]) -> "Results":
-        """The results of some runs: ``included`` says whether a row belongs to them."""
-        return Results([*filter(included, self.rows)], [*filter(included, self.points)])
-
 
 def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
     """The results of finished runs."""
@@ -77,11 +73,9 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
     return Results(rows, points)
 
 
-def stored_results(folder: Path) -> Results:
-    """Read the results that a folder stores."""
-    labels = ("task", "delay", "arm", "seed", "episodes")
-    rows = _read(folder / ROWS, [*labels, "regime", "policy", "frames", "seconds", *MEASURES])
-    return Results(rows, _read(folder / CURVES, [*labels, *LABELS]))
+def stored_results(folder: Path, included: Callable[[Row], bool]) -> Results:
+    """Read the results that a folder stores; ``included`` says which rows."""
+    return Results(*([*filter(included, _read(folder / name))] for name in (ROWS, CURVES)))
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -90,14 +84,11 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     write_atomically(path, csv_table([names, *([row[name] for name in names] for row in rows)]))
 
 
-def _read(path: Path, columns: Sequence[str]) -> Sequence[Row]:
+def _read(path: Path) -> list[Row]:
     try:
         with path.open(newline="") as file:
-            rows = [{name: _value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
-        if missing := [name for name in columns if rows and name not in rows[0]]:
-            raise ValueError(f"no column {missing[0]}")
-        return rows
-    except (OSError, TypeError, ValueError) as error:
+            return [{name: _value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
+    except (TypeError, ValueError) as error:
         raise InputError(f"{path}: it does not hold the results of a comparison ({reason(error)})") from error
 
 

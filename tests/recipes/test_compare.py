@@ -142,9 +142,8 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     assert {line["arm"] for line in table(kept / "table.csv")} == {"undelayed", "random", "script"}
     late, problem = ["experiment.first_seed=9", *stored], "experiment: no run of it is finished in"
     check_refused(lambda: compare(*words, *late), problem, capsys)
-    for text, problem in ("seed\nx\n", "it does not hold"), ("seed\n8\n", "(no column task)"):
-        (kept / "results.csv").write_text(text)
-        check_refused(lambda: compare(*words[:1], *stored), problem, capsys)
+    (kept / "results.csv").write_text("seed\nx\n")
+    check_refused(lambda: compare(*words[:1], *stored), "it does not hold the results", capsys)
 
 
 @pytest.mark.sample(2)

@@ -52,15 +52,8 @@ def printed_line(capsys) -> str:
     return line
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["delay=none", "agents=1"],
-        pytest.param([*BADLY, "scenario=tracking", "agents=8"], marks=pytest.mark.slow),
-    ],
-)
-def test_a_run_folder_holds_configuration_episode_film_and_figure(run, capsys, overrides):
-    folder = run(*overrides, "episode.max_steps=4", "formats=[gif,png,html,geojson]", "views=[2d,3d]")
+def test_a_run_folder_holds_configuration_episode_film_and_figure(run, capsys):
+    folder = run(*BADLY, "agents=2", "episode.max_steps=4", "formats=[gif,png,html,geojson]", "views=[2d,3d]")
     files = {"config.yaml", "run.json", "episode_0.json", "episode_0.geojson"}
     files |= {"episode_0.gif", "episode_0_3d.gif", "episode_0.png", "episode_0.html"}
     assert {path.name for path in folder.iterdir()} == files
@@ -123,33 +116,25 @@ def test_the_extremes_are_the_worst_the_median_and_the_best_episode(flown):
     assert list(kept(episodes, "all")) == [f"episode_{number}" for number in range(5)]
 
 
-@pytest.mark.sample(4)
-@pytest.mark.parametrize("motion", [[], FLYING])
-@pytest.mark.parametrize("order", ["generation", "arrival"])
-def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(flown, motion, order):
-    episode = flown(*BADLY, *motion, f"delay.order={order}")
+def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(flown, capsys):
+    """A lost message is never believed."""
+    episode = flown(*BADLY, *FLYING)
     step, uav = np.indices(episode.age.shape)
     generated = step - episode.age.astype(int)
     assert episode.age.max() > 3
     assert (episode.believed == episode.true[generated, uav]).all()
-
-
-def test_a_lost_message_is_never_believed(flown, capsys):
-    episode = flown(*BADLY)
-    generated = (episode.time[:, None] - episode.age).astype(int)
     believed = {(step, uav) for row in generated.tolist() for uav, step in enumerate(row)}
     lost = set(zip(*map(np.ndarray.tolist, np.nonzero(episode.lost)), strict=True))
     assert lost
     assert not lost & believed
-    assert f"lost {len(lost) / episode.lost[1:].size:.1%}" in printed_line(capsys)
+    assert f"lost {len(lost) / episode.sent.sum():.1%}" in printed_line(capsys)
 
 
-@pytest.mark.parametrize("motion", [[], FLYING])
-def test_if_every_message_is_lost_none_arrives_and_only_sent_messages_count_as_lost(flown, capsys, motion):
-    episode = flown("delay.obs=0", "delay.loss=1", *motion)
+def test_if_every_message_is_lost_none_arrives_and_only_sent_messages_count_as_lost(flown, capsys):
+    episode = flown("delay.obs=0", "delay.loss=1", *FLYING)
     assert episode.arrived.tolist() == [[True] * 3] + [[False] * 3] * 60
     assert episode.lost.any()
-    assert episode.lost[1:].all() == (motion == [])
+    assert not episode.lost[1:].all()
     assert (episode.age == episode.time[:, None]).all()
     assert "mean age 30.50 s, messages late 0.0%, lost 100.0%" in printed_line(capsys)
 
@@ -158,9 +143,6 @@ def test_if_every_message_is_lost_none_arrives_and_only_sent_messages_count_as_l
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["delay.los=0.1"], "delay.los: no such key; did you mean delay.loss?"),
-        (["resume=runs/last"], "resume: nothing is trained; give the run folder as checkpoint"),
-        (["policy=best"], "policy: best is not one of sampled, deterministic, script, random"),
         (["policy=deterministic"], "policy: deterministic needs checkpoint"),
         (
             ["views=[]", "formats=[gif]"],
@@ -182,18 +164,12 @@ def ring(lon: float, lat: float, *corners: tuple[float, float]) -> list[list[flo
 
 SQUARE = ((0.0, 0.0), (0.006, 0.0), (0.006, 0.004), (0.0, 0.004))
 SHAPES = {
-    "concave": [
-        [ring(11.0, 48.0, (0, 0), (0.006, 0), (0.006, 0.002), (0.002, 0.002), (0.002, 0.005), (0, 0.005))]
-    ],
     "hole": [[ring(139.7, 35.6, *SQUARE), ring(139.702, 35.601, *((x / 4, y / 4) for x, y in SQUARE))]],
-    "islands": [[ring(-70.9, -53.2, *SQUARE)], [ring(-70.892, -53.2, *SQUARE)]],
     "date line": [[ring(179.997, -16.8, *SQUARE)]],
 }
 
 
-@pytest.mark.parametrize(
-    "kind", ["hole", *(pytest.param(kind, marks=pytest.mark.slow) for kind in SHAPES if kind != "hole")]
-)
+@pytest.mark.parametrize("kind", [pytest.param("hole"), pytest.param("date line", marks=pytest.mark.slow)])
 def test_a_real_region_of_any_shape_goes_from_file_to_film(run, tmp_path, kind):
     geometry = {"type": "MultiPolygon", "coordinates": SHAPES[kind]}
     park = {"type": "Feature", "properties": {"name": "park"}, "geometry": geometry}
@@ -248,18 +224,8 @@ def test_a_page_has_the_episodes_in_the_order_of_their_files(replay, capsys):
     assert len(text) < len(page([flight()])) + 10_000
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        ({"about": {"seed": float("inf")}}, "not JSON compliant"),
-        ({"reward_terms": {"spotted": {}}}, "late.json: "),
-        ({"time": "soon"}, "late.json: "),
-    ],
-)
-def test_a_damaged_episode_is_refused_in_one_line_and_leaves_no_page(
-    replay, tmp_path, capsys, damage, message
-):
+def test_a_damaged_episode_is_refused_in_one_line_and_leaves_no_page(replay, tmp_path, capsys):
     held = json.loads((tmp_path / "late.json").read_text())
-    (tmp_path / "late.json").write_text(json.dumps({**held, **damage}))
-    check_refused(lambda: replay("replay=[late.json]"), message, capsys)
+    (tmp_path / "late.json").write_text(json.dumps({**held, "time": "soon"}))
+    check_refused(lambda: replay("replay=[late.json]"), "late.json: ", capsys)
     assert not (tmp_path / "page").exists()

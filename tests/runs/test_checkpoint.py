@@ -1,7 +1,6 @@
 """Checkpoint files: whole or not there, refused in one line if they are damaged, and never executed."""
 
 import os
-from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,7 @@ from torch import nn
 from torchrl.collectors import Collector
 
 from damian.baselines.random import random_policy
-from damian.common.atomic_files import remove_unfinished, write_atomically
-from damian.common.errors import InputError, RunError
+from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.runs.checkpoint import plain, read_checkpoint, restore, to_tensordict, write_checkpoint
 from damian.runs.training_state import CarriedStep, load_networks
@@ -45,11 +43,10 @@ def test_everything_that_states_consist_of_is_read_as_it_was(tmp_path):
     nn.BatchNorm1d(3).load_state_dict(read["module"])
 
 
-@pytest.mark.parametrize("value", [object(), {1, 2}, np.zeros(2)])
-def test_what_a_checkpoint_cannot_store_is_refused_before_anything_is_written(file, value):
+def test_what_a_checkpoint_cannot_store_is_refused_before_anything_is_written(file):
     before = file.read_bytes()
     with pytest.raises(InputError, match="cannot be stored"):
-        write_checkpoint(file, {"mine": [0, value]})
+        write_checkpoint(file, {"mine": [0, object()]})
     assert file.read_bytes() == before
 
 
@@ -91,29 +88,6 @@ def test_a_component_that_does_not_fit_is_refused_in_one_line():
         restore({"actor": nn.Linear(3, 5)}, stored, Path("x.pt"), "checkpoint")
     with pytest.raises(InputError, match="it has no critic, only actor"):
         restore({"critic": nn.ReLU()}, stored, Path("x.pt"), "checkpoint")
-
-
-@pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_file_that_cannot_be_written_leaves_the_older_one_and_nothing_else(file, monkeypatch, call):
-    before = file.read_bytes()
-
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, call, fail)
-    with pytest.raises(RunError, match=r"checkpoint\.pt: it cannot be written: No space left on device"):
-        write_checkpoint(file, {"other": OrderedDict()})
-    assert file.read_bytes() == before
-    assert [path.name for path in file.parent.iterdir()] == [file.name]
-
-
-def test_what_a_killed_process_was_writing_is_removed(tmp_path):
-    for name in ("checkpoint.pt.part", "run.json.part", "notes.txt"):
-        (tmp_path / name).touch()
-    remove_unfinished(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-    write_atomically(tmp_path / "notes.txt", "ä")
-    assert (tmp_path / "notes.txt").read_bytes() == "ä".encode()
 
 
 def test_torchrl_still_keeps_the_next_step_of_a_collector_where_it_is_stored_and_restored():

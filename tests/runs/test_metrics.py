@@ -18,10 +18,9 @@ from damian import keys
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
-from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
-from damian.runs.metrics import EpisodeLog, Evaluation, evaluate, evaluation
+from damian.runs.metrics import EpisodeLog, Evaluation, evaluation
 from damian.runs.metrics_log import MetricsLog, read_metrics
 from damian.runs.run_folder import results_table, save_results
 from damian.runs.run_record import check_version
@@ -35,10 +34,7 @@ from damian.world.signal_source import SourceConfig
 HORIZON = 24
 BURSTS = {"law": "burst", "enter": 0.3, "leave": 0.3, "good": 0, "bad": 5, "bad_loss": 0.2}
 DELAYS = {
-    "none": DelayConfig(),
-    "constant": DelayConfig(obs=3),
     "bursts and losses": DelayConfig(obs=BURSTS, loss=0.1),
-    "losses only": DelayConfig(loss=0.3),
     "rewards and actions too": DelayConfig(obs=2, act=1, rew=2),
 }
 
@@ -169,19 +165,6 @@ def test_the_truth_of_a_term_that_reads_the_belief_is_the_belief_from_messages_o
     assert late.perceived_return != pytest.approx(late.return_, rel=0.01)
 
 
-def test_an_evaluation_flies_up_to_the_horizon_and_draws_actions():
-    def env() -> DelayedEnv:
-        return make_env(joint_spotting("instant", DELAYS["constant"]), 8, seed=2, extras=["message"])
-
-    policy = random_policy(env())
-    torch.manual_seed(1)
-    row = evaluate(env(), policy, 6)
-    torch.manual_seed(1)
-    flight = env().rollout(6, policy, break_when_any_done=False)
-    assert row == evaluation(flight, env().server)
-    assert row.perceived_steps <= 6
-
-
 # Measures in training.
 
 
@@ -216,10 +199,11 @@ def ended_episodes(batch: TensorDictBase) -> list[dict[str, float]]:
     return ended
 
 
-@pytest.mark.parametrize("factor", [0.0, 0.9, 0.991])
-def test_the_episode_log_is_an_exponential_mean_over_episodes_in_the_order_of_their_ends(factor):
-    batch, log = training_batch(), EpisodeLog(factor)
+def test_the_episode_log_is_an_exponential_mean_over_episodes_in_the_order_of_their_ends():
+    batch, log, factor = training_batch(), EpisodeLog(0.9), 0.9
     for part in batch.split([13, 1, 26], 1):
+        state, log = log.state_dict(), EpisodeLog(factor)
+        log.load_state_dict(state)
         log.add(part)
     episodes = ended_episodes(batch)
     assert log.finished == len(episodes) > 50
@@ -228,18 +212,6 @@ def test_the_episode_log_is_an_exponential_mean_over_episodes_in_the_order_of_th
         weighted = [w * row[name] for w, row in zip(weights, reversed(episodes), strict=True)]
         assert mean == pytest.approx(sum(weighted) / sum(weights), rel=1e-5)
     assert {row["perceived_success_rate"] for row in episodes} == {0.0, 1.0}
-
-
-def test_a_restored_episode_log_continues_as_the_original():
-    batch = training_batch()
-    log, restored = EpisodeLog(0.9), EpisodeLog(0.9)
-    log.add(batch[:, :20])
-    restored.load_state_dict(log.state_dict())
-    assert restored.means() == log.means()
-    for either in (log, restored):
-        either.add(batch[:, 20:])
-    assert restored.means() == log.means()
-    assert restored.finished == log.finished
 
 
 # Tables and files.
@@ -281,28 +253,24 @@ def test_a_resumed_log_drops_later_rows_and_takes_new_numbers(tmp_path):
     assert (tmp_path / "metrics.csv").read_text().splitlines() == lines
 
 
-@pytest.mark.parametrize("text", ["a\n1\n", "frames,a\n1,many\n", "frames,a\n1\n", "frames,a\n\x001,2\n"])
+@pytest.mark.parametrize("text", ["a\n1\n", "frames,a\n1,many\n"])
 def test_a_broken_metrics_file_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "metrics.csv").write_text(text)
     with pytest.raises(InputError, match=r"metrics\.csv: it (is no table of numbers|has no column frames)"):
         read_metrics(tmp_path)
 
 
-def test_tensorboard_shows_numbers_settings_distributions_and_films_up_to_where_a_run_resumed(tmp_path):
-    film = tmp_path / "film.gif"
-    film.write_bytes(b"GIF89a")
+def test_tensorboard_shows_numbers_settings_and_distributions_up_to_where_a_run_resumed(tmp_path):
     for resumed, frames in ((0, [10, 20]), (10, [20, 30])):
         settings = {"agents": 3, "delay.obs": [1]}
         log = MetricsLog(tmp_path, tensorboard=True, to_csv=False, frames=resumed, settings=settings)
         for each in frames:
             log.add(each, {"loss": float(each + resumed)})
         log.add_histogram(frames[-1], "age", np.arange(6.0))
-        log.add_film(frames[-1], film)
         log.close()
     events = EventAccumulator(str(tmp_path)).Reload()
     assert [(each.step, each.value) for each in events.Scalars("loss")] == [(10, 10), (20, 30), (30, 40)]
     assert [each.histogram_value.num for each in events.Histograms("age")] == [6]
-    assert events.Images("evaluation")[-1].encoded_image_string == b"GIF89a"
     assert "_hparams_/session_start_info" in events.summary_metadata
 
 
