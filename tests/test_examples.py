@@ -53,15 +53,6 @@ def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):
     assert [line for line in lines if "torchrl" not in line] == printed.splitlines()  # it logs there, too
 
 
-def test_the_document_shows_the_examples_code():
-    def lines(text: str) -> str:
-        return "\n".join(line.strip() for line in text.splitlines())
-
-    blocks = re.findall(r"```python\n(.*?)\n```", DOCUMENT, re.DOTALL)[1:]
-    assert len(blocks) == 3
-    assert all(lines(block) in lines(EXAMPLE.read_text()) for block in blocks)
-
-
 @pytest.mark.slow
 def test_a_belief_head_learns_to_predict_on_an_environment_that_is_not_ours():
     pytest.importorskip("vmas")

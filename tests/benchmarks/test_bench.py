@@ -9,7 +9,7 @@ import bench_training
 import pytest
 from bench import BARE, RIVAL, WHOLE, arms, delays, rivals, scenarios
 from bench_timing import Measured, in_turn
-from bench_training import ARMS, HEADER, RIVALS, WIDTHS, Seconds, arm_config, rows, training
+from bench_training import ARMS, HEADER, RIVALS, WIDTHS, arm_config, training
 
 from damian.envs.pipeline import has_message_delay
 from damian.recipes.shared.settings import backupdates
@@ -63,13 +63,6 @@ def test_speed_is_given_relative_to_vmas():
     assert bench.ratio({"ours": Measured(2, 1, 3)}, 2) == "-"
 
 
-@pytest.mark.slow
-def test_growth_has_a_row_for_each_size(presets):
-    for what, sizes in ("worlds", TINY.many_worlds), ("UAVs", TINY.many_uavs):
-        rows = bench.growth(presets, TINY, what, sizes).strip().splitlines()[4:]
-        assert [int(row.split(" | ")[0].strip("| ")) for row in rows] == list(sizes)
-
-
 # The training part.
 
 
@@ -84,15 +77,6 @@ def test_arms_differ_in_delay_awareness_compiling_and_critic_only():
         assert config.model.hidden == [64, 64]
         model = replace(config.model, shared_value=False)
         assert (config.learner, model) == (configs[0].learner, configs[0].model)
-
-
-def test_rows_hold_the_share_of_backupdating_and_the_speed_relative_to_vmas():
-    ours, theirs = Seconds(0.3, 0.1, 0.6), Seconds(1.0, 0.0, 1.0)
-    assert rows({"ours": ours, bench_training.RIVAL: theirs}, frames=8000) == [
-        ("ours", "8,000", "300", "100", "600", "10.0%", "2.00"),
-        (bench_training.RIVAL, "4,000", "1000", "0", "1000", "0.0%", "1.00"),
-    ]
-    assert rows({"ours": ours}, frames=8000)[0][-1] == "-"  # without VMAS
 
 
 @pytest.mark.slow

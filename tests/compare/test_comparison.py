@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.text import Annotation
 
 from damian.compare.comparison import (
     ALL_MESSAGES,
     RANDOM,
-    SCRIPT,
     TRAINED,
     TRAINED_DETERMINISTIC,
     UNKNOWN,
@@ -77,15 +75,6 @@ def test_recovery_is_left_out_if_the_delay_costs_nothing():
     assert str(aware["recovery"]) == "-"
 
 
-def test_fewer_steps_give_a_higher_score():
-    steps = {arm: [20 - x for x in values] for arm, values in THREE.items()}
-    by_steps = Comparison(rows_of("t", "late", steps, 20.0), ARMS, "steps").compared("t", "late")
-    by_return = Comparison(rows_of("t", "late", THREE), ARMS).compared("t", "late")
-    for arm, expected in by_return.items():
-        for name, estimate in expected.estimates.items():
-            np.testing.assert_allclose(by_steps[arm][name], estimate)
-
-
 def test_an_arm_is_compared_over_the_seeds_that_it_and_what_it_is_compared_with_have_finished():
     rows = rows_of("t", "late", THREE)
     alone = Comparison(rows, ARMS).compared("t", "late")
@@ -145,15 +134,6 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
-def test_the_table_lists_the_script_where_it_was_evaluated():
-    rows = rows_of("t", "late", SCORES)
-    script = [row("t", delay, arm, 0, 7.0, SCRIPT) for delay, arm in (("none", "best"), ("late", "blind"))]
-    table = markdown(Comparison(rows + script, ARMS), [])
-    cells = [line.split(" |")[:5] for line in table.splitlines() if "script" in line]
-    names = ("script (undelayed)", "script")
-    assert cells == [[f"| {name}", " ", " script", " 1", " 7.000"] for name in names]
-
-
 def test_a_recovery_is_from_the_naive_arm_of_the_same_track_and_any_two_arms_are_compared():
     scores = SCORES | {"flown": [9.0, 8.0]}  # naive, but trained undelayed: not the reference of late data
     arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}
@@ -208,29 +188,6 @@ def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     assert comparison.compared("t", "late")["aware"]["recovery"].value == pytest.approx((22 / 3 - 4) / 6)
 
 
-def test_arms_are_listed_where_no_arm_without_delay_ran(tmp_path):
-    scores = {name: values for name, values in SCORES.items() if name in ("blind", "aware")}
-    comparison = Comparison(rows_of("t", "late", scores), {name: ARMS[name] for name in scores})
-    assert "| aware | R0 | trained | 2 | 7.500 |" in markdown(comparison, [])
-    assert comparison.compared("t", "late") == {}
-    plot_curves(comparison, {}, {"perceived_steps": 1.0}, tmp_path / "curves.png")
-    plot_norms(comparison, tmp_path / "norms.png")
-
-
-def test_a_task_without_success_has_a_dash_and_several_tasks_are_summed_up():
-    never = {"perceived_success_rate": np.nan, "success_rate": np.nan}
-    rows = rows_of("t", "late", SCORES) + [each | never for each in rows_of("u", "late", SCORES)]
-    text = markdown(Comparison(rows, ARMS), ["a note"])
-    first, second, overall, compute = text.split("##")[1:]
-    assert "Trained for 400 environment steps." in first
-    aware = "| aware | R0 | trained | 2 | 7.500 |"
-    assert aware + " 7.500" in first
-    assert aware + " - |" in second
-    assert "| 2 | 0.750 | 0.583 | 1.000 | - |" in first
-    assert "| aware | 2 | 0.750 |" in overall
-    assert "| aware | 4 | 36 | 0.04 |" in compute
-
-
 def drawn(monkeypatch, draw) -> Figure:
     """The figure that a function draws instead of saving it."""
     figures = []
@@ -254,29 +211,6 @@ def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other
         assert axis.get_legend_handles_labels()[1] == expected
         lines = [bars[0] for bars in axis.containers]
         assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(expected)
-
-
-def test_an_arm_has_the_same_colour_in_all_figures(monkeypatch, tmp_path):
-    comparison = Comparison(rows_of("t", "late", THREE), ARMS)
-    points = [{"episodes": n, "perceived_return": n / 9} for n in range(5)]
-    curve = [{"perceived_success_rate": 0.5, "perceived_steps": 9.0, **point} for point in points]
-    curves = {("t", "late", "blind"): [curve], ("t", "late", "aware"): [curve]}
-    path, found = tmp_path / "figure.png", {}
-    for draw in (
-        lambda: plot_curves(comparison, curves, {}, path),
-        lambda: plot_norms(comparison, path),
-        lambda: plot_delays(comparison, {"one": ["aware", "blind"], "other": ["blind"]}, path),
-    ):
-        for axis in drawn(monkeypatch, draw).axes:
-            shown = [line for line in axis.lines if line.get_label() in ARMS]
-            shown += [bars[0] for bars in axis.containers]
-            labels = [line.get_label() for line in axis.lines if line.get_label() in ARMS]
-            labels += [bars.get_label() for bars in axis.containers]
-            for label, line in zip(labels, shown, strict=True):
-                found.setdefault(label, set()).add(line.get_color())
-    assert {"blind", "aware", "flown"} <= set(found)
-    assert all(len(colours) == 1 for colours in found.values())
-    assert len(set.union(*found.values())) == len(found)
 
 
 def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch, tmp_path):
@@ -330,11 +264,3 @@ def test_curves_are_over_steps_if_all_runs_made_as_many_and_else_over_episodes(
     figure = drawn(monkeypatch, lambda: plot_curves(one, curves, {}, tmp_path / "curves.png"))
     assert {axis.get_xlabel() for axis in figure.axes} == {label}
     assert max(figure.axes[0].lines[0].get_xdata()) == (500 if label != "episodes" else 36)
-
-
-def test_an_infinite_end_of_an_interval_is_drawn_to_the_edge_of_the_panel(monkeypatch, tmp_path):
-    scores = {"best": [9.0, -1.0, 10.0], "blind": [1.0, 5.0, 3.0], "aware": [6.0, 9.0, 7.0]}
-    comparison = Comparison(rows_of("t", "late", scores), ARMS)
-    assert np.isinf(comparison.compared("t", "late")["aware"]["J_norm"][1:]).all()
-    axis = drawn(monkeypatch, lambda: plot_norms(comparison, tmp_path / "figure.png")).axes[0]
-    assert sorted(line.xy[1] for line in axis.findobj(Annotation)) == [0, 0, 1, 1]

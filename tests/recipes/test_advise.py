@@ -1,12 +1,10 @@
 """The program that advises real UAVs, run by its command line: tables, folders and HTTP, and its refusals."""
 
-import contextlib
 import csv
 import http.client
 import json
 import random
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -20,7 +18,6 @@ from helpers import check_refused
 from stopped_runs import is_locked
 
 from damian.advice.session import AdviceSession, read_inbox
-from damian.common.errors import RunError
 from damian.recipes.advise import AdviseConfig, make_session
 from damian.recipes.advise import run as main
 from damian.recipes.train import run as train
@@ -171,26 +168,6 @@ def test_tables_in_a_folder_are_answered_and_wrong_ones_put_aside(inbox, tmp_pat
     assert [list(told) for told in again.told] == [list(told) for told in session.fleet("main").told]
 
 
-def test_the_files_beside_a_table_are_of_the_newest_one_of_its_name(inbox, tmp_path):
-    """A wrong table is corrected under its name, and the next one has the same name again."""
-    session = session_of(tmp_path / "journals")
-    session.create("main", ["A"])
-    lat, lon = session.fleet("main").ground.place(3)
-    for now, uav in ((1e9 + 1, "Z"), (1e9 + 2, "A"), (1e9 + 3, "A")):
-        (inbox / "x.csv").write_text(f"ID,lat,lon,time\n{uav},{lat},{lon},{now}")
-        assert read_inbox(session, "main", inbox, now)
-    found = {path.name: path.read_text() for path in inbox.iterdir() if path.name.startswith("x")}
-    refused = {f"x.csv.1000000002.000.refused{end}" for end in ("", ".txt")}
-    assert {*found} == {"x.csv.done", "x.csv.1000000003.000.done", *refused}
-    assert "'Z' is no UAV" in found["x.csv.1000000002.000.refused.txt"]
-    assert found["x.csv.done"].endswith("1000000003.0")
-    assert found["x.csv.1000000003.000.done"].endswith("1000000002.0"), "nothing is lost"
-    session.close()
-    (inbox / "x.csv.done").unlink()
-    with pytest.raises(RunError, match=r"folder: .*gone: it cannot be read: No such file or directory"):
-        read_inbox(session, "main", inbox / "gone", 1e9)
-
-
 class Program:
     """``damian advise port=0`` as a process of its own."""
 
@@ -272,28 +249,3 @@ def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_pa
             acknowledged[uav] = there
     assert time.time() - start > 6
     assert all(len(times) > 20 for times in acknowledged.values())
-
-
-@pytest.mark.slow
-def test_the_program_ends_when_it_is_asked_to(tmp_path):
-    program = Program(tmp_path)
-    assert program("GET", "/fleets/north", token="wrong-wrong-wrong")[0] == 401
-    host, port = program.url.removeprefix("http://").split(":")
-    for junk in (b"\x00\xff" * 500, b"POST / HTTP/9.9\r\n\r\n", b"GET " + b"x" * 200_000):
-        with socket.create_connection((host, int(port)), timeout=10) as raw:
-            raw.sendall(junk)
-            raw.shutdown(socket.SHUT_WR)
-            with contextlib.suppress(ConnectionError):
-                assert b" 5" not in raw.recv(64)[:12]
-    assert program("PUT", "/fleets/north", {"uavs": ["A"]})[0] == 201
-    assert program("POST", "/fleets/north/reports", "x" * 10_000_000)[0] == 413
-    kept = [path.read_text() for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(kept) >= 3
-    assert not any(TOKEN in text for text in kept), "no file keeps the token"
-    assert program.end(signal.SIGTERM) in (0, 143, -signal.SIGTERM)
-
-
-def test_without_the_server_library_the_remedy_is_named(run, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "uvicorn", None)
-    message = "port: 0 needs uvicorn, which is not installed: pip install 'damian[advise]'"
-    check_refused(lambda: run(*SCRIPT, "port=0"), message, capsys)

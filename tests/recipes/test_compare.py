@@ -14,11 +14,8 @@ from hydra import initialize_config_dir
 from damian.compare.comparison import KNOWN_ON_TIME, TRAINED, Arm
 from damian.recipes.compare import plan
 from damian.recipes.compare import run as main
-from damian.recipes.evaluate import fly
 from damian.recipes.known import CONF
-from damian.recipes.shared.many_runs import Run, perform_all
 from damian.runs.run_lock import locked
-from damian.settings import TrainConfig
 from damian.settings.programs import CompareConfig, Experiment
 
 STORED = Path(__file__).parents[2] / "docs" / "results"
@@ -146,9 +143,8 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     check_refused(lambda: compare(*words[:1], *stored), "it does not hold the results", capsys)
 
 
-@pytest.mark.sample(2)
-@pytest.mark.parametrize("n_seeds", [2, 12])
-def test_a_report_counts_every_stored_seed_unless_a_number_of_seeds_is_given(compare, tmp_path, n_seeds):
+def test_a_report_counts_every_stored_seed_unless_a_number_of_seeds_is_given(compare, tmp_path):
+    n_seeds = 12
     words, results = ["report_only=true", "hydra.run.dir=kept"], table(STORED / "delays/results.csv")
     first = [row for row in results if row["seed"] == "8" and row["delay"] in ("none", "paper")]
     rows = [{**row, "seed": 8 + n} for n in range(n_seeds) for row in first]
@@ -187,16 +183,6 @@ def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compar
     assert "is in use by another run" in capsys.readouterr().err
 
 
-def test_an_unfinished_policy_is_not_flown(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    source = tmp_path / "none/undelayed/seed_8"
-    source.mkdir(parents=True)
-    (source / "best.pt").write_text("a checkpoint of a run that goes on")
-    run = Run("t", "paper", "flown", TrainConfig(checkpoint=str(source)), tmp_path / "flown", fly)
-    assert perform_all([run], 1, (TRAINED, "return")) == [run]
-    assert f"{source} has no finished policy to fly" in (run.folder / "log.txt").read_text()
-
-
 @pytest.mark.slow
 def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_named(compare, capsys):
     words = [*TWO[:2], "arms=[undelayed,unaware,deployed]", TWO[3]]
@@ -233,9 +219,6 @@ def test_slurm_jobs_give_the_same_results_as_this_process(compare):
         (["arms=[deployed]"], "experiment.arms.deployed.policy_of: undelayed is not known"),
         (["tasks=[usecase1]"], "tasks: usecase1 is not one of usecase2"),
         (["slurm={cluster: local}"], "slurm: {'cluster': 'local'} means nothing without launcher=slurm"),
-        (["experiment.arms.both.delayed=false"], "experiment.arms: ['undelayed', 'both'] are not delayed"),
-        (["report_only=true"], "experiment: no run of it is finished in"),
-        (["arms=[]"], "arms: [] names none: leave it out, for all of them"),
         (["overrides=['delay.obs=3']"], "usecase2/none/undelayed: delay.obs: its value delays this arm"),
     ],
 )
@@ -252,30 +235,16 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(
     [
         ("tasks: {spotting: []}", "experiment.arms: it is missing or empty"),
         (
-            "tasks: {spotting: []}\narms: {undelayed: {delayed: false, polcy_of: x}}",
-            "experiment.arms.undelayed.polcy_of: no such key",
-        ),
-        (
             "tasks: {spotting: []}\ndelays: {late: [delay.obs=2]}\narms: {undelayed: {delayed: false}, "
             "both: {overrides: [aware=both]}, flown: {policy_of: both}}",
             "spotting/late/flown: observation.age: the policy was trained with True, so it cannot fly with",
-        ),
-        (
-            "tasks: {coverage: [scenario=coverage]}\narms: {undelayed: {delayed: false}}\n",
-            "score: success_rate is in none of the tasks anything that can be reached",
-        ),
-        (
-            "tasks: {a: [scenario=tracking]}\ndelays: {up: [links=updown, delay.obs=2]}\n"
-            "arms: {undelayed: {delayed: false}, known: {oracle: true}}",
-            "a/up/known: links: updown is not supported",
         ),
     ],
 )
 def test_a_mistake_in_an_experiment_of_ones_own_is_one_line(compare, capsys, tmp_path, text, message):
     (tmp_path / "own" / "experiment").mkdir(parents=True)
     (tmp_path / "own" / "experiment" / "mine.yaml").write_text(text)
-    score = ["score=success_rate"] * message.startswith("score")
-    check_refused(lambda: compare("--config-dir=own", "experiment=mine", *score), message, capsys)
+    check_refused(lambda: compare("--config-dir=own", "experiment=mine"), message, capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["own"]
 
 
@@ -316,12 +285,3 @@ def test_runs_go_seed_by_seed_and_an_arm_does_its_tasks_only():
         f"{name}/seed_{seed}" for seed in (3, 4) for name in ("a/none/best", "a/late/naive", "b/none/best")
     ]
     assert [run.name for run in runs] == [*trained, "b/late/flown/seed_3", "b/late/flown/seed_4"]
-
-
-def test_the_script_flies_only_where_messages_are_late():
-    arms = {"best": Arm(delayed=False), "known": Arm(oracle=True)}
-    delays = {"late": ["delay.obs=2"], "act": ["delay.act=2"]}
-    experiment = Experiment({"a": ["scenario=delaybench/tracking"]}, delays, arms)
-    with initialize_config_dir(str(CONF), version_base=None):
-        runs = plan(CompareConfig(experiment, seeds=1), Path("runs"))
-    assert [run.name for run in runs] == ["a/none/best/seed_0", "a/late/known/seed_0"]

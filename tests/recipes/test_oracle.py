@@ -103,20 +103,6 @@ def foresee(tmp_path, monkeypatch):
     return run_recipe
 
 
-def test_the_table_has_a_row_for_each_set_of_messages_known_on_time(foresee, capsys):
-    table = (foresee() / "result.md").read_text()
-    rows, meaning = table.split("\n\n")
-    assert meaning.startswith("perceived: as far as the server knew")
-    assert [line.split(" | ")[0][2:] for line in rows.splitlines()[2:]] == [
-        "nothing",
-        "where it is",
-        "its own messages",
-        "the others' messages",
-        "everything",
-    ]
-    assert "what is known on time" in capsys.readouterr().out
-
-
 @pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("word", "message"),

@@ -7,37 +7,31 @@ import pytest
 import torch
 from delay_twin import drawn
 from helpers import (
-    HERE,
     KEEPS_GOING,
     MOTIONS,
     all_same,
     both_kinds,
     both_motions,
     everything,
-    go,
-    one_uav,
     play,
     random_actions,
-    same,
     square,
-    walking,
 )
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.delays.config import DelayConfig
 from damian.delays.laws import Held, law_of
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import has_message_delay, make_env
+from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
-from damian.keys import GLOBAL_OBSERVATION, PRIVILEGED_OBSERVATION
+from damian.keys import PRIVILEGED_OBSERVATION
 from damian.learners.mappo import Mappo, MappoConfig
-from damian.learners.networks import ModelConfig, make_critic
+from damian.learners.networks import ModelConfig
 from damian.learners.sac import Sac, SacConfig
 from damian.recipes.train import learning_env, make_learner, replay_buffer
-from damian.server.features import ObservationConfig
 from damian.settings import ClockConfig, TrainConfig
 from damian.world.landing import ActionConfig
 from damian.world.signal_source import SourceConfig
@@ -93,22 +87,7 @@ def test_held_messages_are_lost_as_often_as_before(law, tmp_path):
     assert held.constant_delay is None
 
 
-def test_holding_messages_changes_nothing_without_delay():
-    undelayed = everything(delay=DelayConfig(hold="max"))
-    assert not has_message_delay(undelayed)
-    assert all_same(rollout_of(undelayed), rollout_of(everything()))
-
-
 # The privileged observation.
-
-
-@both_motions
-@pytest.mark.parametrize("delay", [{}, {"obs": PAPER, "act": 1, "history": 2}], ids=["undelayed", "late"])
-def test_an_environment_with_privileged_observations_keeps_its_specs(motion, delay):
-    env = make_env(everything(motion, delay=DelayConfig(**delay)), 2, extras=["privileged"])
-    assert PRIVILEGED in env.observation_spec.keys(True, True)
-    check_env_specs(env, seed=0, break_when_any_done="both")
-    assert env.observation_spec[PRIVILEGED].is_in(env.rollout(3)[PRIVILEGED][:, -1])
 
 
 @both_motions
@@ -142,44 +121,7 @@ def test_the_privileged_observation_ends_with_the_vector_to_the_source(motion):
         torch.testing.assert_close(td[PRIVILEGED][..., -2:], to_source, atol=1e-6, rtol=0)
 
 
-def test_a_belief_in_the_privileged_observation_is_that_the_source_is_where_it_is():
-    observation = ObservationConfig(global_features=[], local_features=[], belief=["belief_moments"])
-    env = make_env(square(observation=observation, source=walking()), 3, extras=["privileged"])
-    cell = math.hypot(*(env.server.grid.centres[1] - env.server.grid.centres[0]).tolist())
-    for td in play(env, actions_for(env, 12)):
-        way, spread, to_source = td[PRIVILEGED][..., :2], td[PRIVILEGED][..., 2:4], td[PRIVILEGED][..., -2:]
-        assert (spread < 1e-3).all()
-        assert ((way - to_source).abs() <= cell / 2 / (200 * math.sqrt(2)) + 1e-6).all()
-
-
-@pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs=PAPER)], ids=["undelayed", "late"])
-def test_privileged_observations_change_no_other_output(delay):
-    scenario = everything(delay=delay)
-    with_it, without = rollout_of(scenario, (*EXTRAS, "privileged")), rollout_of(scenario)
-    assert all(PRIVILEGED in td.keys(True, True) for td in with_it)
-    assert all_same([td.exclude(PRIVILEGED) for td in with_it], without)
-
-
 # The privileged critic.
-
-
-def step_with_source_at(position: list[float]) -> TensorDictBase:
-    """Outputs after a step in which no message arrived; no UAV may hear a source at the position."""
-    scenario = one_uav(delay=DelayConfig(loss=1.0))
-    env = make_env(scenario, extras=["privileged"])
-    env.reset()
-    env.uav_env.state = env.uav_env.state._replace(source=torch.tensor([position]))
-    return go(env, HERE)
-
-
-def test_only_a_privileged_critic_observes_the_source_before_any_message_arrives():
-    env = make_env(one_uav(), extras=["privileged"])
-    here, there = step_with_source_at([390.0, 100.0]), step_with_source_at([390.0, 160.0])
-    assert same(here.exclude(PRIVILEGED), there.exclude(PRIVILEGED))
-    for key, differs in ((PRIVILEGED, True), (GLOBAL_OBSERVATION, False)):
-        critic = make_critic(env, ModelConfig([16]), key)
-        one, other = (critic(td.clone())["agents", "state_value"] for td in (here, there))
-        assert one.equal(other) is not differs
 
 
 def settings(**changed: Any) -> TrainConfig:
@@ -206,17 +148,3 @@ def test_the_actor_beside_a_privileged_critic_has_no_privileged_observation(conf
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         actions = [learner.actor(each)["agents", "action"] for each in (td, other)]
     assert actions[0].equal(actions[1])
-
-
-def test_back_updating_does_not_change_the_privileged_observation():
-    learner, env = learner_of(settings(backupdate=True))
-    batch = env.rollout(12, learner.actor, break_when_any_done=False)
-    corrected = learner.backupdated_batch(batch)
-    assert corrected["agents", "backupdated"].any()
-    assert not corrected["next", "agents", "global_observation"].equal(
-        batch["next", "agents", "global_observation"]
-    )
-    for key in (PRIVILEGED, ("next", *PRIVILEGED)):
-        assert corrected[key].equal(batch[key])
-    losses = learner.learn(env.rollout(12, learner.actor, break_when_any_done=False))
-    assert all(math.isfinite(loss) for loss in losses.values())

@@ -19,16 +19,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "run"
 
 
-NAMED = {
-    "logger.custom": ["evil:Logger"],
-    "learner.name": "evil:Config",
-    "delay.obs": {"law": "evil:Law"},
-    "region.kind": "evil:region",
-    "motion.kind": "evil:Model",
-    "sensors": [{"sensor": "evil:sensor"}],
-    "reward.custom": [{"term": "evil:term"}],
-    "observation.belief": ["evil:feature"],
-}
+NAMED = {"learner.name": "evil:Config", "sensors": [{"sensor": "evil:sensor"}], "motion.kind": "evil:Model"}
 
 
 def test_a_stored_run_names_no_code_that_is_run(folder, tmp_path, capsys):

@@ -89,19 +89,3 @@ def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, changes, 
     path.write_text(json.dumps({**flight().document(), **changes}))
     with pytest.raises(InputError, match=rf"episode\.json: it is no episode of version 2: .*{problem}.*$"):
         Episode.load(path)
-
-
-@pytest.mark.parametrize("text", ["no json", "[1]", "{}", '{"schema": "damian-episode", "version": 2}'])
-def test_another_file_is_refused_in_one_line(tmp_path, text):
-    path = tmp_path / "episode.json"
-    path.write_text(text)
-    with pytest.raises(InputError, match=r"episode\.json: it is no episode"):
-        Episode.load(path)
-    with pytest.raises(InputError, match="no episode"):
-        Episode.load(tmp_path / "missing.json")
-
-
-def test_the_times_of_a_long_episode_differ(tmp_path):
-    long = flight(1, time=np.array([12000.0, 12000.8]))
-    long.save(tmp_path / "episode.json")
-    assert Episode.load(tmp_path / "episode.json").time.tolist() == [12000.0, 12000.8]

@@ -6,7 +6,6 @@ import torch
 from episodes import flight
 from matplotlib.colors import to_rgb
 from PIL import Image
-from torchrl.envs.utils import check_env_specs
 from torchrl.record import VideoRecorder
 
 from damian.baselines.random import random_policy
@@ -32,30 +31,6 @@ def test_a_uav_has_its_colour_where_it_truly_is_and_turns_with_its_heading():
         np.testing.assert_allclose(colour_at(film, 0, east, 102.0), to_rgb(COLOURS[uav]), atol=0.02)
     to_north, to_east = (np.abs(colour_at(film, t, 105.0, 100.0) - to_rgb(COLOURS[1])).sum() for t in (0, 1))
     assert to_east < 0.8 * to_north
-
-
-def test_a_footprint_is_stronger_while_its_uav_spots_the_source():
-    spotted = np.array([[False, False], [True, False]])
-    film = Film(flight(1, spotted=spotted))
-    before, after, other = (
-        colour_at(film, *at) for at in ((0, -70.0, 80.0), (1, -70.0, 80.0), (1, 130.0, 80.0))
-    )
-    land = colour_at(film, 0, 0.0, 150.0)
-    assert np.abs(after - land).sum() > 2 * np.abs(before - land).sum() > 0
-    assert np.abs(other - land).sum() < np.abs(after - land).sum()
-
-
-@pytest.mark.parametrize("view", ["2d", "3d"])
-def test_a_source_that_nobody_knows_is_neither_drawn_nor_explained(view):
-    about = {"uavs": ["A", "B with a long name"]}
-    film = Film(flight(1, source=None, emits=None, about=about), view)
-    if view == "2d":
-        np.testing.assert_allclose(colour_at(film, 0, 0.0, -120.0), colour_at(film, 0, 0.0, -150.0))
-    explained = [text.get_text() for text in film.figure.legends[0].get_texts()]
-    assert len(explained) == 2
-    assert not any("source" in text for text in explained)
-    labels = [text.get_text() for text in film.lanes.get_yticklabels()]
-    assert labels == ["A", "B with \N{HORIZONTAL ELLIPSIS}"]
 
 
 def test_a_ring_stands_where_the_server_believes_a_uav_only_if_it_is_mistaken_in_time():
@@ -138,9 +113,3 @@ def test_torchrls_recorder_films_what_a_film_of_the_episode_shows():
     again = env.rollout(2, random_policy(env))
     film = Film(record(again, env.uav_env, {})[0])
     assert np.array_equal(again["next", "pixels"][0, -1].numpy(), film.frame(2))
-
-
-def test_the_pixels_are_in_the_specs():
-    env = make_env(ScenarioConfig(), 1, seed=0, extras=EXTRAS)
-    env.append_transform(FilmPixels(env.uav_env, view="3d"))
-    check_env_specs(env)

@@ -10,7 +10,6 @@ from geojson_pydantic import FeatureCollection
 from shapely.geometry import shape
 
 from damian.baselines.random import random_policy
-from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
 from damian.settings import DelayConfig, ScenarioConfig
@@ -18,7 +17,6 @@ from damian.show.episode import record
 from damian.show.geojson import feature_collection
 from damian.world.regions.config import RegionConfig
 from damian.world.regions.geodesy import to_local
-from damian.world.regions.region import local_region
 
 
 @pytest.fixture(scope="module")
@@ -114,69 +112,3 @@ def test_what_crosses_the_antimeridian_is_cut_there(episode):
     assert region.area == pytest.approx(shape(one_place["geometry"]).area, rel=1e-4)
     cut = [track for track in kinds["track"] if track["geometry"]["type"] == "MultiLineString"]
     assert all("times" not in track["properties"] for track in cut)
-
-
-@pytest.mark.parametrize("longitude", [179.999, -179.999])
-def test_areas_that_touch_the_antimeridian_stay_areas(episode, longitude):
-    def local_metres(corners: list[list[float]]) -> np.ndarray:
-        return np.column_stack(to_local(*np.array(corners).T[::-1], origin))
-
-    # The region spans the antimeridian in the south, and ends there in the north.
-    origin, above = (0.0, longitude), [[180.0, 0.001], [180.0, 0.002], [179.998, 0.002]]
-    below = [[179.998, -0.002], [180.002, -0.002], [180.002, 0.001]]
-    region = shapely.Polygon(local_metres(below + above))
-    cells = np.stack(np.meshgrid([-45.0, -15.0, 15.0, 45.0], [-30.0, 0.0, 30.0]), -1).reshape(-1, 2)
-    cells += local_metres([[180.0, 0.0]])  # two columns on each side, whose edges touch it
-    belief = np.full((episode.n_steps + 1, len(cells)), 1 / len(cells))
-    moved = replace(episode, origin=origin, region=region, cells=cells, belief=belief)
-    collection = feature_collection(moved, 10)
-    check_rfc_7946(collection)
-    kinds = by_kind(collection)
-    assert [feature["geometry"]["type"] for feature in kinds["belief"]] == ["Polygon"] * len(cells)
-    assert [feature["geometry"]["type"] for feature in kinds["region"]] == ["MultiPolygon"]
-    parts = shapely.get_parts(shape(kinds["region"][0]["geometry"]))
-    assert sorted(part.area for part in parts) == pytest.approx([6e-6, 8e-6], rel=1e-3)
-
-
-@pytest.mark.parametrize("latitude", [-30.0, 0.0, 50.0])
-def test_a_region_whose_hole_touches_its_shell_is_valid(episode, latitude):
-    shell = np.array([[9.996, -0.004], [10.004, -0.004], [10.004, 0.004], [9.996, 0.004]])
-    hole = np.array([[9.996, 0.001], [9.998, 0.001], [9.998, -0.001]])
-    read = local_region([[ring + np.array([0, latitude]) for ring in (shell, hole)]], "lake", None, "test")
-    collection = feature_collection(replace(episode, region=read.polygon, origin=read.origin), 10)
-    check_rfc_7946(collection)
-    written = shape(by_kind(collection)["region"][0]["geometry"])
-    assert written.area == pytest.approx(shapely.Polygon(shell, [hole]).area, rel=1e-6)
-
-
-def flown_about_the_antimeridian(episode, longitude: float, metres: list[list[float]]):
-    """The track of UAV 0 along points [T, 2] metres east of the antimeridian and north of an origin there."""
-    origin = (-17.0, longitude)
-    (east,), _north = to_local([-17.0], [180.0], origin)
-    path = np.array(metres) + np.array([east, 0.0])
-    position = episode.position.copy()
-    position[: len(path), 0, :2] = path
-    moved = replace(episode, origin=origin, position=position)
-    track = by_kind(feature_collection(moved, len(path) - 1))["track"][0]
-    return track, path, origin
-
-
-@pytest.mark.parametrize("longitude", [179.999, -179.999])
-def test_a_track_across_the_antimeridian_is_cut_between_all_of_its_points(episode, longitude):
-    metres = [[-90, 0], [-90, 0], [60, 0], [60, 0], [0, 0], [90, 9], [0, 0], [0, 0], [-90, 0], [-60, 5]]
-    track, path, origin = flown_about_the_antimeridian(episode, longitude, metres)
-    assert track["geometry"]["type"] == "MultiLineString"
-    assert "times" not in track["properties"]
-    parts = [np.array(part) for part in track["geometry"]["coordinates"]]
-    assert [len(part) for part in parts] == [3, 7, 3]
-    for part, following, sign in zip(parts, parts[1:], [1, -1], strict=False):
-        assert (part[-1, 0], following[0, 0]) == (180 * sign, -180 * sign)
-        assert part[-1, 1] == following[0, 1]
-    # The first crossing lies within a step, and the second is a point of the track, which both parts have.
-    points = np.delete(local(track, origin), [2, 3, 10], axis=0)
-    np.testing.assert_allclose(points, path, atol=0.02)
-
-
-def test_an_episode_without_a_place_on_earth_is_refused(episode):
-    with pytest.raises(InputError, match="geojson: its region has no latitude and longitude"):
-        feature_collection(replace(episode, origin=None), 3)

@@ -5,25 +5,21 @@ Run by `make test-browser`. Selenium is imported where it is used, so that the o
 
 import io
 from contextlib import contextmanager
-from dataclasses import replace
 from importlib import import_module
 from shutil import which
 
 import numpy as np
 import pytest
-import shapely
-from episodes import SQUARE, flight
+from episodes import flight
 from PIL import Image
 
 from damian.common.plotting import COLOURS
 from damian.show.replay_page import save_page
-from damian.world.regions.geodesy import to_latlon
 
 pytestmark = pytest.mark.browser
 FLAGS = ["--headless=new", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader"]
 FLAGS += ["--enable-unsafe-swiftshader", "--hide-scrollbars"]
 LAST, LATE = 20, 4
-ORIGIN = (52.8, -4.1)
 
 
 def late_flight(late: int = LATE, **changes):
@@ -235,22 +231,6 @@ def coloured(picture, uav, tolerance=40):
     return np.nonzero(np.abs(picture.astype(int) - colour).max(-1) < tolerance)
 
 
-def test_real_uavs_have_their_ids_and_an_unknown_source_is_not_drawn(opened):
-    about = {"uavs": ["north-1", "a rather long identifier of a UAV"], "fleet": "north"}
-    known = late_flight()
-    with opened(known) as page:
-        with_source = page.map()
-    with opened(replace(known, about=about, source=None, emits=None)) as page:
-        assert page.map() != with_source
-        heads = [head.text for head in page.all(".numbers tbody th")]
-        assert heads == about["uavs"]
-        page.press("END")
-        check_numbers(page, known, LAST)
-        page.press("v")
-        page.press("HOME")
-        check_numbers(page, known, 0)
-
-
 def test_the_space_shows_uavs_above_the_ground_and_turns(opened):
     place = np.tile([[-80.0, 0.0, 0.0], [80.0, 0.0, 0.0]], (LAST + 1, 1, 1))
     place[LAST, 0, 2] = 60.0
@@ -270,55 +250,3 @@ def test_the_space_shows_uavs_above_the_ground_and_turns(opened):
         drag.click_and_hold().move_by_offset(120, 0).release().perform()
         page.settle()
         assert (page.picture(".view") != high).any(-1).mean() > 0.05
-
-
-def test_several_episodes_share_the_time_and_one_that_has_ended_waits(opened):
-    short = flight(5, about={"overrides": ["delay.obs=0"], "seed": 3}, reward=np.ones((6, 2)))
-    with opened(short, late_flight()) as page:
-        assert [each.text for each in page.all(".card h2")] == ["delay.obs=0", "delay.obs=4"]
-        left, right = (card.rect for card in page.all(".card"))
-        assert left["y"] == right["y"]
-        assert left["x"] + left["width"] <= right["x"]
-        page.press("END")
-        assert (page.shown("time", 0), page.shown("time", 1)) == ("10 s", "40 s")
-        assert page.shown("return", 0) == "return 6.00"
-        check_numbers(page, late_flight(), LAST, card=1)
-
-
-def test_the_pointer_tells_latitude_and_longitude_of_a_real_region(opened):
-    region = shapely.transform(SQUARE, lambda xy: xy + np.array([3000.0, -1500.0]))
-    with opened(flight(region=region, origin=ORIGIN)) as page:
-        page.actions().move_to_element(page.one(".view")).perform()
-        page.settle()
-        north, west = page.one(".hint").text.replace("°", "").split(", ")
-        assert (north[-1], west[-1]) == ("N", "W")
-        latitude, longitude = to_latlon(3000.0, -1500.0, ORIGIN)
-        assert float(north[:-1]) == pytest.approx(float(latitude), abs=3e-5)
-        assert -float(west[:-1]) == pytest.approx(float(longitude), abs=3e-5)
-
-
-def test_one_can_come_nearer_to_the_map_and_see_all_of_it_again(opened):
-    def places():
-        found = []
-        for shift in (0, 120):
-            page.actions().move_to_element_with_offset(page.one(".view"), shift, 0).perform()
-            page.settle()
-            east, north = page.one(".hint").text.replace("\u2212", "-").split(", ")
-            found.append([float(east.split()[1]), float(north.split()[1])])
-        return np.array(found)
-
-    with opened(late_flight()) as page:
-        before, picture = places(), page.map()
-        page.press("+")
-        nearer = places()
-        np.testing.assert_allclose(nearer[0], before[0], atol=2)
-        np.testing.assert_allclose(2 * (nearer[1] - nearer[0]), before[1] - before[0], atol=3)
-        page.actions().move_to_element(page.one(".view")).click_and_hold().move_by_offset(60, 0).perform()
-        page.actions().release().perform()
-        page.settle()
-        moved = places()
-        np.testing.assert_allclose(2 * (nearer[0] - moved[0]), nearer[1] - nearer[0], atol=3)
-        assert page.map() != picture
-        page.actions().double_click(page.one(".view")).perform()
-        page.settle()
-        assert page.map() == picture

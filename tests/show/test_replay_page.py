@@ -3,7 +3,6 @@
 import json
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from episodes import flight
 
 from damian.common.plotting import COLOURS
-from damian.show import replay_page
 from damian.show.replay_page import page, save_page, titles
 
 EVIL = "scenario=</script><script>alert('&\"\ud800')</script><!--"
@@ -84,19 +82,6 @@ def test_the_modules_are_the_files_and_name_only_each_other():
         assert len(source.splitlines()) <= 250, name
         assert source.startswith("/**"), name
     assert {*re.findall(r"https?://[^\"'`\s\\]+", sources["libraries"])} == {"http://www.w3.org/1999/xhtml"}
-
-
-def test_the_bundle_has_just_what_the_page_uses_of_the_libraries():
-    folder = Path(replay_page.__file__).parent / "page"
-    entry = (folder / "libraries" / "libraries.js").read_text()
-    exported = {*re.findall(r"(\w+)(?:,\n| \})", entry)}
-    used = {"uPlot"} if 'import { uPlot } from "libraries"' in (folder / "charts.js").read_text() else set()
-    for name in ("space.js", "space_uav.js"):
-        used |= {*re.findall(r"\bthree\.(\w+)", (folder / name).read_text())} - {"js"}
-    assert exported == used
-    bundle = (folder / "libraries.min.js").read_text()
-    (names,) = re.findall(r"export\{([^}]*)\};?\s*$", bundle)
-    assert {each.rpartition(" as ")[2] for each in names.split(",")} == used
 
 
 def test_names_of_any_text_stay_text():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from simple_spread import HORIZON, KINEMATICS, SEEN, SimpleSpread
+from simple_spread import HORIZON, SimpleSpread
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -67,20 +67,6 @@ def test_every_step_is_that_of_mpe2(agents, ratio):
     assert collisions > 30
 
 
-def test_what_agents_see_is_in_the_messages_and_the_kinematics():
-    env = SimpleSpread(WORLDS)
-    td = env.reset()
-    seen = td[SEEN].view(WORLDS, 3, 5, 2)
-    for world in range(WORLDS):
-        for i in range(3):
-            others = [j for j in range(3) if j != i]
-            places = [*env.landmarks[world], *(env.position[world, j] for j in others)]
-            for place, way in zip(places, seen[world, i], strict=True):
-                assert way.equal(place - env.position[world, i])
-    assert td[keys.OBSERVATION][..., :4].equal(td[KINEMATICS])
-    assert td[keys.OBSERVATION][..., 4:14].equal(seen.flatten(2))
-
-
 def test_the_specs_hold_and_episodes_are_truncated_after_25_steps_and_begin_anew():
     env = SimpleSpread(4)
     check_env_specs(env)
@@ -90,17 +76,3 @@ def test_the_specs_hold_and_episodes_are_truncated_after_25_steps_and_begin_anew
     assert steps[keys.TRUNCATED].squeeze(-1).equal(last.expand(4, -1))
     assert steps[keys.DONE].equal(steps[keys.TRUNCATED])
     assert not steps[keys.TERMINATED].any()
-
-
-def test_a_reset_of_some_worlds_leaves_the_others_alone():
-    env = SimpleSpread(4)
-    env.rollout(5)
-    before = env.position.clone(), env.velocity.clone(), env.landmarks.clone(), env.steps.clone()
-    flags = torch.tensor([[True], [False], [True], [False]])
-    env.reset(TensorDict({"_reset": flags}, [4]))
-    after = env.position, env.velocity, env.landmarks, env.steps
-    for old, new in zip(before, after, strict=True):
-        assert new[1::2].equal(old[1::2])
-        assert not new[::2].equal(old[::2])
-    assert (env.velocity[::2] == 0).all()
-    assert (env.steps[::2] == 0).all()
