@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,10 +148,7 @@ def _short(number: float) -> str:
 def _estimates(
     statistic: Any, scores: Floats, bounds: tuple[float, float] = (-np.inf, np.inf)
 ) -> list[Estimate]:
-    """Estimates, K in number, of a statistic that maps ``scores`` [strata, ..., seeds] to [K].
-
-    ``bounds`` are its smallest and its largest possible value.
-    """
+    """Estimates of a statistic that maps ``scores`` [strata, ..., seeds] to [K], within ``bounds``."""
     low, high = bootstrap(statistic, scores, bounds=bounds)
     ends = (np.ravel(statistic(scores)), np.ravel(low), np.ravel(high))
     return [Estimate(*map(float, numbers)) for numbers in zip(*ends, strict=True)]
@@ -257,27 +253,12 @@ class Comparison:
             found["recovery"] = _recovery(array)
         return Compared(seeds, {**found, "of_oracle": _ratio(scores[arm], oracle)})
 
-    def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
-        """Probability that a run of one delayed arm beats one of another, with its score interval, by names.
-
-        Seeds are those that both have finished; there is no entry for arms that share none.
-        """
-        scores = dict(list(self.scores(task, delay).items())[2:])
-        found = {}
-        for one, other in permutations(scores, 2):
-            seeds, array = _paired([scores[other], scores[one]])
-            if seeds:
-                value = float(probability_of_improvement(array[0, 1], array[0, 0]))
-                found[one, other] = Estimate(value, *improvement_interval(value, len(seeds)))
-        return found
-
     def overall(self) -> dict[str, tuple[int, Estimate]]:
         """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.
 
         Held-out tasks do not count. Of the others, only the arms and delays that every one has do, and of
-        each arm the seeds that it and the undelayed arm have everywhere. The result is empty if there are
-        fewer than two combinations of task and delay. Seeds are resampled within each task, because its
-        delays share the undelayed arm.
+        each arm the seeds that it and the undelayed arm have everywhere; there must be two combinations of
+        task and delay. Seeds are resampled within each task, because its delays share the undelayed arm.
         """
         by_task = {task: self.delays(task) for task in self.tasks() if HELD_OUT_MARK not in task}
         delays = [d for d in next(iter(by_task.values()), []) if all(d in ds for ds in by_task.values())]
@@ -322,10 +303,7 @@ def _norms(scores: Floats) -> Floats:
 
 
 def _improvement(scores: Floats) -> Floats:
-    """Probability that the last arm beats the strongest naive one, [*, 1, arms, seeds] to [*].
-
-    First come undelayed and random, then the naive arms.
-    """
+    """Probability that the last arm beats the strongest of ``scores[..., 2:-1, :]``, the naive ones."""
     naive = scores[..., 0, 2:-1, :]
     strongest = np.expand_dims(naive.mean(-1).argmax(-1), (-1, -2))
     other = np.take_along_axis(naive, strongest, -2)[..., 0, :]

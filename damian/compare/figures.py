@@ -48,16 +48,14 @@ _POINTS = 200
 _NORMS_IN_A_ROW = 4
 _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 """Style of lines at a reference."""
-_NO_NORMS = "no J_norm is known:\nthe undelayed arm has no run, or none better than the random policy"
 
 
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
     """Draw learning curves over environment steps; over episodes if not all runs made as many steps.
 
-    The paper's Figures 5 and 6 are over episodes. One task has a row of panels for each delay, with return,
-    success rate and steps; of several tasks, each has a row with its returns under each delay. A curve is the
-    mean over seeds of the smoothed measures of the runs, with its 95 % band. Dashed lines: the random policy
-    and, where known, the best possible value; dotted lines: arms that train nothing.
+    One task has a row of panels for each delay, with return, success rate and steps; of several tasks, each
+    has a row with its returns under each delay. A curve is the mean over seeds, with its 95 % band. Dashed
+    lines: the random policy and, where known, the best possible value; dotted lines: arms that train nothing.
 
     Args:
         comparison: comparison to draw.
@@ -90,13 +88,11 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
 def plot_norms(comparison: Comparison, path: Path) -> None:
     """Draw J_norm of each arm under each delay, with its 95 % interval, in a panel for each task.
 
-    A task in which no J_norm is known has no panel; if it is known in none, the figure says so.
+    A task in which no J_norm is known has no panel; if it is known in none, there is no figure.
     """
     norms = {task: found for task in comparison.tasks() if (found := _known_norms(comparison, task))}
     if not norms:
-        figure = Figure(figsize=(4.2, 1.0))
-        figure.text(0.5, 0.5, _NO_NORMS, ha="center", va="center", fontsize=8)
-        figure.savefig(path, dpi=150)
+        path.unlink(missing_ok=True)  # an older one would show other runs
         return
     width = min(len(norms), _NORMS_IN_A_ROW)
     height = math.ceil(len(norms) / width)
@@ -125,13 +121,11 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
 
 
 def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], path: Path) -> None:
-    """Draw the score of arms over the delays of the first task.
+    """Draw the score of arms over the delays of the first task, with 95 % intervals.
 
-    Below it, in a column with a naive arm, stands the recovery of the others; in a column without one, where
-    arms differ in what they observe, their share of the score of the script that knows all messages on time.
-
-    Dashed lines: the undelayed arm and the random policy, without delay; dotted: the script that knows all
-    messages on time, if an arm flies it. Bars are 95 % intervals.
+    Below it, in a column with a naive arm, stands the recovery of the others; in a column without one their
+    share of the score of the script that knows all messages on time. Dashed lines: the undelayed arm and the
+    random policy, without delay; dotted: that script.
 
     Args:
         comparison: comparison to draw.
@@ -198,7 +192,7 @@ def _progress(curves: Curves) -> str:
 def _curve_panel(
     axis: Axes, comparison: Comparison, curves: Curves, content: tuple[str, str, str], progress: str
 ) -> None:
-    """Draw all arms of a task under a delay, by one measure, which ``content`` names, over ``progress``."""
+    """Draw all arms in a panel of ``_panels``."""
     task, delay, measure = content
     for name, arm in comparison.arms.items():
         run = (task, delay if arm.delayed else NOT_LATE, name)
@@ -265,27 +259,14 @@ def _delay_column(column: Sequence[Axes], comparison: Comparison, task: str, arm
     above.legend(frameon=False)
     below.set_xticks(range(len(delays)), delays)
     below.set_ylabel("recovery (0: naive, 1: undelayed)" if has_naive else "share of the script's return")
-    lowest = below if below.containers else above
-    if lowest is above:  # no recovery or share is known
-        below.set_visible(False)
-        above.tick_params(labelbottom=True)
-    lowest.set_xlabel("delay of the observations [steps]")
+    below.set_xlabel("delay of the observations [steps]")
 
 
 def _error_bars(axis: Axes, known: Sequence[tuple[float, Estimate]], **style: Any) -> None:
-    """Draw known estimates at their places.
-
-    A bar whose end is infinite goes to the edge of the panel: matplotlib would leave it out.
-    """
+    """Draw known estimates at their places; an infinite interval has no bar."""
     bars = np.array([(each.value - each.low, each.high - each.value) for _, each in known]).T
-    places, values = [x for x, _ in known], [each.value for _, each in known]
-    drawn = axis.errorbar(places, values, yerr=bars, markersize=4, **style)
-    line = {"arrowstyle": "-", "color": style["color"], "shrinkA": 0, "shrinkB": 0}
-    line["linewidth"] = drawn[2][0].get_linewidth()[0]
-    for place, value, *ends in zip(places, values, *bars, strict=True):
-        for edge, length in enumerate(ends):
-            if np.isinf(length):
-                axis.annotate("", (place, edge), (place, value), ("data", "axes fraction"), "data", line)
+    places, values = zip(*((x, each.value) for x, each in known), strict=True)
+    axis.errorbar(places, values, yerr=bars, markersize=4, **style)
 
 
 def _references(axis: Axes, comparison: Comparison, task: str) -> None:

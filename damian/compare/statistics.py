@@ -12,8 +12,6 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from damian.common import checks
-
 Floats = NDArray[np.floating]
 
 LEAST_GAP = 0.1
@@ -81,7 +79,6 @@ def resampled(scores: Floats, draws: int, seed: int = 0) -> Floats:
     Returns:
         the resampled scores, [draws, strata, *, seeds].
     """
-    checks.whole("draws", draws, 1)
     strata, n_seeds = scores.shape[0], scores.shape[-1]
     drawn = np.random.default_rng(seed).integers(n_seeds, size=(draws, strata, n_seeds))
     between = (1,) * (scores.ndim - 2)
@@ -117,9 +114,8 @@ def improvement_interval(probability: float, n_seeds: int) -> tuple[float, float
     """Score interval of a ``probability_of_improvement`` between two methods with as many seeds each.
 
     It has every probability from which the one that was found differs by no more than chance allows (Newcombe
-    2006, method 5, https://doi.org/10.1002/sim.2324). A bootstrap is of no use here: where every run beats
-    every other one, no resample tells otherwise, and its interval has no width. With fewer than ``FEWEST``
-    seeds both ends are nan.
+    2006, method 5, https://doi.org/10.1002/sim.2324), also where every run beats every other one, for which a
+    bootstrap has no width. With fewer than ``FEWEST`` seeds both ends are nan.
     """
     if n_seeds < FEWEST or math.isnan(probability):
         return math.nan, math.nan
@@ -155,7 +151,6 @@ def bootstrap(
     value = np.asarray(statistic(scores), dtype=float)
     strata, n_seeds = scores.shape[0], scores.shape[-1]
     if n_seeds < FEWEST:
-        checks.whole("draws", draws, 1)
         return np.full_like(value, np.nan), np.full_like(value, np.nan)
     quantile, many = student_quantile((1 + LEVEL) / 2, strata * (n_seeds - 1)), 100_000
     factor = math.sqrt(n_seeds / (n_seeds - 1)) * quantile / student_quantile((1 + LEVEL) / 2, many)

@@ -13,37 +13,25 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image
 from tensordict import TensorDictBase
-from torchrl.data import Composite, Unbounded
-from torchrl.envs import Transform
 
-from damian.common import checks
 from damian.common.plotting import STYLE
 from damian.envs.uav_env import UavEnv
 from damian.show.episode import Episode, at_instant, episode_of
 from damian.show.frame import frame_of
 from damian.show.views import INK, MapView, SpaceView, draw_messages, legend_marks
 
-VIEWS = ("2d", "3d")
 DPI = 100
 SIZE = (7.2, 7.0)
 """Width and height of a film [inches]."""
 STEPS_PER_SECOND = 4
 """Steps that a film shows in a second."""
-LONGEST_GIF = 1000
-"""Most steps of a GIF, all of whose pictures (half a megabyte each) are in memory until it is written."""
 LAST_STEPS = 6
 """Steps for whose time a film shows the last instant."""
 _STYLE: dict[Any, Any] = {**STYLE, "font.size": 8.5}
 
 
 def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
-    """Write a film of an episode: a GIF if the path ends so, else what ffmpeg makes of the path.
-
-    Raises:
-        InputError: there is no such view, or the episode is too long for a GIF.
-    """
-    if path.suffix == ".gif":
-        check_gif(episode)
+    """Write a film of an episode: a GIF if the path ends so, else what ffmpeg makes of the path."""
     film, steps = Film(episode, view), range(episode.n_steps + 1)
     if path.suffix != ".gif":
         writer = FFMpegWriter(STEPS_PER_SECOND)
@@ -57,16 +45,6 @@ def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
     first.save(path, save_all=True, append_images=others, duration=times, loop=0)
 
 
-def check_gif(episode: Episode) -> None:
-    """Refuse an episode that is too long for a GIF.
-
-    Raises:
-        InputError: it has more than ``LONGEST_GIF`` steps.
-    """
-    should = f"steps are more than {LONGEST_GIF}, the most of a gif: choose mp4 or html, or a shorter episode"
-    checks.require(episode.n_steps <= LONGEST_GIF, "formats", episode.n_steps, should)
-
-
 class Film:
     """Draws the instants of an episode, one at a time, into the same figure.
 
@@ -78,13 +56,9 @@ class Film:
     Args:
         episode: the episode to draw.
         view: ``2d``: from above; ``3d``: with the space above it.
-
-    Raises:
-        InputError: there is no such view.
     """
 
     def __init__(self, episode: Episode, view: str = "2d") -> None:
-        checks.one_of("view", view, VIEWS)
         self.episode = episode
         self.colours = [uav.colour for uav in frame_of(episode, 0).uavs]
         with matplotlib.rc_context(_STYLE):
@@ -165,11 +139,6 @@ class LiveFilm:
     """
 
     def __init__(self, env: UavEnv, view: str = "2d") -> None:
-        should = "is not 1: a film shows one world"
-        checks.require(env.batch_size[0] == 1, "film: number of worlds", env.batch_size[0], should)
-        checks.one_of("film: view", view, VIEWS)
-        for extra in ("message", "state"):
-            checks.require(extra in env.extras, "film: extras", sorted(env.extras), f"lack {extra}")
         self.env, self.view = env, view
         self._instants: list[TensorDictBase] = []
 
@@ -186,44 +155,3 @@ class LiveFilm:
         stacked = cast(TensorDictBase, torch.stack([each[0] for each in self._instants]))  # type: ignore[arg-type]
         episode = episode_of(stacked, self.env, {})
         return Film(episode, self.view).frame(episode.n_steps)
-
-
-class FilmPixels(Transform):
-    """Writes the picture of each instant, as a film of the episode so far shows it.
-
-    It writes ``pixels`` [1, height, width, 3] uint8. Drawing takes about 0.3 s a step, so that it suits
-    evaluations, not training.
-
-    Args:
-        env: the environment without delays, of one world, with the extras ``message``, ``state`` and
-            ``reward_terms``.
-        view: ``2d`` or ``3d``.
-
-    Examples:
-        >>> env = make_env(scenario, 1, extras=["message", "state", "reward_terms"])
-        >>> env.append_transform(FilmPixels(env.uav_env))
-        >>> env.append_transform(VideoRecorder(logger, tag="flight"))
-        >>> env.rollout(50, policy)
-        >>> env.transform.dump()
-    """
-
-    def __init__(self, env: UavEnv, view: str = "2d") -> None:
-        super().__init__(in_keys=[], out_keys=["pixels"])
-        self.film = LiveFilm(env, view)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.film.add(next_tensordict)
-        return self._draw(next_tensordict)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        self.film.begin(tensordict_reset)
-        return self._draw(tensordict_reset)
-
-    def _draw(self, outputs: TensorDictBase) -> TensorDictBase:
-        return outputs.set("pixels", torch.as_tensor(self.film.picture(), device=outputs.device).unsqueeze(0))
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        width, height = (round(DPI * size) for size in SIZE)
-        shape, device = torch.Size([1, height, width, 3]), observation_spec.device
-        observation_spec["pixels"] = Unbounded(shape, dtype=torch.uint8, device=device)
-        return observation_spec

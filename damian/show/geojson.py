@@ -2,14 +2,12 @@
 
 import json
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.affinity import translate
 
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
@@ -37,9 +35,9 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     """An episode up to an instant as a FeatureCollection.
 
     The property ``kind`` of a feature says what it is: ``region``, ``landing points``, ``track`` (of a UAV,
-    with ``times`` [s] of its points, if it is one line), ``source track`` (if it is known), ``footprint``
-    and ``coverage`` (what its footprints have covered) of a UAV, ``believed position`` (with ``age_s``), and
-    ``belief`` (a cell, with the ``probability`` that the source is in it).
+    with ``times`` [s] of its points), ``source track`` (if it is known), ``footprint`` and ``coverage`` (what
+    its footprints have covered) of a UAV, ``believed position`` (with ``age_s``), and ``belief`` (a cell,
+    with the ``probability`` that the source is in it). Across the antimeridian, longitudes go beyond 180.
 
     Args:
         episode: flown over a real region.
@@ -48,12 +46,11 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     Raises:
         InputError: the region has no place on Earth.
     """
-    origin, features = origin_of(episode), []
-    for geometry, properties in _features(episode, step):
-        on_earth = _on_earth(geometry, origin)
-        if on_earth["type"] != "LineString":
-            properties.pop("times", None)
-        features.append({"type": "Feature", "properties": properties, "geometry": on_earth})
+    origin = origin_of(episode)
+    features = [
+        {"type": "Feature", "properties": properties, "geometry": _on_earth(geometry, origin)}
+        for geometry, properties in _features(episode, step)
+    ]
     return {"type": "FeatureCollection", "features": features}
 
 
@@ -95,55 +92,11 @@ def _path(places: Floats) -> shapely.LineString | shapely.Point:
 
 
 def _on_earth(geometry: Any, origin: tuple[float, float]) -> dict[str, Any]:
-    """A geometry of local metres in longitude and latitude, cut at the antimeridian, holes clockwise."""
-    edge = -180.0 if origin[1] < 0 else 180.0  # no other antimeridian is within half a turn of the origin
+    """A geometry of local metres in longitude and latitude, with holes clockwise."""
 
     def degrees(metres: NDArray[np.float64]) -> NDArray[np.float64]:
         latitude, longitude = to_latlon(metres[:, 0], metres[:, 1], origin)
         longitude = origin[1] + wrap_longitude(longitude - origin[1])
-        # Points that the rounding below moves onto the antimeridian are put there before anything is cut.
-        longitude[np.abs(longitude - edge) < 10.0**-DIGITS] = edge
-        return np.column_stack([longitude, latitude])
+        return np.column_stack([longitude, latitude]).round(DIGITS)
 
-    parts = [_turned(part) for part in _cut(shapely.transform(geometry, degrees), edge)]
-    lines = parts[0].geom_type == "LineString"
-    whole = parts[0] if len(parts) == 1 else (shapely.multilinestrings if lines else shapely.union_all)(parts)
-    rounded = shapely.transform(whole, lambda xy: xy.round(DIGITS))
-    if shapely.get_dimensions(rounded) == 2 and not rounded.is_valid:  # a gap below a centimetre has closed
-        rounded = shapely.make_valid(rounded, method="structure", keep_collapsed=False)
-    return json.loads(shapely.to_geojson(shapely.orient_polygons(rounded)))
-
-
-def _turned(part: Any) -> Any:
-    """A geometry on one side of the antimeridian, turned to longitudes in [-180, 180]."""
-    west, _, east, _ = part.bounds
-    return translate(part, -360 * np.round((west + east) / 720))
-
-
-def _cut(geometry: Any, edge: float) -> list[Any]:
-    """Parts of a geometry in degrees, each on one side of the antimeridian of longitude ``edge``."""
-    west, _, east, _ = geometry.bounds
-    if not west < edge < east:
-        return [geometry]
-    if shapely.get_num_geometries(geometry) > 1:
-        return [piece for part in shapely.get_parts(geometry) for piece in _cut(part, edge)]
-    if geometry.geom_type == "LineString":
-        return _cut_path(shapely.get_coordinates(geometry), edge)
-    sides = [shapely.box(low, -90, low + 360, 90) for low in (edge - 360, edge)]
-    pieces = shapely.get_parts(shapely.intersection(geometry, sides))
-    # Where an area only touches the antimeridian, the other side has a line or a point of it.
-    return [*pieces[shapely.get_dimensions(pieces) == 2]]
-
-
-def _cut_path(places: NDArray[np.float64], edge: float) -> list[shapely.LineString]:
-    """A path [T, 2] in degrees, cut where it crosses longitude ``edge``; all of its points stay, in order."""
-    beyond = places[:, 0] - edge
-    last = np.flatnonzero(beyond[:-1] * beyond[1:] < 0)
-    share = beyond[last] / (beyond[last] - beyond[last + 1])
-    crossings = places[last] + share[:, None] * (places[last + 1] - places[last])
-    crossings[:, 0] = edge
-    places = np.insert(places, last + 1, crossings, axis=0)
-    side = np.sign(places[:, 0] - edge)
-    off = np.flatnonzero(side)
-    cuts = off[1:][side[off[1:]] != side[off[:-1]]] - 1
-    return [shapely.LineString(places[a : b + 1]) for a, b in pairwise([0, *cuts, len(places) - 1])]
+    return json.loads(shapely.to_geojson(shapely.orient_polygons(shapely.transform(geometry, degrees))))

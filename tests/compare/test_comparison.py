@@ -15,7 +15,6 @@ from damian.compare.comparison import (
     Comparison,
 )
 from damian.compare.figures import ARM_COLOURS, plot_curves, plot_delays, plot_norms
-from damian.compare.report import markdown
 from damian.compare.statistics import interquartile_mean
 
 ARMS = {
@@ -134,17 +133,13 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
-def test_a_recovery_is_from_the_naive_arm_of_the_same_track_and_any_two_arms_are_compared():
+def test_a_recovery_is_from_the_naive_arm_of_the_same_track():
     scores = SCORES | {"flown": [9.0, 8.0]}  # naive, but trained undelayed: not the reference of late data
     arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}
     comparison = Comparison(rows_of("t", "late", scores), arms)
     compared = comparison.compared("t", "late")
     assert compared["aware"]["recovery"].value == pytest.approx((7.5 - 3) / (10 - 3))
     assert compared["flown"]["recovery"] is UNKNOWN  # the strongest naive arm of its track
-    pairs = comparison.pairs("t", "late")
-    assert pairs["aware", "flown"].value == (0 + 0 + 0.5 + 1) / 4
-    assert pairs["flown", "aware"].value == (1 + 1 + 0.5 + 0) / 4
-    assert "| aware | 1.000 | 0.375 |" in markdown(comparison, [])
 
 
 def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its_own():
@@ -211,22 +206,6 @@ def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other
         assert axis.get_legend_handles_labels()[1] == expected
         lines = [bars[0] for bars in axis.containers]
         assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(expected)
-
-
-def test_a_figure_has_no_empty_panel_and_says_where_nothing_is_known(monkeypatch, tmp_path):
-    unknown = [each | {"return": np.nan} for each in rows_of("u", "late", SCORES)]
-    comparison = Comparison(unknown + rows_of("t", "late", SCORES), ARMS)
-    path = tmp_path / "figure.png"
-    figure = drawn(monkeypatch, lambda: plot_norms(comparison, path))
-    assert [axis.get_title() for axis in figure.axes] == ["t"]
-    figure = drawn(monkeypatch, lambda: plot_delays(comparison, {"none": ["left out"]}, path))
-    assert [axis.get_title() for axis in figure.axes] == ["t"]
-    figure = drawn(monkeypatch, lambda: plot_norms(Comparison(unknown, ARMS), path))
-    assert not figure.axes
-    assert "no J_norm is known" in figure.texts[0].get_text()
-    path.write_text("of an earlier report")
-    plot_curves(Comparison(unknown, ARMS), {}, {}, path)
-    assert not path.exists()
 
 
 @pytest.mark.parametrize(("first", "drawn_over"), [(3, [3.0, 4.0]), (5, [])])

@@ -68,7 +68,7 @@ def test_a_region_a_motion_model_and_a_sensor_of_ones_own_are_trained_with(run):
         (["delay.obs={law: law:Satellite, hops: 2}"], "delay.obs.hops: 2 is no setting of the law law:Satel"),
         (["sensors=[{sensor: sensor:wind, strenght: 3}]"], "sensors[0].strenght: 3 is no parameter of"),
         (["reward.custom=[{term: law:Satellite}]"], "reward.custom[0].term: law:Satellite is no reward term"),
-        (["region.kind=region:yard", "region.options={sid: 50}"], "region.options.sid: 50 is not one of its"),
+        ([*REGION[:2], "region.options={sid: 50}"], "region.options.sid: 50 is not one of its"),
         (["motion.kind=law:Satellite"], "motion.kind: law:Satellite is no class derived from"),
     ],
 )

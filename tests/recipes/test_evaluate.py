@@ -122,7 +122,6 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tm
     ("word", "message"),
     [
         ("agents=5", "agents: the policy was trained with 3, so it cannot fly with 5"),
-        ("learner=predictive_mappo", "learner=predictive_mappo: the policy was trained with False"),
         ("observation.belief=[belief_moments]", r"observation.belief: the policy was trained with \[\]"),
     ],
 )

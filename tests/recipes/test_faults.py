@@ -120,18 +120,6 @@ def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, me
     assert files(copied) == names
 
 
-def test_a_cut_last_line_is_no_row(tmp_path):
-    for text, rows in (
-        ("", 0),
-        ("fra", 0),
-        ("frames,x\n1,", 0),
-        ("frames,x\n1,2\n3", 1),
-        ("frames,x\n1,2\n3,4\n", 2),
-    ):
-        (tmp_path / "metrics.csv").write_text(text)
-        assert len(read_metrics(tmp_path)) == rows
-
-
 # Signals.
 
 
@@ -171,12 +159,6 @@ def test_sigterm_stops_a_run_after_its_update(run, capsys, monkeypatch):
 
 
 # The best policy.
-
-
-def test_no_policy_is_the_best_while_only_short_episodes_can_have_ended(run):
-    folder = run(*TINY, "scenario=spotting", "episode.success_share=0.3", "episode.max_steps=100")
-    assert read_metrics(folder)[-1]["perceived_success_rate"] == 1  # because failed episodes go on
-    assert not (folder / "best.pt").exists()
 
 
 @pytest.mark.slow

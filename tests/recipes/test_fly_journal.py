@@ -81,23 +81,12 @@ def test_a_setting_that_is_given_replaces_that_of_the_advice(show):
     assert "agents=5" not in episode.about["overrides"]
 
 
-@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (["policy=script"], "policy: script means nothing with journal, which flies nothing"),
-        (["eval_episodes=7"], "eval_episodes: 7 means nothing with journal"),
-        (["span=[3]"], "span: [3.0] is not [FIRST, LAST], two times of a journal [s]"),
         (["span=[90,99]"], "span: no step lies between 90 and 99 s: the journal covers 0 to 5 s"),
-        (["journal=nothing.jsonl"], "nothing.jsonl: it cannot be read: No such file or directory"),
-        (["region=usecase"], "lat, lon"),
     ],
 )
 def test_what_cannot_be_shown_is_refused_in_one_line(show, capsys, overrides, message):
     check_refused(lambda: show(*overrides), message, capsys)
-
-
-def test_a_later_span_begins_later(show):
-    episode = Episode.load(show("span=[2,4]") / "episode_0.json")
-    assert episode.about["began"] == "2023-11-14T22:13:23.000Z"
-    assert episode.time[0] == 0

@@ -83,11 +83,6 @@ def test_a_killed_search_goes_on_with_the_trial_that_it_was_training(search):
 
 
 @pytest.mark.slow
-def test_several_processes_share_a_search(search):
-    assert len(rows(search("trials=3", "processes=2") / "trials.csv")) == 3
-
-
-@pytest.mark.slow
 def test_a_trial_that_is_worse_than_others_is_pruned(search, monkeypatch):
     hopeless = optuna.pruners.ThresholdPruner(lower=1e9)
     monkeypatch.setattr(tune.optuna.pruners, "MedianPruner", lambda *_, **__: hopeless)

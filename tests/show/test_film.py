@@ -2,20 +2,12 @@
 
 import numpy as np
 import pytest
-import torch
 from episodes import flight
 from matplotlib.colors import to_rgb
 from PIL import Image
-from torchrl.record import VideoRecorder
 
-from damian.baselines.random import random_policy
-from damian.common.errors import InputError
 from damian.common.plotting import COLOURS
-from damian.envs.pipeline import make_env
-from damian.settings import DelayConfig, ScenarioConfig
-from damian.show import film as films
-from damian.show.episode import record
-from damian.show.film import Film, FilmPixels, save_film
+from damian.show.film import Film, save_film
 
 
 def colour_at(film: Film, step: int, east: float, north: float) -> np.ndarray:
@@ -72,44 +64,3 @@ def test_a_film_of_the_space_shows_a_uav_above_the_place_where_it_stands():
     colours = [(np.abs(film.frame(0) / 255 - to_rgb(COLOURS[1])).max(-1) < 0.02) for film in (low, high)]
     heights = [np.nonzero(colour[:450, :500])[0].min() for colour in colours]
     assert heights[1] < heights[0] - 20
-
-
-def test_a_gif_of_too_many_steps_and_an_unknown_view_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(films, "LONGEST_GIF", 2)
-    with pytest.raises(InputError, match="formats: 3 steps are more than 2, the most of a gif: choose mp4"):
-        save_film(flight(3), tmp_path / "film.gif")
-    assert not any(tmp_path.iterdir())
-    with pytest.raises(InputError, match="view: 3D is not one of 2d, 3d"):
-        Film(flight(1), "3D")
-
-
-# While an environment runs, through TorchRL's own recorder.
-
-EXTRAS = ["message", "state", "reward_terms"]
-
-
-class Kept:
-    """A logger that keeps the videos."""
-
-    def __init__(self) -> None:
-        self.videos: dict[str, torch.Tensor] = {}
-
-    def log_video(self, name: str, video: torch.Tensor, **_: object) -> None:
-        self.videos[name] = video
-
-
-def test_torchrls_recorder_films_what_a_film_of_the_episode_shows():
-    scenario = ScenarioConfig(delay=DelayConfig(obs=2))
-    env, logger = make_env(scenario, 1, seed=0, extras=EXTRAS), Kept()
-    env.append_transform(FilmPixels(env.uav_env))
-    env.append_transform(VideoRecorder(logger, tag="flight", skip=1, make_grid=False))
-    rollout = env.rollout(3, random_policy(env))
-    env.transform.dump()
-    video = logger.videos["flight"]
-    assert video.shape[-4:] == (4, 3, 700, 720)
-    film = Film(record(rollout, env.uav_env, {})[0])
-    last = np.moveaxis(video.reshape(-1, 3, 700, 720)[-1].numpy(), 0, -1)
-    assert np.array_equal(last, film.frame(3))
-    again = env.rollout(2, random_policy(env))
-    film = Film(record(again, env.uav_env, {})[0])
-    assert np.array_equal(again["next", "pixels"][0, -1].numpy(), film.frame(2))
