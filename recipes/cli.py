@@ -146,11 +146,7 @@ ERRORS = (HydraException, OmegaConfBaseException, YAMLError)
 
 
 def composed(program: str, overrides: Sequence[str], own_folder: str | None = None) -> DictConfig:
-    """The configuration that Hydra composes from overrides, with its own section ``hydra``.
-
-    Raises:
-        InputError: the overrides or a file cannot be composed.
-    """
+    """The configuration that Hydra composes from overrides, with its own section ``hydra``."""
     words = whole_laws(overrides)
     if own_folder:
         words.append(f"hydra.searchpath=['file://{Path(own_folder).resolve()}']")
@@ -184,11 +180,7 @@ def _without_hydra(found: DictConfig) -> DictConfig:
 
 
 def checked(found: DictConfig, program: str = "train") -> Any:
-    """A composed configuration as an instance of its dataclass, whose checks it passes.
-
-    Raises:
-        InputError: a value is impossible, or a key is unknown.
-    """
+    """A composed configuration as an instance of its dataclass, whose checks it passes."""
     plain = _without_hydra(found)
     try:
         config: Any = OmegaConf.to_object(plain)

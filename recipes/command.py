@@ -23,7 +23,7 @@ PROGRAMS = {
     "tune": "search for better settings of a learner with Optuna",
     "fly": "fly episodes, and keep or replay them as files, films, figures and pages",
     "advise": "advise real UAVs: from what they report, where each should land next",
-    "oracle": "fly a policy or the script with ever more known on time: which delay costs how much",
+    "oracle": "fly the script with ever more known on time: which delay costs how much",
 }
 """What each program does, by its name; the program is the module of this name."""
 SETTINGS = {name: name for name in PROGRAMS} | {"evaluate": "train", "oracle": "train"}

@@ -55,11 +55,7 @@ def stored(config: TrainConfig) -> tuple[DelayedEnv, ProbabilisticActor]:
 
 
 def stored_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
-    """The actor of ``config.checkpoint``, for an environment.
-
-    Raises:
-        InputError: no checkpoint is given, or its actor has other observations, actions or layers.
-    """
+    """The actor of ``config.checkpoint``, for an environment."""
     if not config.checkpoint:
         raise InputError("checkpoint: it is missing: the run folder with the policy to fly")
     actor = config.learner.make_actor(env, config.model)

@@ -1,21 +1,15 @@
-"""Fly a policy, or the script, with ever more known on time: which late messages cost how much.
+"""Fly the script with ever more known on time: which late messages cost how much.
 
-    damian train scenario=tracking hydra.run.dir=runs/undelayed
-    damian oracle checkpoint=runs/undelayed delay=paper
     damian oracle scenario=delaybench/tracking delay=paper
     damian oracle -m scenario=delaybench/tracking delay.obs=2,4,8,16
 
-With a checkpoint its policy flies, first as it must, then with some messages before they arrive (regime R3,
-docs/protocol.md). A policy with a belief is refused; the overrides of its training apply too.
-
-Without a checkpoint the script flies (``damian.baselines.greedy.Searcher``): each UAV goes where it most
-probably detects the source next, as the belief says, by the messages that have arrived at the server, by each
-UAV's own messages at once too (both R0), by all messages at once, and by the source's true place (both R3).
-With all messages on time it is a strong reference, and no proven limit: a policy that plans further ahead may
-win more. The run folder gets config.yaml, result.csv and result.md, with one row for what is known.
+The script (``damian.baselines.greedy.Searcher``) lets each UAV go where it most probably detects the source
+next, as the belief says: by the messages that have arrived at the server, by each UAV's own messages at once
+too (both R0), by all messages at once, and by the source's true place (both R3, docs/protocol.md). With all
+messages on time it is a strong reference, and no proven limit: a policy that plans further ahead may win
+more. The run folder gets config.yaml, result.csv and result.md, with one row for what is known.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -24,7 +18,6 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torch.nn.functional import one_hot
-from torchrl.envs import StepCounter
 
 from damian import keys
 from damian.baselines.greedy import greedy_policy
@@ -36,87 +29,31 @@ from damian.envs.pipeline import has_message_delay, make_env
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import save_results
 from damian.server.belief import SourceGrid
-from damian.server.server import Server
 from damian.settings import ScenarioConfig, TrainConfig
-from damian.world.messages import Messages
 
 from . import cli
-from .evaluate import stored
 from .shared.runs import save_config
-
-ALL = Messages._fields
-PLACE = ("position", "target", "track", "trail")
-"""Fields of a message that a UAV can compute from its own past actions; its detections are not among them."""
 
 
 def fly(config: TrainConfig, folder: Path) -> None:
-    """Evaluate the policy of ``config.checkpoint``, or else the script, and fill the run folder."""
+    """Evaluate the script by what is known on time, and fill the run folder."""
     check(config)
     save_config(config, folder)
-    rows = policy_rows(config) if config.checkpoint else script_rows(config)
-    table = save_results(rows, folder, config.episode.success_share is not None, late=True)
+    table = save_results(script_rows(config), folder, config.episode.success_share is not None, late=True)
     print(f"\nwhat is known on time:\n\n{table}")
 
 
 def check(config: TrainConfig) -> None:
     """Check that the rows can differ, and that they follow from what the server broadcasts."""
+    if config.checkpoint:
+        remedy = "a policy flies with more on time by damian evaluate with observation.own=true or delay=none"
+        raise InputError(f"checkpoint: the script flies here; {remedy}")
     if not has_message_delay(config):
         raise InputError("delay.obs: no message is late or lost; choose a delay such as delay=paper")
     should = "is not supported: the rows compare what the server can know; choose links=server"
     checks.require(config.links.kind == "server", "links", config.links.kind, should)
-    if not config.checkpoint and not config.seeks_source:
+    if not config.seeks_source:
         raise InputError("reward: nothing is won by finding the source, which is all that the script does")
-    if config.checkpoint:
-        should = "is not supported: the rows replace what the server broadcasts at every step; leave it out"
-        checks.require(config.clock.steps("server") == 1, "clock.server", config.clock.server, should)
-        should = "is not supported: what a UAV believes follows from more messages than the latest ones"
-        belief, messages = config.observation.belief, config.delay.messages
-        checks.require(not belief, "observation.belief", belief, should)
-        checks.require(not messages, "delay.messages", messages, should)
-
-
-# A stored policy.
-
-
-def policy_rows(config: TrainConfig) -> dict[str, Evaluation]:
-    """Evaluations of the stored policy, in the same episodes, by what a UAV knows on time."""
-    env, actor = stored(config)
-    env.append_transform(StepCounter())
-    own = torch.eye(config.agents, dtype=torch.bool, device=env.device)
-    known_on_time = {
-        "nothing": (own & ~own, ALL),
-        "where it is": (own, PLACE),
-        "its own messages": (own, ALL),
-        "the others' messages": (~own, ALL),
-        "everything": (own | ~own, ALL),
-    }
-    rows = {}
-    for name, (on_time, fields) in known_on_time.items():
-        env.set_seed(config.eval_seed)
-        observe = observe_with_timely_messages(env.server, on_time, fields)
-        policy = TensorDictSequential([observe, actor])  # type: ignore[list-item]
-        rows[name] = evaluate(env, policy, config.horizon)
-    return rows
-
-
-def observe_with_timely_messages(server: Server, on_time: Tensor, fields: Sequence[str]) -> TensorDictModule:
-    """A module that replaces the actor's observations by those with some messages known on time.
-
-    Args:
-        server: the server of the environment.
-        on_time: row i, column j: does UAV i know UAV j's latest message at once, [N, N] bool.
-        fields: fields of the messages that are known at once.
-    """
-
-    def observe(received: Tensor, sent: Tensor, observation: Tensor, steps: Tensor) -> Tensor:
-        timely = server.observe_with_timely_messages(received, sent, steps.squeeze(-1), on_time, fields)
-        return torch.cat([timely, observation[..., timely.shape[-1] :]], -1)  # keep the action history
-
-    in_keys = [keys.RECEIVED, keys.MESSAGE, keys.OBSERVATION, keys.STEP_COUNT]
-    return TensorDictModule(observe, in_keys=in_keys, out_keys=[keys.OBSERVATION])
-
-
-# The script.
 
 
 def script_rows(config: TrainConfig) -> dict[str, Evaluation]:

@@ -8,8 +8,8 @@ Every override of damian train may be given, except resume. Each trial is a trai
 RUN/trial_N; its value is what the evaluation after it measures (score and policy). A trial whose return is
 below the median of the earlier trials, at the same number of frames, is pruned. After Ctrl-C or a kill the
 same command continues, from the checkpoints of the trials that were being trained. The run folder,
-runs/tune unless hydra.run.dir names another one, gets search.db (Optuna's storage, for its dashboard),
-trials.csv, table.md, and the figures history.png, slices.png and importances.png.
+runs/tune unless hydra.run.dir names another one, gets trials.csv, table.md, and search.db, Optuna's storage,
+of which its dashboard draws figures (optuna-dashboard sqlite:///RUN/search.db).
 
 All trials have the same seed and are compared in the same episodes: what was searched for must be shown with
 other seeds (damian compare).
@@ -21,13 +21,11 @@ import math
 import shlex
 import signal
 import sys
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from damian.common import checks
@@ -55,7 +53,6 @@ try:
         IntDistribution,
     )
     from optuna.trial import Trial, TrialState
-    from optuna.visualization import matplotlib as figures
 except ImportError as error:
     raise InputError("damian tune: optuna is not installed; pip install optuna") from error
 
@@ -234,7 +231,7 @@ def search(config: TuneConfig, overrides: list[str], folder: Path) -> None:
 
 
 def report(found: Search) -> None:
-    """Write the table and the figures, and print how to train with the best settings.
+    """Write the table, and print how to train with the best settings.
 
     Raises:
         RunError: no trial has been finished.
@@ -262,24 +259,7 @@ def report(found: Search) -> None:
     ]
     text = "\n\n".join(lines) + "\n"
     write_atomically(found.folder / "table.md", text)
-    plot(found)
     print(text)
-
-
-def plot(found: Search) -> None:
-    """Draw Optuna's figures."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Optuna says that its figures are experimental
-        drawn = {
-            "history": figures.plot_optimization_history(found.study),
-            "slices": figures.plot_slice(found.study, params=[*found.space]),
-        }
-        if found.n_finished > 1 and len(found.space) > 1:
-            judge = optuna.importance.PedAnovaImportanceEvaluator()
-            drawn["importances"] = figures.plot_param_importances(found.study, evaluator=judge)
-        for name, axes in drawn.items():
-            figure = np.atleast_1d(axes).ravel()[0].figure
-            figure.savefig(found.folder / f"{name}.png", dpi=120, bbox_inches="tight")
 
 
 def search_all(config: TuneConfig, folder: Path) -> None:

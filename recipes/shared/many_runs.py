@@ -91,11 +91,7 @@ class Run:
 
 
 def check_stored(run: Run) -> None:
-    """Check that a run folder is empty or holds a run with the same settings.
-
-    Raises:
-        InputError: the stored settings differ or cannot be read.
-    """
+    """Check that a run folder is empty or holds a run with the same settings."""
     if not (run.folder / CONFIG).exists():
         return
     try:
@@ -117,9 +113,6 @@ class SlurmJobs:
     Args:
         folder: gets the files of submitit; all machines must see it.
         parameters: of submitit's executor; ``cluster: local`` starts processes of this machine instead.
-
-    Raises:
-        InputError: submitit is not installed, knows no such parameter, or finds no Slurm here.
     """
 
     def __init__(self, folder: Path, parameters: Mapping[str, Any]) -> None:
@@ -153,9 +146,6 @@ def perform_all(
         processes: number of runs at the same time.
         told: policy and measure of the latest run that the progress bar shows.
         slurm: carries out the runs, if they are not carried out on this machine.
-
-    Raises:
-        KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
     """
     todo, failed = [run for run in runs if not run.finished], []
     with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
@@ -172,12 +162,7 @@ def perform_all(
 def perform_each(
     runs: Iterable[Run], processes: int, slurm: SlurmJobs | None = None
 ) -> Iterator[tuple[Run, BaseException | None]]:
-    """Carry out runs; yields each, when it has ended, with its error, or None.
-
-    Args:
-        runs: taken from an iterator one by one, as processes become free.
-        processes: number of runs at the same time; a single one is this process.
-        slurm: carries out the runs, if they are not carried out on this machine.
+    """Carry out runs, taken one by one as processes become free; yields each with its error, or None.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.

@@ -50,9 +50,6 @@ def prepared(
         own_folder: a folder with configuration files of the user's own.
         folder: the run folder that the command line names.
         again: the folder may hold what the same command has left there.
-
-    Raises:
-        InputError: a value is impossible, a key is unknown, or there is no run to resume.
     """
     given = composed(program, words, own_folder)
     words = [word for word in words if not key_of(word).startswith("hydra")]
@@ -145,10 +142,6 @@ def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[s
         key: the setting that names the folder, for errors.
         trust: whether components of other code that the file names may be imported.
         named: words of the command line, whose components may be imported.
-
-    Raises:
-        InputError: there is no run, it cannot be read, another minor version of damian has written it, or it
-            names code that may not be imported.
     """
     file = folder / CONFIG
     if not file.is_file():
@@ -177,16 +170,8 @@ def stored_overrides(folder: Path) -> list[str]:
 def require_trust(found: Any, key: str, trust: bool, named: Sequence[str]) -> None:
     """Refuse components of other code that stored settings name, unless the caller has named or trusts them.
 
-    Importing ``package.module:Name`` runs the module, and a stored file may come from anybody.
-
-    Args:
-        found: the stored settings, before anything is made of them.
-        key: the setting that names the file, for errors.
-        trust: ``trust=true`` was given.
-        named: words of the command line.
-
-    Raises:
-        InputError: there is such a component.
+    Importing ``package.module:Name`` runs the module, and a stored file may come from anybody. So nothing is
+    made of ``found``, the stored settings, before. The other arguments are those of ``stored_config``.
     """
     typed = " ".join(named)
     foreign = [path for path in _components(found) if path not in typed]
@@ -243,7 +228,7 @@ def inherited(
         stored: settings of the stored run.
         before: overrides of the stored run.
         given: those of the new program.
-        own: keys that have another default in this program, which those of the stored run do not replace.
+        own: keys with another default in this program.
     """
     keys = [*map(key_of, given), *own]
     history = [] if {"delay.history", "aware"} & {*keys} else [f"delay.history={stored.delay.history}"]
@@ -264,11 +249,7 @@ def own_defaults(kind: type) -> set[str]:
 
 
 def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
-    """Check that a policy can fly in another scenario than the one that it was trained in.
-
-    Raises:
-        InputError: its observations, actions or layers would differ; the message names the setting.
-    """
+    """Check that a policy has the same observations, actions and layers in another scenario."""
     new, old = _shape(config), _shape(stored)
     for key, value in new.items():
         if value != old[key]:
