@@ -82,13 +82,6 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
     print(f"learning curve: {folder / FIGURE}")
 
 
-def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
-    """The replay buffer (back-updating or not) of the learner, if it needs one."""
-    with own_code(config.learner.name):
-        size = config.learner.buffer_size(learning_setup(config))
-    return None if size is None else make_buffer(config, env, size)
-
-
 def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
     """The learner, with the replay buffer that it needs."""
     name = config.learner.name
@@ -100,11 +93,15 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
     return learner
 
 
-def make_buffer(config: TrainConfig, env: DelayedEnv, size: int) -> ReplayBuffer:
-    """A replay buffer of ``size`` environment steps; with ``backupdate``, what arrives late corrects them."""
+def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
+    """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct it."""
+    setup, actor = learning_setup(config), config.recompute_actor
+    with own_code(config.learner.name):
+        size = config.learner.buffer_size(setup)
+    if size is None:
+        return None
     if not backupdates(config):
         return ReplayBuffer(storage=TimeStorage(size, device=config.device))
-    setup, actor = learning_setup(config), config.recompute_actor
     least = setup.least_buffer
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
     checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)

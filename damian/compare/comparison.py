@@ -18,7 +18,7 @@ from damian.compare.statistics import (
     recovery,
 )
 from damian.runs.run_folder import DETERMINISTIC
-from damian.settings.programs import Arm
+from damian.settings.programs import LESS_IS_BETTER, Arm
 
 TRAINED, UNTRAINED, SCRIPT, RANDOM = "trained", "untrained", "script", "random"
 TRAINED_DETERMINISTIC, UNTRAINED_DETERMINISTIC = TRAINED + DETERMINISTIC, UNTRAINED + DETERMINISTIC
@@ -52,19 +52,16 @@ class Column:
     """Its heading in Markdown."""
     bounds: tuple[float, float] = (-np.inf, np.inf)
     """Smallest and largest possible value."""
-    is_score: bool = False
-    """Whether arms can be compared by it."""
-    less_is_better: bool = False
 
 
 _SHARE, _TIME = (0.0, 1.0), (0.0, np.inf)
 MEASURED = (
-    Column("return", "return", is_score=True),
-    Column("success_rate", "success", _SHARE, is_score=True),
-    Column("steps", "steps", _TIME, is_score=True, less_is_better=True),
-    Column("perceived_return", "perceived return", is_score=True),
-    Column("perceived_success_rate", "perceived success", _SHARE, is_score=True),
-    Column("perceived_steps", "perceived steps", _TIME, is_score=True, less_is_better=True),
+    Column("return", "return"),
+    Column("success_rate", "success", _SHARE),
+    Column("steps", "steps", _TIME),
+    Column("perceived_return", "perceived return"),
+    Column("perceived_success_rate", "perceived success", _SHARE),
+    Column("perceived_steps", "perceived steps", _TIME),
     Column("age", "age", _TIME),
     Column("late", "late", _SHARE),
     Column("lost", "lost", _SHARE),
@@ -83,8 +80,6 @@ recovery is 0 for the strongest naive arm of the same track and 1 for the undela
 probability that a run beats one of that naive arm; of_oracle: the score over that of the script which knows
 all messages on time, if an arm flies it."""
 MEASURES = tuple(column.name for column in MEASURED)
-SCORES = tuple(column.name for column in MEASURED if column.is_score)
-LESS_IS_BETTER = tuple(column.name for column in MEASURED if column.less_is_better)
 BOUNDS = {column.name: column.bounds for column in MEASURED}
 
 Row = Mapping[str, Any]

@@ -61,7 +61,7 @@ def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = Tr
         env: environment of B worlds, with ``message`` among its extras.
         policy: chooses the actions.
         horizon: number of steps after which an episode that has not ended is cut.
-        sample: whether to draw actions from the policy's distribution; else the most likely one is taken.
+        sample: draw actions from the policy's distribution, instead of the most likely ones.
     """
     add_recurrent_state(env, policy)
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC

@@ -92,11 +92,7 @@ class TrainingState:
             write_checkpoint(self.folder / BEST, content)
 
     def load(self) -> None:
-        """Continue from the checkpoint of the run, and remove what a killed run has left beside it.
-
-        Raises:
-            InputError: it is missing, damaged, or does not fit.
-        """
+        """Continue from the checkpoint of the run, and remove what a killed run has left beside it."""
         path = checkpoint_file(self.folder, "resume")
         content = _content(path, "resume")
         restore(self.components, content["components"], path, "resume")
@@ -117,17 +113,8 @@ def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> Non
     restore(components, _content(path, key)["components"], path, key)
 
 
-def stored_progress(folder: Path) -> dict[str, Any]:
-    """How far the stored training of a run folder has come: the parts of its checkpoint."""
-    return _content(checkpoint_file(folder, "resume"), "resume")["training"]
-
-
 def checkpoint_file(written: Path, key: str) -> Path:
-    """The file that a run folder, or a file in one, stands for.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The file that a run folder, or a file in one, stands for."""
     path = written if written.is_file() else written / CHECKPOINT
     if not path.exists():
         raise InputError(f"{key}: {path}: there is no such file, so there is nothing to load")
@@ -141,7 +128,7 @@ def _states(parts: Mapping[str, Any]) -> dict[str, Any]:
 def _content(path: Path, key: str) -> dict[str, Any]:
     content = read_checkpoint(path, key)
     if not all(isinstance(content.get(part), dict) for part in ("components", "training")):
-        raise InputError(f"{key}: {path}: it is not the checkpoint of a training; give the folder of a run")
+        raise InputError(f"{key}: {path}: it is not the checkpoint of a training")
     return content
 
 

@@ -119,16 +119,6 @@ class Episode:
         """Whether the UAV sent a message in the step that arrives at a later one, [T + 1, N]."""
         return self.sent & (self.delay > 0)
 
-    @property
-    def arrived(self) -> Flags:
-        """Whether a message arrived in the step, even one older than the message held, [T + 1, N]."""
-        step, uav = np.nonzero(self.sent & (self.delay >= 0))
-        arrival = step + self.delay[step, uav]
-        arrived = np.zeros_like(self.sent)
-        arrived[arrival[arrival < len(arrived)], uav[arrival < len(arrived)]] = True
-        arrived[0] = True
-        return arrived
-
     @cached_property
     def squares(self) -> NDArray[np.object_]:
         """What of each of the belief's square cells lies in the region, [K] polygons or several of them."""
@@ -146,11 +136,7 @@ class Episode:
         return np.flatnonzero(self.belief[step] > LIKELY * self.belief[step].max())
 
     def save(self, path: Path) -> None:
-        """Write the episode as JSON.
-
-        Raises:
-            RunError: the file cannot be written.
-        """
+        """Write the episode as JSON."""
         write_atomically(path, json.dumps(self.document(), separators=(",", ":")))
 
     def document(self) -> dict[str, Any]:

@@ -48,11 +48,6 @@ def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
 class Film:
     """Draws the instants of an episode, one at a time, into the same figure.
 
-    The view shows the region with its landing points, the UAVs with their paths and footprints (stronger
-    while they spot the source), the source (filled while it emits), where the server believes the UAVs to be
-    (rings, with the age of what it knows), and, if there is one, its belief about the source. Below: a row
-    for each UAV with every message, from the time at which it was sent until it arrives.
-
     Args:
         episode: the episode to draw.
         view: ``2d``: from above; ``3d``: with the space above it.
@@ -104,7 +99,7 @@ class Film:
         return Image.fromarray(self.frame(step)).quantize(dither=Image.Dither.NONE)
 
     def _draw_charts(self) -> None:
-        """Draw over time the return so far and the age of what the server knows, or the batteries if used."""
+        """Draw over time the return so far, and the ages of messages, or the batteries if they are used."""
         episode = self.episode
         used = not np.allclose(episode.battery, episode.battery[:1])
         titles = ("return so far", "battery [%]" if used else "age of information [s]")

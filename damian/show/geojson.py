@@ -22,12 +22,7 @@ _CORNERS = 16
 
 
 def save_geojson(episode: Episode, path: Path) -> None:
-    """Write an episode as GeoJSON, with what is true and believed at its last instant.
-
-    Raises:
-        InputError: its region has no place on Earth.
-        RunError: the file cannot be written.
-    """
+    """Write an episode as GeoJSON, with what is true and believed at its last instant."""
     write_atomically(path, json.dumps(feature_collection(episode, episode.n_steps), separators=(",", ":")))
 
 
@@ -42,9 +37,6 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     Args:
         episode: flown over a real region.
         step: number of steps to write.
-
-    Raises:
-        InputError: the region has no place on Earth.
     """
     origin = origin_of(episode)
     features = [

@@ -14,10 +14,8 @@ from string import Template
 from typing import Any
 from urllib.parse import quote
 
-from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.plotting import COLOURS
-from damian.settings.programs import MOST_EPISODES
 from damian.show.episode import LIKELY, Episode
 
 _PAGE = Path(__file__).parent / "page"
@@ -31,22 +29,12 @@ _NOT_FLOWN = (*_TOLD, "hydra", "formats", "views", "keep", "eval_episodes", "jou
 
 
 def save_page(episodes: Sequence[Episode], path: Path) -> None:
-    """Write a page that plays episodes side by side, on one time line.
-
-    Raises:
-        InputError: there are no episodes, or more than ``MOST_EPISODES``.
-        RunError: the file cannot be written.
-    """
+    """Write a page that plays episodes side by side, on one time line."""
     write_atomically(path, page(episodes))
 
 
 def page(episodes: Sequence[Episode]) -> str:
-    """The text of a page that plays episodes.
-
-    Raises:
-        InputError: there are no episodes, or more than ``MOST_EPISODES``.
-    """
-    checks.in_range("episodes", len(episodes), 1, MOST_EPISODES)
+    """The text of a page that plays episodes."""
     shared, names = titles(episodes)
     shown = [{"title": name, **episode.document()} for name, episode in zip(names, episodes, strict=True)]
     replay = {"colours": COLOURS, "likely": LIKELY, "shared": shared, "episodes": shown}
