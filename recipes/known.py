@@ -44,12 +44,12 @@ PLAIN = {
     "actions": ["discrete", "continuous"],
     "learner": [*LEARNERS],
     "model": ["mlp"],
-    "logger": ["all", "csv", "tensorboard", "wandb", "mlflow"],
+    "logger": ["all", "csv", "tensorboard", "wandb"],
     "delay": ["none"],
     "aware": ["none"],
 }
 """Options of the groups that need no file, because they only choose a kind."""
-LOGGERS = {name: f"damian.runs.loggers:{name}" for name in ("wandb", "mlflow")}
+LOGGERS = {"wandb": "damian.runs.loggers:wandb"}
 """Loggers of DAMIAN that stand in settings by their paths."""
 
 

@@ -17,10 +17,9 @@ import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 from tqdm import tqdm
@@ -157,8 +156,6 @@ def update(
     means = {"episodes": float(episodes.finished), **episodes.means()}
     numbers = {**means, **mean_terms(batch), **losses}
     log.add(progress.frames, numbers)
-    for name, values in distributions(batch).items():
-        log.add_histogram(progress.frames, name, values)
     check_convergence(config, state, losses)
     return numbers
 
@@ -195,17 +192,6 @@ def mean_terms(batch: TensorDictBase) -> dict[str, float]:
     """Mean of each weighted reward term (eq. 5-8) over the steps, worlds and UAVs of a batch [B, T]."""
     terms = cast(TensorDictBase, batch[next_key(keys.REWARD_TERMS)])
     return {f"reward/{name}": term.mean().item() for name, term in terms.items()}
-
-
-def distributions(batch: TensorDictBase) -> dict[str, NDArray[Any]]:
-    """The actions of a batch [B, T], and the ages [steps] of the messages at the server, if it has them."""
-    action = cast(torch.Tensor, batch[keys.ACTION])
-    found = {"action": action}
-    if action.is_floating_point():
-        found = {"action/distance": action[..., 0], "action/heading": action[..., 1]}
-    if (age := batch.get(next_key(keys.AGE), None)) is not None:
-        found["age"] = cast(torch.Tensor, age)
-    return {name: values.flatten().float().cpu().numpy() for name, values in found.items()}
 
 
 def open_log(config: TrainConfig, state: TrainingState) -> MetricsLog:

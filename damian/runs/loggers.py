@@ -1,4 +1,4 @@
-"""Loggers, which get every number that a training logs: the user's own ones, and two of TorchRL's."""
+"""Loggers, which get every number that a training logs: the user's own ones, and one of TorchRL's."""
 
 import secrets
 from collections.abc import Callable, Mapping, Sequence
@@ -11,16 +11,12 @@ from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry, check_parameters
 
-BINS = 64
-"""Bins of a histogram."""
-
 
 class Logger(Protocol):
     """Receives numbers, as TorchRL's loggers do.
 
     Further methods are called if it has them: ``log_hparams(settings)`` at the beginning, with every setting
-    by its dotted key; ``log_histogram(name, values, step)`` with the actions and ages [steps] of an update;
-    ``close()`` at the end.
+    by its dotted key, and ``close()`` at the end.
     """
 
     def log_scalar(self, name: str, value: float, step: int) -> None:
@@ -72,30 +68,7 @@ def _read(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
     return path, make, parameters
 
 
-class TorchrlLogger:
-    """Passes what a training logs on to a logger of TorchRL's.
-
-    Args:
-        logger: one of ``torchrl.record.loggers``.
-        finish: ends the run of its library.
-        histograms: whether that library takes histograms.
-    """
-
-    def __init__(self, logger: Any, finish: Callable[[], Any], histograms: bool) -> None:
-        self.logger, self.close, self._histograms = logger, finish, histograms
-
-    def log_scalar(self, name: str, value: float, step: int) -> None:
-        self.logger.log_scalar(name, value, step=step)
-
-    def log_hparams(self, settings: Mapping[str, Any]) -> None:
-        self.logger.log_hparams(dict(settings))
-
-    def log_histogram(self, name: str, values: Sequence[float], step: int) -> None:
-        if self._histograms:
-            self.logger.log_histogram(name, values, step=step, bins=BINS)
-
-
-def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> TorchrlLogger:
+def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Logger:
     """A run of Weights & Biases, named as the run folder; a resumed training continues it.
 
     Args:
@@ -103,37 +76,16 @@ def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> To
         project: the run's project.
         offline: keep everything in the folder, for ``wandb sync``; so does the variable WANDB_MODE=offline.
     """
-    library, stored = _installed("wandb"), folder / "wandb_id.txt"
+    try:
+        library = import_module("wandb")
+    except ImportError:
+        raise InputError("logger: wandb is not installed; pip install wandb") from None
     from torchrl.record.loggers import WandbLogger  # noqa: PLC0415 (takes seconds to import)
 
+    stored = folder / "wandb_id.txt"
     if not stored.exists():
         write_atomically(stored, secrets.token_hex(8))
-    logger = WandbLogger(
-        folder.name, offline, str(folder), stored.read_text(), project, log_env_packages=False
-    )
-    return TorchrlLogger(logger, library.finish, histograms=True)
-
-
-def mlflow(
-    folder: Path, *, tracking_uri: str = "sqlite:///mlflow.db", experiment: str = "damian"
-) -> TorchrlLogger:
-    """A run of MLflow, named as the run folder; MLflow takes no histograms.
-
-    Args:
-        folder: the run folder.
-        tracking_uri: MLflow's store or server.
-        experiment: the run's experiment.
-    """
-    library = _installed("mlflow")
-    from torchrl.record.loggers import MLFlowLogger  # noqa: PLC0415 (takes seconds to import)
-
-    logger = MLFlowLogger(experiment, tracking_uri)
-    library.set_tag("mlflow.runName", folder.name)
-    return TorchrlLogger(logger, library.end_run, histograms=False)
-
-
-def _installed(package: str) -> Any:
-    try:
-        return import_module(package)
-    except ImportError:
-        raise InputError(f"logger: {package} is not installed; pip install {package}") from None
+    number = stored.read_text()
+    logger: Any = WandbLogger(folder.name, offline, str(folder), number, project, log_env_packages=False)
+    logger.close = library.finish
+    return logger

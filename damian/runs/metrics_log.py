@@ -8,14 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError, naming_errors
-from damian.runs.loggers import BINS, Logger
+from damian.runs.loggers import Logger
 
 METRICS = "metrics.csv"
 _FIRST_COLUMN = "frames"
@@ -54,7 +52,7 @@ class MetricsLog:
         # TensorBoard does not show what older files hold of steps from ``purge_step`` on.
         purge_step = frames + 1 if frames else None
         self._events = SummaryWriter(str(folder), purge_step=purge_step) if tensorboard else None
-        self._call("log_hparams", self._settings)
+        self._call("log_hparams", dict(self._settings))
 
     def add(self, frames: int, numbers: Mapping[str, float]) -> None:
         """Log numbers by name, after so many environment steps over all worlds.
@@ -77,12 +75,6 @@ class MetricsLog:
             self._add_settings(numbers)
             for name, number in numbers.items():
                 self._events.add_scalar(name, number, frames)
-
-    def add_histogram(self, frames: int, name: str, values: NDArray[np.floating]) -> None:
-        """Log a distribution of values [K], after so many environment steps over all worlds."""
-        if self._events:
-            self._events.add_histogram(name, values, frames, bins=BINS)  # type: ignore[arg-type]
-        self._call("log_histogram", name, values, frames)
 
     def sync(self) -> None:
         """Make the rows last, even if the machine stops; a checkpoint comes after its rows."""

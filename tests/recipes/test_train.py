@@ -111,14 +111,9 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run, tra
     assert OmegaConf.load(still / "config.yaml").model.hidden == [16]
 
 
-def test_tensorboard_shows_settings_and_distributions(run):
+def test_tensorboard_shows_settings(run):
     folder = run(*TINY, "delay=paper", "aware=backupdate")
-    events = EventAccumulator(str(folder), {"histograms": 0, "scalars": 0}).Reload()
-    for name, highest in (("action", 200), ("age", 20)):
-        histograms = events.Histograms(name)
-        assert [each.step for each in histograms] == [128, 256]
-        assert all(each.histogram_value.num == 128 * 3 for each in histograms)
-        assert 0 <= histograms[-1].histogram_value.min <= histograms[-1].histogram_value.max < highest
+    events = EventAccumulator(str(folder)).Reload()
     plugin = events.summary_metadata["_hparams_/session_start_info"].plugin_data
     settings = HParamsPluginData.FromString(plugin.content).session_start_info.hparams
     assert settings["seed"].number_value == 0
