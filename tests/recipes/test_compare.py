@@ -192,7 +192,7 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
     assert measured(folder / "other") == expected
     broken = folder / "other" / "usecase2" / "none" / "undelayed" / "seed_8"
     (broken / "result.csv").unlink()
-    (broken / "metrics.csv").write_text("nonsense")
+    (broken / "checkpoint.pt").write_text("nonsense")
     with pytest.raises(SystemExit) as stopped:
         compare(*words, "processes=2", "hydra.run.dir=runs/usecase2/other")
     assert stopped.value.code == 1
