@@ -2,8 +2,6 @@
 
 import re
 import runpy
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -33,17 +31,6 @@ def test_back_updated_rewards_and_ends_are_the_true_ones_wherever_the_message_ha
     errors = {name: float(value) for name, value in printed}
     assert errors["reward after back-updating"] < 0.05 * errors["reward as collected"]
     assert errors["message in hindsight"] < 0.05 * errors["message that the room held"]
-
-
-def test_the_example_runs_as_a_program_from_another_folder(tmp_path):
-    code = (
-        f"import runpy, sys; sys.path.insert(0, {str(ROOT)!r}); "
-        f"runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert "mean error of the reward after back-updating" in done.stdout
 
 
 def test_the_smallest_case_of_the_document_prints_what_stands_below_it(capsys):

@@ -41,6 +41,7 @@ def test_chunks_take_turns_and_have_their_own_median_and_spread(monkeypatch):
     assert times == {"slow": Measured(3, 2, 6), "fast": Measured(1, 1, 1)}
 
 
+@pytest.mark.slow
 def test_every_environment_of_the_delay_table_is_measured(presets):
     text = bench.cost_of_delays({"everything": presets["everything"]}, TINY)
     assert [f"everything: {kind} " in text for kind in delays()] == [True] * len(delays())

@@ -112,6 +112,7 @@ def test_a_learner_gets_what_it_reads_and_what_was_held_before_and_after_back_up
     assert 0.5 < float(metrics["changed"]) == float(metrics["marked"]) < 1
 
 
+@pytest.mark.slow
 def test_every_run_of_the_experiment_in_the_document_is_accepted(run, folder, capsys):
     text = (Path(damian.__file__).parents[1] / "docs" / "extending.md").read_text()
     (shown,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)

@@ -143,6 +143,7 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     check_refused(lambda: compare(*words[:1], *stored), "it does not hold the results", capsys)
 
 
+@pytest.mark.slow
 def test_a_report_counts_every_stored_seed_unless_a_number_of_seeds_is_given(compare, tmp_path):
     n_seeds = 12
     words, results = ["report_only=true", "hydra.run.dir=kept"], table(STORED / "delays/results.csv")

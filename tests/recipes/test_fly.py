@@ -90,6 +90,7 @@ def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run,
     check_refused(lambda: run("policy=deterministic", "checkpoint=flown", folder="two"), refusal, capsys)
 
 
+@pytest.mark.slow
 def test_the_episodes_are_those_in_which_a_training_evaluates_its_policy(run, monkeypatch):
     flown = ["agents=2", "scenario=tracking", "delay=paper", "actions.distances=[0,30,60]", "eval_episodes=6"]
     words = ["frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "hydra.run.dir=trained"]

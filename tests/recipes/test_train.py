@@ -131,6 +131,7 @@ def test_every_policy_is_evaluated_in_the_same_episodes(run):
     assert others == [one] * 5
 
 
+@pytest.mark.slow
 def test_a_sweep_fills_one_folder_per_run(run, tmp_path):
     run("-m", *TINY, "agents=1,2", "hydra.sweep.dir=sweep")
     tables = list((tmp_path / "sweep").glob("*/result.md"))

@@ -67,17 +67,6 @@ def test_the_states_that_critics_of_bpql_read_are_the_undelayed_observations_tha
     assert not late.equal(steps["next", *keys.GLOBAL_OBSERVATION])
 
 
-def test_the_actor_of_bpql_observes_what_has_arrived_and_its_own_actions_since(steps):
-    for step in range(STEPS):
-        begin = 200 if step >= 200 else 0
-        held = steps[keys.GLOBAL_OBSERVATION][max(step - DELAY, begin)]  # the state then, by the test above
-        since = [
-            (steps[keys.ACTION][i] + 2) / 4 if i >= begin else torch.tensor([0.5])  # scaled to [0, 1]
-            for i in range(step - DELAY, step)
-        ]
-        torch.testing.assert_close(steps[keys.OBSERVATION][step], torch.cat([held, *since]))
-
-
 @pytest.mark.parametrize(("arm", "waits"), [("history", 0), ("bpql", DELAY)])
 def test_bpql_alone_waits_until_the_observation_after_a_step_has_arrived(arm, waits):
     learner = collected(arm, 20)

@@ -80,16 +80,4 @@ def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, arm
         assert late["next", *keys.BACKUPDATED].any()
 
 
-@pytest.mark.parametrize("arm", [name for name, arm in ARMS.items() if arm])
-def test_every_arm_learns(small, arm):
-    env = make_env(ARMS[arm], 4, LATE)
-    learner = make_learner(env, ARMS[arm], 1)
-    before = [weights.clone() for weights in learner.actor.parameters()]
-    with torch.no_grad():
-        batches = env.rollout(2 * HORIZON, learner.actor, break_when_any_done=False).split(HORIZON, 1)
-    numbers = [learner.learn(batch) for batch in batches][-1]
-    assert numbers.get("backupdated", 1) > 0
-    assert any(not old.equal(new) for old, new in zip(before, learner.actor.parameters(), strict=True))
-
-
 # The command line.
