@@ -16,7 +16,6 @@ figure.png and curves.png. With report_only=true these are made again, from the 
 any, from results.csv and curves.csv.
 """
 
-import signal
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -38,7 +37,7 @@ from damian.compare.figures import plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.envs.pipeline import has_message_delay
-from damian.runs.interrupt import exit_code
+from damian.runs.interrupt import end_interrupted
 from damian.settings import TrainConfig
 from damian.settings.programs import SEEDS, CompareConfig
 
@@ -118,7 +117,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         elif source is None and not arm.oracle and not arm.untrained:
             check_learning(unseeded)
     except InputError as error:
-        raise InputError(f"{task}/{delay}/{name}: {error}") from error
+        raise InputError(f"{task}/{delay}/{name}: {error}") from None
     if arm.oracle and not flies_script:
         return  # nothing is won by finding the source, as the script does, or no message is late
     for seed in config.every_seed:
@@ -224,9 +223,8 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
         if not config.report_only:
             slurm = SlurmJobs(folder / "slurm", config.slurm or {}) if config.launcher == "slurm" else None
             failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score), slurm)
-    except KeyboardInterrupt:
-        print("interrupted; run the same command again to continue", file=sys.stderr)
-        sys.exit(exit_code(signal.SIGINT))
+    except KeyboardInterrupt as error:
+        end_interrupted(error)
     for run in failed:
         print(f"failed: {run.name}; see {run.folder / LOG}", file=sys.stderr)
     done = [run for run in runs if run.finished]

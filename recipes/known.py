@@ -51,6 +51,27 @@ PLAIN = {
 """Options of the groups that need no file, because they only choose a kind."""
 LOGGERS = {"wandb": "damian.runs.loggers:wandb"}
 """Loggers of DAMIAN that stand in settings by their paths."""
+SYNONYMS = {
+    "lr": "learner.lr",
+    "learning_rate": "learner.lr",
+    "gamma": "learner.gamma",
+    "belief": "aware=belief",
+    "history": "delay.history",
+    "num_envs": "worlds",
+    "n_envs": "worlds",
+    "total_frames": "frames",
+    "total_timesteps": "frames",
+    "timesteps": "frames",
+    "n_agents": "agents",
+    "num_agents": "agents",
+    "uavs": "agents",
+    "algo": "learner",
+    "task": "scenario",
+    "env": "scenario",
+    "gpu": "device",
+    "cuda": "device",
+}
+"""What people type who know other programs, and what it is called here."""
 
 
 # ------------------------------------------------------------------------------------------ words
@@ -195,6 +216,8 @@ def no_such_key(key: str, program: str = "train", section: Sequence[str] = ()) -
         program: one of ``SCHEMAS``.
         section: keys beside it, where they are known; a learner of the user's own has its own keys.
     """
+    if key in SYNONYMS:
+        return f"{key}: no such key; did you mean {SYNONYMS[key]}?"
     known, group = known_settings(program), key.partition(".")[0]
     if key in known and group in CHOSEN:
         return f"{key}: no such key of the chosen {group}; another {group}=OPTION has it"

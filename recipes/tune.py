@@ -19,7 +19,6 @@ import functools
 import json
 import math
 import shlex
-import signal
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
@@ -33,7 +32,7 @@ from damian.common.atomic_files import write_atomically
 from damian.common.csv_table import csv_table
 from damian.common.errors import InputError, RunError
 from damian.common.markdown import markdown_table
-from damian.runs.interrupt import exit_code
+from damian.runs.interrupt import end_interrupted
 from damian.settings import TrainConfig
 from damian.settings.programs import TuneConfig
 
@@ -269,9 +268,8 @@ def search_all(config: TuneConfig, folder: Path) -> None:
     overrides = [word for word in config.overrides if key_of(word).split(".")[0] not in OWN]
     try:
         search(config, overrides, folder)
-    except KeyboardInterrupt:
-        print("interrupted; run the same command again to continue", file=sys.stderr)
-        sys.exit(exit_code(signal.SIGINT))
+    except KeyboardInterrupt as error:
+        end_interrupted(error)
     print(f"results: {folder}")
 
 

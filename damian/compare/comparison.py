@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -247,6 +248,20 @@ class Comparison:
             found["improvement"] = Estimate(probability, *improvement_interval(probability, len(seeds)))
             found["recovery"] = _recovery(array)
         return Compared(seeds, {**found, "of_oracle": _ratio(scores[arm], oracle)})
+
+    def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
+        """Probability that a run of one delayed arm beats one of another, with its score interval, by names.
+
+        Seeds are those that both have finished; there is no entry for arms that share none.
+        """
+        scores = dict(list(self.scores(task, delay).items())[2:])
+        found = {}
+        for one, other in permutations(scores, 2):
+            seeds, array = _paired([scores[other], scores[one]])
+            if seeds:
+                value = float(probability_of_improvement(array[0, 1], array[0, 0]))
+                found[one, other] = Estimate(value, *improvement_interval(value, len(seeds)))
+        return found
 
     def overall(self) -> dict[str, tuple[int, Estimate]]:
         """Number of seeds and interquartile mean of J_norm by delayed arm, over all tasks and delays.

@@ -21,6 +21,8 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
         for delay in comparison.delays(task) or [NOT_LATE]:
             lines = [line for line in all_lines if line.task == task and line.delay in (NOT_LATE, delay)]
             parts += [f"## {task}, delay {delay}", _length(comparison, task), _table(lines)]
+            if delay != NOT_LATE:
+                parts += _pairs(comparison, task, delay)
     overall = [(arm, seeds, str(norm)) for arm, (seeds, norm) in comparison.overall().items()]
     if overall:
         table = markdown_table(("arm", "n", "interquartile mean of J_norm"), overall)
@@ -50,6 +52,15 @@ def _table(lines: Sequence[Line]) -> str:
         rows.append([name, line.regime, line.policy, str(len(line.seeds)), *measured, n_compared, *compared])
     heads = [*left, "n", *heads, "n compared", *(column.head for column in COMPARED)]
     return markdown_table(heads, rows, left=len(left))
+
+
+def _pairs(comparison: Comparison, task: str, delay: str) -> list[str]:
+    """Table of the probabilities that a run of one arm beats a run of another."""
+    pairs = comparison.pairs(task, delay)
+    arms = list(dict.fromkeys(one for one, _ in pairs))
+    rows = [[one, *(str(pairs.get((one, other), "")) for other in arms)] for one in arms]
+    title = "Probability that a run of the row's arm beats one of the column's [95 % score interval]:"
+    return [title, markdown_table(("arm", *arms), rows)] if arms else []
 
 
 def _compute(comparison: Comparison) -> str:

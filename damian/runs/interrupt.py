@@ -1,8 +1,9 @@
 """Ends a training after its current update when the process is asked to stop."""
 
 import signal
+import sys
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Ctrl-C, and what batch systems and ``kill`` send."""
@@ -34,3 +35,14 @@ class Interrupt:
 def exit_code(number: int) -> int:
     """The exit code of a process that a signal has ended, as shells count it: 130 or 143."""
     return 128 + number
+
+
+def interrupt(number: int, _: FrameType | None) -> NoReturn:
+    """Handle a signal as Ctrl-C; the error holds the signal's number."""
+    raise KeyboardInterrupt(number)
+
+
+def end_interrupted(error: KeyboardInterrupt) -> NoReturn:
+    """End a program that the same command continues."""
+    print("interrupted; run the same command again to continue", file=sys.stderr)
+    sys.exit(exit_code(error.args[0] if error.args else signal.SIGINT))

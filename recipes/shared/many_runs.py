@@ -32,6 +32,7 @@ from tqdm import tqdm
 
 from damian.common.errors import InputError, RunError
 from damian.runs.checkpoint import digest
+from damian.runs.interrupt import interrupt
 from damian.runs.run_folder import CHECKPOINT, CONFIG, RESULTS
 from damian.runs.run_lock import locked
 from damian.runs.run_record import read_record
@@ -168,7 +169,7 @@ def perform_each(
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
         RunError: a worker process was killed.
     """
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # batch systems send it
+    before = signal.signal(signal.SIGTERM, interrupt)  # batch systems send it
     try:
         if slurm is not None:
             yield from _in_pool(runs, processes, ThreadPoolExecutor(processes), slurm.carry_out, slurm.cancel)

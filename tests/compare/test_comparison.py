@@ -15,6 +15,7 @@ from damian.compare.comparison import (
     Comparison,
 )
 from damian.compare.figures import ARM_COLOURS, plot_curves, plot_delays, plot_norms
+from damian.compare.report import markdown
 from damian.compare.statistics import interquartile_mean
 
 ARMS = {
@@ -133,13 +134,17 @@ def test_a_table_has_every_arm_and_policy_with_intervals_and_its_regime():
     assert (lines[3].cells()["recovery"], lines[8].cells()["J_norm"]) == ("", "")
 
 
-def test_a_recovery_is_from_the_naive_arm_of_the_same_track():
+def test_a_recovery_is_from_the_naive_arm_of_the_same_track_and_any_two_arms_are_compared():
     scores = SCORES | {"flown": [9.0, 8.0]}  # naive, but trained undelayed: not the reference of late data
     arms = ARMS | {"flown": Arm(naive=True, policy_of="best")}
     comparison = Comparison(rows_of("t", "late", scores), arms)
     compared = comparison.compared("t", "late")
     assert compared["aware"]["recovery"].value == pytest.approx((7.5 - 3) / (10 - 3))
     assert compared["flown"]["recovery"] is UNKNOWN  # the strongest naive arm of its track
+    pairs = comparison.pairs("t", "late")
+    assert pairs["aware", "flown"].value == (0 + 0 + 0.5 + 1) / 4
+    assert pairs["flown", "aware"].value == (1 + 1 + 0.5 + 0) / 4
+    assert "| aware | 1.000 | 0.375 |" in markdown(comparison, [])
 
 
 def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its_own():

@@ -196,7 +196,7 @@ def test_several_processes_give_the_same_results_as_one_and_a_failed_run_is_name
     with pytest.raises(SystemExit) as stopped:
         compare(*words, "processes=2", "hydra.run.dir=runs/usecase2/other")
     assert stopped.value.code == 1
-    assert f"failed: usecase2/none/undelayed/seed_8; see {broken / 'log.txt'}" in capsys.readouterr().err
+    assert "failed: usecase2/none/undelayed/seed_8; see " in capsys.readouterr().err
     assert "missing: usecase2/none/undelayed/seed_8" in (folder / "other" / "table.md").read_text()
 
 
