@@ -88,44 +88,6 @@ class World:
         return content, self.clock - sent, True
 
 
-class ServedWorld(World):
-    """Agents that send to a server, which broadcasts what it holds.
-
-    Args:
-        down: delay of what is broadcast to an agent at a clock [steps], None if it is lost.
-        further: arguments of ``World``; the links to the server are (-1, sender).
-    """
-
-    def __init__(self, *further: Any, down: Callable[[int, int], int | None], **named: Any) -> None:
-        super().__init__(*further, **named)
-        self.down = down
-
-    def step(self, contents: Sequence[Any], wanted: Collection[Link], begins: bool = False) -> None:
-        super().step(contents, {(-1, j) for _, j in wanted}, begins)
-        if begins:
-            self.broadcasts, self.got = [], {}
-            if self.known:
-                self.holds = {(-1, j): (self.clock, contents[j]) for j in self.agents}
-        snapshot = dict(self.holds)
-        for i in self.agents:
-            delay = self.down(self.clock, i)
-            if delay is not None:
-                self.broadcasts.append(Packet(self.clock + delay, self.clock, i, snapshot))
-        for packet in self.broadcasts:
-            if packet.arrives == self.clock and self.got.get(packet.to, (-1,))[0] < packet.sent:
-                self.got[packet.to] = (packet.sent, packet.content)
-        if begins and self.known:
-            self.got = dict.fromkeys(self.agents, (self.clock, snapshot))
-
-    def seen(self, receiver: int, sender: int, zeros: Any) -> tuple[Any, int, bool]:
-        _, known = self.got.get(receiver, (-1, {}))
-        mine, self.holds = self.holds, {(receiver, j): message for (_, j), message in known.items()}
-        try:
-            return super().seen(receiver, sender, zeros)
-        finally:
-            self.holds = mine
-
-
 def table(law: Any, streams: Tensor, n_steps: int, loss: float = 0.0) -> Callable[[int, int], int | None]:
     """The delay that a law draws at a clock for a row; None if the message is lost."""
     sampler = sampler_of(law_of(law), loss=loss)
@@ -150,7 +112,6 @@ def check_against_twin(
     n_steps: int = 25,
     forced: Callable[[int], list[int]] = lambda _: [],
     sent: Any = ("agents", "observation"),
-    policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
 ) -> list[TensorDictBase]:
     """Compare every output of a rollout with partial resets with that of the twins.
 
@@ -161,13 +122,12 @@ def check_against_twin(
         n_steps: number of steps.
         forced: worlds to reset after a step, beside those that are done.
         sent: key of what is sent, among the outputs, or among the inputs of a step.
-        policy: chooses actions; random if not given.
     """
     torch.manual_seed(0)
     td, worlds = env.reset(), range(env.batch_size[0])
     channel = env.transform[-1] if len(env.transform) else env.transform
     memory = channel.memory
-    twins = [make(b, memory.get("streams", memory.get("up_streams"))) for b in worlds]
+    twins = [make(b, memory["streams"]) for b in worlds]
 
     def follow(outputs: TensorDictBase, inputs: TensorDictBase | None, mask: list[bool]) -> None:
         source = outputs if sent in outputs.keys(True) else inputs
@@ -181,7 +141,7 @@ def check_against_twin(
     follow(td, None, [True] * len(worlds))
     seen = [td]
     for t in range(n_steps):
-        td = policy(td) if policy else env.rand_action(td)
+        td = env.rand_action(td)
         stepped = env.step(td)
         follow(stepped["next"], stepped, [True] * len(worlds))
         td = step_mdp(stepped)

@@ -140,9 +140,6 @@ CASES = {
             [[0, LATE, 1], [3, 0, 0], [0, LATE, 0]], OBSERVATION, loss=0.2, limit=2, sent_key="message_sent"
         ),
     ),
-    "Channel, server": Case(
-        uavs, lambda: Channel(LATE, OBSERVATION, topology="server", down_delay=LATE, down_loss=0.1)
-    ),
     "Channel, messages": Case(uavs, lambda: Channel(LATE, action_key=("agents", "words"), message_size=2)),
     "ServerNode": Case(unserved, _server_node),
 }

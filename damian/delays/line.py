@@ -55,11 +55,10 @@ class DelayLine:
     Args:
         sampler: draws the delays.
         order: one of ``ORDERS``.
-        gradients: whether messages keep their autograd graph; the slots are then not written in place.
     """
 
-    def __init__(self, sampler: Sampler, order: str, gradients: bool = False) -> None:
-        self.sampler, self._gradients = sampler, gradients
+    def __init__(self, sampler: Sampler, order: str) -> None:
+        self.sampler = sampler
         self._hold_last_generated = order == "generation"
         certainly_arrives = bool((sampler.chances[:, -1] < 1e-10).all())  # draws have 32 bits
         self._always_longest = sampler.constant_delay == sampler.longest
@@ -139,13 +138,8 @@ class DelayLine:
         memory = memory | {"clock": clock, "place": row_now, "channel": channel, "generated_at": generated_at}
         held = []
         for i, value in enumerate(values):
-            slots, old = memory[f"slots_{i}"], memory[f"held_{i}"]
-            flat = slots.flatten(0, 1)
-            if self._gradients:
-                flat = flat.index_copy(0, row_sent, value)
-                memory[f"slots_{i}"] = flat.view_as(slots)
-            else:
-                flat.index_copy_(0, row_sent, value)
+            flat, old = memory[f"slots_{i}"].flatten(0, 1), memory[f"held_{i}"]
+            flat.index_copy_(0, row_sent, value)
             held.append(torch.where(expand_mask(fresh, old), flat.index_select(0, row_now), old))
             memory[f"held_{i}"] = held[i]
         return memory, Delivery(held, clock - generated_at, fresh, delay)

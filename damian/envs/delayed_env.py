@@ -16,6 +16,7 @@ from damian.common.tensors import expand_mask, tree_where
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Server
 from damian.transforms.base import Entries, Memory, StatefulTransform, act, begin, observe, select_entries
+from damian.transforms.hold import SkipUntilReady
 from damian.world.state import PackedState
 
 _BASE = "base_env."
@@ -136,7 +137,9 @@ class DelayedEnv(TransformedEnv):
         step = self._method("_whole_step", *stateful, *entries)
         worlds, memories, outputs = step(env.worlds, memories, entries)
         for transform in stateful:
-            while (skipped := transform.skipped_worlds(outputs)) is not None and skipped.any():
+            while (
+                isinstance(transform, SkipUntilReady) and (skipped := transform.skipped_worlds(outputs)).any()
+            ):
                 step = self._method("_further_step", *stateful, *entries)
                 worlds, memories, outputs = step(transform, worlds, memories, entries, outputs, skipped)
         self._store(stateful, worlds, memories)
@@ -175,7 +178,7 @@ class DelayedEnv(TransformedEnv):
 
     def _further_step(
         self,
-        skipping: StatefulTransform,
+        skipping: SkipUntilReady,
         worlds: PackedState,
         memories: list[Memory],
         entries: Entries,
@@ -275,7 +278,7 @@ class DelayedEnv(TransformedEnv):
 
 def _may_skip(transforms: list[StatefulTransform]) -> bool:
     """Does any of the transforms make a step last longer in some worlds?"""
-    return any(type(each).skipped_worlds is not StatefulTransform.skipped_worlds for each in transforms)
+    return any(isinstance(each, SkipUntilReady) for each in transforms)
 
 
 def _keep_others(before: TensorDictBase, after: TensorDictBase) -> TensorDictBase:

@@ -222,7 +222,7 @@ def link_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         keys.MESSAGE,
         keys.LINKED,
         loss=links.loss,
-        topology="all" if links.hears is None else links.hears,
+        hears=links.hears,
         comm_range=links.range,
         position_key=keys.POSITION if link_reads(links, dt) else None,
         limit=links.limit,

@@ -1,6 +1,6 @@
 """A transform that delays actions (paper, section 3.3), and what transforms that remember actions share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -10,20 +10,17 @@ from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorS
 from torchrl.data.tensor_specs import Stacked
 from torchrl.envs import EnvBase
 
-from damian.common import checks
 from damian.common.errors import InputError
 from damian.delays.laws import law_of, sampler_of
 from damian.delays.line import DelayLine
 from damian.transforms.base import (
     Change,
     Entries,
-    KeyUsage,
     Memory,
     StatefulTransform,
     as_rows,
     existing,
     from_rows,
-    require_keys,
     sibling_key,
     spec_rows,
 )
@@ -47,12 +44,10 @@ class ActionSpecs(NamedTuple):
 
 
 class _Range(NamedTuple):
-    """Range of each number of an action, in the shape of the spec."""
+    """Range of each number of an action, in the shape of the spec and the type of the actions."""
 
     low: Tensor
-    """Lowest value, in the type of the actions."""
     high: Tensor
-    """Highest value, in the type of the actions."""
     bounded: Tensor
     """Whether the spec sets these bounds, bool; if not, they are those of the type of the actions."""
 
@@ -104,27 +99,15 @@ def _range(spec: TensorSpec) -> _Range:
 
 
 def _default_action(space: _Range, default: Any) -> Tensor:
-    """The default action in the shape and type of the range.
-
-    Raises:
-        InputError: the default is no legal action.
-    """
+    """The default action in the shape and type of the range."""
     low, high = space.low, space.high
     if default is None:
         return torch.maximum(torch.minimum(torch.zeros_like(low), high), low)
-    real = low.is_floating_point()
-    should = (
-        f"is not a legal default action: {'numbers' if real else 'whole numbers'} between "
-        f"{low.min().item() + 0} and {high.max().item() + 0}, one for all or in the shape {tuple(low.shape)}"
-    )
-    try:
-        value = torch.as_tensor(default, dtype=low.dtype if real else None, device=low.device)
-        value = value.expand(low.shape)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"default: {default} {should}") from error
-    legal = (real or not value.is_floating_point()) and bool(((value >= low) & (value <= high)).all())
-    checks.require(legal, "default", default, should)
-    return value.to(low.dtype)
+    value = torch.as_tensor(default, dtype=low.dtype, device=low.device).expand(low.shape)
+    if not bool(((value >= low) & (value <= high)).all()):
+        bounds = f"{low.min().item() + 0} and {high.max().item() + 0}"
+        raise InputError(f"default: {default} is not a legal default action, which lies between {bounds}")
+    return value
 
 
 class ActionTransform(StatefulTransform):
@@ -149,24 +132,10 @@ class ActionTransform(StatefulTransform):
         """A value of ``actions`` for each of the M rows, [M, ...]."""
         return self.as_rows_of_spec(value, self.env.full_action_spec, self.action_key)
 
-    def flag_to_require(self, key: NestedKey | None) -> list[NestedKey]:
-        """The key of a flag in the policy's input, if a reset must output it before this transform.
-
-        It need not if the specs of the whole environment name the flag: then a later transform may write it,
-        or it may be a part of the action.
-        """
-        if key is None:
-            return []
-        env = cast(EnvBase, self.container)
-        specs = (env.full_observation_spec, env.full_state_spec, env.full_action_spec, env.full_done_spec)
-        named = {key for spec in specs for key in spec.keys(True, True)}
-        return [] if key in named else [key]
-
     @property
     def actions(self) -> ActionSpecs:
         """Shape, range and default of the actions, read from the environment's specs once."""
         if "_actions" not in self.__dict__:
-            require_keys(type(self).__name__, [self.action_key], self.env.full_action_spec)
             self.__dict__["_actions"] = read_action_specs(self.env, self.action_key, self.default)
         return self.__dict__["_actions"]
 
@@ -186,6 +155,9 @@ class ActionDelay(ActionTransform):
     which no newer action arrives, it executes the same action again. The TensorDict keeps the chosen action.
     With delay 0 the rollout is the same, bit for bit, as without the transform.
 
+    A worked timeline, with a delay of 3 steps: the action a0, chosen at t = 0, is executed in the step that
+    begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
+
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
             A delay is drawn for each world, each agent (under a nested key) and each step.
@@ -201,15 +173,13 @@ class ActionDelay(ActionTransform):
             ``SerialEnv`` passes it on, a ``ParallelEnv`` only if its specs name it.
         context_keys: key of each entry that the law may read, by the name that the law gives it
             (``ContextSampler``). The policy's input and the outputs of a reset must have the entry.
-        seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
-            global generator at the first reset.
-        gradients: let gradients flow through the executed actions (``StatefulTransform``).
+        seed: as in ``StatefulTransform``.
 
     A bare name for one of the three keys above means an entry in the same TensorDict as the action.
 
     Raises:
         InputError: the delay is not valid, or its law reads what has no key; at the first use of the
-            environment also: the default is no legal action, or the environment has no entry ``sent_key``.
+            environment also: it has no such action, or the default is no legal one.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))
@@ -228,33 +198,20 @@ class ActionDelay(ActionTransform):
         valid_key: NestedKey | None = None,
         context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
-        gradients: bool = False,
     ) -> None:
-        super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed, gradients=gradients)
+        super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
         self.draws = self.sampler.constant_delay is None
         self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
-        self.line = DelayLine(self.sampler, "generation", gradients)
+        self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
         self.action_keys = existing([self.action_key, self.sent_key, *self.contexts.keys.values()])
 
     @property
-    def key_usage(self) -> KeyUsage:
-        return KeyUsage(replaces=[self.action_key])
-
-    @property
     def row_dims(self) -> dict[str, int]:
         return self.line.row_dims(1)
-
-    @property
-    def memory_sizes(self) -> dict[str, int]:
-        return {"longest": self.sampler.longest}
-
-    @property
-    def required_keys(self) -> Sequence[NestedKey]:
-        return self.flag_to_require(self.sent_key)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         initial = self.action_rows(self.actions.initial)

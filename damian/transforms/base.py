@@ -1,41 +1,44 @@
 """The base class of transforms with memory, the order in which they must stand, and how seeds reach them.
 
+Outputs of the environment pass the transforms of a ``Compose`` from the first to the last, and actions from
+the last to the first. ``STAGES`` says which of damian's transforms must come before which.
+
 Importing this module extends ``TransformedEnv.set_seed`` for the whole process, in workers too: it then also
 seeds the transforms of damian that the environment contains. All else stays as it is.
 """
 
 import itertools
 import multiprocessing
-import warnings
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import wraps
 from typing import Any, NamedTuple, NoReturn, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import (
     Compose,
-    ConditionalPolicySwitch,
     ConditionalSkip,
     EnvBase,
-    FrameSkipTransform,
-    MultiAction,
     NoopResetEnv,
     RandomTruncationTransform,
-    RewardSum,
     StepCounter,
     TerminateTransform,
     Transform,
     TransformedEnv,
 )
 
-from damian.common import checks, counter_rng
+from damian.common import counter_rng
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.common.text_files import listed
-from damian.keys import DONE, ENDS, STEPPED, last_part
+from damian.keys import DONE, STEPPED, last_part
+
+STAGES = ("server", "delay", "history")
+"""The order of damian's transforms that share a key, from the environment outwards: nodes that compute
+observations and rewards anew, then delays, clocks and sums of them, then what must not be delayed itself,
+such as the actions as they were chosen."""
 
 Memory = dict[str, Tensor]
 """The memory of a transform: its buffers by name."""
@@ -62,33 +65,6 @@ class Correction(NamedTuple):
     """Only of late rewards: key of the delay of each reward [steps]."""
 
 
-class KeyUsage(NamedTuple):
-    """What a transform does with which keys; this decides which of two transforms must come first."""
-
-    overwrites: Sequence[NestedKey] = ()
-    """Entries that it writes whether they exist or not, and whatever their values are."""
-    delays: Sequence[NestedKey] = ()
-    """Entries whose values it delays or holds."""
-    appends: Sequence[NestedKey] = ()
-    """Entries to which it appends values that the actor knows without delay."""
-    replaces: Sequence[NestedKey] = ()
-    """Actions that it replaces before they reach the environment."""
-    records: Sequence[NestedKey] = ()
-    """Actions that it records as the policy chose them."""
-    flushes_at_end: bool = False
-    """Whether it delivers what is still in transit in the last step of an episode."""
-    may_end: bool = False
-    """Whether it may end episodes."""
-    skips: bool = False
-    """Whether it may keep worlds from stepping."""
-    computes: Sequence[tuple[NestedKey, NestedKey]] = ()
-    """Entries that it computes from others: pairs of the entry read and the one written."""
-    age_of: Sequence[tuple[NestedKey, NestedKey]] = ()
-    """Entries whose age it writes: pairs of the entry and the age."""
-    held_entries: Sequence[tuple[NestedKey, NestedKey | None]] = ()
-    """Entries that it holds: pairs of the entry and of the age that grows meanwhile, if there is one."""
-
-
 class StatefulTransform(Transform):
     """Base class of transforms that remember earlier steps of each world, or of each agent of each world.
 
@@ -104,8 +80,8 @@ class StatefulTransform(Transform):
     compile into one graph.
 
     ``set_seed`` of the environment seeds everything that the transform draws. Without it, and without
-    ``seed``, the seed is drawn from torch's global generator at the first reset. What the transform writes
-    shares no memory with its buffers, so that others may change it in place.
+    ``seed``, the seed is drawn from torch's global generator at the first reset. No gradient flows through
+    the memory, and what the transform writes shares no memory with its buffers.
 
     Args:
         in_keys: keys of the entries that the transform reads, as in TorchRL's ``Transform``: one key (a name,
@@ -114,25 +90,24 @@ class StatefulTransform(Transform):
         in_keys_inv: keys of the actions that it reads.
         out_keys_inv: keys of the actions that it writes.
         seed: seed of everything that the transform draws, until the environment is seeded.
-        gradients: keep the autograd graph of the entries that the transform remembers. If false, what it
-            writes has no gradient with respect to its inputs. The graph of a rollout grows from step to step;
-            a reset of all worlds cuts it.
     """
 
+    stage: str = "delay"
+    """One of ``STAGES``."""
+    flushes_at_end: bool = False
+    """Whether it delivers what is still in transit in the last step of an episode."""
     action_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_reset`` and ``on_step``, if they exist."""
+    extra_keys: Sequence[NestedKey] = ()
+    """Keys of the entries that are written beside ``out_keys``."""
     dropped_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are removed from the outputs."""
     sent_key: NestedKey | None = None
     """Key of the flag that says which rows send a message in this step; None if all do."""
     per_world: bool = False
     """Whether the memory has a row for each world, whatever entries ``in_keys`` name."""
-    same_batch_size: bool = False
-    """Whether all entries must have one batch size, because each row has a part of all of them."""
-    omittable_outputs: Sequence[str] = ()
-    """Names of those arguments whose key is that of an entry to create, or None to leave it out."""
     sees_merged_steps_only: bool = False
     """Whether the transform sees only the merged steps of ``SkipUntilReady``, as TorchRL's transforms do."""
     draws: bool = False
@@ -142,23 +117,19 @@ class StatefulTransform(Transform):
     _rows: torch.Size | None = None
     _seed: int | None = None
     _world_seeds: Tensor | None = None
-    _begun: tuple[TensorDictBase, Memory] | None = None
-    """Outputs of the latest reset of all worlds, and the memory after it, which a step replaces."""
+    _first: TensorDictBase | None = None
+    """Outputs of a reset of all worlds, as long as no step follows it."""
 
     def __init__(
         self,
-        in_keys: NestedKey | Sequence[NestedKey] = (),
-        out_keys: NestedKey | Sequence[NestedKey] = (),
-        in_keys_inv: NestedKey | Sequence[NestedKey] = (),
-        out_keys_inv: NestedKey | Sequence[NestedKey] = (),
+        in_keys: NestedKey | Sequence[NestedKey] | None = None,
+        out_keys: NestedKey | Sequence[NestedKey] | None = None,
+        in_keys_inv: NestedKey | Sequence[NestedKey] | None = None,
+        out_keys_inv: NestedKey | Sequence[NestedKey] | None = None,
         seed: int | None = None,
-        gradients: bool = False,
     ) -> None:
-        super().__init__(*(read_keys(keys) for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)))
-        if seed is not None:
-            checks.seed(f"{type(self).__name__}: seed", seed)
+        super().__init__(*(keys or None for keys in (in_keys, out_keys, in_keys_inv, out_keys_inv)))
         self._seed = seed
-        self.gradients = gradients
 
     # Pure functions, for subclasses.
 
@@ -214,27 +185,6 @@ class StatefulTransform(Transform):
         """
         return None
 
-    def skipped_worlds(self, entries: Entries) -> Tensor | None:
-        """Worlds that must step once more before the outputs are returned, [B] bool.
-
-        Args:
-            entries: outputs of the step.
-
-        Returns:
-            The mask, or None if the transform never skips steps.
-        """
-        return None
-
-    def merge_steps(self, entries: Entries, later: Entries, stepped: Tensor) -> Entries:
-        """Merge the outputs of several steps into those of one step.
-
-        Args:
-            entries: outputs before the latest step.
-            later: outputs of the latest step.
-            stepped: worlds that took the latest step, [B] bool.
-        """
-        raise NotImplementedError
-
     # What a transform is, for subclasses.
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
@@ -243,7 +193,7 @@ class StatefulTransform(Transform):
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
-        """Keys of the entries that the outputs of the first reset must have."""
+        """Keys of the entries that the environment must output before this transform."""
         return self.in_keys
 
     @property
@@ -257,21 +207,9 @@ class StatefulTransform(Transform):
         return {}
 
     @property
-    def memory_sizes(self) -> dict[str, int]:
-        """Settings on which the shape and meaning of the memory depend, by name."""
-        return {}
-
-    @property
-    def key_usage(self) -> KeyUsage:
-        """What this transform does with which keys, for ``check_order``."""
-        return KeyUsage()
-
-    @property
-    def created_keys(self) -> list[NestedKey]:
+    def created_keys(self) -> Sequence[NestedKey]:
         """Keys of the entries that the transform adds to the outputs of the environment."""
-        others = (getattr(self, name) for name in self.omittable_outputs)
-        new = [key for key in self.out_keys if key not in [*self.in_keys, *self.key_usage.overwrites]]
-        return new + [key for key in others if key is not None]
+        return [*(key for key in self.out_keys if key not in self.in_keys), *self.extra_keys]
 
     # The memory.
 
@@ -292,8 +230,8 @@ class StatefulTransform(Transform):
         inner = tensordict.get(path, None) if path else tensordict
         if inner is not None:
             return inner.batch_size
-        # No entry of the group is in the outputs. The batch may be chosen at a reset (``batch_locked`` is
-        # false, as in TorchRL's ``PendulumEnv``); the specs lack these leading dimensions then.
+        # No entry of the group is in the outputs. The specs lack leading dimensions of a batch that is chosen
+        # at a reset (``batch_locked`` is false, as in TorchRL's ``PendulumEnv``).
         kinds = (self.env.full_action_spec, self.env.full_reward_spec)
         inner_specs = next(specs[path] for specs in kinds if path in specs.keys(True))
         return torch.Size((*tensordict.batch_size, *inner_specs.shape[len(self.env.batch_size) :]))
@@ -310,11 +248,12 @@ class StatefulTransform(Transform):
 
     def set_memory(self, memory: Memory) -> None:
         """Replace the buffers that have these names."""
+        self._first = None
         self._buffers.update(memory)
 
     def clear_memory(self) -> None:
         """Delete the memory; the next reset counts as the first."""
-        self._rows, self._begun = None, None
+        self._rows = None
         self._buffers.clear()
 
     def expand_worlds(self, worlds: Tensor) -> Tensor:
@@ -342,7 +281,7 @@ class StatefulTransform(Transform):
         Args:
             entries: inputs or outputs of the step.
         """
-        sending = entries[self.sent_key].reshape(-1) if self.sent_key in entries else None
+        sending = None if self.sent_key is None else entries[self.sent_key].reshape(-1)
         if STEPPED not in entries:
             return sending
         stepped = self.expand_worlds(entries[STEPPED].reshape(-1))
@@ -351,36 +290,24 @@ class StatefulTransform(Transform):
     # TorchRL's hooks.
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        mask = None
-        if self.has_memory:
-            mask = reset_rows(tensordict, self.row_key, self.rows)
-            rows = self.find_rows(tensordict_reset)
-            if mask is None and not self.env.batch_locked and rows != self.rows:
-                self.clear_memory()  # such an environment may begin with another number of worlds
-            elif rows != self.rows:
-                raise RuntimeError(
-                    f"{type(self).__name__} has memory for rows of shape {tuple(self.rows)}, but there are "
-                    f"now {tuple(rows)}: load a state that was saved with as many worlds and agents"
-                )
+        mask = reset_rows(tensordict, self.row_key, self.rows) if self.has_memory else None
+        if mask is None and self.has_memory and self.find_rows(tensordict_reset) != self.rows:
+            self.clear_memory()  # the number of worlds may be chosen at a reset
         if not self.has_memory:
             self._init(tensordict_reset)
         outputs = tensordict_reset.detach() if mask is None else None
         # TorchRL restores the entries of the worlds without a reset.
         written = self._write(tensordict_reset, self._begin(tensordict_reset, mask))
-        self._begun = None if outputs is None else (outputs, self.memory)
+        self._first = outputs
         return written
 
     def _init(self, outputs: TensorDictBase) -> None:
         """Allocate the memory, given the outputs of the first reset."""
-        _check_orders(self.container)  # other transforms may have come since this one
-        require_keys(type(self).__name__, self.required_keys, outputs)
-        if self.in_keys_inv:
-            require_keys(type(self).__name__, self.in_keys_inv, self.env.full_action_spec)
+        container = cast(EnvBase, self.container)
+        check_order(all_transforms(container))
+        require_keys(type(self).__name__, self.in_keys_inv, self.env.full_action_spec.keys(True, True))
+        _ = container.output_spec  # checks all other keys
         self._rows = self.find_rows(outputs)
-        if self.same_batch_size:
-            for key in self.in_keys:
-                shape, should = row_shape(outputs, key), "have other batch sizes: use one transform for each"
-                checks.require(shape == self.rows, type(self).__name__, f"{self.row_key} and {key}", should)
         with torch.inference_mode(False):  # else the buffers could be written only in inference mode
             self.set_memory(self.init_memory(outputs))
 
@@ -390,22 +317,21 @@ class StatefulTransform(Transform):
         if mask is None:
             device = next((value.device for value in memory.values()), None)
             mask = torch.ones(self.rows.numel(), dtype=torch.bool, device=device)
-            memory = {name: value.detach() for name, value in memory.items()}
-        return self.on_reset(memory, select_entries(outputs, self.step_keys, self.gradients), mask)
+        return self.on_reset(memory, select_entries(outputs, self.step_keys), mask)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self.action_keys:
             return tensordict
-        self.check(tensordict.batch_size)
-        entries = select_entries(tensordict, [*self.action_keys, STEPPED], self.gradients)
+        self.check()
+        entries = select_entries(tensordict, [*self.action_keys, STEPPED])
         change = self.on_action(self.memory, entries)
         if STEPPED in entries:
             change = self._only_stepped(change, entries[STEPPED], tensordict, tensordict)
         return self._write(tensordict, change)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.check(next_tensordict.batch_size)
-        entries = select_entries(next_tensordict, self.step_keys, self.gradients)
+        self.check()
+        entries = select_entries(next_tensordict, self.step_keys)
         stepped = tensordict.get(STEPPED, None)
         if stepped is None:
             return self._write(next_tensordict, self.on_step(self.memory, entries))
@@ -461,59 +387,39 @@ class StatefulTransform(Transform):
         """The specs with those of what the transform writes.
 
         Raises:
-            InputError: it would write two entries under one name, or over an entry that there is already.
+            InputError: an entry that it reads is missing, or it would write over an entry of another.
         """
-        name, created = type(self).__name__, self.created_keys
-        checks.distinct(f"{name}: names of the entries that it writes", created)
-        present = {key for spec in output_spec.values() if spec is not None for key in spec.keys(True)}
-        for key in created:
-            require_new(name, key, present)
+        specs = [spec for spec in output_spec.values() if spec is not None]
+        present = [key for spec in specs for key in spec.keys(True, True)]
+        name = type(self).__name__
+        require_keys(name, self.required_keys, present)
+        taken = next((key for key in self.created_keys if key in present), None)
+        if taken is not None:
+            raise InputError(f"{name}: {taken} is already an entry of the environment: choose another name")
         return super().transform_output_spec(output_spec)
-
-    def set_container(self, container: Any) -> None:
-        super().set_container(container)
-        if isinstance(container, Compose | TransformedEnv):
-            _check_orders(container)  # again in ``_init``, as a Compose may not belong to an environment yet
 
     @property
     def env(self) -> EnvBase:
-        """The environment with the transforms before this one.
-
-        Raises:
-            RuntimeError: the transform does not belong to an environment.
-        """
+        """The environment with the transforms before this one."""
         parent = self.parent
         if parent is None:
             self._refuse()
         return parent
 
-    def check(self, batch_size: torch.Size | None = None) -> None:
-        """Make sure that the transform belongs to an environment that has been reset.
-
-        Args:
-            batch_size: of the TensorDict of a step, if there is one.
+    def check(self) -> None:
+        """Make sure that the transform has memory.
 
         Raises:
-            RuntimeError: it does not, or the TensorDict has other worlds than the memory.
+            RuntimeError: its environment has not been reset.
         """
-        if not self.has_memory and self._begun is not None:  # it was seeded after the reset
-            (outputs, _), self._begun = self._begun, None
+        if not self.has_memory and self._first is not None:  # it was seeded after the reset
+            outputs = self._first
             self._init(outputs)
             self.set_memory(self._begin(outputs, None)[0])
-        if not self.has_memory or self.container is None:
+        if not self.has_memory:
             self._refuse()
-        if batch_size is not None and batch_size != self.rows[: len(batch_size)]:
-            name, n_rows = type(self).__name__, tuple(self.rows)
-            raise RuntimeError(
-                f"{name} has memory for rows of shape {n_rows}, but this step has the batch size "
-                f"{tuple(batch_size)}: every step needs all worlds that were reset; those that skip it "
-                "have a false '_step', which an environment whose batch is chosen at reset does not support"
-            )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._refuse()
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._refuse()
 
     def _refuse(self) -> NoReturn:
@@ -537,44 +443,38 @@ class StatefulTransform(Transform):
         """A copy of the transform without memory."""
         copied = super().clone()
         copied.clear_memory()
+        copied._first = None
         return copied
 
     def get_extra_state(self) -> Tensor | None:
-        """``memory_sizes`` and the shape of the rows, for ``state_dict``."""
-        if self._rows is None:
-            return None
-        return torch.tensor([*self.memory_sizes.values(), *self._rows], dtype=torch.long)
+        """The shape of the rows, for ``state_dict``."""
+        return None if self._rows is None else torch.tensor(self._rows, dtype=torch.long)
 
     def set_extra_state(self, state: Tensor | None) -> None:
-        """Set the shape of the rows from a ``state_dict``.
-
-        Raises:
-            RuntimeError: the state is that of a transform with other settings.
-        """
-        if state is None:
-            self._rows = None
-            return
-        n_sizes, numbers = len(self.memory_sizes), state.tolist()
-        if numbers[:n_sizes] != [*self.memory_sizes.values()]:
-            raise RuntimeError(
-                f"{type(self).__name__} has {self.memory_sizes}, but the loaded state is of one with "
-                f"{numbers[:n_sizes]}: load it into a transform with the settings that it had"
-            )
-        self._rows = torch.Size(numbers[n_sizes:])
+        """Set the shape of the rows from a ``state_dict``."""
+        self._rows = None if state is None else torch.Size(state.tolist())
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        if prefix + "_extra_state" in state_dict:  # refuse a foreign state before the memory is replaced
-            self.set_extra_state(state_dict[prefix + "_extra_state"])
-        inner = {
-            name.removeprefix(prefix): value for name, value in state_dict.items() if name.startswith(prefix)
-        }
+        """Load the memory. A state without entries of this transform makes the next reset the first.
+
+        Raises:
+            RuntimeError: the memory is that of a transform with other settings.
+        """
+        inner = {k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)}
         saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
-        devices = {name: buffer.device for name, buffer in self.memory.items()}
-        # TorchRL also loads states without entries of this transform: the next reset is then the first.
+        own = self.memory
+        for name, value in saved.items():
+            if name in own and own[name].shape != value.shape:
+                raise RuntimeError(
+                    f"{type(self).__name__}: the loaded {name} has the shape {list(value.shape)}, not "
+                    f"{list(own[name].shape)}: load it into a transform with the settings that it had"
+                )
         self.clear_memory()
-        self.set_memory({k: v.detach().clone().to(devices.get(k, v.device)) for k, v in saved.items()})
+        self.set_memory(
+            {k: v.detach().clone().to(own[k].device if k in own else v.device) for k, v in saved.items()}
+        )
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Random streams.
@@ -582,26 +482,17 @@ class StatefulTransform(Transform):
     def set_seed(self, seed: int | None) -> None:
         """Set the seed and delete the memory; the next reset counts as the first.
 
-        If all worlds have just been reset, they need not be reset again. ``set_seed`` of the environment
-        calls this method. Transforms of one environment draw different numbers from the same seed.
+        If all worlds have just been reset, they need not be reset again, as TorchRL's collectors reset an
+        environment when they are made, and are seeded afterwards. ``set_seed`` of the environment calls this
+        method. Transforms of one environment draw different numbers from the same seed.
         """
         self._seed, self._world_seeds = seed, None
-        self._seeded_anew()
+        self.clear_memory()
 
     def seed_worlds(self, seeds: Tensor) -> None:
         """Set a seed for each world, [B] integers: a world's draws then do not depend on the other worlds."""
         self._seed, self._world_seeds = None, seeds.to(torch.long)
-        self._seeded_anew()
-
-    def _seeded_anew(self) -> None:
-        """Delete the memory; a step needs no reset if none was taken since the latest reset of all worlds.
-
-        For TorchRL's collectors reset an environment when they are made, and are seeded afterwards.
-        """
-        begun = self._begun
-        stepped = begun is None or any(self._buffers.get(k) is not value for k, value in begun[1].items())
         self.clear_memory()
-        self._begun = None if begun is None or stepped else (begun[0], {})
 
     def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
         """A random stream (a key of the counter-based generator) for each row, [M] int64.
@@ -625,18 +516,14 @@ class StatefulTransform(Transform):
         return counter_rng.bits64(worlds.view(-1, 1), name, agents).flatten()
 
 
-# A step of several transforms; pure functions. ``DelayedEnv`` compiles them with the worlds.
+# A step of several transforms, in the order in which they process outputs; pure functions. ``DelayedEnv``
+# compiles them with the worlds.
 
 
 def act(
     transforms: Sequence[StatefulTransform], memories: Sequence[Memory], entries: Entries
 ) -> tuple[list[Memory], Entries]:
     """Pass the inputs of a step through the transforms, from the last to the first.
-
-    Args:
-        transforms: in the order in which they process outputs.
-        memories: of each of them.
-        entries: inputs of the step.
 
     Returns:
         The new memories, and the inputs as the environment gets them.
@@ -649,10 +536,7 @@ def act(
 
 
 def observe(
-    transforms: Sequence[StatefulTransform],
-    memories: Sequence[Memory],
-    outputs: Entries,
-    extra: Entries | None = None,
+    transforms: Sequence[StatefulTransform], memories: Sequence[Memory], outputs: Entries, extra: Entries
 ) -> tuple[list[Memory], Entries]:
     """Pass the outputs of a step through the transforms.
 
@@ -664,7 +548,7 @@ def observe(
     """
     changed_memories = list(memories)
     for i, transform in enumerate(transforms):
-        changed_memories[i], changed = transform.on_step(changed_memories[i], outputs | (extra or {}))
+        changed_memories[i], changed = transform.on_step(changed_memories[i], outputs | extra)
         outputs = drop_keys(outputs | changed, transform.dropped_keys)
     return changed_memories, outputs
 
@@ -687,90 +571,36 @@ def begin(
 def check_order(transforms: Sequence[Transform]) -> None:
     """Refuse an order in which one transform undoes or misses the effect of another.
 
-    Pairs of which neither is damian's are not looked at. What TorchRL's own transforms do is read from their
-    keys. Where a wrong order may be meant, a warning is given.
-
     Args:
         transforms: transforms in the order in which they process the environment's outputs.
 
     Raises:
-        InputError: two transforms are in the wrong order; the message names them and the key.
+        InputError: a transform of damian's reads what one of an earlier stage changes after it; rewards in
+            transit would be lost at an end of the episode; or a transform of TorchRL's takes or skips steps
+            of which the others do not know.
     """
-    usages = [(transform, _usage_of(transform)) for transform in transforms]
-    for (first, a), (second, b) in itertools.combinations(usages, 2):
-        if isinstance(first, StatefulTransform) or isinstance(second, StatefulTransform):
-            _check_pair(first, a, second, b)
+    for first, second in itertools.combinations(transforms, 2):
+        problem = None
+        if isinstance(first, StatefulTransform) and isinstance(second, StatefulTransform):
+            read = {*first.in_keys, *first.in_keys_inv}
+            shared = read.intersection([*second.out_keys, *second.out_keys_inv])
+            if shared and STAGES.index(first.stage) > STAGES.index(second.stage):
+                problem = f"it reads {shared.pop()}, which the other one changes"
+        elif isinstance(first, StatefulTransform) and first.flushes_at_end and _ends_episodes(second):
+            problem = "what is in transit at the end of an episode would be lost"
+        elif isinstance(first, StatefulTransform) and isinstance(second, NoopResetEnv):
+            problem = "it would remember what was before the idle steps"
+        elif isinstance(first, ConditionalSkip) and isinstance(second, StatefulTransform):
+            problem = "only then do the others know which worlds skip a step"
+        if problem:
+            names = type(first).__name__, type(second).__name__
+            raise InputError(f"order of transforms: {names[0]} must come after {names[1]}: {problem}")
 
 
-def _check_orders(container: Any) -> None:
-    """Refuse a wrong order in a Compose, or in an environment and those within it.
-
-    Raises:
-        InputError: as ``check_order``; or a transform of the same environment steps a copy of damian's.
-    """
-    own = leaf_transforms(container if isinstance(container, Compose) else container.transform)
-    check_order(own if isinstance(container, Compose) else all_transforms(container))
-    first = next((each for each in own if isinstance(each, StatefulTransform)), None)
-    for each in own[own.index(first) :] if first is not None else []:
-        if isinstance(each, _STEPPING):
-            name = type(each).__name__
-            why = f"{name} steps a copy of what comes before it, which has no memory; or put it around: "
-            around = f"TransformedEnv(env, {name}(...), auto_unwrap=False)"
-            raise _wrong_order((type(first).__name__, name), why + around)
-
-
-_STEPPING = (FrameSkipTransform, NoopResetEnv, MultiAction, ConditionalPolicySwitch)
-"""TorchRL's transforms that step a copy of what comes before them in their environment."""
-
-
-def _check_pair(first: Transform, a: KeyUsage, second: Transform, b: KeyUsage) -> None:
-    names = type(first).__name__, type(second).__name__
-    used = [*first.in_keys, *a.delays, *a.appends] if isinstance(first, StatefulTransform) else []
-    for key in _common_keys(used, b.overwrites):
-        raise _wrong_order(names, f"it uses {key}, which {names[1]} creates")
-    for key in _common_keys(a.records, b.replaces):
-        why = f"it must record {key} as chosen, and actions pass the transforms in reverse order"
-        raise _wrong_order(names, why)
-    for key in _common_keys(a.appends, b.delays):
-        raise _wrong_order(names, f"{names[1]} must not delay what it appends to {key}")
-    if a.flushes_at_end and b.may_end:
-        raise _wrong_order(names, f"what is in transit when {names[1]} ends an episode would be lost")
-    if a.skips:
-        raise _wrong_order(names, f"{names[1]} must know which worlds skip a step")
-    for key, computed in a.computes:
-        if key in b.delays and key in second.out_keys and computed not in b.delays:
-            problem = f"{names[0]} computes {computed} from {key} before {names[1]} changes {key}"
-            warnings.warn(f"order of transforms: {problem}", stacklevel=2)
-    for (key, age), (held, grown) in itertools.product(a.age_of, b.held_entries):
-        if key == held and age != grown:
-            problem = f"{names[1]} holds {key}, whose age {names[0]} writes under {age}"
-            remedy = f"give {names[1]} age_key={age!r}, so that the age grows with what is held"
-            warnings.warn(f"order of transforms: {problem}: {remedy}", stacklevel=2)
-
-
-def _usage_of(transform: Transform) -> KeyUsage:
-    if isinstance(transform, StatefulTransform):
-        return transform.key_usage
-    ends = isinstance(transform, StepCounter) and transform.max_steps is not None
-    ends = ends or isinstance(transform, (RandomTruncationTransform, TerminateTransform))
-    # Not the properties: some of TorchRL's transforms choose their keys when these are first read.
-    read, written = (transform.__dict__.get(name) or [] for name in ("_in_keys", "_out_keys"))
-    if isinstance(transform, RewardSum) and not read:
-        read, written = ["reward"], ["episode_reward"]
-    others = [key for key in written if key not in read]
-    return KeyUsage(
-        may_end=ends or any(last_part(key) in ENDS for key in others),
-        skips=isinstance(transform, ConditionalSkip),
-        computes=[(key, other) for key in read for other in others],
-    )
-
-
-def _wrong_order(names: tuple[str, str], why: str) -> InputError:
-    return InputError(f"order of transforms: {names[0]} must come after {names[1]}, because {why}")
-
-
-def _common_keys(some: Sequence[NestedKey], others: Sequence[NestedKey]) -> list[NestedKey]:
-    return [key for key in some if key in others]
+def _ends_episodes(transform: Transform) -> bool:
+    if isinstance(transform, StepCounter):
+        return transform.max_steps is not None
+    return isinstance(transform, RandomTruncationTransform | TerminateTransform)
 
 
 def leaf_transforms(transform: Transform | None) -> list[Any]:
@@ -831,39 +661,13 @@ TransformedEnv.set_seed = _set_seed  # type: ignore[method-assign]
 # Entries of TensorDicts, viewed as M rows: one for each world, or for each agent of each world.
 
 
-def read_keys(written: NestedKey | Sequence[NestedKey]) -> list[NestedKey]:
-    """Keys as TorchRL's transforms take them: a name or a tuple of names is one key, a list holds several.
-
-    Raises:
-        InputError: something is no key.
-    """
-    keys = [written] if isinstance(written, str) or _is_nested(written) else written
-    no_key = "is not a key such as 'observation' or ('agents', 'observation'), nor a list of keys"
-    checks.require(isinstance(keys, Iterable), "keys", repr(written), no_key)
-    found: list[NestedKey] = list(cast(Iterable[NestedKey], keys))
-    for key in found:
-        checks.require(bool(key) and (isinstance(key, str) or _is_nested(key)), "keys", repr(key), no_key)
-    return [unravel_key(key) for key in found]
-
-
-def _is_nested(key: object) -> bool:
-    """Is this a tuple of names, at any depth, as ``unravel_key`` takes it?"""
-    return isinstance(key, tuple) and bool(key) and all(isinstance(k, str) or _is_nested(k) for k in key)
-
-
 def path_of(key: NestedKey) -> tuple[str, ...]:
     """The path of the TensorDict that directly contains an entry."""
     return cast(tuple[str, ...], key[:-1]) if isinstance(key, tuple) else ()
 
 
-def row_shape(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
-    """The batch size of the TensorDict that directly contains an entry."""
-    path = path_of(key)
-    return (tensordict.get(path) if path else tensordict).batch_size
-
-
 def spec_rows(specs: Composite, key: NestedKey) -> torch.Size:
-    """As ``row_shape``, but read from specs."""
+    """The shape of the specs that directly contain that of an entry."""
     path = path_of(key)
     return (specs[path] if path else specs).shape
 
@@ -878,13 +682,13 @@ def from_rows(value: Tensor, rows: torch.Size) -> Tensor:
     return value.view((*rows, *value.shape[1:]))
 
 
-def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey], gradients: bool = False) -> Entries:
-    """The entries with these keys, as far as they exist, without their autograd graph unless it is wanted."""
+def select_entries(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
+    """The entries with these keys, as far as they exist, without their autograd graph."""
     found = {}
     for key in keys:
         value = tensordict.get(key, None)
         if value is not None:
-            found[key] = value.detach() if value.requires_grad and not gradients else value
+            found[key] = value.detach() if value.requires_grad else value
     return found
 
 
@@ -911,33 +715,18 @@ def existing(keys: Iterable[NestedKey | None]) -> list[NestedKey]:
     return [key for key in keys if key is not None]
 
 
-def require_keys(transform: str, keys: Sequence[NestedKey], present: TensorDictBase | Composite) -> None:
+def require_keys(transform: str, keys: Sequence[NestedKey], present: Iterable[NestedKey]) -> None:
     """Require that the entries that a transform reads exist.
-
-    Args:
-        transform: name of the transform, for errors.
-        keys: of the entries.
-        present: the outputs of a reset, or specs.
 
     Raises:
         InputError: one is missing.
     """
-    known = list(present.keys(True, True))
-    for key in keys:
-        should = f"is not among the keys of the environment: {listed(map(str, known))}"
-        if isinstance(key, tuple) and all(part in known for part in key):
-            should = f"is one nested key, which the environment lacks; two keys are written {list(key)}"
-        checks.require(key in known, transform, key, should)
-
-
-def require_new(transform: str, key: NestedKey, present: Iterable[NestedKey]) -> None:
-    """Require that an entry that a transform creates would not replace another one.
-
-    Raises:
-        InputError: there is such an entry already.
-    """
-    should = "is already an entry of the environment: choose another name (None leaves an optional entry out)"
-    checks.require(unravel_key(key) not in present, transform, key, should)
+    known = list(present)
+    missing = next((key for key in keys if key not in known), None)
+    if missing is not None:
+        raise InputError(
+            f"{transform}: {missing} is not among the keys of the environment: {listed(map(str, known))}"
+        )
 
 
 def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[NestedKey]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from damian.common import checks, counter_rng
 from damian.delays.laws import Law
 from damian.delays.samplers import MessageContext, Sampler
-from damian.transforms.base import Entries, Memory, as_rows, require_keys, sibling_key
+from damian.transforms.base import Entries, Memory, as_rows, sibling_key
 
 
 class ContextReader:
@@ -51,23 +51,9 @@ class ContextReader:
         self._since_clock = 0 if before_step else 1
 
     def init_memory(self, memory: Memory, tensordict: TensorDictBase, rows: torch.Size) -> Memory:
-        """Add what the contexts need to the memory.
-
-        Args:
-            memory: of the transform, M rows.
-            tensordict: outputs of the first reset.
-            rows: shape of the rows.
-
-        Raises:
-            InputError: an entry is missing, or has no part for each row.
-        """
+        """Add what the contexts need to the memory of the transform, M rows of the shape ``rows``."""
         if not self._sees_context:
             return memory
-        for name, key in self.keys.items():
-            require_keys(f"context_keys.{name}", [key], tensordict)
-            shape = tuple(tensordict.get(key).shape)
-            should = f"has shape {shape}, but messages are sent by rows of shape {tuple(rows)}"
-            checks.require(shape[: len(rows)] == tuple(rows), f"context_keys.{name}", key, should)
         n_agents = rows.numel() // tensordict.batch_size.numel()
         return memory | {"agents": torch.arange(n_agents, device=memory["streams"].device)}
 

@@ -16,13 +16,11 @@ from damian.transforms.base import (
     Change,
     Correction,
     Entries,
-    KeyUsage,
     Memory,
     StatefulTransform,
     as_rows,
     existing,
     from_rows,
-    require_keys,
     sibling_key,
     spec_rows,
 )
@@ -58,14 +56,15 @@ class ActionHistory(ActionTransform):
 
     Raises:
         InputError: the number of steps is not a positive integer; at the first use of the environment also:
-            ``append_to`` cannot be appended to, the default is no legal action, or the environment has no
-            entry ``recorded_key``.
+            ``append_to`` is no vector of floats, or the default is no legal action.
 
     Examples:
         >>> history = ActionHistory(2, append_to="observation")
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ActionDelay(2), history))
         >>> env.rollout(100)["observation"]  # the last two columns are the last two actions
     """
+
+    stage = "history"
 
     def __init__(
         self,
@@ -92,16 +91,8 @@ class ActionHistory(ActionTransform):
         self.step_keys = existing([*self.in_keys, self.age_key])
 
     @property
-    def key_usage(self) -> KeyUsage:
-        return KeyUsage(appends=self.in_keys, records=[self.action_key])
-
-    @property
-    def memory_sizes(self) -> dict[str, int]:
-        return {"steps": self.steps, "with_age": int(self.age_key is not None)}
-
-    @property
     def required_keys(self) -> Sequence[NestedKey]:
-        return [*self.step_keys, *self.flag_to_require(self.recorded_key)]
+        return self.step_keys
 
     @property
     def _n_numbers(self) -> int:
@@ -135,7 +126,7 @@ class ActionHistory(ActionTransform):
             older = memory["since"] + 1
             changed["since"] = torch.cat([older[:, 1:], torch.ones_like(older[:, :1])], -1)
             unchanged["since"] = older
-        if self.recorded_key in entries:
+        if self.recorded_key is not None:
             recorded = entries[self.recorded_key].reshape(-1, 1)
             changed = {name: torch.where(recorded, new, unchanged[name]) for name, new in changed.items()}
         return memory | changed, {}
@@ -181,7 +172,6 @@ class ActionHistory(ActionTransform):
             shape = torch.Size((*rows, width))
             observation_spec[key] = Unbounded(shape, dtype=torch.float32, device=device)
             return observation_spec
-        require_keys(type(self).__name__, [key], observation_spec)
         old = observation_spec[key]
         flat = old.dtype.is_floating_point and len(old.shape) == len(rows) + 1
         should = "is not a vector of floats, so no actions can be appended to it; use out_key instead"
@@ -230,7 +220,7 @@ class MessageHistory(StatefulTransform):
         own: whether an agent knows its own messages as soon as they are sent.
 
     Raises:
-        InputError: the number of steps is not a positive integer, or ``group`` has no agents.
+        InputError: the number of steps is not a positive integer.
 
     Examples:
         >>> delay = ObservationDelay(Uniform(3, 7), "observation", "received", delay_key="delay")
@@ -259,10 +249,6 @@ class MessageHistory(StatefulTransform):
         )
         self.out_keys = [written]
         self.step_keys = existing([self.row_key, self.delay_key, self.sent_key])
-
-    @property
-    def memory_sizes(self) -> dict[str, int]:
-        return {"steps": self.steps}
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -355,10 +341,7 @@ class MessageHistory(StatefulTransform):
         return message if self.encode is None else self.encode(message)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        require_keys(type(self).__name__, [self.row_key], observation_spec)
         spec, rows = observation_spec[self.row_key], spec_rows(observation_spec, self.row_key)
-        should = "needs messages of several agents, under a nested key such as ('agents', 'message')"
-        checks.require(not self.group or len(rows) > len(observation_spec.shape), "group", True, should)
         encoded = self._encoded(spec.zero())
         shape = (*rows, self.steps * (rows[-1] if self.group else 1), encoded.shape[-1] + 3)
         observation_spec[self.out_keys[0]] = Unbounded(

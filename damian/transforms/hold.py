@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from damian import keys
-from damian.common import checks, counter_rng
+from damian.common import checks
 from damian.common.tensors import expand_mask
 from damian.delays.laws import Delay, in_steps
 from damian.keys import next_key
@@ -16,7 +16,6 @@ from damian.transforms.base import (
     Change,
     Correction,
     Entries,
-    KeyUsage,
     Memory,
     StatefulTransform,
     as_rows,
@@ -34,33 +33,28 @@ class SampleAndHold(StatefulTransform):
     keep the values of the last tick, and the environment executes the actions ``in_keys_inv`` of the last
     tick again. With a period of one step nothing changes.
 
+    A worked timeline, with a period of 3 steps: the clock ticks at t = 0, 3 and 6. The observation of t = 0
+    is shown at t = 0, 1 and 2, and that of t = 3 at t = 3, 4 and 5. The action chosen at t = 0 is executed in
+    the steps that begin at t = 0, 1 and 2, whatever is chosen at t = 1 and 2.
+
     Args:
         period: time between two ticks: steps (``4``), or a time (``"2s"``).
-        in_keys: keys of the entries that are sampled and held; their TensorDicts have the same batch size.
-        in_keys_inv: keys of the actions that are held, of the same batch size too: an action chosen between
-            two ticks is not executed.
+        in_keys: keys of the entries that are sampled and held.
+        in_keys_inv: keys of the actions that are held: an action chosen between two ticks is not executed.
         ready_key: key of a flag, [...] bool, that is set to false between two ticks, as an agent cannot
             choose then; None to leave it out.
         age_key: key of the age of the entries that are held [steps], [..., 1], as ``ObservationDelay`` writes
             it: between two ticks it grows by one in each step. A bare name means an entry in the same
             TensorDict as ``in_keys[0]``; None to leave ages as they are.
         dt: length of a step [s], for a period given as a time.
-        stagger: every row (world, or agent under a nested key) draws the time from each reset to its second
-            tick, from one step to a period, so that the clocks do not all tick in the same step.
-        seed: seed of these draws until the environment is seeded; if there is none, it is drawn from torch's
-            global generator at the first reset.
-        gradients: let gradients flow through the held entries (``StatefulTransform``).
 
     Raises:
-        InputError: the period is not valid, no key is given, or there is an age but no entry is held; at the
-            first reset also: the entries have different batch sizes.
+        InputError: the period is not valid, or no key is given.
 
     Examples:
         >>> clock = SampleAndHold(4, ["observation"], ["action"])
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), clock)  # the agent acts in every fourth step
     """
-
-    same_batch_size = True
 
     def __init__(
         self,
@@ -71,34 +65,16 @@ class SampleAndHold(StatefulTransform):
         ready_key: NestedKey | None = None,
         age_key: NestedKey | None = None,
         dt: float = 1.0,
-        stagger: bool = False,
-        seed: int | None = None,
-        gradients: bool = False,
     ) -> None:
-        super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv, seed, gradients)
+        super().__init__(in_keys, in_keys, in_keys_inv, in_keys_inv)
         should = "is empty, and so is in_keys_inv: name the entries or the actions to hold"
         checks.require(bool(self.in_keys or self.in_keys_inv), "in_keys", in_keys, should)
         checks.above("dt", dt, 0.0, "s")
         self.period = in_steps("period", period, dt)
         checks.in_range("period", self.period, 1, unit="steps")
-        self.ready_key, self.stagger = ready_key, stagger
-        should = "is the age of the entries that are held, but in_keys is empty"
-        checks.require(bool(self.in_keys) or age_key is None, "age_key", age_key, should)
-        self.age_key = sibling_key(self.row_key, age_key)
-        self.draws = stagger
+        self.ready_key, self.age_key = ready_key, sibling_key(self.row_key, age_key)
         self.action_keys = self.in_keys_inv
         self.step_keys = existing([*self.in_keys, ready_key, self.age_key])
-
-    @property
-    def key_usage(self) -> KeyUsage:
-        delayed = existing([*self.in_keys, self.age_key])
-        held = [(key, self.age_key) for key in self.in_keys if self.period > 1]
-        return KeyUsage(delays=delayed, replaces=self.in_keys_inv, held_entries=held)
-
-    @property
-    def memory_sizes(self) -> dict[str, int]:
-        n_entries = len(self.in_keys) + (self.age_key is not None)
-        return {"period": self.period, "entries": n_entries, "in_keys_inv": len(self.in_keys_inv)}
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -107,49 +83,45 @@ class SampleAndHold(StatefulTransform):
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         first = select_entries(tensordict, self.in_keys)
         device = next((value.device for value in first.values()), self.env.device)
-        elapsed = torch.zeros(self.rows.numel(), dtype=torch.long, device=device)
-        memory = {"elapsed": elapsed}  # steps since the latest tick
+        memory = {"elapsed": torch.zeros(self.rows.numel(), dtype=torch.long, device=device)}  # since a tick
         memory |= {f"held_{i}": as_rows(value, self.rows) for i, value in enumerate(first.values())}
         specs = self.env.full_action_spec
         for i, key in enumerate(self.in_keys_inv):
             memory[f"action_at_tick_{i}"] = self.as_rows_of_spec(specs[key].zero(), specs, key)
         if self.age_key:
             memory["age"] = as_rows(tensordict.get(self.age_key), self.rows)
-        if not self.stagger:
-            return memory
-        streams = self.streams(tensordict.batch_size, device)
-        names = ("episode", "phase", "interval")  # "interval": steps from the latest tick to the next one
-        return memory | {"streams": streams} | {name: elapsed.clone() for name in names}
+        return memory
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         memory = memory | {"elapsed": memory["elapsed"].masked_fill(mask, 0)}
-        if self.stagger:
-            episode = memory["episode"] + mask
-            phase = counter_rng.bits(memory["streams"], episode) % self.period
-            new = {"phase": phase, "interval": self.period - phase}
-            memory = memory | {name: torch.where(mask, value, memory[name]) for name, value in new.items()}
-            memory["episode"] = episode
-        memory, held = self._hold(memory, entries, self.in_keys, "held", mask)
-        return self._with_age(memory, held, entries, mask, 0)
+        return self._hold_entries(memory, entries, mask, 0)
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
         return self._hold(memory, entries, self.in_keys_inv, "action_at_tick", memory["elapsed"] == 0)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         elapsed = memory["elapsed"] + 1
-        ticks = elapsed >= memory.get("interval", self.period)
-        memory = memory | {"elapsed": elapsed.masked_fill(ticks, 0)}
-        if self.stagger:
-            memory["interval"] = memory["interval"].masked_fill(ticks, self.period)
-        memory, held = self._hold(memory, entries, self.in_keys, "held", ticks)
+        ticks = elapsed >= self.period
+        memory, held = self._hold_entries(
+            memory | {"elapsed": elapsed.masked_fill(ticks, 0)}, entries, ticks, 1
+        )
         if self.ready_key:
             ready = entries[self.ready_key]
             held[self.ready_key] = ready & ticks.view_as(ready)
-        return self._with_age(memory, held, entries, ticks, 1)
+        return memory, held
 
     def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
         aged = {"age": memory["age"] + n_steps} if self.age_key else {}
         return memory | {"elapsed": (memory["elapsed"] + n_steps) % self.period} | aged
+
+    def _hold_entries(self, memory: Memory, entries: Entries, sampled: Tensor, n_steps: int) -> Change:
+        """Hold the entries ``in_keys``; where they are not sampled, their age grows by ``n_steps``."""
+        memory, held = self._hold(memory, entries, self.in_keys, "held", sampled)
+        if self.age_key:
+            new = as_rows(entries[self.age_key], self.rows)
+            age = torch.where(expand_mask(sampled, new), new, memory["age"] + n_steps)
+            memory, held[self.age_key] = memory | {"age": age}, from_rows(age, self.rows).clone()
+        return memory, held
 
     def _hold(
         self, memory: Memory, entries: Entries, keys: Sequence[NestedKey], name: str, sampled: Tensor
@@ -163,35 +135,11 @@ class SampleAndHold(StatefulTransform):
             outputs[key] = from_rows(held, self.rows).clone()  # the memory keeps the held values
         return memory, outputs
 
-    def _with_age(
-        self, memory: Memory, held: Entries, entries: Entries, sampled: Tensor, n_steps: int
-    ) -> Change:
-        """Add the age of the entries that are held to the outputs, if it has a key.
-
-        Args:
-            memory: memory with what is held now.
-            held: outputs without the age.
-            entries: entries that came in, with the age of those that are not held.
-            sampled: rows that hold what came in, [M] bool; in the others the age grows.
-            n_steps: by how many steps.
-        """
-        if not self.age_key:
-            return memory, held
-        new = as_rows(entries[self.age_key], self.rows)
-        age = torch.where(expand_mask(sampled, new), new, memory["age"] + n_steps)
-        return memory | {"age": age}, held | {self.age_key: from_rows(age, self.rows).clone()}
-
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
-        """Keeps entries, between two ticks, as they are known by now for the latest tick.
-
-        Raises:
-            InputError: the clocks are staggered, so that no stored step says when they ticked.
-        """
+        """Keeps entries, between two ticks, as they are known by now for the latest tick."""
         held = [key for key in self.in_keys if key in keys]
         if not held or self.period == 1:
             return None
-        should = "has ticks that no stored step shows: back-updating needs a clock without stagger"
-        checks.require(not self.stagger, "SampleAndHold: stagger", self.stagger, should)
 
         def hold_again(entries: Entries, steps: TensorDictBase, count: Tensor) -> Entries:
             elapsed = count + 1
@@ -249,11 +197,12 @@ class SkipUntilReady(StatefulTransform):
         return memory, {keys.DURATION: torch.ones_like(entries[keys.DONE], dtype=torch.long)}
 
     def skipped_worlds(self, entries: Entries) -> Tensor:
-        """Worlds in which no agent is ready and the episode goes on, [B] bool."""
+        """Worlds in which no agent is ready after a step and the episode goes on, [B] bool."""
         ready, done = entries[keys.READY], entries[keys.DONE]
         return ~(ready.flatten(1).any(-1) | done.view(-1))
 
     def merge_steps(self, entries: Entries, later: Entries, stepped: Tensor) -> Entries:
+        """Merge the outputs of a later step into ``entries`` in the worlds ``stepped`` [B] that took it."""
         duration = entries[keys.DURATION]
         weight = (self.gamma**duration).view(-1)
         sums = {k: entries[k] + expand_mask(weight, later[k]) * later[k] for k in self.reward_keys}

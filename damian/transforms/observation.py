@@ -14,13 +14,11 @@ from damian.delays.line import ORDERS, DelayLine, Delivery
 from damian.transforms.base import (
     Change,
     Entries,
-    KeyUsage,
     Memory,
     StatefulTransform,
     as_rows,
     existing,
     from_rows,
-    require_keys,
     select_entries,
     sibling_key,
     spec_rows,
@@ -35,11 +33,14 @@ class ObservationDelay(StatefulTransform):
     holds a message until another one arrives. After a reset it holds the first message of the episode, which
     has no delay. With delay 0 the rollout is the same, bit for bit, as without the transform.
 
+    A worked timeline, with a delay of 3 steps: the reset, t = 0, shows observation 0, of age 0. Observation 1
+    is sent at t = 1 and arrives at t = 4. So t = 1, 2 and 3 show observation 0 again, of ages 1, 2 and 3, and
+    t = 4 shows observation 1, of age 3.
+
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
             A delay is drawn for each world, each agent (under a nested key) and each step.
-        in_keys: keys of the entries that are sent together, or one key; their TensorDicts have the same batch
-            size.
+        in_keys: keys of the entries that are sent together, or one key.
         out_keys: keys under which the received entries are written; if not given, ``in_keys``, so that the
             current entries are overwritten.
         loss: probability that a message is lost.
@@ -54,25 +55,19 @@ class ObservationDelay(StatefulTransform):
         sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
         context_keys: key of each entry that the law may read, by the name that the law gives it
             (``ContextSampler``).
-        seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
-            global generator at the first reset.
-        gradients: let gradients flow through the received entries (``StatefulTransform``).
+        seed: as in ``StatefulTransform``.
 
     A bare name for one of the five keys above means an entry in the same TensorDict as ``in_keys[0]``.
 
     Raises:
-        InputError: the delay or the order is not valid, the law reads what has no key, or ``in_keys`` and
-            ``out_keys`` are none or not as many; at the first reset also: the entries have different batch
-            sizes.
+        InputError: the delay or the order is not valid, or the law reads what has no key; at the first use of
+            the environment also: an entry is missing, or one to write exists already.
 
     Examples:
         >>> delay = ObservationDelay(Uniform(3, 7), loss=0.1)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), delay)
         >>> env.rollout(100)["age"]  # steps since each observation was generated
     """
-
-    omittable_outputs = ("age_key", "fresh_key", "delay_key")
-    same_batch_size = True
 
     def __init__(
         self,
@@ -89,40 +84,28 @@ class ObservationDelay(StatefulTransform):
         sent_key: NestedKey | None = None,
         context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
-        gradients: bool = False,
     ) -> None:
         checks.one_of("order", order, ORDERS)
-        super().__init__(in_keys, out_keys or in_keys, seed=seed, gradients=gradients)
-        checks.require(bool(self.in_keys), "in_keys", in_keys, "name nothing to send")
-        as_many = len(self.in_keys) == len(self.out_keys)
-        checks.require(as_many, "out_keys", out_keys, f"are not {len(self.in_keys)} keys, as in_keys are")
+        super().__init__(in_keys, out_keys or in_keys, seed=seed)
         law = law_of(delay)
         self.sampler = sampler_of(law, dt, loss)
         self.draws = self.sampler.constant_delay is None
         self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
-        self.line = DelayLine(self.sampler, order, gradients)
+        self.line = DelayLine(self.sampler, order)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
+        self.extra_keys = existing([self.age_key, self.fresh_key, self.delay_key])
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.row_key)
-        self.step_keys = [*self.required_keys, *self.contexts.keys.values()]
-
-    @property
-    def key_usage(self) -> KeyUsage:
-        ages = [(key, self.age_key) for key in self.out_keys if self.age_key is not None]
-        return KeyUsage(delays=self.in_keys, age_of=ages)
+        self.step_keys = self.required_keys
 
     @property
     def row_dims(self) -> dict[str, int]:
         return self.line.row_dims(len(self.in_keys))
 
     @property
-    def memory_sizes(self) -> dict[str, int]:
-        return {"longest": self.sampler.longest, "in_keys": len(self.in_keys)}
-
-    @property
     def required_keys(self) -> Sequence[NestedKey]:
-        return existing([*self.in_keys, self.sent_key])
+        return existing([*self.in_keys, self.sent_key, *self.contexts.keys.values()])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))
@@ -158,7 +141,6 @@ class ObservationDelay(StatefulTransform):
         return entries
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        require_keys(type(self).__name__, self.in_keys, observation_spec)
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if out_key != key:
                 observation_spec[out_key] = observation_spec[key].clone()

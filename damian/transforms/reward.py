@@ -19,14 +19,13 @@ from damian.transforms.base import (
     Change,
     Correction,
     Entries,
-    KeyUsage,
     Memory,
     StatefulTransform,
     any_flag,
     as_rows,
+    existing,
     flag_keys,
     from_rows,
-    require_keys,
     sibling_key,
     spec_rows,
 )
@@ -39,14 +38,13 @@ class RewardTransform(StatefulTransform):
     Args:
         reward_key: key of the reward.
         seed: as in ``StatefulTransform``.
-        gradients: as in ``StatefulTransform``.
     """
 
     n_slots: int
     """Number of rewards that are remembered for each of the M rows, K."""
 
-    def __init__(self, reward_key: NestedKey, seed: int | None = None, gradients: bool = False) -> None:
-        super().__init__(reward_key, reward_key, seed=seed, gradients=gradients)
+    def __init__(self, reward_key: NestedKey, seed: int | None = None) -> None:
+        super().__init__(reward_key, reward_key, seed=seed)
         self.reward_key: NestedKey = self.in_keys[0]
 
     @property
@@ -54,39 +52,13 @@ class RewardTransform(StatefulTransform):
         return [self.reward_key]
 
     @property
-    def key_usage(self) -> KeyUsage:
-        return KeyUsage(delays=[self.reward_key])
-
-    @property
-    def memory_sizes(self) -> dict[str, int]:
-        return {"n_slots": self.n_slots}
-
-    @property
-    def required_keys(self) -> Sequence[NestedKey]:
-        return []  # a reset outputs no reward
-
-    @property
     def row_dims(self) -> dict[str, int]:
         return {"past": 1}
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         specs = self.env.full_reward_spec
-        require_keys(type(self).__name__, [self.reward_key], specs)
         zero = self.as_rows_of_spec(specs[self.reward_key].zero(), specs, self.reward_key)
         return {"past": zero.new_zeros(self.n_slots, *zero.shape)}
-
-    def sum_dtype(self, dtype: torch.dtype) -> torch.dtype:
-        """The type of the rewards that the transform writes, given the type of those that it reads."""
-        return dtype
-
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
-        require_keys(type(self).__name__, [self.reward_key], reward_spec)
-        if self.n_slots > 1:  # sums of rewards have other bounds than one reward
-            old = reward_spec[self.reward_key]
-            reward_spec[self.reward_key] = Unbounded(
-                old.shape, dtype=self.sum_dtype(old.dtype), device=old.device
-            )
-        return reward_spec
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
         past = memory["past"]
@@ -100,6 +72,10 @@ class RewardDelay(RewardTransform):
     are still in transit are received, so that none is lost. Hence the transform must come after every
     transform that ends episodes, such as ``StepCounter(max_steps=100)``, and not in a worker if these end
     around the workers. With delay 0 the rollout is the same, bit for bit, as without the transform.
+
+    A worked timeline, with a delay of 3 steps: the reward r1 of the first step is earned at t = 1 and
+    received at t = 4; the steps before receive 0. If the episode ends at t = 5, that step receives r2 + r3 +
+    r4 + r5.
 
     Rewards in transit lie in a ring of K slots (``past``), one for each coming step; ``due`` [K, M] is the
     time at which those in a slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a
@@ -118,9 +94,7 @@ class RewardDelay(RewardTransform):
             it out. An actor must not observe it; back-updating needs it.
         earned_key: key for the reward earned in this step, whenever it is received; None to leave it out. An
             actor must not observe it; back-updating needs it if no messages tell the reward.
-        seed: seed of the delays until the environment is seeded; if there is none, it is drawn from torch's
-            global generator at the first reset.
-        gradients: let gradients flow through the received rewards (``StatefulTransform``).
+        seed: as in ``StatefulTransform``.
 
     A bare name for one of these keys means an entry in the same TensorDict as the reward. After a reset, what
     ``delay_key`` and ``earned_key`` name is 0.
@@ -133,7 +107,7 @@ class RewardDelay(RewardTransform):
         >>> rollout = env.rollout(200)  # the sum of the rewards is that of the environment
     """
 
-    omittable_outputs = ("delay_key", "earned_key")
+    flushes_at_end = True
 
     def __init__(
         self,
@@ -145,12 +119,12 @@ class RewardDelay(RewardTransform):
         delay_key: NestedKey | None = None,
         earned_key: NestedKey | None = None,
         seed: int | None = None,
-        gradients: bool = False,
     ) -> None:
-        super().__init__(reward_key, seed, gradients)
+        super().__init__(reward_key, seed)
         self.delay_key, self.earned_key = (
             sibling_key(self.reward_key, key) for key in (delay_key, earned_key)
         )
+        self.extra_keys = existing([self.delay_key, self.earned_key])
         law = law_of(delay)
         self.sampler = sampler_of(law, dt)
         self.draws = self.sampler.constant_delay is None
@@ -173,10 +147,6 @@ class RewardDelay(RewardTransform):
     def reset_parent(self) -> None:
         super().reset_parent()
         self.__dict__.pop("_done_keys", None)
-
-    @property
-    def key_usage(self) -> KeyUsage:
-        return KeyUsage(delays=[self.reward_key], flushes_at_end=True)
 
     @property
     def row_dims(self) -> dict[str, int]:
@@ -234,8 +204,6 @@ class RewardDelay(RewardTransform):
             added = torch.where(expand_mask(stepped, there), added, there)
             arrival = torch.where(stepped, arrival, old)
         due.index_copy_(0, row, arrival)
-        if self.gradients:
-            return flat.index_copy(0, row, added).view_as(past)
         flat.index_copy_(0, row, added)
         return past
 
@@ -253,6 +221,12 @@ class RewardDelay(RewardTransform):
         if self.earned_key is not None:
             entries[self.earned_key] = from_rows(earned.clone(), self.rows)
         return entries
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
+        if self.n_slots > 1:  # sums of rewards have other bounds than one reward
+            old = reward_spec[self.reward_key]
+            reward_spec[self.reward_key] = Unbounded(old.shape, dtype=old.dtype, device=old.device)
+        return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         rewards, device = self.env.full_reward_spec, observation_spec.device
@@ -321,13 +295,12 @@ class CumulativeReward(RewardTransform):
     """Replaces the reward by the discounted sum of the latest rewards (paper, eq. 4).
 
     R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode. With ``steps=1``
-    nothing changes. Sums of integer rewards are float32; those of other rewards keep their type.
+    nothing changes. Sums of integers are float32.
 
     Args:
         steps: number of rewards in the sum, T.
         gamma: discount per step, in (0, 1].
         reward_key: key of the reward.
-        gradients: let gradients flow through the sum (``StatefulTransform``).
 
     Raises:
         InputError: the number of steps or the discount is not valid.
@@ -337,23 +310,25 @@ class CumulativeReward(RewardTransform):
         >>> rollout = env.rollout(200)  # each reward is a discounted sum of the last five
     """
 
-    def __init__(
-        self, steps: int, gamma: float = 0.9, reward_key: NestedKey = "reward", *, gradients: bool = False
-    ) -> None:
+    def __init__(self, steps: int, gamma: float = 0.9, reward_key: NestedKey = "reward") -> None:
         checks.whole("steps", steps, 1)
         checks.above("gamma", gamma, 0.0)
         checks.in_range("gamma", gamma, 0.0, 1.0)
-        super().__init__(reward_key, gradients=gradients)
+        super().__init__(reward_key)
         self.n_slots, self.gamma = steps, gamma
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
         reward = as_rows(entries[self.reward_key], self.rows)
         past = torch.cat([reward.unsqueeze(0), memory["past"][:-1]])
-        total = discounted_sum(past, self.gamma, self.sum_dtype(reward.dtype))
+        total = discounted_sum(past, self.gamma)
         return memory | {"past": past}, {self.reward_key: from_rows(total, self.rows)}
 
-    def sum_dtype(self, dtype: torch.dtype) -> torch.dtype:
-        return dtype if dtype.is_floating_point or self.n_slots == 1 else torch.float32
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:  # type: ignore[override]
+        old = reward_spec[self.reward_key]
+        if self.n_slots > 1:
+            dtype = torch.promote_types(old.dtype, torch.float32)
+            reward_spec[self.reward_key] = Unbounded(old.shape, dtype=dtype, device=old.device)
+        return reward_spec
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
         """Sums the corrected rewards of the same episode."""
@@ -368,21 +343,16 @@ class CumulativeReward(RewardTransform):
         past = before.unfold(0, self.n_slots, 1).movedim(-1, 0).flip(0)  # [K, T, B, ...], the newest first
         age = torch.arange(self.n_slots, device=count.device).view(-1, 1, 1)
         past = past.masked_fill(expand_mask(age > count, past), 0)
-        return entries | {key: discounted_sum(past, self.gamma, cast(Tensor, steps[key]).dtype)}
+        return entries | {key: discounted_sum(past, self.gamma)}
 
 
-def discounted_sum(past: Tensor, gamma: float, dtype: torch.dtype) -> Tensor:
-    """The discounted sum of the latest rewards (paper, eq. 4).
-
-    Args:
-        past: the latest K rewards, the newest first, [K, ...].
-        gamma: discount per step.
-        dtype: type of the sum.
-    """
+def discounted_sum(past: Tensor, gamma: float) -> Tensor:
+    """The discounted sum (paper, eq. 4) of the latest K rewards, the newest first, [K, ...]."""
+    dtype = torch.promote_types(past.dtype, torch.float32)
     weights = devices.constant(tuple(gamma**age for age in range(len(past))), dtype, past.device)
     # In double precision, so that the order of the sum, which depends on the batch, does not matter.
-    precise = torch.float64 if dtype.is_floating_point else dtype
-    return (weights.view(-1, *[1] * (past.dim() - 1)) * past).sum(0, dtype=precise).to(dtype)
+    weighted = weights.view(-1, *[1] * (past.dim() - 1)) * past
+    return weighted.sum(0, dtype=torch.float64).to(dtype)
 
 
 class EpisodeTotals(StatefulTransform):
@@ -402,6 +372,7 @@ class EpisodeTotals(StatefulTransform):
         >>> env.rollout(50)["next", "agents", "episode_reward"]  # [64, 50, N, 1]
     """
 
+    stage = "history"
     sees_merged_steps_only = True
     per_world = True
 
@@ -414,14 +385,6 @@ class EpisodeTotals(StatefulTransform):
         super().__init__(reward_key, [return_key, count_key])
         self.return_key, self.count_key = self.out_keys
         self.step_keys = self.in_keys
-
-    @property
-    def key_usage(self) -> KeyUsage:
-        return KeyUsage(computes=[(self.in_keys[0], self.return_key)])
-
-    @property
-    def required_keys(self) -> list[NestedKey]:
-        return []  # a reset outputs no reward
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         reward = self.env.full_reward_spec[self.in_keys[0]].zero()
@@ -441,7 +404,6 @@ class EpisodeTotals(StatefulTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         rewards, device = self.env.full_reward_spec, observation_spec.device
-        require_keys(type(self).__name__, self.in_keys, rewards)
         reward = rewards[self.in_keys[0]]
         observation_spec[self.return_key] = Unbounded(reward.shape, dtype=reward.dtype, device=device)
         shape = torch.Size((*observation_spec.shape, 1))

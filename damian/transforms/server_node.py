@@ -14,7 +14,6 @@ from damian.server.server import Server
 from damian.transforms.base import (
     Change,
     Entries,
-    KeyUsage,
     Memory,
     StatefulTransform,
     as_rows,
@@ -44,7 +43,9 @@ class ServerNode(StatefulTransform):
         >>> env = TransformedEnv(env, Compose(uplink, ServerNode(env.server)))
     """
 
+    stage = "server"
     per_world = True
+    created_keys = ()  # ``UavEnv`` writes all of them at a reset
 
     def __init__(
         self,
@@ -62,10 +63,6 @@ class ServerNode(StatefulTransform):
         self.own_key = keys.MESSAGE if server.observation.own else None
         self.belief_keys = [keys.BELIEF, keys.OWN_BELIEF][: 1 + server.observation.own] if server.grid else []
         self.step_keys = existing([*self.in_keys, self.own_key, *self.belief_keys, keys.SOURCE_OVER])
-
-    @property
-    def key_usage(self) -> KeyUsage:
-        return KeyUsage(overwrites=self.out_keys)
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -129,15 +126,13 @@ class OnboardNode(StatefulTransform):
         >>> env = TransformedEnv(env, Compose(channel, OnboardNode(env.server)))
     """
 
+    stage = "server"
     per_world = True
+    created_keys = ()
 
     def __init__(self, server: Server, *, dropped_keys: Sequence[NestedKey] = ()) -> None:
         super().__init__(keys.LINKED, keys.OBSERVATION)
         self.server, self.dropped_keys, self.step_keys = server, list(dropped_keys), self.in_keys
-
-    @property
-    def key_usage(self) -> KeyUsage:
-        return KeyUsage(overwrites=self.out_keys)
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         device = tensordict.get(self.in_keys[0]).device
@@ -184,10 +179,6 @@ class Belief(StatefulTransform):
         super().__init__(reads, [keys.BELIEF, *([keys.OWN_BELIEF] if own else [])])
         self.server, self.longest, self.delayed, self.own = server, longest, delayed, own
         self.step_keys = reads
-
-    @property
-    def memory_sizes(self) -> dict[str, int]:
-        return {"longest": self.longest, "own": int(self.own)}
 
     @property
     def row_dims(self) -> dict[str, int]:

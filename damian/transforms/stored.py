@@ -9,11 +9,10 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
-from damian.common import checks
 from damian.common.errors import InputError
 from damian.keys import ENDS, last_part
 from damian.transforms.action import ActionTransform
-from damian.transforms.base import StatefulTransform, leaf_transforms, require_keys
+from damian.transforms.base import leaf_transforms
 
 _TRAJECTORY = ("collector", "traj_ids")
 """Key under which TorchRL's collectors store the number of each step's episode."""
@@ -25,49 +24,46 @@ def delay_trajectories(
     transform: Transform,
     *,
     action_spec: TensorSpec | None = None,
-    start_key: NestedKey | None = None,
 ) -> TensorDictBase:
     """Apply transforms to stored steps, as if the environment had had them when the steps were collected.
 
     The stored steps are played back in their order. The result equals, bit for bit, what the same transforms
     with the same seeds give in the environment, if the actions are the same. A row of ``data`` is a world,
     and may contain several episodes. A step begins an episode if it is the first of its row, if the step
-    before it is done, if ``is_init`` or the number ``("collector", "traj_ids")`` says so, or if an entry
-    differs from the one under ``"next"`` one step before, as where rows were cut and joined. The message of
-    such a step has no delay. Rewards in transit where the data ends or is cut are not paid.
+    before it is done, if the number ``("collector", "traj_ids")`` says so, or if an entry differs from the
+    one under ``"next"`` one step before, as where rows were cut and joined. The message of such a step has no
+    delay. Rewards in transit where the data ends or is cut are not paid.
 
     Args:
         data: steps as TorchRL stores them, [T] or [*, T] with time last: entries, actions, and under
             ``"next"`` the outputs of each step. TensorDicts of agents have batch size [*, T, N].
         transform: a transform, or a ``Compose`` of several. It is copied, so it can be used again.
-        action_spec: ``env.full_action_spec`` (or ``env.action_spec``) of the environment of the steps, of any
-            number of worlds; only ``ActionHistory`` needs it, for the range of the actions.
-        start_key: key of a flag, [*, T, 1] or [*, T] bool: does the step begin an episode. If given, nothing
-            else tells where episodes begin.
+        action_spec: ``env.full_action_spec`` of the environment of the steps, of any number of worlds; only
+            ``ActionHistory`` needs it, for the range of the actions.
 
     Returns:
         The steps with what the transforms change or add; ``data`` stays as it is.
 
     Raises:
-        InputError: the transform would have changed what happened, as ``ActionDelay`` does, or is none, or
-            the data lacks an entry or has no steps.
+        InputError: the transform would have changed what happened, as ``ActionDelay`` does.
 
     Examples:
         >>> steps = GymEnv("Pendulum-v1").rollout(400, break_when_any_done=False)
         >>> late = delay_trajectories(steps, ObservationDelay(Uniform(1, 4), seed=0))
         >>> late["next", "age"]  # steps since each observation was generated
     """
-    if not data.batch_size.numel() or not data.dim() or ("next", "done") not in data.keys(True):
-        raise InputError(
-            'data: it has no steps with ("next", "done"): give steps as TorchRL stores them, [*, T]'
-        )
-    checks.require("time" not in data.names[:-1], "data", f"dimensions {data.names}", "must have time last")
     leaves = leaf_transforms(transform)
     for leaf in leaves:
-        _check_transform(leaf)
+        if leaf.out_keys_inv or any(last_part(key) in ENDS for key in leaf.out_keys):
+            raise InputError(
+                f"transform: {type(leaf).__name__} changes which actions are executed or when episodes end, "
+                "but stored steps show what followed: use it where the steps are collected"
+            )
     playback = _Playback(data, _read_action_specs(data, leaves, action_spec))
-    env = TransformedEnv(playback, transform.clone())
-    return _play(env, playback, _find_starts(data, start_key))
+    played = _play(TransformedEnv(playback, transform.clone()), playback, _find_starts(data))
+    if not played["next", "done"].equal(data["next", "done"]):
+        raise InputError("transform: it ends episodes where the stored steps go on")
+    return played
 
 
 def _play(env: EnvBase, playback: "_Playback", starts: Tensor) -> TensorDictBase:
@@ -78,9 +74,7 @@ def _play(env: EnvBase, playback: "_Playback", starts: Tensor) -> TensorDictBase
             now = env.reset(now.set("_reset", starts[..., time].unsqueeze(-1)))
         steps.append(env.step(playback.add_inputs(now)))
         now = env.step_mdp(steps[-1])
-    played = cast(TensorDictBase, torch.stack(steps, starts.dim() - 1))
-    playback.check_ends(played)
-    return played.refine_names(..., "time")
+    return cast(TensorDictBase, torch.stack(steps, starts.dim() - 1)).refine_names(..., "time")
 
 
 class _Playback(EnvBase):
@@ -93,7 +87,7 @@ class _Playback(EnvBase):
 
     def __init__(self, data: TensorDictBase, action_spec: Composite) -> None:
         super().__init__(device=data.device, batch_size=data.batch_size[:-1])
-        self._steps, self._time, self._done = data.unbind(-1), 0, data.get(("next", "done"))
+        self._steps, self._time = data.unbind(-1), 0
         first, after = self._steps[0], self._steps[0]["next"]
         self._outputs = _output_keys(first)
         ends = [key for key in _leaves(after) if last_part(key) in ENDS]
@@ -107,14 +101,6 @@ class _Playback(EnvBase):
     def add_inputs(self, outputs: TensorDictBase) -> TensorDictBase:
         """The outputs before a step, and what is stored beside them: actions, and what the policy wrote."""
         return outputs.update(self._steps[self._time].select(*self._inputs))
-
-    def check_ends(self, played: TensorDictBase) -> None:
-        """Require that the steps as they were played end episodes where the stored ones do."""
-        if not played.get(("next", "done")).equal(self._done):
-            raise InputError(
-                "transform: it ends episodes where the stored steps go on; limit their length where "
-                "you collect the steps"
-            )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         return self._steps[self._time].select(*self._outputs)
@@ -130,21 +116,15 @@ class _Playback(EnvBase):
 # The stored steps.
 
 
-def _find_starts(data: TensorDictBase, start_key: NestedKey | None) -> Tensor:
+def _find_starts(data: TensorDictBase) -> Tensor:
     """Mask of the first steps of episodes, [*, T] bool."""
     before, after = cast(TensorDictBase, data[..., :-1]), cast(TensorDictBase, data[..., 1:])
-    if start_key is not None:
-        checks.require(start_key in _leaves(data), "start_key", start_key, "is not in the data")
-        starts = _any(after, after.get(start_key))
-    else:
-        starts = _any(before, before.get(("next", "done")))
-        for key in [key for key in _leaves(data) if last_part(key) == "is_init"]:
-            starts = starts | _any(after, after.get(key))
-        if _TRAJECTORY in _leaves(data):
-            starts = starts | _any(after, after.get(_TRAJECTORY) != before.get(_TRAJECTORY))
-        for key in _output_keys(data):
-            new, expected = after.get(key), before.get("next").get(key)
-            starts = starts | _any(after, ~torch.isclose(new, expected, rtol=0, atol=0, equal_nan=True))
+    starts = _any(before, before.get(("next", "done")))
+    if _TRAJECTORY in _leaves(data):
+        starts = starts | _any(after, after.get(_TRAJECTORY) != before.get(_TRAJECTORY))
+    for key in _output_keys(data):
+        new, expected = after.get(key), before.get("next").get(key)
+        starts = starts | _any(after, ~torch.isclose(new, expected, rtol=0, atol=0, equal_nan=True))
     first = torch.ones(*data.batch_size[:-1], 1, dtype=torch.bool, device=starts.device)
     return torch.cat([first, starts], -1)
 
@@ -164,27 +144,6 @@ def _leaves(tensordict: TensorDictBase) -> list[NestedKey]:
     return list(tensordict.keys(True, True))
 
 
-# The transforms, and the specs that they read.
-
-
-def _check_transform(transform: Transform) -> None:
-    """Refuse a transform that would have changed what happened."""
-    if not isinstance(transform, StatefulTransform):
-        return
-    name, usage = type(transform).__name__, transform.key_usage
-    remedy = f"use it where the steps are collected, TransformedEnv(env, {name}(...))"
-    if usage.replaces:
-        raise InputError(
-            f"transform: {name} changes which actions are executed, but stored steps show what followed from "
-            f"the stored ones; {remedy}"
-        )
-    skips = type(transform).skipped_worlds is not StatefulTransform.skipped_worlds
-    if skips or any(last_part(key) in ENDS for key in transform.out_keys):
-        raise InputError(
-            f"transform: {name} changes how long steps or episodes last, but stored steps are over; {remedy}"
-        )
-
-
 def _read_action_specs(
     data: TensorDictBase, transforms: Sequence[Transform], action_spec: TensorSpec | None
 ) -> Composite:
@@ -193,14 +152,11 @@ def _read_action_specs(
     keys = [transform.action_key for transform in transforms if isinstance(transform, ActionTransform)]
     specs = _specs_of(step, [key for key in _leaves(step) if key in keys])
     for key in keys:
-        require_keys("transform", [key], step)
         if action_spec is None:
             raise InputError(f"action_spec: it is needed for the range of {key}: pass env.full_action_spec")
         spec: Any = action_spec[key] if isinstance(action_spec, Composite) else action_spec
         action = step.get(key)
-        n_worlds = len(spec.shape) - len(
-            action.shape[n_batch:]
-        )  # leading dimensions, which the data may lack
+        n_worlds = len(spec.shape) - len(action.shape[n_batch:])  # leading dimensions of the spec alone
         specs[key] = spec[(0,) * n_worlds].expand(action.shape) if n_worlds else spec.expand(action.shape)
     return specs
 

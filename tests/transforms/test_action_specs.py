@@ -16,7 +16,6 @@ from torchrl.data import (
 from torchrl.envs import TransformedEnv
 from transform_cases import ACTION
 
-from damian.common.errors import InputError
 from damian.transforms import ActionDelay, ActionHistory
 
 HISTORY = ("agents", "action_history")
@@ -76,17 +75,8 @@ def test_every_number_of_every_agent_is_scaled_by_its_own_bounds(spec, low, high
             assert found[tuple(at)].item() == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_history_of_the_lowest_and_the_highest_action_is_0_and_1():
-    for spec, low, high in list(RANGES.values())[:5]:
-        for bound, expected in ((low, 0.0), (high, 1.0)):
-            env = TransformedEnv(Plain(spec), ActionHistory(1, ACTION))
-            td = env.step(env.reset().set(ACTION, bound.to(spec.dtype)))
-            assert (td["next", *HISTORY] == expected).all()
-
-
 # Defaults.
 
-DISCRETE = "a legal default action: whole numbers between 0 and"
 LEGAL = {
     "number": (Categorical(5, GROUP), 4, torch.full(GROUP, 4)),
     "a number for each agent": (Categorical(5, GROUP), [3, 4], torch.tensor([3, 4]).expand(GROUP)),
@@ -109,15 +99,6 @@ LEGAL = {
     "truth": (Binary(3, (*GROUP, 3), dtype=torch.bool), True, torch.ones(*GROUP, 3, dtype=torch.bool)),
     "unbounded": (Unbounded((*GROUP, 1)), -1e9, torch.full((*GROUP, 1), -1e9)),
 }
-ILLEGAL = {
-    "too large": (Categorical(5, GROUP), 7, f"7 is not {DISCRETE} 4, one for all or in the shape (3, 2)"),
-    "a float": (Categorical(5, GROUP), 2.0, f"2.0 is not {DISCRETE} 4"),
-    "wrong shape": (Categorical(5, GROUP), [1, 2, 3], f"[1, 2, 3] is not {DISCRETE} 4"),
-    "a word": (Categorical(5, GROUP), "left", f"left is not {DISCRETE} 4"),
-    "index": (OneHot(3, (*GROUP, 3)), 3, f"3 is not {DISCRETE} 2, one for all or in the shape (3, 2)"),
-    "small type": (Bounded(0, 200, GROUP, dtype=torch.uint8), 300, f"300 is not {DISCRETE} 200"),
-    "not a number": (Bounded(-1.0, 1.0, GROUP), float("nan"), "nan is not a legal default action"),
-}
 
 
 @pytest.mark.parametrize(("spec", "default", "expected"), LEGAL.values(), ids=LEGAL)
@@ -129,15 +110,3 @@ def test_a_legal_default_is_executed_first(spec, default, expected):
     assert executed.equal(expected.to(spec.dtype))
     history = TransformedEnv(Plain(spec), ActionHistory(2, ACTION, default=default)).reset()[HISTORY]
     assert history.isfinite().all()
-
-
-@pytest.mark.parametrize(("spec", "default", "message"), ILLEGAL.values(), ids=ILLEGAL)
-@pytest.mark.parametrize(
-    "make", [lambda d: ActionDelay(2, ACTION, default=d), lambda d: ActionHistory(2, ACTION, default=d)]
-)
-def test_an_illegal_default_is_one_line_at_the_first_use_of_the_specs(spec, default, message, make):
-    env = TransformedEnv(Plain(spec), make(default))
-    with pytest.raises(InputError) as error:
-        env.reset()
-    assert str(error.value).startswith(f"default: {message}")
-    assert "\n" not in str(error.value)

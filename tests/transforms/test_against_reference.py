@@ -244,3 +244,14 @@ def test_a_history_of_action_codes_is_appended_to_the_observation():
         assert observation[..., 7:].equal(
             torch.cat([codes[choices()[t - 2]], codes[choices()[t - 1]]], -1).double()
         )
+
+
+@pytest.mark.parametrize("clocks", [[3], [2, 3], [1]])
+def test_the_age_is_that_of_the_observation_that_clocks_hold(law, clocks):
+    late = ObservationDelay(law, [OBSERVATION], order="arrival")
+    slow = [SampleAndHold(period, [OBSERVATION], age_key="age") for period in clocks]
+    outputs = play(delayed(late, *slow), choices())
+    sent_at = torch.tensor(column(outputs, *OBSERVATION))[..., 2]
+    age = torch.tensor(column(outputs, "agents", "age")).squeeze(-1)
+    now = (torch.arange(len(outputs)) + 1) // 2
+    assert age.equal((now.view(-1, 1, 1) - sent_at).float())

@@ -12,7 +12,6 @@ from torchrl.data import Bounded
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from damian.common.errors import InputError
 from damian.delays.laws import Burst, Uniform
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
@@ -26,9 +25,8 @@ HEARS = [[True, True, False], [False, True, True], [True, False, True]]
 CHANNELS = {
     "all": {},
     "limit": {"limit": 2, "loss": 0.2},
-    "matrix": {"topology": HEARS, "loss": [[0.0, 0.5, 0.1]] * 3},
+    "matrix": {"hears": HEARS, "loss": [[0.0, 0.5, 0.1]] * 3},
     "laws": {"delay": [[0, 3, LATE], [Burst(), 0, 1], ["2s", 0, 0]], "known_at_reset": True},
-    "server": {"topology": "server", "down_delay": LATE, "down_loss": 0.1},
     "range": {"comm_range": 0.8, "position_key": "observation"},
     "message": {"action_key": MESSAGE, "message_size": 2},
 }
@@ -78,28 +76,6 @@ def test_the_outputs_match_specs_that_can_be_indexed(options):
         assert specs["agents"][0, 1].shape == ()
 
 
-@pytest.mark.parametrize("options", [{"delay": 2}, {"delay": 0, "topology": "server", "down_delay": 2}])
-def test_a_channel_works_on_pettingzoo_without_a_batch_dimension(options):
-    env = TransformedEnv(pettingzoo(), channel(in_keys=("agent", "observation"), **options))
-    check_env_specs(env)
-    late = env.rollout(5)
-    sent, received = late["agent", "observation"], late["agent", "received"]
-    assert received[2:, 0, 1].equal(sent[:-2, 1])
-    assert received[:, 1, 1].equal(sent[:, 1])
-    assert late["agent", "received_age"][:, 0, 1].tolist() == [0, 1, 2, 2, 2]
-    assert late["agent", "received_mask"][:, 0, 1].tolist() == [False, False, True, True, True]
-
-
-@pytest.mark.parametrize("options", [{}, {"topology": "server", "down_delay": 0}])
-def test_with_delay_0_everyone_sees_everyones_current_message(options):
-    env = TransformedEnv(vmas(), channel(delay=0, **options))
-    for outputs in outputs_of(env):
-        sent, received = outputs[OBSERVATION], outputs[RECEIVED]
-        assert received.equal(sent.unsqueeze(1).expand_as(received))
-        assert not outputs[WRITTEN[1]].any()
-        assert outputs[WRITTEN[2]].all()
-
-
 def test_several_entries_are_sent_together():
     keys = [OBSERVATION, ("agents", "ready")]
     env, alone = (
@@ -131,7 +107,7 @@ def test_a_chosen_message_is_an_action_that_the_environment_never_gets():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["limit", "laws", "server", "message"])
+@pytest.mark.parametrize("name", ["limit", "laws", "message"])
 def test_a_step_with_uavs_compiles_into_one_graph_that_does_the_same(name):
     options = CHANNELS[name] | (
         {"in_keys": OBSERVATION} if name != "message" else {"action_key": ("agents", "words")}
@@ -149,7 +125,7 @@ def test_a_step_with_uavs_compiles_into_one_graph_that_does_the_same(name):
 
 
 @pytest.mark.sample(2)
-@pytest.mark.parametrize("name", ["all", "limit", "matrix", "laws", "server"])
+@pytest.mark.parametrize("name", ["all", "limit", "matrix", "laws"])
 def test_nothing_changes_before_a_falsified_message_arrives(name):
     def outputs(**tampered: Any) -> list[TensorDictBase]:
         return outputs_of(
@@ -170,7 +146,7 @@ def test_nothing_changes_before_a_falsified_message_arrives(name):
     assert heard
 
 
-@pytest.mark.parametrize("name", ["all", "limit", "matrix", "laws", "server"])
+@pytest.mark.parametrize("name", ["all", "limit", "matrix", "laws"])
 def test_a_world_does_the_same_alone_as_among_others(name):
     def written(worlds: list[int]) -> torch.Tensor:
         transform = channel(**CHANNELS[name])
@@ -187,30 +163,6 @@ def test_a_world_does_the_same_alone_as_among_others(name):
     assert all(same(together[b], written([name])[0]) for b, name in enumerate(WORLDS))
 
 
-@pytest.mark.parametrize("name", ["limit", "laws", "server"])
-def test_a_world_that_pauses_goes_on_as_if_it_had_not(name):
-    pausing, steady = (channel(**CHANNELS[name]) for _ in range(2))
-    for each in (pausing, steady):
-        each.seed_worlds(torch.tensor(WORLDS))
-        TransformedEnv(Counting(WORLDS, N), each).reset()
-    torch.manual_seed(0)
-    sent, truth, done = torch.randn(15, len(WORLDS), N, 7).double(), [], [0] * len(WORLDS)
-    for contents in sent:
-        memory, outputs = steady.on_step(steady.memory, {OBSERVATION: contents})
-        steady.set_memory(memory)
-        truth.append(outputs)
-    while min(done) < len(sent):
-        steps = torch.tensor([n < len(sent) and bool(torch.rand(()) < 0.5) for n in done])
-        contents = torch.stack([sent[min(n, len(sent) - 1), b] for b, n in enumerate(done)])
-        contents[~steps] = -1.0
-        before = pausing.memory
-        memory, outputs = pausing.on_step(before, {OBSERVATION: contents, "_step": steps})
-        pausing.set_memory(pausing.merge_worlds(before, memory, steps))
-        for b in steps.nonzero().flatten().tolist():
-            assert all(value[b].equal(truth[done[b]][key][b]) for key, value in outputs.items())
-            done[b] += 1
-
-
 def test_a_limited_medium_is_shared_fairly():
     env = TransformedEnv(Counting([*range(200)], N, ends=0.0), Channel(0, limit=1, seed=1))
     fresh = torch.stack([td[WRITTEN[1]] == 0 for td in outputs_of(env, 20)[::2]])
@@ -222,41 +174,3 @@ def test_a_limited_medium_is_shared_fairly():
 
 
 # Errors.
-
-
-TWO = [[0, 1], [1, 0]]
-MISTAKES = {
-    "topology: ring is not one of all, server": {"topology": "ring"},
-    "topology: .* is not N x N": {"topology": [[True, False]]},
-    "delay 2 x 2, topology 3 x 3: these are of different numbers": {"delay": TWO, "topology": HEARS},
-    "delay: .* has an entry for each link.*server only": {"delay": TWO, "topology": "server"},
-    "loss: 1.5 is not between 0 and 1": {"loss": [[0, 1.5], [0, 0]]},
-    "down_delay: 2 goes only with topology='server'": {"down_delay": 2},
-    "comm_range: 5 needs a position_key": {"comm_range": 5},
-    "action_key: .* does not go with in_keys": {
-        "action_key": MESSAGE,
-        "message_size": 1,
-        "in_keys": OBSERVATION,
-    },
-    "in_keys: observation is not in a group of agents": {"in_keys": "observation"},
-}
-
-
-@pytest.mark.parametrize("line", MISTAKES)
-def test_a_wrong_argument_is_one_line(line):
-    with pytest.raises(InputError, match=line):
-        channel(**MISTAKES[line])
-
-
-IN_USE = {
-    "Channel: the links are given for 2 agents, but .* is of 3": {"delay": TWO},
-    "Channel: .*words.* is not among the keys": {"in_keys": ("agents", "words")},
-    "Channel: .*ready.* is already an entry": {"out_keys": "ready"},
-    "action_key: .* is not a new name beside": {"action_key": ("agents", "action"), "message_size": 1},
-}
-
-
-@pytest.mark.parametrize("line", IN_USE)
-def test_what_does_not_fit_the_environment_is_one_line(line):
-    with pytest.raises(InputError, match=line):
-        TransformedEnv(Counting(WORLDS, N), channel(**IN_USE[line])).rollout(2)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from channel_twin import ServedWorld, World, check_against_twin, table, turn
+from channel_twin import World, check_against_twin, table, turn
 from delay_twin import Counting
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
@@ -57,40 +57,26 @@ def test_messages_arrive_as_their_law_says(law, known):
 
 
 @pytest.mark.parametrize("limit", [1, 2])
-def test_a_limit_a_flag_and_requests_choose_who_sends(limit):
+def test_a_limit_and_a_flag_choose_who_sends(limit):
     channel = Channel(
         Uniform(0, 3),
         limit=limit,
         sent_key="message_sent",
-        request_key="ready",
         loss=0.1,
         known_at_reset=True,
     )
 
     def wants(outputs: Any, _: Any, b: int) -> set:
-        sent, asks = outputs["agents", "message_sent"][b], outputs["agents", "ready"][b]
-        return {(i, j) for i, j in ALL if sent[j] and asks[i]}
+        sent = outputs["agents", "message_sent"][b]
+        return {(i, j) for i, j in ALL if sent[j]}
 
     make = twin_of(Uniform(0, 3), 0.1, limit=limit, known=True)
     check_against_twin(counting(channel), make, wants)
 
 
-def test_requests_of_links_may_come_from_the_policy_and_nothing_is_sent_at_a_reset():
-    env = counting(Channel(Uniform(0, 2), request_key="request"))
-
-    def policy(td: Any) -> Any:
-        return env.rand_action(td).set(("agents", "request"), torch.rand(len(WORLDS), N, N) < 0.4)
-
-    def wants(_: Any, inputs: Any, b: int) -> set:
-        asked = inputs["agents", "request"][b] if inputs is not None else torch.zeros(N, N)
-        return {(i, j) for i, j in ALL if asked[i, j]}
-
-    check_against_twin(env, twin_of(Uniform(0, 2)), wants, policy=policy)
-
-
 def test_a_matrix_says_who_hears_whom():
     hears = [[False, True, False], [False, True, True], [True, False, False]]
-    env = counting(Channel(Uniform(0, 3), topology=hears))
+    env = counting(Channel(Uniform(0, 3), hears=hears))
     links = {(i, j) for i, j in ALL if hears[i][j]}
     check_against_twin(env, twin_of(Uniform(0, 3)), lambda *_: links)
 
@@ -114,40 +100,6 @@ def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
         return World(N, delay)
 
     check_against_twin(counting(Channel(laws, loss=losses)), make, everyone)
-
-
-@pytest.mark.parametrize("known", [False, True])
-@pytest.mark.parametrize(
-    ("up", "down", "limit"), [(0, 0, None), (Uniform(0, 3), Uniform(1, 2), None), (1, 2, 2)]
-)
-def test_a_server_broadcasts_what_it_holds(up, down, limit, known):
-    channel = Channel(
-        up,
-        loss=0.2,
-        topology="server",
-        down_delay=down,
-        down_loss=0.3,
-        limit=limit,
-        sent_key="message_sent",
-        known_at_reset=known,
-    )
-
-    def make(b: int, streams: Tensor) -> World:
-        ups = table(up, streams, CLOCKS, 0.2)
-        downs = table(down, counter_rng.bits(streams, torch.ones_like(streams)), CLOCKS, 0.3)
-        return ServedWorld(
-            N,
-            lambda clock, link, _: ups(clock, b * N + link[1]),
-            down=lambda clock, i: downs(clock, b * N + i),
-            limit=limit,
-            turn=lambda clock, j: turn(streams[b * N + j], clock, j),
-            known=known,
-        )
-
-    def wants(outputs: Any, _: Any, b: int) -> set:
-        return {(i, j) for i, j in ALL if outputs["agents", "message_sent"][b, j]}
-
-    check_against_twin(counting(channel), make, wants)
 
 
 @dataclass(frozen=True)
@@ -239,37 +191,6 @@ def test_a_law_may_read_the_positions_of_sender_and_receiver(navigation):
             return None if metres > 1.5 else min(math.floor(metres / 0.3), 9)
 
         return World(N, delay)
-
-    def wants(outputs: Any, _: Any, b: int) -> set:
-        now["outputs"] = outputs
-        return ALL
-
-    check_against_twin(env, make, wants, forced=some_worlds)
-
-
-@dataclass(frozen=True)
-class Base(Law):
-    """A step per 0.5 m between an agent and a server at the origin, and one for every other agent."""
-
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> ContextSampler:
-        return ContextSampler(self.delays, 9, loss, reads=["position"])
-
-    def delays(self, context: MessageContext) -> Tensor:
-        metres = torch.linalg.vector_norm(context.entries["position"], dim=-1)
-        agent = torch.maximum(context.sender, context.receiver)
-        return (metres / 0.5).floor() + agent + context.n_sending - 1
-
-
-def test_the_laws_of_a_server_read_the_position_of_the_agent_that_sends_or_receives(navigation):
-    env = navigation(Channel(Base(), topology="server", down_delay=Base(), position_key="observation"))
-    now = {}
-
-    def delay(b: int, agent: int, n_sending: int) -> int:
-        return min(math.floor(math.hypot(*place(now["outputs"], b, agent)) / 0.5) + agent + n_sending - 1, 9)
-
-    def make(b: int, _: Tensor) -> World:
-        down = lambda _, i: delay(b, i, 1)  # noqa: E731
-        return ServedWorld(N, lambda _, link, n_sending: delay(b, link[1], n_sending), down=down)
 
     def wants(outputs: Any, _: Any, b: int) -> set:
         now["outputs"] = outputs

@@ -184,19 +184,6 @@ def test_a_reset_of_the_agents_of_one_world_resets_the_root_entries_of_that_worl
     assert td["state"].flatten().tolist() == [0.0, 1.0]
 
 
-def test_where_flags_have_several_levels_the_outermost_reset_decides():
-    kind = KINDS["PettingZoo"]
-    env = TransformedEnv(kind.make(), ObservationDelay(2, kind.observation))
-    td = env.reset()
-    for _ in range(2):
-        td = env.step(env.rand_action(td))["next"]
-    flags = {"_reset": torch.tensor([True]), ("agent", "_reset"): torch.tensor([[True], [False]])}
-    for key, flag in flags.items():
-        td.set(key, flag)
-    env.reset(td)
-    assert env.transform.memory["reset_at"].tolist() == [2, 2]
-
-
 # A batch chosen at reset.
 
 
@@ -222,14 +209,3 @@ def test_a_batch_chosen_at_reset_does_what_its_worlds_do_alone(make):
             chosen = td.clone().set("action", action[world : world + 1])
             td = step_mdp(alone.step(chosen), exclude_reward=False)
             assert same(td, expected[world : world + 1])
-
-
-@every_transform
-def test_another_batch_size_at_a_reset_begins_anew(make):
-    kind = KINDS["batch chosen at reset"]
-    env = TransformedEnv(kind.make(), make(kind, LATE))
-    for n_worlds in (3, 5, 2):
-        td = env.reset(env.gen_params(batch_size=[n_worlds]))
-        td = env.step(env.rand_action(td))["next"]
-        assert td.shape == (n_worlds,)
-        assert env.transform.rows.numel() == n_worlds

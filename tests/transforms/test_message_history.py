@@ -2,13 +2,10 @@
 
 import pytest
 import torch
-from contract import LATE, OBSERVATION
+from contract import LATE
 from helpers import square
-from plain_env import GROUP, Plain
 from tensordict import TensorDictBase
-from torchrl.data import Unbounded
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
 from damian import keys
 from damian.envs.uav_env import UavEnv
@@ -94,16 +91,3 @@ def test_a_message_changes_nothing_before_it_arrives():
                 assert bool(same[world, step + later, receiver, row]) == (not arrived)
     assert not same.all()
     assert same.sum() > 0.8 * same.numel()
-
-
-TYPES = {torch.float16: torch.float32, torch.int64: torch.float32, torch.float64: torch.float64}
-
-
-@pytest.mark.parametrize("sent", TYPES)
-def test_a_history_has_the_type_of_its_spec(sent):
-    delay = ObservationDelay(1, OBSERVATION, ("agents", "received"), delay_key="delay")
-    history = MessageHistory(K, OBSERVATION, delay_key="delay")
-    env = TransformedEnv(Plain(observation=Unbounded((*GROUP, 4), dtype=sent)), Compose(delay, history))
-    check_env_specs(env)
-    found = env.rollout(3)["agents", "history"]
-    assert found.dtype == env.observation_spec["agents", "history"].dtype == TYPES[sent]

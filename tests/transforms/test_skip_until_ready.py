@@ -1,7 +1,7 @@
 """A merged step equals, bit for bit, the single steps in which no UAV is ready to choose an action."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,20 +10,15 @@ from context_law import Crowd
 from helpers import everything, same, square
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
-from damian.delays.laws import Law
-from damian.delays.samplers import ContextSampler, MessageContext, Sampler
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
-from damian.envs.uav_env import UavEnv
 from damian.keys import ACTION, REWARD
 from damian.server.termination import EpisodeConfig
 from damian.settings import ClockConfig
-from damian.transforms.hold import SkipUntilReady
 from damian.world.landing import ActionConfig
 
 LATE = {"law": "uniform", "low": 1, "high": 5, "probability": 0.6}
@@ -174,22 +169,6 @@ def test_resets_of_some_worlds_during_episodes_give_the_same_outputs():
     check_equal(flights("messages, lost ones, history"), interrupted={1: 2, 2: 4})
 
 
-@dataclass(frozen=True)
-class SlowStart(Law):
-    """The first messages of an episode take longest."""
-
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        return ContextSampler(self.delays, 6, loss, loses=False)
-
-    def delays(self, context: MessageContext) -> Tensor:
-        return torch.where(context.time == 0, 6, 1)
-
-
-def test_no_action_of_a_paused_world_arrives_in_its_next_episode():
-    scenario = replace(flights("nothing"), delay=DelayConfig(act=SlowStart()))
-    check_equal(scenario, interrupted={0: 3, 1: 2, 2: 4})
-
-
 def test_a_reward_is_discounted_once_for_each_earlier_step_of_the_merged_step():
     flying = {"agents": 1, "motion": everything("polynomial").motion}
     action = torch.arange(8, 16).view(8, 1)  # 50 m in each direction
@@ -200,21 +179,6 @@ def test_a_reward_is_discounted_once_for_each_earlier_step_of_the_merged_step():
         total += (k < td["duration"]).unsqueeze(-1) * 0.5**k * other[REWARD]
     assert td[REWARD].equal(total)
     assert (total != other[REWARD]).any()
-
-
-def test_a_worlds_outputs_do_not_depend_on_the_other_worlds():
-    scenario, seeds = skips(flights("all of it")), torch.tensor([11, 12, 13])
-    together = make_env(scenario, N_WORLDS)
-    together.seed_worlds(seeds)
-    for world in range(N_WORLDS):
-        alone = make_env(scenario, 1)
-        alone.seed_worlds(seeds[world : world + 1])
-        together.seed_worlds(seeds)
-        td, one = together.reset(), alone.reset()
-        for action in choices(together):
-            after, td = together.step_and_maybe_reset(td.set(ACTION, action))
-            after_one, one = alone.step_and_maybe_reset(one.set(ACTION, action[world : world + 1]))
-            assert same(after["next"][world], after_one["next"][0])
 
 
 @pytest.mark.slow
@@ -232,16 +196,3 @@ def test_the_compiled_environment_merges_the_same_steps():
 def test_skipping_is_refused_where_all_messages_are_needed():
     with pytest.raises(InputError, match=r"clock\.skip: True skips steps, but back-updating"):
         make_env(skips(square()), 1, extras=["message"])
-
-
-def test_the_transform_is_refused_outside_a_delayed_environment():
-    env = TransformedEnv(UavEnv(square(), 2), SkipUntilReady())
-    with pytest.raises(RuntimeError, match="SkipUntilReady works only in a DelayedEnv"):
-        env.rollout(2)
-
-
-def test_a_step_of_some_worlds_only_is_refused():
-    env = make_env(skips(square()), 2)
-    td = env.reset().set(ACTION, torch.zeros(2, 3, dtype=torch.long))
-    with pytest.raises(RuntimeError, match="_step"):
-        env.step(td.set("_step", torch.tensor([True, False])))

@@ -6,9 +6,8 @@ from typing import Any
 import pytest
 import torch
 from delay_twin import Counting
-from helpers import same, square
-from tensordict import LazyStackedTensorDict, TensorDict, TensorDictBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from helpers import same
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import (
     Compose,
     EnvBase,
@@ -16,26 +15,20 @@ from torchrl.envs import (
     InitTracker,
     RewardSum,
     SerialEnv,
-    StepCounter,
     Transform,
     TransformedEnv,
 )
-from transform_cases import ACTION, N_AGENTS, OBSERVATION, REWARD, STEPS, WORLDS
+from transform_cases import ACTION, OBSERVATION, REWARD, STEPS, WORLDS
 
-from damian.common.errors import InputError
 from damian.delays.laws import Uniform
-from damian.envs.uav_env import UavEnv
 from damian.transforms import (
-    ActionDelay,
     ActionHistory,
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
-    ServerNode,
     delay_trajectories,
 )
-from damian.transforms.hold import SkipUntilReady
 
 LATE = Uniform(0, 3)
 
@@ -113,12 +106,6 @@ def test_rows_that_were_cut_and_joined_begin_anew():
     assert same(found, torch.cat([delay_trajectories(part, late) for part in (one, other)], 1))
 
 
-def test_worlds_one_after_the_other_in_one_row_begin_anew():
-    data, late = counted(10), ObservationDelay(3, [OBSERVATION])
-    found = delay_trajectories(data.reshape(-1), late)
-    assert same(found, delay_trajectories(data, late).reshape(-1))
-
-
 def test_an_episode_begins_after_the_end_of_another_even_where_nothing_else_tells():
     steps = {"observation": torch.zeros(6, 1), "action": torch.zeros(6, 1)}
     done = torch.tensor([0, 0, 1, 0, 0, 0], dtype=torch.bool).unsqueeze(-1)
@@ -129,83 +116,10 @@ def test_an_episode_begins_after_the_end_of_another_even_where_nothing_else_tell
     assert found["next", "reward"].flatten().tolist() == [0, 0, 3, 0, 0, 1]
 
 
-@pytest.mark.parametrize("key", ["is_init", ("collector", "traj_ids"), "begins"])
-def test_a_flag_or_the_number_of_the_trajectory_tells_where_an_episode_begins(key):
+def test_the_number_of_the_trajectory_tells_where_an_episode_begins():
     data = counted(8, ends=0.0)
     again = torch.arange(8).expand(len(WORLDS), 8) == torch.tensor([2, 3, 4, 9]).unsqueeze(-1)
-    data = data.set(key, again.long().cumsum(-1) if key[0] == "collector" else again.unsqueeze(-1))
-    late = ObservationDelay(2, [OBSERVATION])
-    ages = delay_trajectories(data, late, start_key="begins" if key == "begins" else None)["agents", "age"]
-    expected = [
-        [0, 1, 0, 1, 2, 2, 2, 2],
-        [0, 1, 2, 0, 1, 2, 2, 2],
-        [0, 1, 2, 2, 0, 1, 2, 2],
-        [0, 1, *[2] * 6],
-    ]
-    assert ages[:, :, 0, 0].tolist() == expected
-
-
-# Replay buffers.
-
-
-def test_steps_go_out_of_a_replay_buffer_and_into_another_one_delayed():
-    data, late = counted(10), ObservationDelay(LATE, [OBSERVATION], seed=3)
-    undelayed = ReplayBuffer(storage=LazyTensorStorage(10 * len(WORLDS), ndim=2))
-    undelayed.extend(data)
-    delayed = ReplayBuffer(storage=LazyTensorStorage(1000))
-    delayed.extend(delay_trajectories(undelayed[:], late).reshape(-1))
-    found = delayed.sample(16)
-    assert found["next", "agents", "age"].shape == (16, N_AGENTS, 1)
-    expected = delay_trajectories(data, late).reshape(-1)
-    assert same(delayed[:].exclude("index"), expected)
-
-
-@pytest.mark.parametrize("lazy", [False, True])
-def test_data_and_transform_stay_as_they_are(lazy):
-    data, late = counted(10), ObservationDelay(LATE, [OBSERVATION], seed=3)
-    data = LazyStackedTensorDict(*data.unbind(1), stack_dim=1) if lazy else data
-    copy = data.clone()
-    found = delay_trajectories(data, late)
-    found.apply_(lambda value: value.zero_())
-    assert same(data, copy)
-    assert not late.has_memory
-    assert same(delay_trajectories(data, late), delay_trajectories(data, late))
-
-
-# What is refused.
-
-
-def server_node() -> Transform:
-    return ServerNode(UavEnv(square(), num_worlds=1, extras=["message"], messages_only=True).server)
-
-
-REFUSED = {
-    "ActionDelay changes which actions": lambda: ActionDelay(2, ACTION),
-    "SampleAndHold changes which actions": lambda: SampleAndHold(2, [OBSERVATION], [ACTION]),
-    "ServerNode changes how long": server_node,
-    "SkipUntilReady changes how long": SkipUntilReady,
-    "ends episodes where": lambda: StepCounter(max_steps=3),
-}
-
-
-@pytest.mark.parametrize("text", REFUSED)
-def test_a_transform_that_would_have_changed_what_happened_is_refused(text):
-    with pytest.raises(InputError, match=text) as error:
-        delay_trajectories(counted(8), Compose(RewardSum([REWARD], ["sum"]), REFUSED[text]()))
-    assert "\n" not in str(error.value)
-
-
-def test_a_history_needs_the_range_of_the_actions():
-    with pytest.raises(InputError, match="action_spec: it is needed"):
-        delay_trajectories(counted(5), ActionHistory(2, ACTION))
-
-
-def test_steps_without_what_is_needed_are_refused():
-    late = ObservationDelay(1, [OBSERVATION])
-    for data in (counted(5).exclude("next"), counted(5)[:, :0]):
-        with pytest.raises(InputError, match="data: it has no steps"):
-            delay_trajectories(data, late)
-    with pytest.raises(InputError, match="time last"):
-        delay_trajectories(counted(5).transpose(0, 1), late)
-    with pytest.raises(InputError, match="start_key: begins is not in the data"):
-        delay_trajectories(counted(5), late, start_key="begins")
+    data = data.set(("collector", "traj_ids"), again.long().cumsum(-1))
+    ages = delay_trajectories(data, ObservationDelay(2, [OBSERVATION]))["agents", "age"]
+    assert ages[0, :, 0, 0].tolist() == [0, 1, 0, 1, 2, 2, 2, 2]
+    assert ages[3, :, 0, 0].tolist() == [0, 1, *[2] * 6]

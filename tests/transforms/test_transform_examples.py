@@ -1,6 +1,5 @@
 """The examples of delays run, and docs/transforms.md shows their code."""
 
-import re
 import runpy
 from pathlib import Path
 from typing import Any
@@ -29,14 +28,6 @@ def test_agents_of_vmas_have_ages_of_their_own():
     age = run("late_vmas")["age"]
     assert age.shape == (32, 50, 3, 1)
     assert not age[:, :, 0].equal(age[:, :, 1])
-
-
-@pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested")
-def test_agents_of_pettingzoo_have_ages_of_their_own():
-    pytest.importorskip("mpe2")
-    age = run("late_pettingzoo")["age"]
-    assert age.shape == (25, 3, 1)
-    assert not age[:, 0].equal(age[:, 1])
 
 
 def test_agents_of_vmas_hear_what_others_chose_to_say():
@@ -80,14 +71,3 @@ def test_workers_draw_the_same_delays_again_each_its_own():
     one, other = run("late_workers")["draw"](SerialEnv)
     assert one != other
     assert run("late_workers")["draw"](SerialEnv) == [one, other]
-
-
-def test_the_document_shows_the_examples_code():
-    def stripped(text: str) -> str:
-        return "\n".join(line.strip() for line in text.splitlines())
-
-    blocks = re.findall(r"```python\n(.*?)\n```", (ROOT / "docs" / "transforms.md").read_text(), re.DOTALL)
-    examples = {path.name: stripped(path.read_text()) for path in EXAMPLES.glob("*.py")}
-    shown = [[name for name, code in examples.items() if stripped(block) in code] for block in blocks]
-    assert all(len(names) == 1 for names in shown)
-    assert {name for names in shown for name in names} == set(examples)

@@ -1,0 +1,136 @@
+"""Keys that do not fit the environment, wrong settings and wrong uses are refused in one line."""
+
+import pytest
+import torch
+from contract import ACTION, OBSERVATION, REWARD
+from delay_twin import Counting
+from plain_env import GROUP, Plain
+from tensordict import TensorDict
+from torchrl.data import Categorical
+from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, Transform, TransformedEnv
+
+from damian.common.errors import InputError
+from damian.delays.laws import Burst
+from damian.transforms import (
+    ActionDelay,
+    ActionHistory,
+    Channel,
+    CumulativeReward,
+    ObservationDelay,
+    RewardDelay,
+    SampleAndHold,
+    delay_trajectories,
+)
+from damian.transforms.hold import SkipUntilReady
+
+MISSING = {
+    "observatoin": lambda: ObservationDelay(3, ["observation", "observatoin"]),
+    "sent": lambda: ObservationDelay(3, sent_key="sent"),
+    "age": lambda: ActionHistory(2, append_to="observation", age_key="age"),
+    "rewrad": lambda: RewardDelay(2, "rewrad"),
+    "act": lambda: SampleAndHold(2, ["observation"], ["act"]),
+}
+
+
+@pytest.mark.parametrize("key", MISSING)
+def test_a_key_that_the_environment_does_not_have_is_named(key):
+    with pytest.raises(InputError, match=f": {key} is not among the keys of the environment: ") as error:
+        TransformedEnv(GymEnv("Pendulum-v1"), MISSING[key]()).rollout(3)
+    assert "\n" not in str(error.value)
+
+
+IN_USE = {
+    "two ages": lambda: [ObservationDelay(1, OBSERVATION), ObservationDelay(3, OBSERVATION)],
+    "two histories": lambda: [ActionHistory(2, ACTION), ActionHistory(3, ACTION)],
+    "an entry of the environment": lambda: [ObservationDelay(2, OBSERVATION, age_key="reward")],
+    "a channel": lambda: [Channel(1, OBSERVATION, "reward")],
+}
+
+
+@pytest.mark.parametrize("transforms", IN_USE.values(), ids=IN_USE)
+def test_an_entry_that_there_is_already_is_not_replaced(transforms):
+    with pytest.raises(InputError, match="is already an entry of the environment: choose another name"):
+        TransformedEnv(Plain(), Compose(*transforms())).rollout(3)
+
+
+def test_a_delay_around_workers_does_not_replace_the_age_of_the_delay_within():
+    def make() -> TransformedEnv:
+        return TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(1))
+
+    with pytest.raises(InputError, match="ObservationDelay: age is already"):
+        TransformedEnv(SerialEnv(2, make), ObservationDelay(2)).reset()
+
+
+MISTAKES = {
+    "in_keys: .* is empty, and so is in_keys_inv": lambda: SampleAndHold(2, [], []),
+    "dt: -1 s is not above 0 s": lambda: SampleAndHold("3s", dt=-1),
+    "order: newest is not one of": lambda: ObservationDelay(1, order="newest"),
+    "delay: .* loses messages, but no reward": lambda: RewardDelay(Burst(bad_loss=0.5)),
+    "steps: 0 is not at least 1": lambda: CumulativeReward(0),
+    "delay 2 x 2, hears 3 x 3: these are of": lambda: Channel([[0, 1], [1, 0]], hears=[[True] * 3] * 3),
+    "loss: 1.5 is not between 0 and 1": lambda: Channel(1, loss=[[0, 1.5], [0, 0]]),
+    "comm_range: 5 needs a position_key": lambda: Channel(1, comm_range=5),
+    "action_key: .* does not go with in_keys": lambda: Channel(
+        1, OBSERVATION, action_key=("agents", "words"), message_size=1
+    ),
+    "in_keys: observation is not in a group": lambda: Channel(1, "observation"),
+}
+
+
+@pytest.mark.parametrize("line", MISTAKES)
+def test_a_wrong_argument_is_one_line(line):
+    with pytest.raises(InputError, match=line):
+        MISTAKES[line]()
+
+
+def test_links_of_another_number_of_agents_are_refused():
+    with pytest.raises(InputError, match=r"Channel: the links are given for 2 agents, but .* is of 3"):
+        TransformedEnv(Counting([3, 5], 3), Channel([[0, 1], [1, 0]])).reset()
+
+
+@pytest.mark.parametrize("make", [ActionDelay, ActionHistory])
+def test_a_default_that_is_no_legal_action_is_refused(make):
+    env = TransformedEnv(Plain(Categorical(5, GROUP)), make(2, ACTION, default=7))
+    with pytest.raises(InputError, match=r"default: 7 is not a legal default action, .* between 0 and 4"):
+        env.reset()
+
+
+CHANGES = {
+    "ActionDelay changes which actions": lambda: ActionDelay(3, ACTION),
+    "SampleAndHold changes which actions": lambda: SampleAndHold(3, [], ACTION),
+    "it ends episodes where the stored steps go on": lambda: StepCounter(3),
+}
+
+
+@pytest.mark.parametrize("text", CHANGES)
+def test_stored_steps_refuse_what_would_have_changed_what_happened(text):
+    with pytest.raises(InputError, match=f"transform: {text}"):
+        delay_trajectories(Counting([3, 5]).rollout(8, break_when_any_done=False), CHANGES[text]())
+
+
+@pytest.mark.parametrize("use", [lambda t: t, Compose])
+def test_outside_an_environment_the_error_says_what_to_do(use):
+    with pytest.raises(RuntimeError, match=r"ObservationDelay.*TransformedEnv\(env.*delay_trajectories"):
+        use(ObservationDelay(2))(TensorDict({"observation": torch.zeros(3, 1)}, [3]))
+
+
+def test_a_skipping_clock_is_refused_outside_a_delayed_environment():
+    with pytest.raises(RuntimeError, match="SkipUntilReady works only in a DelayedEnv"):
+        TransformedEnv(Plain(), SkipUntilReady(reward_keys=[REWARD])).rollout(2)
+
+
+def test_the_state_of_another_delay_is_refused():
+    def begun(delay: int) -> Transform:
+        env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(delay))
+        env.rollout(3)
+        return env.transform
+
+    one, other = begun(2), begun(5)
+    with pytest.raises(RuntimeError, match="load it into a transform with the settings that it had"):
+        other.load_state_dict(one.state_dict())
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(2))
+    with pytest.raises(RuntimeError, match="after a reset"):
+        env.step(env.rand_action(env.base_env.reset()))
