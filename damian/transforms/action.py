@@ -1,6 +1,6 @@
 """A transform that delays actions (paper, section 3.3), and what transforms that remember actions share."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -208,6 +208,10 @@ class ActionDelay(ActionTransform):
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
         self.action_keys = existing([self.action_key, self.sent_key, *self.contexts.keys.values()])
+
+    @property
+    def required_keys(self) -> Sequence[NestedKey]:
+        return [*self.contexts.keys.values()]
 
     @property
     def row_dims(self) -> dict[str, int]:
