@@ -68,20 +68,16 @@ class Correction(NamedTuple):
 class StatefulTransform(Transform):
     """Base class of transforms that remember earlier steps of each world, or of each agent of each world.
 
-    The memory has M rows. For an entry under a nested key, such as ``("agents", "observation")``, there is a
-    row for each element of the batch size of its innermost TensorDict; for an entry at the root, one for each
-    world. The memory is allocated at the first reset and kept in buffers: ``state_dict`` saves it (by
-    reference; clone the tensors before the next step, as some of them are written in place), ``to`` moves it,
-    and worker processes receive it by pickling.
+    The memory has M rows: for an entry under a nested key, such as ``("agents", "observation")``, one for each
+    element of the batch size of its innermost TensorDict; for an entry at the root, one for each world. It is
+    allocated at the first reset and kept in buffers: ``state_dict`` saves it (by reference; clone the tensors
+    before the next step, as some of them are written in place), and ``to`` moves it.
 
     A subclass implements pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before the
     environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one transform, and
     ``act``, ``observe`` and ``begin`` below for several at once, so that all transforms of an environment
-    compile into one graph.
-
-    ``set_seed`` of the environment seeds everything that the transform draws. Without it, and without
-    ``seed``, the seed is drawn from torch's global generator at the first reset. No gradient flows through
-    the memory, and what the transform writes shares no memory with its buffers.
+    compile into one graph. No gradient flows through the memory, and what a transform writes shares no memory
+    with its buffers.
 
     Args:
         in_keys: keys of the entries that the transform reads, as in TorchRL's ``Transform``: one key (a name,
@@ -89,7 +85,8 @@ class StatefulTransform(Transform):
         out_keys: keys of the entries that it writes.
         in_keys_inv: keys of the actions that it reads.
         out_keys_inv: keys of the actions that it writes.
-        seed: seed of everything that the transform draws, until the environment is seeded.
+        seed: seed of everything that the transform draws, until ``set_seed`` of the environment seeds it; if
+            not given, it is drawn from torch's global generator at the first reset.
     """
 
     stage: str = "delay"
@@ -134,40 +131,15 @@ class StatefulTransform(Transform):
     # Pure functions, for subclasses.
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
-        """Begin new episodes.
-
-        Args:
-            memory: memory before the reset.
-            entries: outputs of the reset, as far as ``step_keys`` names them.
-            mask: rows that are reset, [M] bool.
-
-        Returns:
-            The new memory, and the entries to write.
-        """
+        """Begin new episodes in the rows of the mask [M], given the outputs ``step_keys`` of the reset."""
         return memory, {}
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
-        """Change entries on their way from the policy to the environment.
-
-        Args:
-            memory: memory before the step.
-            entries: inputs of the step, as far as ``action_keys`` names them.
-
-        Returns:
-            The new memory, and the entries to write.
-        """
+        """Change the inputs ``action_keys`` of a step on their way from the policy to the environment."""
         return memory, {}
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        """Change the outputs of a step.
-
-        Args:
-            memory: memory after ``on_action``.
-            entries: outputs of the step, as far as ``step_keys`` names them.
-
-        Returns:
-            The new memory, and the entries to write.
-        """
+        """Change the outputs ``step_keys`` of a step; the memory is that after ``on_action``."""
         return memory, {}
 
     def after_idle_steps(self, memory: Memory, n_steps: int) -> Memory:
@@ -209,6 +181,8 @@ class StatefulTransform(Transform):
     @property
     def created_keys(self) -> Sequence[NestedKey]:
         """Keys of the entries that the transform adds to the outputs of the environment."""
+        if self.stage == "server":  # it writes what the environment has written, anew
+            return []
         return [*(key for key in self.out_keys if key not in self.in_keys), *self.extra_keys]
 
     # The memory.
@@ -261,13 +235,7 @@ class StatefulTransform(Transform):
         return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
     def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
-        """The memory if only some worlds have stepped; the other worlds have sent no message.
-
-        Args:
-            before: memory before the step.
-            after: memory after a step of all worlds.
-            stepped: worlds that have stepped, [B] bool.
-        """
+        """The memory if only the worlds of the mask ``stepped`` [B] have stepped; others have sent nothing."""
         rows, merged = self.expand_worlds(stepped), {}
         for name, new in after.items():
             mask = rows.view(*[1] * self.row_dims.get(name, 0), *rows.shape)
@@ -276,11 +244,7 @@ class StatefulTransform(Transform):
         return merged
 
     def sending_rows(self, entries: Entries) -> Tensor | None:
-        """The rows that send a message in this step, [M] bool; None if all do.
-
-        Args:
-            entries: inputs or outputs of the step.
-        """
+        """The rows that send a message in this step, [M] bool; None if all do."""
         sending = None if self.sent_key is None else entries[self.sent_key].reshape(-1)
         if STEPPED not in entries:
             return sending
@@ -341,13 +305,9 @@ class StatefulTransform(Transform):
     def _only_stepped(
         self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase
     ) -> Change:
-        """Undo a change in the worlds that do not step: these keep their memory and their entries.
+        """Undo a change in the worlds that do not step: they keep their memory, and their entries in ``before``.
 
-        Args:
-            change: as if all worlds had stepped.
-            stepped: worlds that step, [B] bool.
-            before: contains the entries from before the step.
-            after: contains the entries that ``before`` lacks.
+        ``after`` has the entries that ``before`` lacks.
         """
         memory, entries = change
         stepped = stepped.reshape(-1)
@@ -384,11 +344,7 @@ class StatefulTransform(Transform):
         return observation_spec
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """The specs with those of what the transform writes.
-
-        Raises:
-            InputError: an entry that it reads is missing, or it would write over an entry of another.
-        """
+        """The specs with those of what the transform writes; all keys are checked."""
         specs = [spec for spec in output_spec.values() if spec is not None]
         present = [key for spec in specs for key in spec.keys(True, True)]
         name = type(self).__name__
@@ -407,11 +363,7 @@ class StatefulTransform(Transform):
         return parent
 
     def check(self) -> None:
-        """Make sure that the transform has memory.
-
-        Raises:
-            RuntimeError: its environment has not been reset.
-        """
+        """Refuse a step before the first reset."""
         if not self.has_memory and self._first is not None:  # it was seeded after the reset
             outputs = self._first
             self._init(outputs)
@@ -457,11 +409,7 @@ class StatefulTransform(Transform):
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
-        """Load the memory. A state without entries of this transform makes the next reset the first.
-
-        Raises:
-            RuntimeError: the memory is that of a transform with other settings.
-        """
+        """Load the memory. A state without entries of this transform makes the next reset the first."""
         inner = {k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)}
         saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
         own = self.memory
@@ -483,8 +431,7 @@ class StatefulTransform(Transform):
         """Set the seed and delete the memory; the next reset counts as the first.
 
         If all worlds have just been reset, they need not be reset again, as TorchRL's collectors reset an
-        environment when they are made, and are seeded afterwards. ``set_seed`` of the environment calls this
-        method. Transforms of one environment draw different numbers from the same seed.
+        environment when they are made, and are seeded afterwards.
         """
         self._seed, self._world_seeds = seed, None
         self.clear_memory()
@@ -495,12 +442,7 @@ class StatefulTransform(Transform):
         self.clear_memory()
 
     def streams(self, batch: torch.Size, device: torch.device) -> Tensor:
-        """A random stream (a key of the counter-based generator) for each row, [M] int64.
-
-        Args:
-            batch: batch size of the worlds.
-            device: device of the streams.
-        """
+        """A random stream (a key of the counter-based generator) for each row, [M] int64."""
         n_worlds = batch.numel()
         n_agents = self.rows.numel() // n_worlds
         if not self.draws:
@@ -523,11 +465,7 @@ class StatefulTransform(Transform):
 def act(
     transforms: Sequence[StatefulTransform], memories: Sequence[Memory], entries: Entries
 ) -> tuple[list[Memory], Entries]:
-    """Pass the inputs of a step through the transforms, from the last to the first.
-
-    Returns:
-        The new memories, and the inputs as the environment gets them.
-    """
+    """Pass the inputs of a step through the transforms, from the last to the first."""
     changed_memories = list(memories)
     for i, transform in reversed(list(enumerate(transforms))):
         changed_memories[i], changed = transform.on_action(changed_memories[i], entries)
@@ -538,13 +476,9 @@ def act(
 def observe(
     transforms: Sequence[StatefulTransform], memories: Sequence[Memory], outputs: Entries, extra: Entries
 ) -> tuple[list[Memory], Entries]:
-    """Pass the outputs of a step through the transforms.
+    """Pass the outputs of a step through the transforms, after ``act``.
 
-    Args:
-        transforms: in the order in which they process outputs.
-        memories: of each of them, after ``act``.
-        outputs: of the environment.
-        extra: entries that the transforms read, but that are no outputs.
+    ``extra`` are entries that the transforms read, but that are no outputs.
     """
     changed_memories = list(memories)
     for i, transform in enumerate(transforms):
@@ -625,8 +559,8 @@ def all_transforms(env: EnvBase | None) -> list[Transform]:
 def stream_name(transform: Transform) -> str:
     """The name that keeps the random streams of a transform apart from all others in its environment.
 
-    It is made of the transform's class and keys and, if several have both in common, of its place among them,
-    so that adding another transform changes no draws.
+    Transforms of one class and with the same keys are told apart by their order, so that adding another
+    transform changes no draws.
     """
     name = _class_and_keys(transform)
     others = all_transforms(transform.container)
@@ -698,12 +632,9 @@ def drop_keys(entries: Entries, keys: Sequence[NestedKey]) -> Entries:
 
 
 def sibling_key(key: NestedKey, name: NestedKey | None) -> NestedKey | None:
-    """The key of an entry in the same TensorDict as another entry.
+    """The key of an entry that has this bare name in the TensorDict of another entry.
 
-    Args:
-        key: key of the other entry, such as ``("agents", "observation")``.
-        name: bare name, such as ``age``, which gives ``("agents", "age")``. A nested key, or None, is
-            returned as it is.
+    A nested key, or None, is returned as it is.
     """
     if name is None or not isinstance(name, str) or isinstance(key, str):
         return name
@@ -716,11 +647,7 @@ def existing(keys: Iterable[NestedKey | None]) -> list[NestedKey]:
 
 
 def require_keys(transform: str, keys: Sequence[NestedKey], present: Iterable[NestedKey]) -> None:
-    """Require that the entries that a transform reads exist.
-
-    Raises:
-        InputError: one is missing.
-    """
+    """Require that the entries that a transform reads exist; else raise an ``InputError``."""
     known = list(present)
     missing = next((key for key in keys if key not in known), None)
     if missing is not None:
@@ -730,16 +657,11 @@ def require_keys(transform: str, keys: Sequence[NestedKey], present: Iterable[Ne
 
 
 def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[NestedKey]:
-    """The keys of the flags that apply to an entry, such as ``done``, the outermost first.
+    """The keys among ``present`` of the flags of this name that apply to an entry, the outermost first.
 
     These are the flags in the TensorDict of the entry and in those that contain it. If there are none, they
     are all flags within the innermost TensorDict around the entry that contains any: a world is done, or is
     reset, if any of its agents is, as TorchRL aggregates flags.
-
-    Args:
-        name: name of the flag.
-        key: key of the entry.
-        present: all keys that exist.
     """
     path = path_of(key)
     flags = [flag for flag in present if last_part(flag) == name]

@@ -45,7 +45,6 @@ class ServerNode(StatefulTransform):
 
     stage = "server"
     per_world = True
-    created_keys = ()  # ``UavEnv`` writes all of them at a reset
 
     def __init__(
         self,
@@ -128,7 +127,6 @@ class OnboardNode(StatefulTransform):
 
     stage = "server"
     per_world = True
-    created_keys = ()
 
     def __init__(self, server: Server, *, dropped_keys: Sequence[NestedKey] = ()) -> None:
         super().__init__(keys.LINKED, keys.OBSERVATION)

@@ -96,5 +96,5 @@ def test_a_law_that_reads_what_there_is_not_is_refused():
     with pytest.raises(InputError, match=r"delay.act: .* reads altitude, but a law can read only position"):
         check_laws(DelayConfig(act=Crowd("altitude")), 1.0)
     env = delayed(ActionDelay(Crowd("seen"), ACTION, context_keys={"seen": "speed"}))
-    with pytest.raises(InputError, match=r"context_keys.seen: .* is not among the keys"):
+    with pytest.raises(InputError, match=r"ActionDelay: .*speed.* is not among the keys"):
         env.reset()
