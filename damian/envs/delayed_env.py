@@ -35,16 +35,8 @@ class DelayedEnv(TransformedEnv):
 
     @property
     def uav_env(self) -> UavEnv:
-        """The ``UavEnv`` under the transforms.
-
-        Raises:
-            TypeError: the base environment is of another class, which has no worlds to seed or to compile.
-        """
-        if not isinstance(self.base_env, UavEnv):
-            raise TypeError(
-                f"DelayedEnv needs a UavEnv as its base_env here, not {type(self.base_env).__name__}"
-            )
-        return self.base_env
+        """The ``UavEnv`` under the transforms."""
+        return cast(UavEnv, self.base_env)
 
     @property
     def server(self) -> Server:
@@ -73,11 +65,7 @@ class DelayedEnv(TransformedEnv):
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> None:  # type: ignore[override]
-        """Load a state; one without the environment's, as TorchRL's collectors save it, leaves the worlds.
-
-        Raises:
-            InputError: it is the state of another number of worlds, or of another scenario.
-        """
+        """Load a state; one without the environment's, as TorchRL's collectors save it, leaves the worlds."""
         base = {k.removeprefix(_BASE): value for k, value in state_dict.items() if k.startswith(_BASE)}
         others = OrderedDict((k, value) for k, value in state_dict.items() if not k.startswith(_BASE))
         if base:
@@ -87,16 +75,8 @@ class DelayedEnv(TransformedEnv):
     def compile(self, **options: Any) -> "DelayedEnv":
         """Compile a step of ``UavEnv`` with its transforms as one graph.
 
-        Args:
-            options: for ``torch.compile``, instead of the default ones, which suit a CPU.
-
-        Returns:
-            The environment itself.
-
-        Raises:
-            TypeError: the base environment is not a ``UavEnv``.
+        ``options`` are for ``torch.compile``, instead of the default ones, which suit a CPU.
         """
-        _ = self.uav_env  # raises the TypeError
         object.__setattr__(self, "_compiled", CompiledMethods(options))  # TransformedEnv's own is for specs
         return self
 
@@ -117,8 +97,7 @@ class DelayedEnv(TransformedEnv):
         return method if self._compiled is None else self._compiled.get(method, *variant)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        partial = "_step" in tensordict or "next" in tensordict
-        if partial or not isinstance(self.base_env, UavEnv):
+        if "_step" in tensordict or "next" in tensordict:
             return super()._step(tensordict)
         stateful, others = self._split_transforms()
         if others:
@@ -151,8 +130,7 @@ class DelayedEnv(TransformedEnv):
         """The memories of the transforms, and the entries that they and the worlds read before a step."""
         memories, entries = [], select_entries(tensordict, [keys.ACTION, keys.ACTION_VALID])
         for transform in stateful:
-            if not transform.has_memory:
-                transform.check()  # raises an error that says why
+            transform.check()
             entries |= select_entries(tensordict, transform.action_keys)
             memories.append(transform.memory)
         return memories, entries
@@ -201,8 +179,7 @@ class DelayedEnv(TransformedEnv):
     def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
         stateful, others = self._split_transforms()
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        was_reset = isinstance(self.base_env, UavEnv) and all(transform.has_memory for transform in stateful)
-        if mask is None or not was_reset:
+        if mask is None or not all(transform.has_memory for transform in stateful):
             return super()._reset(tensordict, **options)
         env, memories = self.uav_env, [transform.memory for transform in stateful]
         reset = self._method("_whole_reset", *stateful)
@@ -229,7 +206,7 @@ class DelayedEnv(TransformedEnv):
         """
         stateful, others = self._split_transforms()
         partial = "_step" in tensordict or "next" in tensordict or tensordict.device != self.device
-        if others or partial or not isinstance(self.base_env, UavEnv) or _may_skip(stateful):
+        if others or partial or _may_skip(stateful):
             return super()._step_and_maybe_reset(tensordict)
         self._assert_tensordict_shape(tensordict)
         env, (memories, entries) = self.uav_env, self._step_inputs(stateful, tensordict)

@@ -153,10 +153,8 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
 def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_delay: bool) -> ObservationDelay:
     """The delay of the messages to the server.
 
-    Args:
-        scenario: all settings.
-        output_messages: output the age of the messages held and the delay of those sent.
-        reads_delay: a later transform reads the delay.
+    ``output_messages``: write the age of the messages held and the delay of those sent; ``reads_delay``: a
+    later transform reads that delay.
     """
     delay = scenario.delay
     return ObservationDelay(
@@ -179,8 +177,6 @@ def remembering_transforms(
     """What keeps messages of earlier steps: the belief, and the history of messages to learn a belief from.
 
     Args:
-        scenario: all settings.
-        server: server node.
         longest: longest delay of a message [steps].
         delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is delayed.
     """

@@ -13,7 +13,6 @@ from torchrl.envs import EnvBase
 
 from damian import keys
 from damian.common import checks, counter_rng, devices
-from damian.common.compiling import CompiledMethods
 from damian.common.tensors import expand_mask, gather_rows, tree_map, tree_where
 from damian.envs.scenario import ScenarioConfig, make_simulation
 from damian.server.features import feature_bounds
@@ -74,10 +73,6 @@ class UavEnv(EnvBase):
         messages_only: a step outputs no observation, reward or end, because a ``ServerNode`` transform
             computes them from the messages that have arrived.
 
-    ``UavEnv(...).compile()`` compiles the step (half a minute at first, then up to twice as fast).
-
-    Raises:
-        InputError: the scenario asks for something impossible, or another argument is not valid.
     """
 
     def __init__(
@@ -109,20 +104,7 @@ class UavEnv(EnvBase):
         self._reset_outputs = self._outputs_at_reset(initial, features)
         self._make_specs(self._bounds(features))
         self.set_seed(seed)
-        self._compiled: CompiledMethods | None = None
         self.to(torch.device(device))
-
-    def compile(self, **options: Any) -> "UavEnv":
-        """Compile the computation of a step as one graph.
-
-        Args:
-            options: for ``torch.compile``, instead of the default ones, which suit a CPU.
-
-        Returns:
-            The environment itself.
-        """
-        self._compiled = CompiledMethods(options)
-        return self
 
     def to(self, device: DEVICE_TYPING) -> "UavEnv":
         """Move the worlds and all tables, in place."""
@@ -155,11 +137,7 @@ class UavEnv(EnvBase):
         return self.worlds._asdict()
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        """Put the worlds into the state of a ``state_dict``.
-
-        Raises:
-            InputError: it is that of another number of worlds or of another scenario.
-        """
+        """Put the worlds into the state of a ``state_dict``, of as many worlds and the same scenario."""
         loaded = {}
         for name, own in self.worlds._asdict().items():
             shape, should = list(state[name].shape), f"is not {list(own.shape)}: load it into as many worlds"
@@ -175,13 +153,7 @@ class UavEnv(EnvBase):
 
         Args:
             seeds: integers, one for each world, [B].
-
-        Raises:
-            InputError: there is not one integer for each world.
         """
-        good = seeds.shape == self.batch_size and not seeds.is_floating_point()
-        should = f"are not {self.batch_size[0]} integers, one for each world"
-        checks.require(good, "seeds", f"{list(seeds.shape)} of {seeds.dtype}", should)
         seeds = seeds.to(self.device, torch.long)
         zero = torch.zeros_like(seeds)
         if "worlds" not in self.__dict__:
@@ -196,10 +168,8 @@ class UavEnv(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action, valid = tensordict.get(keys.ACTION), tensordict.get(keys.ACTION_VALID, None)
-        before, inputs = self.worlds, [action] if valid is None else [action, valid]
-        # With and without ``valid`` a step has its own graph, because no guard checks whether it is given.
-        step = self.step_fn if self._compiled is None else self._compiled.get(self.step_fn, len(inputs))
-        self.worlds, outputs = step(before, *inputs)
+        before = self.worlds
+        self.worlds, outputs = self.step_fn(before, action, valid)
         if self.messages_only:  # TorchRL expects a reward from every environment
             outputs[keys.REWARD] = self.full_reward_spec[keys.REWARD].zero()
         stepped = tensordict.get(keys.STEPPED, None)
@@ -218,8 +188,7 @@ class UavEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        reset = self.reset_fn if self._compiled is None else self._compiled.get(self.reset_fn)
-        self.worlds, outputs = reset(self.worlds, mask.view(-1))
+        self.worlds, outputs = self.reset_fn(self.worlds, mask.view(-1))
         return self.to_tensordict(outputs)
 
     # Pure functions of the state, which can be compiled.
@@ -305,12 +274,7 @@ class UavEnv(EnvBase):
         return torch.cat([global_observation, to_source.clamp(-1, 1)], -1)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
-        """Outputs of a reset, [B, ...] by key, or tables [Q, ...] for each of the Q initial conditions.
-
-        Args:
-            initial: first states of episodes.
-            features: features of their messages.
-        """
+        """Outputs of a reset, [Q, ...] by key, from Q first states of episodes and their features."""
         outputs = self._state_outputs(initial, features)
         if "reward_terms" in self.extras:
             zero = torch.zeros_like(initial.track)

@@ -68,10 +68,10 @@ class Correction(NamedTuple):
 class StatefulTransform(Transform):
     """Base class of transforms that remember earlier steps of each world, or of each agent of each world.
 
-    The memory has M rows: for an entry under a nested key, such as ``("agents", "observation")``, one for each
-    element of the batch size of its innermost TensorDict; for an entry at the root, one for each world. It is
-    allocated at the first reset and kept in buffers: ``state_dict`` saves it (by reference; clone the tensors
-    before the next step, as some of them are written in place), and ``to`` moves it.
+    The memory has M rows: for an entry under a nested key, such as ``("agents", "observation")``, one for
+    each element of the batch size of its innermost TensorDict; for an entry at the root, one for each world.
+    It is allocated at the first reset and kept in buffers: ``state_dict`` saves it (by reference; clone the
+    tensors before the next step, as some of them are written in place), and ``to`` moves it.
 
     A subclass implements pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before the
     environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one transform, and
@@ -235,7 +235,7 @@ class StatefulTransform(Transform):
         return worlds.view(-1, 1).expand(-1, self.rows.numel() // len(worlds)).reshape(-1)
 
     def merge_worlds(self, before: Memory, after: Memory, stepped: Tensor) -> Memory:
-        """The memory if only the worlds of the mask ``stepped`` [B] have stepped; others have sent nothing."""
+        """The memory if only the worlds ``stepped`` [B] have stepped; the others have sent nothing."""
         rows, merged = self.expand_worlds(stepped), {}
         for name, new in after.items():
             mask = rows.view(*[1] * self.row_dims.get(name, 0), *rows.shape)
@@ -305,9 +305,9 @@ class StatefulTransform(Transform):
     def _only_stepped(
         self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase
     ) -> Change:
-        """Undo a change in the worlds that do not step: they keep their memory, and their entries in ``before``.
+        """Undo a change in the worlds that do not step: they keep their memory and their entries.
 
-        ``after`` has the entries that ``before`` lacks.
+        ``before`` has the entries from before the step, and ``after`` those that it lacks.
         """
         memory, entries = change
         stepped = stepped.reshape(-1)

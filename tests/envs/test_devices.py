@@ -123,6 +123,7 @@ def no_data(monkeypatch):
     monkeypatch.setattr(devices, "data_dependent", lambda device: False)
 
 
+@pytest.mark.sample(2)
 @every_scenario
 def test_no_step_and_no_reset_waits_for_the_device(scenario, no_data):
     arguments = inputs(scenario)
@@ -130,7 +131,7 @@ def test_no_step_and_no_reset_waits_for_the_device(scenario, no_data):
         step_and_reset(*arguments)
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @every_scenario
 def test_a_step_and_a_reset_touch_no_tensor_of_another_device(scenario, no_data):
     env, worlds, memories, entries, mask = inputs(scenario)

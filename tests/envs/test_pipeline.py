@@ -1,21 +1,18 @@
 """``make_env``: the messages that the server holds, the action history, and clocks."""
 
-import math
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from delayed_envs import DELAYS, PAPER, after_steps, choices, delayed, every_delay
+from delayed_envs import DELAYS, PAPER, choices, delayed, every_delay
 from helpers import FLYING, KEEPS_GOING, all_same, both_motions, everything, play, square
-from torch import Tensor
 
 from damian.delays.config import DelayConfig
-from damian.delays.laws import law_of
-from damian.envs.pipeline import action_codes, make_env
+from damian.envs.pipeline import action_codes
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, MESSAGE, OBSERVATION, READY, RECEIVED
+from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, OBSERVATION, READY, RECEIVED
 from damian.settings import ClockConfig
 from damian.world.landing import action_table
 from damian.world.messages import Messages
@@ -43,40 +40,7 @@ def test_the_age_of_every_held_message_is_right(delays, motion):
     assert n_old > 15
 
 
-def test_after_a_reset_the_server_holds_the_first_message_of_every_uav():
-    env = delayed(everything(**DELAYS["everything"]), 8)
-    outputs = play(env, choices(env, 30))
-    after_reset = [outputs[0]]
-    for stepped, following in zip(outputs[1::2], outputs[2::2], strict=True):
-        after_reset.append(following[stepped["done"].squeeze(-1)])
-    assert sum(len(td) for td in after_reset) > 20
-    for td in after_reset:
-        assert td[RECEIVED].equal(td[MESSAGE])
-        assert not td[AGE].any()
-        assert not td["agents", "delay"].any()
-        assert not Messages.unpack(td[RECEIVED]).time.any()
-
-
 SILENT = SourceConfig(emission="per_step", emission_probability=0.0)
-
-
-def check_mean(rows: Tensor, exact: float) -> None:
-    """The mean of independent rows lies within four standard errors of the exact mean."""
-    error = rows.std() / math.sqrt(len(rows))
-    assert 0 < error < 0.02
-    assert abs(rows.mean() - exact) < 4 * error
-
-
-def test_the_delay_law_of_the_paper_delays_15_percent_and_the_mean_age_is_the_exact_one():
-    scenario = square(source=SILENT, episode=KEEPS_GOING, delay=DelayConfig(obs=PAPER))
-    env = make_env(scenario, 512, extras=["message"])
-    outputs = play(env, choices(env, 150))
-    delays = after_steps(outputs, ("agents", "delay")).double().view(150, -1)
-    ages = after_steps(outputs, AGE).double().view(150, -1)[20:]
-    check_mean((delays > 0).double().mean(0), 0.15)
-    chances = law_of(PAPER).sampler().chances[0]
-    older = 1 - chances.cumsum(0)[:-1]  # P(D > i)
-    check_mean(ages.mean(0), older.cumprod(0).sum().item())
 
 
 def test_the_action_history_holds_the_chosen_displacements_east_and_north():

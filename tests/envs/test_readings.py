@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import FLYING, all_same, both_motions, everything, play, random_actions, square
+from helpers import both_motions, everything, play, random_actions
 from sensor_cases import GLOBAL, LOCAL, SENSORS
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
@@ -57,18 +57,6 @@ def test_a_reward_term_reads_features_of_any_width_and_range(motion):
             output["agents", "global_observation"][..., 0],
         )
         assert output["agents", "reward"].squeeze(-1).equal(felt.sum(-1) + widest)
-
-
-@pytest.mark.slow
-def test_a_compiled_environment_with_sensors_does_the_same():
-    observation = ObservationConfig(["spotted", *LOCAL], GLOBAL)
-    scenario = square(motion=FLYING, sensors=SENSORS, observation=observation, delay=DelayConfig(obs=2))
-    plain, graph = (make_env(scenario, 3, seed=1, extras=["message"]) for _ in range(2))
-    generator = torch.Generator().manual_seed(0)
-    actions = [random_actions(plain.uav_env, generator) for _ in range(14)]
-    shown = play(plain, actions)
-    assert any(output["done"].any() for output in shown)
-    assert all_same(shown, play(graph.compile(backend="eager"), actions))
 
 
 # Specs.

@@ -1,19 +1,18 @@
 """``env.state_dict()`` of a whole environment: an equal one that loads it goes on in the same way."""
 
 import io
-from collections import OrderedDict
 
 import pytest
 import torch
 from delayed_envs import DELAYS
 from helpers import all_same, everything
 from torchrl.collectors import Collector
-from torchrl.envs import RewardSum, SerialEnv, StepCounter
+from torchrl.envs import RewardSum, StepCounter
 
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
-from damian.envs.uav_env import EXTRAS, UavEnv
+from damian.envs.uav_env import EXTRAS
 
 QUICK = ("everything", "polynomial")
 
@@ -81,15 +80,3 @@ def test_a_state_as_torchrls_collector_saves_it_leaves_the_worlds():
     env.load_state_dict(collector.state_dict()["env_state_dict"])
     assert env.uav_env.worlds is before
     collector.shutdown()
-
-
-def test_an_environment_without_delays_and_several_in_one_have_a_state_too():
-    env = UavEnv(num_worlds=2)
-    env.reset()
-    state = OrderedDict(through_a_file(env.state_dict()))
-    twin = UavEnv(num_worlds=2, seed=3)
-    twin.load_state_dict(state)
-    assert all(a.equal(b) for a, b in zip(env.worlds, twin.worlds, strict=True))
-    several = SerialEnv(2, lambda: make_env(everything("instant"), 2))
-    several.reset()
-    several.load_state_dict(through_a_file(several.state_dict()))

@@ -10,10 +10,8 @@ from torchrl.envs import EnvBase, RewardSum, StepCounter
 
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.delayed_env import DelayedEnv
-from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.keys import AGENTS, EPISODE_REWARD, GLOBAL_OBSERVATION, REWARD
-from damian.settings import ClockConfig
 from damian.transforms.reward import EpisodeTotals
 
 STEPS = 20
@@ -84,18 +82,6 @@ def test_with_links_between_uavs():
     check_equal_to_torchrls_way(everything(delay=delay, links=LinkConfig(kind="matrix", delay=1)))
 
 
-def test_with_merged_steps_the_totals_are_those_of_decisions():
-    scenario = everything("polynomial", clock=ClockConfig(skip=True, skip_discount=0.9))
-    envs = [make_env(scenario, 4, extras=()) for _ in range(2)]
-    envs[0].append_transform(EpisodeTotals())
-    envs[1].append_transform(RewardSum([REWARD], [EPISODE_REWARD]))
-    envs[1].append_transform(StepCounter())
-    actions = choices(envs[0], STEPS)
-    ours, torchrls = (steps_of(env, actions) for env in envs)
-    assert any(td["next", "duration"].max() > 1 for td in ours[::2])
-    assert all(same(outputs_of(one), outputs_of(other)) for one, other in zip(ours, torchrls, strict=True))
-
-
 @pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs=2, loss=0.1)])
 def test_remembered_coverage_is_that_of_the_messages(delay):
     env = delayed(everything("polynomial", delay=delay))
@@ -108,17 +94,3 @@ def test_remembered_coverage_is_that_of_the_messages(delay):
         n_distances = env.uav_env.n_agents - 1  # one feature has a column for each other UAV
         column += (n_distances - 1) * ("agent_distances" in env.server.observation.critic[:column])
         assert torch.equal(step["next", GLOBAL_OBSERVATION][..., column], features["coverage"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("delays", ["paper", "everything"])
-@both_motions
-def test_compiled(delays, motion):
-    scenario = everything(motion, **DELAYS[delays])
-    env, compiled = counted(scenario), counted(scenario).compile()
-    actions = choices(env, STEPS)
-    for eager, other in zip(steps_of(env, actions), steps_of(compiled, actions), strict=True):
-        assert set(eager.keys(True, True)) == set(other.keys(True, True))
-        for key, value in eager.items(True, True):
-            exact = not value.is_floating_point()
-            assert torch.equal(value, other[key]) if exact else torch.allclose(value, other[key], atol=1e-6)
