@@ -49,9 +49,6 @@ class Flight:
         seed: of the regions and initial conditions that are drawn now.
         render_mode: ``rgb_array``, for one world, or None.
         view: of the pictures: ``2d``, from above, or ``3d``.
-
-    Raises:
-        InputError: the scenario asks for something impossible, or a render mode or view is unknown.
     """
 
     _now: TensorDictBase
@@ -146,16 +143,9 @@ def _instant(outputs: TensorDictBase) -> Instant:
 
 
 def actions_in(space: Space[Any], key: str, given: Any) -> Array:
-    """Actions as an array of the type of a space; they may be of another type of the same kind.
-
-    Raises:
-        InputError: they do not lie in the space, or are fractions where integers are asked for.
-    """
-    try:
-        found = np.asarray(given).astype(space.dtype, casting="same_kind")
-    except (TypeError, ValueError):  # such as a text, or lists of several lengths
-        found = None
-    if found is None or not space.contains(found):
+    """Actions as an array of the type of a space; refused if they do not lie in it."""
+    found = np.asarray(given).astype(space.dtype, casting="same_kind")
+    if not space.contains(found):
         raise InputError(f"{key}: {given} is not in {space}")
     return found
 

@@ -1,6 +1,6 @@
 """Gymnasium environments of one UAV: a single world, and many worlds that step as one batch."""
 
-from typing import Any, SupportsFloat
+from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
@@ -24,9 +24,6 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides the rest.
         render_mode: ``rgb_array``, or None.
         view: of the pictures: ``2d``, from above, or ``3d``.
-
-    Raises:
-        InputError: the scenario has several UAVs, or asks for something impossible.
     """
 
     metadata = METADATA
@@ -58,14 +55,9 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
         return self.flight.render()
 
     def action_masks(self) -> Array:
-        """Which actions are legal now, [A] bool; all of them if nothing is masked.
-
-        Raises:
-            AttributeError: actions are continuous.
-        """
-        if not isinstance(self.action_space, gymnasium.spaces.Discrete):
-            raise AttributeError("action_masks: continuous actions have no mask")
-        return self._info.get("action_mask", np.ones(self.action_space.n)).astype(bool)
+        """Which discrete actions are legal now, [A] bool; all of them if nothing is masked."""
+        space = cast(gymnasium.spaces.Discrete, self.action_space)
+        return self._info.get("action_mask", np.ones(space.n)).astype(bool)
 
 
 class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
@@ -79,9 +71,6 @@ class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
         scenario: all settings, with ``agents=1``.
         num_envs: number of worlds, B.
         seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides the rest.
-
-    Raises:
-        InputError: the scenario has several UAVs, or asks for something impossible.
     """
 
     def __init__(self, scenario: ScenarioConfig, num_envs: int = 1, seed: int = 0) -> None:

@@ -29,9 +29,6 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
         seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides the rest.
         render_mode: ``rgb_array``, or None.
         view: of the pictures: ``2d``, from above, or ``3d``.
-
-    Raises:
-        InputError: the scenario asks for something impossible.
     """
 
     def __init__(

@@ -99,8 +99,8 @@ class BackupdateStorage(TimeStorage):
         step_count_key: earlier steps of the episode, [T, B, 1] (``StepCounter``); 0 where it begins.
         hindsight_key: if given, the entry ``("next", hindsight_key)`` is added: the newest message sent by
             that step that has arrived by now, as ``received_key`` in shape; and its age ``hindsight_age``
-            beside ``delay_key``, as the delay in shape. Give it with ``order="arrival"``, or with messages
-            from elsewhere, if a sender may be silent for more than ``longest`` steps.
+            beside ``delay_key``, as the delay in shape. Give it with ``order="arrival"`` if a sender may be
+            silent for more than ``longest`` steps.
         options: of ``LazyTensorStorage``.
 
     Raises:
@@ -152,8 +152,8 @@ class BackupdateStorage(TimeStorage):
         """Write steps [T, B] at the indices ``cursor`` of the first dimension, and back-update.
 
         Raises:
-            InputError: an entry is missing or misshapen, the storage is too small for the batch, a message or
-                a reward is later than ``longest``, or the steps were joined to n-step returns.
+            InputError: an entry is missing, the storage is too small for the batch, a message or a reward is
+                later than ``longest``, or the steps were joined to n-step returns.
         """
         if data.dim() != 2:
             raise InputError(f"steps: a batch of shape {list(data.shape)} is not [T, B]")
@@ -165,28 +165,21 @@ class BackupdateStorage(TimeStorage):
 
     def _check(self, data: TensorDictBase) -> None:
         """Require that steps [T, B] have the entries that the storage reads, and fit into it."""
-        names, late, worlds = self.step_keys, self._late_rewards, tuple(data.shape)
-        needed = [("step_count_key", names.step_count, (*worlds, 1), "StepCounter()")]
-        needed += [("done", ENDS[0], (*worlds, 1), "every environment")]
-        delays = [("reward", late.delay_key)] if late and late.delay_key else []
+        names, late, present = self.step_keys, self._late_rewards, data.keys(True)
+        needed = [
+            ("step_count_key", names.step_count, "StepCounter()"),
+            ("done", ENDS[0], "every environment"),
+        ]
+        delays = [("reward", late.delay_key, "RewardDelay(delay_key=...)")] if late and late.delay_key else []
         if self.recompute is not None:
-            message = next_key(names.message)
-            checks.require(message in data.keys(True), "message_key", message, "is not in the steps")
-            size = tuple(data.get(message).shape)
             writer = f"ObservationDelay(delay, {names.message!r}, {names.received!r}, delay_key=...)"
-            needed += [("received_key", next_key(names.received), size, writer)]
-            needed += [("delay_key", next_key(names.delay), (*size[:-1], 1), writer)]
-            needed += [("age_key", next_key(names.age), (*size[:-1], 1), writer)]
-            delays.append(("message", names.delay))
-        for name, key, size, writer in needed:
-            shape = tuple(data.get(key).shape) if key in data.keys(True) else None
-            found = "is not in the steps" if shape is None else f"has the shape {shape}, not {size}"
-            checks.require(shape == size, name, key, f"{found}: {writer} writes it")
-        if names.hindsight is not None:
-            key = next_key(names.hindsight)
-            checks.require(
-                key not in data.keys(True), "hindsight_key", key, "is an entry of the steps already"
-            )
+            needed += [("message_key", next_key(names.message), "the environment")]
+            needed += [("received_key", next_key(names.received), writer)]
+            needed += [("age_key", next_key(names.age), writer)]
+            delays.append(("message", names.delay, writer))
+        needed += [("delay_key", next_key(key), writer) for _, key, writer in delays]
+        for name, key, writer in needed:
+            checks.require(key in present, name, key, f"is not in the steps: {writer} writes it")
         n_worlds = self._n_worlds = data.shape[1] if self._n_worlds is None else self._n_worlds
         if data.shape[1] != n_worlds:
             raise InputError(
@@ -199,9 +192,7 @@ class BackupdateStorage(TimeStorage):
                 f"max_size: {self.max_size} is too little for batches of {len(data)} steps and delays of "
                 f"up to {self.longest} steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}"
             )
-        for name, key in delays:
-            should = "is not in the steps: RewardDelay(delay_key=...) writes it"
-            checks.require(next_key(key) in data.keys(True), "delay_key", next_key(key), should)
+        for name, key, _ in delays:
             longest = int(data[next_key(key)].max())
             if longest > self.longest:
                 raise InputError(f"longest: a {name} takes {longest} steps, more than {self.longest} steps")
@@ -215,42 +206,6 @@ class BackupdateStorage(TimeStorage):
             data[next_key(self.step_keys.hindsight)] = data[next_key(self.step_keys.received)].clone()
             data[self.step_keys.hindsight_age] = data[next_key(self.step_keys.age)].long()
         return data
-
-    def receive(self, world: Tensor, agent: Tensor | None, steps_ago: Tensor, message: Tensor) -> None:
-        """Add messages from outside the environment, such as those of real UAVs, and back-update.
-
-        The messages count as arriving after the latest stored step.
-
-        Args:
-            world: index of each sender's world, [K].
-            agent: index of each sender in its world, [K]; not used if the messages are at the root.
-            steps_ago: steps from the generation of each message to the latest stored step, [K]; with K = 0
-                nothing changes.
-            message: packed messages, [K, M].
-
-        Raises:
-            InputError: a message is older than the longest delay, or than the stored steps, no steps are
-                stored, ``agent`` is missing, or the storage has no messages.
-        """
-        checks.require(self.recompute is not None, "recompute", None, "recomputes nothing from messages")
-        if not steps_ago.numel():
-            return
-        should = "belong to no step: none is stored yet, so extend the replay buffer first"
-        checks.require(len(self) > 0, "receive", f"{len(steps_ago)} messages", should)
-        oldest, newest = int(steps_ago.max()), int(steps_ago.min())
-        reach = min(self.longest, self.n_steps - 1)
-        if newest < 0 or oldest > reach:
-            raise InputError(f"steps_ago: {newest} to {oldest} is not between 0 and {reach} steps")
-        sent, delay = (self.steps[next_key(key)] for key in (self.step_keys.message, self.step_keys.delay))
-        index = self.latest(oldest + 1).flip(0)[steps_ago]
-        rows = [index, world]
-        if sent.dim() == 4:
-            if agent is None:
-                raise InputError(f"agent: None is not the index of a sender in a group of {sent.shape[2]}")
-            rows.append(agent)
-        sent[(*rows,)] = message
-        delay[(*rows, 0)] = steps_ago
-        self.backupdate(oldest + 1)
 
     def backupdate(self, n_steps: int) -> None:
         """Correct the latest ``n_steps`` steps with all that has arrived by the last step."""
@@ -309,10 +264,9 @@ class BackupdateStorage(TimeStorage):
     def _correct(self, entries: Entries, steps: TensorDictBase) -> Entries:
         """Apply the corrections to what ``recompute`` returned for steps [T, B]."""
         entries = {unravel_key(key): value for key, value in entries.items()}
-        recorded, n_ends = set(map(next_key, self.step_keys[:4])), sum(key in entries for key in ENDS)
-        checks.require(
-            n_ends in (0, len(ENDS)), "recompute", ENDS, "are returned in part: return all or none"
-        )
+        some = [key in entries for key in ENDS]
+        should = "are returned in part: return all or none"
+        checks.require(all(some) or not any(some), "recompute", ENDS, should)
         count = steps[self.step_keys.step_count].squeeze(-1)
         for correction in self.corrections:
             entries = correction.correct(entries, steps, count)
@@ -321,9 +275,6 @@ class BackupdateStorage(TimeStorage):
             should = "is not an entry after the steps of the same shape and dtype"
             same = stored is not None and (value.shape, value.dtype) == (stored.shape, stored.dtype)
             checks.require(same and key[0] == "next", "recompute", key, should)
-            checks.require(
-                key not in recorded, "recompute", key, "records what was known then, and must stay"
-            )
         return entries
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
 
 import damian.interop
@@ -82,40 +81,6 @@ def test_every_world_of_the_vector_environment_equals_a_single_one(actions):
             assert infos["ready"][world] == info["ready"]
 
 
-def test_the_infos_of_the_vector_environment_are_those_of_gymnasiums_own():
-    options = {"overrides": ["delay.obs=2", "episode.max_steps=7"]}
-    vector = gymnasium.make_vec("damian/Spotting-v0", num_envs=3, **options)
-    singles = [lambda: gymnasium.make("damian/Spotting-v0", **options)] * 3
-    reference = gymnasium.vector.SyncVectorEnv(singles, autoreset_mode=AutoresetMode.SAME_STEP)
-    _, infos = vector.reset(seed=4)
-    assert same_infos(infos, reference.reset(seed=4)[1])
-    vector.action_space.seed(0)
-    ended = []
-    for _ in range(30):
-        chosen = vector.action_space.sample()
-        (*_, infos), (*_, expected) = vector.step(chosen), reference.step(chosen)
-        ended.append(infos.get("_final_info", np.zeros(3, bool)))
-        assert same_infos(infos, expected)
-    assert any(0 < each.sum() < 3 for each in ended)  # one world ends, another does not
-
-
-def same_infos(infos, others):
-    """Equal names, masks and types, and equal values where the masks are true."""
-    if infos.keys() != others.keys():
-        return False
-    for name, mask in infos.items():
-        if name.startswith("_"):
-            value, other = infos[name[1:]], others[name[1:]]
-            if isinstance(value, dict):
-                equal = same_infos(value, other)
-            else:
-                equal = value.dtype == other.dtype
-                equal = equal and all(map(np.array_equal, value[mask], other[mask]))
-            if not (equal and np.array_equal(mask, others[name])):
-                return False
-    return True
-
-
 def test_a_picture_shows_what_a_film_of_the_episode_shows():
     env = gymnasium.make("damian/Spotting-v0", render_mode="rgb_array", overrides=["delay.obs=2"])
     env.reset(seed=0)
@@ -143,33 +108,6 @@ def test_masks_are_those_that_maskable_learners_ask_for():
     env = gymnasium.make("damian/Energy-v0").unwrapped
     _, info = env.reset(seed=0)
     assert np.array_equal(env.action_masks(), info["action_mask"].astype(bool))
-    env = gymnasium.make("damian/Energy-v0", overrides=["actions=continuous"]).unwrapped
-    with pytest.raises(AttributeError, match="continuous actions have no mask"):
-        env.action_masks()
-
-
-TAKEN = {
-    "continuous": (np.array([0.25, 1.0]), [0.25, 1], np.array([0.5, 1], np.float16)),
-    "discrete": (3, np.array(3, np.uint8), np.uint64(3)),
-}
-REFUSED = {
-    "continuous": ([0.5, 1.01], [np.nan, 0.5], [0.5], [[0.5], [0.5, 1]], "north", None),
-    "discrete": (3.0, -1, 999, [3], np.uint64(2**64 - 1), 2**70, "3", None),
-}
-
-
-@pytest.mark.parametrize("actions", TAKEN)
-def test_actions_may_be_of_any_type_of_the_same_kind(actions):
-    env = UavGymEnv(compose_scenario("agents=1", f"actions={actions}"))
-    for action in TAKEN[actions]:
-        exact = np.asarray(action).astype(env.action_space.dtype)
-        env.reset(seed=0)
-        expected = env.step(exact)[0]
-        env.reset(seed=0)
-        assert np.array_equal(env.step(action)[0], expected)
-    for action in REFUSED[actions]:
-        with pytest.raises(InputError, match=r"action: .* is not in (Box|Discrete)"):
-            env.step(action)
 
 
 def test_what_a_user_can_get_wrong_is_said_in_one_line():

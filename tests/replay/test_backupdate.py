@@ -19,7 +19,6 @@ from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
 from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
-from damian.world.messages import Messages
 
 LONGEST = 5
 RANDOM_DELAY = {"law": "uniform", "low": 0, "high": LONGEST}
@@ -68,17 +67,6 @@ def test_latest_arrived_equals_a_loop_over_messages(loss, order):
                     start = max(s for s in range(t + 1) if begins[s, b, i])
                     arrived = [g for g in range(start, t + 1) if 0 <= log.delay[g, b, i] <= now - g]
                     assert latest[t, b, i] == max(arrived, default=start - 1)
-
-
-def test_steps_from_the_middle_of_an_episode_give_the_same_even_if_the_held_message_is_much_older():
-    generator = torch.Generator().manual_seed(4)
-    n_older = 0
-    for _ in range(20):
-        log, _ = random_log(30, 0.8, "generation", generator)
-        window = MessageLog(*(part[15:] for part in log))
-        assert latest_arrived(window)[0][LONGEST:].equal(latest_arrived(log)[0][15 + LONGEST :])
-        n_older += int((window.age[LONGEST:] > LONGEST + 1).sum())
-    assert n_older > 100
 
 
 def test_no_message_that_arrives_after_the_time_of_learning_is_used():
@@ -192,45 +180,6 @@ def test_an_actors_observation_can_be_back_updated_but_its_action_history_stays(
     assert history.any()
     assert in_order(replay, 39)["agents", "observation"][..., -2 * 2 :].equal(history)
     assert corrected["agents", "observation"].shape[-1] >= n_features + 2 * 2
-
-
-@pytest.mark.parametrize("order", ["generation", "arrival"])
-@pytest.mark.parametrize("motion", ["instant", "polynomial"])
-def test_backupdated_is_true_where_a_late_message_is_newer_than_the_held_one(motion, order):
-    scenario = everything(motion, episode=EpisodeConfig(max_steps=9))
-    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, loss=0.2, order=order)), 40)
-    replay = buffer(scenario, 64)
-    for part in delayed.split(8, 1):
-        replay.extend(part)
-    flags = in_order(replay, 40)["agents", "backupdated"].squeeze(-1)
-    delay = delayed["next", "agents", "delay"].squeeze(-1)
-    held = Messages.unpack(delayed["next", "agents", "received"]).time
-    step_count, expected = delayed["step_count"].squeeze(-1), torch.zeros_like(flags)
-    for b in range(4):
-        for t in range(40):
-            start = t - int(step_count[b, t])
-            for i in range(flags.shape[-1]):
-                arrived = [g for g in range(start, t + 1) if 0 <= delay[b, g, i] <= 39 - g]
-                newest = max((g - start + 1 for g in arrived), default=0)
-                expected[t, b, i] = newest > held[b, t, i]
-    assert 0.05 < expected.float().mean() < 0.95
-    assert flags.equal(expected)
-
-
-def test_the_actors_observations_and_actions_stay():
-    scenario = everything("instant", episode=EpisodeConfig(max_steps=9))
-    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY, history=2)), 30)
-    replay = buffer(scenario, 64)
-    replay.extend(delayed)
-    corrected = in_order(replay, 30).transpose(0, 1)
-    changed = {key for key in delayed.keys(True, True) if not corrected[key].equal(delayed[key])}
-    assert ("agents", "observation") not in changed
-    assert ("agents", "action") not in changed
-    assert ("next", "agents", "reward") in changed
-    assert ("agents", "global_observation") in changed
-    begins, key = delayed["step_count"].squeeze(-1) == 0, ("agents", "global_observation")
-    assert begins[:, 1:].any()
-    assert corrected[key][begins].equal(delayed[key][begins])
 
 
 def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened():

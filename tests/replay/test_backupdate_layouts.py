@@ -1,10 +1,8 @@
 """Back-updating without UAVs, against a slow twin: messages at the root or in a group, and hindsight."""
 
 import pytest
-import torch
 from remote import (
     ENDS,
-    LONGEST,
     WORLDS,
     Twin,
     both_layouts,
@@ -17,13 +15,8 @@ from remote import (
 )
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 
-from damian.common.errors import InputError
-from damian.delays.laws import Uniform
 from damian.keys import next_key
-from damian.replay.backupdate import BackupdateStorage
-from damian.transforms import ObservationDelay
 
 
 @both_layouts
@@ -89,38 +82,3 @@ def test_the_ends_stay_if_recompute_returns_none(group):
     assert not after[reward].equal(collected[reward].transpose(0, 1))
     name = key(group, "observation")
     assert after[name].equal(collected[name].transpose(0, 1))
-
-
-@both_layouts
-def test_messages_from_elsewhere_count_as_arrived(group):
-    collected = rollout(make_env(group, loss=0.5), 30)
-    delay_key, message_key = next_key(key(group, "delay")), next_key(key(group, "message"))
-    lost = (collected[delay_key][:, -LONGEST - 1 :] < 0).squeeze(-1).nonzero()
-    world, agent, ago = lost[:, 0], lost[:, 2] if group else None, LONGEST - lost[:, 1]
-    rows = (world, 29 - ago, *([agent] if group else []))
-    assert len(lost) > 4
-    arrived, message = collected.clone(), collected[message_key][rows]
-    arrived[delay_key][(*rows, 0)] = ago
-    expected = stored(make_storage(group), arrived)
-    collected[message_key][rows] = 0.0
-    storage = make_storage(group)
-    stored(storage, collected)
-    storage.receive(world, agent, ago, message)
-    after = storage[storage.latest()]
-    assert all(after[name].equal(expected[name]) for name in expected.keys(True, True))
-    if group:
-        with pytest.raises(InputError, match="agent: None is not the index of a sender in a group of 2"):
-            storage.receive(world, None, ago, message)
-
-
-def test_a_single_gymnasium_environment_can_be_stored_with_hindsight_alone():
-    delay = ObservationDelay(Uniform(3, 7), ["observation"], ["received"], delay_key="delay", seed=0)
-    env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(delay, StepCounter()))
-    names = {"message_key": "observation", "received_key": "received", "hindsight_key": "hindsight"}
-    storage = BackupdateStorage(100, lambda steps, messages: {}, 7, delay_key="delay", age_key="age", **names)
-    after = stored(storage, env.rollout(60).unsqueeze(0))["next"].squeeze(1)
-    arrived = torch.arange(60).unsqueeze(-1) + after["delay"] <= 59
-    true, held, hindsight = (after[name] for name in ("observation", "received", "hindsight"))
-    assert arrived.sum() > 50
-    assert torch.where(arrived, hindsight == true, True).all()
-    assert not torch.where(arrived, held == true, True).any(-1).all()

@@ -207,62 +207,8 @@ def test_late_rewards_alone_are_credited_in_any_environment(window):
     assert after["backupdated"].flatten().nonzero().flatten().tolist() == paid_late
     assert after["next", "done"].equal(steps["next", "done"])
     assert after["valid"].all()
-    with pytest.raises(InputError, match="recompute: None recomputes nothing from messages"):
-        storage.receive(torch.tensor([0]), None, torch.tensor([0]), torch.zeros(1, 1))
-
-
-def test_rewards_in_transit_at_a_reset_that_ends_no_episode_are_not_credited():
-    env = late_cartpole()
-    steps = torch.cat([env.rollout(6), env.rollout(6)])
-    assert not steps["next", "done"].any()
-    storage = BackupdateStorage(100, None, 4, corrections=corrections_of(env.transform, ["reward"]))
-    ReplayBuffer(storage=storage).extend(steps.unsqueeze(0))
-    left = 5 - torch.arange(12) % 6
-    expected = steps["next", "reward_delay"].flatten() <= left
-    assert storage[storage.latest()]["next", "reward"].flatten().bool().equal(expected)
-    assert not expected.all()
-
-
-def test_a_reward_later_than_longest_and_a_ring_without_the_earlier_steps_are_refused():
-    env = make_late((), Case(LONGEST + 1, 3))
-    collected = rollout(env, 40)
-    assert collected["next", "reward_delay"].max() == LONGEST + 1
-    with pytest.raises(InputError, match=f"longest: a reward takes {LONGEST + 1} steps, more than {LONGEST}"):
-        stored(storage_of(env, (), 60), collected)
-    with pytest.raises(InputError, match="max_size: 153 is too little for batches of 40 steps"):
-        stored(storage_of(env, (), 51), collected)
 
 
 def test_a_reward_delay_that_does_not_tell_its_delays_is_refused():
     with pytest.raises(InputError, match="RewardDelay: back-updating needs each delay"):
         corrections_of(Compose(ActionDelay(2), RewardDelay(2)), ["reward"])
-
-
-@pytest.mark.parametrize(
-    ("corrections", "options", "message"),
-    [
-        ([], {}, "recompute: None needs corrections that credit late rewards"),
-        (
-            corrections_of(RewardDelay(2, delay_key="late"), ["reward"]),
-            {},
-            "delay_key: .*late.* is not in the",
-        ),
-        (
-            corrections_of(RewardDelay(2, delay_key="reward_delay"), ["reward"]),
-            {},
-            "earned_key: nothing says",
-        ),
-        (
-            corrections_of(RewardDelay(2, delay_key="reward_delay"), ["reward"]),
-            {"hindsight_key": "h"},
-            "goes without hindsight_key",
-        ),
-    ],
-)
-def test_a_storage_refuses_corrections_that_cannot_work(corrections, options, message):
-    def store() -> None:
-        storage = BackupdateStorage(100, None, 4, corrections=corrections, **options)
-        ReplayBuffer(storage=storage).extend(late_cartpole().rollout(5).unsqueeze(0))
-
-    with pytest.raises(InputError, match=message):
-        store()

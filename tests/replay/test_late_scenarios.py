@@ -18,7 +18,6 @@ from damian.envs.scenario import ScenarioConfig
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import server_recompute
-from damian.server.features import ObservationConfig
 from damian.server.termination import EpisodeConfig
 from damian.settings import ClockConfig
 
@@ -101,25 +100,3 @@ def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(na
             assert found[key][..., :n_features].equal(true[key][..., :n_features]), key
             assert found[key][..., n_features:].equal(late[key][..., n_features:]), key
             assert not late[key][..., :n_features].equal(true[key][..., :n_features])
-
-
-def test_a_reward_counts_only_once_it_has_been_paid():
-    scenario = everything(episode=EpisodeConfig(max_steps=None), delay=DelayConfig(obs=1, rew=3))
-    _, found = backupdated(scenario, False)
-    reward = found[next_key(keys.REWARD)]
-    assert reward[: STEPS - 3].ne(0).all()
-    assert reward[STEPS - 3 :].eq(0).all()
-
-
-def test_own_messages_and_slow_agents_go_with_hindsight():
-    observation = ObservationConfig(local_features=["spotted", "battery"], own=True)
-    scenario = everything(
-        episode=EpisodeConfig(max_steps=9),
-        observation=observation,
-        delay=DelayConfig(obs=LATE, rew=2),
-        clock=ClockConfig(agents="3s"),
-    )
-    on_time = replace(scenario, delay=DelayConfig())
-    (_, found), true = backupdated(scenario, True), fly(training_env(on_time))
-    for key in (keys.OBSERVATION, next_key(keys.REWARD), next_key(keys.GLOBAL_OBSERVATION)):
-        assert found[key][: STEPS - LONGEST].equal(true[key][: STEPS - LONGEST]), key

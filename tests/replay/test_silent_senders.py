@@ -66,16 +66,6 @@ def test_an_older_message_that_arrives_last_never_replaces_a_newer_one():
     assert entry(kept, "hindsight_age") == [0, 0, *range(18)]
 
 
-def test_a_message_from_elsewhere_counts_until_a_newer_one_arrives():
-    steps = silent_steps(20, {0: 0, 15: 2}, [*[0] * 17, *[15] * 3])
-    kept, buffer = storage()
-    buffer.extend(steps[:, :6])
-    kept.receive(torch.tensor([0]), None, torch.tensor([1]), torch.tensor([[4.0]]))
-    for part in steps[:, 6:].split(2, 1):
-        buffer.extend(part)
-    assert entry(kept) == [*[0.0] * 4, *[4.0] * 11, *[15.0] * 5]
-
-
 def truth(env, steps: TensorDictBase) -> Tensor:
     """The rewards of steps [T, B], had all messages that were sent arrived at once, [T, B, N]."""
     sent = env.server.messages(steps[next_key(keys.MESSAGE)])
