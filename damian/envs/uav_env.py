@@ -68,11 +68,9 @@ class UavEnv(EnvBase):
         extras: which of ``message``, ``state``, ``reward_terms``, ``position`` and (reference experiments
             only) ``privileged`` are output; each costs time. Delays need ``message``.
         simulation: the physics; built from the scenario and the seed if not given.
-        server: computes observations, rewards and ends of episodes from messages; built from the scenario and
-            the simulation if not given.
+        server: computes observations, rewards and ends of episodes from messages; built if not given.
         messages_only: a step outputs no observation, reward or end, because a ``ServerNode`` transform
             computes them from the messages that have arrived.
-
     """
 
     def __init__(

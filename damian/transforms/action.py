@@ -1,13 +1,12 @@
 """A transform that delays actions (paper, section 3.3), and what transforms that remember actions share."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
-from torchrl.data.tensor_specs import Stacked
 from torchrl.envs import EnvBase
 
 from damian.common.errors import InputError
@@ -81,9 +80,6 @@ def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs
 
 def _range(spec: TensorSpec) -> _Range:
     """The range of each number of an action."""
-    if isinstance(spec, Stacked):  # agents with different ranges
-        parts = [_range(one) for one in cast(Any, spec).unbind(spec.dim)]
-        return _Range(*(torch.stack(part, spec.dim) for part in zip(*parts, strict=True)))
     bounded = isinstance(spec, Categorical | Bounded)
     if isinstance(spec, MultiCategorical):  # before Categorical, which is its base class
         low, high = 0, spec.nvec - 1

@@ -62,11 +62,7 @@ class ContextReader:
     ) -> MessageContext | None:
         """The context of the messages of this step, or None if the law sees none.
 
-        Args:
-            memory: before the step.
-            entries: contain those that the law reads, [*rows, ...].
-            sent: mask of the messages that are really sent, [M] bool; all of them if not given.
-            rows: shape of the rows.
+        ``sent`` [M] bool: which are really sent; all of them if not given.
         """
         if not self._sees_context:
             return None

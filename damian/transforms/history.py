@@ -55,8 +55,8 @@ class ActionHistory(ActionTransform):
             the action was chosen (only with ``age_key``).
 
     Raises:
-        InputError: the number of steps is not a positive integer; at the first use of the environment also:
-            ``append_to`` is no vector of floats, or the default is no legal action.
+        InputError: at the first use of the environment: ``append_to`` is no vector of floats, or the default
+            is no legal action.
 
     Examples:
         >>> history = ActionHistory(2, append_to="observation")
@@ -289,8 +289,7 @@ class MessageHistory(StatefulTransform):
             memory: of a single world, before the step.
             message: the packed message, [...].
             agent: number of its sender, the row of the memory.
-            lag: the delay, steps from when it was sent to the step that follows; at least 1. One above
-                ``steps`` changes nothing.
+            lag: the delay, at least 1 step; one above ``steps`` changes nothing.
         """
         if lag > self.steps:
             return memory
@@ -301,13 +300,9 @@ class MessageHistory(StatefulTransform):
         return memory
 
     def _added(self, memory: Memory, message: Tensor, due: Tensor, sent: Tensor) -> Memory:
-        """The memory with the messages of a step as the newest ones.
+        """The memory with the messages [*rows, ...] of a step as the newest ones.
 
-        Args:
-            memory: before the step.
-            message: the messages, [*rows, ...].
-            due: steps until they arrive, [M].
-            sent: which of them are really sent, [M] bool.
+        ``due`` [M]: steps until they arrive; ``sent`` [M] bool: which of them are really sent.
         """
         newest = {
             "kept": as_rows(self._encoded(message), self.rows),

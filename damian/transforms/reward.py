@@ -265,7 +265,11 @@ class RewardDelay(RewardTransform):
         """Whether the reward of each step has been paid by the last step, as the delay in shape."""
         delay = cast(Tensor, steps[next_key(cast(NestedKey, self.delay_key))])
         begins = expand_mask(count == 0, delay).expand_as(delay)
-        return paid_by_now(delay, begins, expand_mask(steps[keys.RESET_AFTER].squeeze(-1), delay))
+        step = expand_mask(torch.arange(len(delay), device=delay.device), delay).expand(delay.shape)
+        # The last step before a reset pays what is still in transit, if the environment was done there.
+        last = torch.cat([next_true(begins)[1:], torch.full_like(step[:1], len(step))]) - 1
+        done = expand_mask(steps[keys.RESET_AFTER].squeeze(-1), delay).expand_as(step)
+        return (step + delay <= last) | done.gather(0, last)
 
 
 def sum_in_transit(past: Tensor, due: Tensor, time: Tensor) -> Tensor:
@@ -273,22 +277,6 @@ def sum_in_transit(past: Tensor, due: Tensor, time: Tensor) -> Tensor:
     # In double precision, so that the order of the sum, which depends on the batch, does not matter.
     precise = torch.float64 if past.is_floating_point() else past.dtype
     return torch.where(expand_mask(due > time, past), past, 0).sum(0, dtype=precise).to(past.dtype)
-
-
-def paid_by_now(delay: Tensor, begins: Tensor, reset_after: Tensor) -> Tensor:
-    """Whether the reward earned at each step has been paid by the last step, [T, *] bool.
-
-    The last step before a reset pays what is still in transit, if the environment was done there.
-
-    Args:
-        delay: delay of the reward earned at each step [steps], [T, *].
-        begins: whether this step is the first after a reset, [T, *].
-        reset_after: whether the environment was done with this step, [T, *].
-    """
-    steps = expand_mask(torch.arange(len(delay), device=delay.device), delay).expand(delay.shape)
-    none_later = torch.full_like(steps[:1], len(steps))
-    last = torch.cat([next_true(begins)[1:], none_later]) - 1
-    return (steps + delay <= last) | reset_after.expand_as(steps).gather(0, last)
 
 
 class CumulativeReward(RewardTransform):
@@ -361,11 +349,6 @@ class EpisodeTotals(StatefulTransform):
     The entries are those of TorchRL's ``RewardSum`` and ``StepCounter``, bit for bit; but a ``DelayedEnv``
     computes them in the same function as the rest of a step and the resets after it, which saves time.
 
-    Args:
-        reward_key: key of the rewards.
-        return_key: key of their sum since the episode began, in the shape of the rewards.
-        count_key: key of the number of steps since then, [B, 1] long.
-
     Examples:
         >>> env = make_env(ScenarioConfig(), num_worlds=64)
         >>> env.append_transform(EpisodeTotals())
@@ -376,18 +359,12 @@ class EpisodeTotals(StatefulTransform):
     sees_merged_steps_only = True
     per_world = True
 
-    def __init__(
-        self,
-        reward_key: NestedKey = keys.REWARD,
-        return_key: NestedKey = keys.EPISODE_REWARD,
-        count_key: NestedKey = keys.STEP_COUNT,
-    ) -> None:
-        super().__init__(reward_key, [return_key, count_key])
-        self.return_key, self.count_key = self.out_keys
+    def __init__(self) -> None:
+        super().__init__(keys.REWARD, [keys.EPISODE_REWARD, keys.STEP_COUNT])
         self.step_keys = self.in_keys
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
-        reward = self.env.full_reward_spec[self.in_keys[0]].zero()
+        reward = self.env.full_reward_spec[keys.REWARD].zero()
         return {"total": reward, "count": torch.zeros(len(reward), 1, dtype=torch.long, device=reward.device)}
 
     def on_reset(self, memory: Memory, entries: Entries, mask: Tensor) -> Change:
@@ -395,17 +372,16 @@ class EpisodeTotals(StatefulTransform):
         return memory, self._outputs(memory)
 
     def on_step(self, memory: Memory, entries: Entries) -> Change:
-        memory = {"total": memory["total"] + entries[self.in_keys[0]], "count": memory["count"] + 1}
+        memory = {"total": memory["total"] + entries[keys.REWARD], "count": memory["count"] + 1}
         return memory, self._outputs(memory)
 
     def _outputs(self, memory: Memory) -> Entries:
         # Copies, because others may change what a step outputs in place.
-        return {self.return_key: memory["total"].clone(), self.count_key: memory["count"].clone()}
+        return {keys.EPISODE_REWARD: memory["total"].clone(), keys.STEP_COUNT: memory["count"].clone()}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        rewards, device = self.env.full_reward_spec, observation_spec.device
-        reward = rewards[self.in_keys[0]]
-        observation_spec[self.return_key] = Unbounded(reward.shape, dtype=reward.dtype, device=device)
+        reward, device = self.env.full_reward_spec[keys.REWARD], observation_spec.device
+        observation_spec[keys.EPISODE_REWARD] = Unbounded(reward.shape, dtype=reward.dtype, device=device)
         shape = torch.Size((*observation_spec.shape, 1))
-        observation_spec[self.count_key] = Unbounded(shape, dtype=torch.long, device=device)
+        observation_spec[keys.STEP_COUNT] = Unbounded(shape, dtype=torch.long, device=device)
         return observation_spec

@@ -209,8 +209,7 @@ class Belief(StatefulTransform):
             memory: of a single world, before the step; it is changed in place.
             message: the packed message, [M].
             agent: number of its UAV.
-            lag: the delay, steps from when it was sent to the step that follows; at least 1. One above
-                ``longest`` changes nothing.
+            lag: the delay, at least 1 step; one above ``longest`` changes nothing.
         """
         if lag <= self.longest:
             messages = self.server.messages(message.view(1, 1, -1))

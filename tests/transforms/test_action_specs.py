@@ -33,11 +33,6 @@ RANGES: dict[str, tuple[TensorSpec, torch.Tensor, torch.Tensor]] = {
         -NARROW_AND_WIDE,
         NARROW_AND_WIDE,
     ),
-    "stacked agents": (
-        torch.stack([Bounded(-1.0, 1.0, (3, 2)), Bounded(-10.0, 10.0, (3, 2))], 1),  # type: ignore[arg-type]
-        -NARROW_AND_WIDE,
-        NARROW_AND_WIDE,
-    ),
     "different numbers": (
         Bounded(-numbered(3).double(), numbered(5).double(), (*GROUP, 2), dtype=torch.float64),
         -numbered(3),
@@ -82,7 +77,6 @@ LEGAL = {
     "a number for each agent": (Categorical(5, GROUP), [3, 4], torch.tensor([3, 4]).expand(GROUP)),
     "none": (Bounded(2, 7, GROUP, dtype=torch.int64), None, torch.full(GROUP, 2)),
     "none, below 0": (Bounded(-7.0, -2.0, GROUP), None, torch.full(GROUP, -2.0)),
-    "none, stacked": (RANGES["stacked agents"][0], None, torch.zeros(*GROUP, 2)),
     "at the bound": (
         Bounded(0.3, 0.7, GROUP, dtype=torch.float64),
         0.7,
