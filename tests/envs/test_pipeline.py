@@ -12,7 +12,7 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import action_codes
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
-from damian.keys import ACTION, AGE, GLOBAL_OBSERVATION, OBSERVATION, READY, RECEIVED
+from damian.keys import ACTION, AGE, OBSERVATION, READY, RECEIVED
 from damian.settings import ClockConfig
 from damian.world.landing import action_table
 from damian.world.messages import Messages
@@ -110,18 +110,6 @@ def test_between_two_ticks_of_their_clock_uavs_do_not_act():
         n_moves += (after.position != before.position).any().item()
         td = following
     assert n_moves > 5
-
-
-def test_between_two_ticks_of_the_servers_clock_observations_do_not_change():
-    env = delayed(with_clocks(server="4s"))
-    outputs, n_changes = play(env, choices(env, 30)), 0
-    for t, td in enumerate(outputs[2::2], 1):
-        before = outputs[2 * t - 2]
-        if t % 4:
-            assert td[OBSERVATION][..., :-4].equal(before[OBSERVATION][..., :-4])
-            assert td[GLOBAL_OBSERVATION].equal(before[GLOBAL_OBSERVATION])
-        n_changes += (td[GLOBAL_OBSERVATION] != before[GLOBAL_OBSERVATION]).any().item()
-    assert n_changes > 5
 
 
 @pytest.mark.sample(2)

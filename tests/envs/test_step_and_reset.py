@@ -71,7 +71,7 @@ def test_without_delays(motion, kind):
     check_equal_to_torchrls_way(everything(motion, kind))
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @every_delay
 def test_with_delays(delays):
     check_equal_to_torchrls_way(everything("polynomial", **DELAYS[delays]))

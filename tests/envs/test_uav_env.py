@@ -19,7 +19,6 @@ from helpers import (
     random_actions,
     same,
 )
-from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from damian.delays.config import DelayConfig
@@ -88,17 +87,6 @@ def test_all_observations_lie_between_0_and_1_and_rewards_are_the_sum_of_their_t
 
 def random_action_entry(env, generator):
     return ("agents", "action"), random_actions(env, generator)
-
-
-def test_outputs_become_the_tensordict_that_a_checked_construction_makes():
-    """``to_tensordict`` calls TensorDict's private constructor, which a new version may change."""
-    env = UavEnv(everything(), num_worlds=3)
-    found = env.reset()
-    checked = TensorDict({}, found.batch_size).update(found.to_dict())
-    checked["agents"] = TensorDict(found["agents"].to_dict(), (3, env.n_agents))
-    assert same(found, checked)
-    assert found["agents"].batch_size == (3, env.n_agents)
-    assert found.device == env.device
 
 
 # Worlds and seeds.

@@ -27,7 +27,7 @@ KINDS = [
 """Every task, kind of action and motion; over them the delays take turns."""
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(("task", "actions", "motion", "delay"), KINDS[::3])  # every value of each
 def test_gymnasiums_checker_finds_nothing(task, actions, motion, delay):
     overrides = [f"actions={actions}", f"motion={motion}", delay]

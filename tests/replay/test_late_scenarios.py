@@ -80,7 +80,7 @@ FLYING = {"late messages, slow server", "late and summed rewards", "slow agents,
 """Cases with real flights; in the others UAVs move at once."""
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("name", CASES)
 def test_hindsight_equals_the_same_pipeline_without_late_messages_and_rewards(name):
     case, motion = CASES[name], "polynomial" if name in FLYING else "instant"

@@ -6,15 +6,13 @@ from typing import Any
 import pytest
 import torch
 from delay_twin import Counting
-from helpers import all_same, same, square
+from helpers import same
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from damian.delays.laws import Burst, Uniform
-from damian.envs.delayed_env import DelayedEnv
-from damian.envs.uav_env import UavEnv
 from damian.transforms import Channel
 
 LATE = Uniform(0, 3)
@@ -104,24 +102,6 @@ def test_a_chosen_message_is_an_action_that_the_environment_never_gets():
 
 
 # Properties.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["limit", "laws", "message"])
-def test_a_step_with_uavs_compiles_into_one_graph_that_does_the_same(name):
-    options = CHANNELS[name] | (
-        {"in_keys": OBSERVATION} if name != "message" else {"action_key": ("agents", "words")}
-    )
-
-    def outputs(compile_: bool) -> list[TensorDictBase]:
-        env = DelayedEnv(UavEnv(square(), num_worlds=2), Compose(channel(**options)))
-        env.set_seed(3)
-        if compile_:
-            torch._dynamo.reset()
-            env.compile(backend="eager")
-        return outputs_of(env, 12)
-
-    assert all_same(outputs(True), outputs(False))
 
 
 @pytest.mark.sample(2)

@@ -111,12 +111,3 @@ def test_what_is_written_shares_no_memory_with_the_buffers(kind, make):
 def storages(tensors: list[torch.Tensor]) -> set[int]:
     """Addresses of the memory of tensors."""
     return {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.numel()}
-
-
-# Graphs.
-
-
-# Gradients.
-
-
-# Keys.

@@ -18,7 +18,7 @@ from contract import (
 )
 from helpers import all_same, same
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, ParallelEnv, SerialEnv, Transform, TransformedEnv
+from torchrl.envs import ParallelEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
@@ -50,19 +50,6 @@ def test_the_outputs_match_the_specs(case):
     env = case.build()
     check_env_specs(env, break_when_any_done="both")
     assert env.rollout(12, break_when_any_done=False).shape == (*env.batch_size, 12)
-
-
-@pytest.mark.sample(4)
-@every_case
-def test_a_transform_does_the_same_in_a_compose_appended_or_around_a_transformed_environment(case):
-    variants = [
-        case.build(),
-        TransformedEnv(case.env(), Compose(case.make())),
-        TransformedEnv(case.env()).append_transform(case.make()),
-        TransformedEnv(TransformedEnv(case.env()), case.make()),
-    ]
-    outputs = [onward(env, begun(env)) for env in variants]
-    assert all(all_same(one, outputs[0]) for one in outputs[1:])
 
 
 @pytest.mark.sample(4)
@@ -199,9 +186,6 @@ def whole_step(transform):
         return transform._step(transform.inv(td), after)
 
     return step
-
-
-# Gradients.
 
 
 # Collectors.

@@ -4,22 +4,10 @@ from collections.abc import Sequence
 
 import pytest
 import torch
-from delay_twin import Counting
 from helpers import all_same, play
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
-    Composite,
-    MultiCategorical,
-    MultiOneHot,
-    OneHot,
-    TensorSpec,
-    Unbounded,
-)
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import EnvBase
 from transform_cases import ACTION, LAWS, N_AGENTS, OBSERVATION, PAPER, REWARD, WORLDS, choices, delayed
 
 from damian.delays.laws import Burst, Geometric
@@ -143,54 +131,3 @@ def test_delays_of_observations_and_actions_add_up(i, j):
     assert both[1].equal(summed[1])
     assert both[2].equal(summed[2])
     assert len(both[1].unique()) > 3
-
-
-# Every kind of action spec.
-
-GROUP = (len(WORLDS), N_AGENTS)
-ACTIONS = {
-    "numbers": Categorical(5, shape=GROUP),
-    "two numbers": MultiCategorical([3, 4], shape=(*GROUP, 2)),
-    "one-hot": OneHot(4, shape=(*GROUP, 4)),
-    "two one-hots": MultiOneHot([3, 4], shape=(*GROUP, 7)),
-    "flags": Binary(3, shape=(*GROUP, 3)),
-    "bounded": Bounded(-2.0, 2.0, shape=(*GROUP, 2)),
-    "unbounded": Unbounded((*GROUP, 2)),
-}
-
-
-class ActionRecorder(Transform):
-    """Gives an environment another action spec, records the actions, and passes zeros on."""
-
-    def __init__(self, spec: TensorSpec) -> None:
-        super().__init__(in_keys_inv=[ACTION])
-        self.spec, self.recorded = spec, []
-
-    def _inv_call(self, td: TensorDictBase) -> TensorDictBase:
-        self.recorded.append(td[ACTION].clone())
-        return td.set(ACTION, torch.zeros(GROUP, dtype=torch.long))
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        input_spec["full_action_spec"][ACTION] = self.spec
-        return input_spec
-
-
-@pytest.mark.parametrize("spec", ACTIONS.values(), ids=ACTIONS)
-def test_actions_of_every_spec_can_be_delayed_and_recorded(spec):
-    recorder = ActionRecorder(spec)
-    transforms = Compose(recorder, ActionDelay(2, ACTION), ActionHistory(2, ACTION))
-    env = TransformedEnv(Counting(WORLDS, ends=0.0), transforms)
-    td, chosen = env.reset(), []
-    for _ in range(6):
-        td = env.rand_action(td)
-        chosen.append(td[ACTION].clone())
-        td = env.step_mdp(env.step(td))
-    executed = recorder.recorded
-    assert spec.is_in(executed[0])
-    assert executed[0].equal(executed[1])
-    assert all(late.equal(early) for late, early in zip(executed[2:], chosen, strict=False))
-    history = td["agents", "action_history"]
-    assert history.shape[-1] == 2 * (chosen[0].numel() // len(WORLDS) // N_AGENTS)
-    if not isinstance(spec, Unbounded):
-        assert ((history >= 0) & (history <= 1)).all()
-    assert history.dtype == torch.float32
