@@ -167,12 +167,3 @@ def begun(env: EnvBase, n_steps: int = 5, seed: int = 0) -> TensorDictBase:
 def memory(transform: Transform) -> list[Tensor]:
     """All tensors that a transform remembers."""
     return [value for value in transform.state_dict().values() if value is not None]
-
-
-def flat(state: dict) -> dict[str, Tensor]:
-    """Flatten nested dictionaries of tensors, with dots between the keys."""
-    flattened = {}
-    for key, value in state.items():
-        inner = flat(value) if isinstance(value, dict) else {"": value}
-        flattened |= {f"{key}.{name}".rstrip("."): tensor for name, tensor in inner.items()}
-    return flattened

@@ -64,13 +64,6 @@ def cases(transforms: dict[str, Callable[..., StatefulTransform]]) -> pytest.Mar
 
 
 every_case = cases(TRANSFORMS)
-FAST = {
-    "ObservationDelay, PettingZoo, state",
-    "RewardDelay, flags in the group, root entries",
-    "ActionDelay, batch chosen at reset",
-    "Channel, VMAS",
-}
-"""Cases that are compiled in every run of the tests; the others take a second each, and are slow tests."""
 every_transform = pytest.mark.parametrize("make", TRANSFORMS.values(), ids=TRANSFORMS)
 drawing = cases({name: TRANSFORMS[name] for name in ("ObservationDelay", "ActionDelay", "RewardDelay")})
 
