@@ -11,9 +11,6 @@ def make_simulation(scenario: ScenarioConfig, seed: int) -> Simulation:
     Args:
         scenario: all settings.
         seed: of the regions, the start positions and the source's walks; at least 0.
-
-    Raises:
-        InputError: the scenario asks for something impossible, or the seed is no whole number.
     """
     checks.seed("seed", seed, 0)
     return Simulation(scenario, scenario.clock.dt, scenario.observation.window, seed)

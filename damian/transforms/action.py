@@ -59,9 +59,6 @@ def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs
         key: key of the action.
         default: default action: a number, or values in the shape of an action (indices for one-hot actions);
             if None, the legal value nearest to 0.
-
-    Raises:
-        InputError: the default is no legal action.
     """
     specs = env.full_action_spec
     spec, rows = specs[key], spec_rows(specs, key)
@@ -172,10 +169,6 @@ class ActionDelay(ActionTransform):
         seed: as in ``StatefulTransform``.
 
     A bare name for one of the three keys above means an entry in the same TensorDict as the action.
-
-    Raises:
-        InputError: the delay is not valid, or its law reads what has no key; at the first use of the
-            environment also: it has no such action, or the default is no legal one.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))

@@ -73,9 +73,6 @@ class Channel(StatefulTransform):
 
     A bare name for one of the keys means an entry in the same TensorDict as ``in_keys[0]`` or ``action_key``.
 
-    Raises:
-        InputError: an argument is invalid, or does not go with another one.
-
     Examples:
         >>> env = VmasEnv("navigation", num_envs=32, n_agents=3)
         >>> env = TransformedEnv(env, Channel(Uniform(1, 5), loss=0.1))

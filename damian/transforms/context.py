@@ -26,9 +26,6 @@ class ContextReader:
         dt: length of a step [s].
         beside: key of the delayed entry; a bare name in ``context_keys`` means an entry beside it.
         before_step: the messages are sent before the environment steps, as actions are.
-
-    Raises:
-        InputError: the law reads a name that has no key.
     """
 
     def __init__(

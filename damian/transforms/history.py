@@ -54,10 +54,6 @@ class ActionHistory(ActionTransform):
         reflected_after: an observation reflects an action if it was generated at least this many steps after
             the action was chosen (only with ``age_key``).
 
-    Raises:
-        InputError: at the first use of the environment: ``append_to`` is no vector of floats, or the default
-            is no legal action.
-
     Examples:
         >>> history = ActionHistory(2, append_to="observation")
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ActionDelay(2), history))
@@ -218,9 +214,6 @@ class MessageHistory(StatefulTransform):
         encode: function from messages [..., M] to the D numbers to keep; if not given, these are the message.
         group: whether agents get the messages of all agents of their world.
         own: whether an agent knows its own messages as soon as they are sent.
-
-    Raises:
-        InputError: the number of steps is not a positive integer.
 
     Examples:
         >>> delay = ObservationDelay(Uniform(3, 7), "observation", "received", delay_key="delay")

@@ -48,9 +48,6 @@ class SampleAndHold(StatefulTransform):
             TensorDict as ``in_keys[0]``; None to leave ages as they are.
         dt: length of a step [s], for a period given as a time.
 
-    Raises:
-        InputError: the period is not valid, or no key is given.
-
     Examples:
         >>> clock = SampleAndHold(4, ["observation"], ["action"])
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), clock)  # the agent acts in every fourth step
@@ -173,9 +170,6 @@ class SkipUntilReady(StatefulTransform):
     Args:
         gamma: discount per merged step, in [0, 1]; with 1, returns are those of the single steps.
         reward_keys: keys of the rewards to sum.
-
-    Raises:
-        InputError: gamma is not in [0, 1].
 
     Examples:
         >>> clock = ClockConfig(skip=True)  # adds the transform

@@ -59,10 +59,6 @@ class ObservationDelay(StatefulTransform):
 
     A bare name for one of the five keys above means an entry in the same TensorDict as ``in_keys[0]``.
 
-    Raises:
-        InputError: the delay or the order is not valid, or the law reads what has no key; at the first use of
-            the environment also: an entry is missing, or one to write exists already.
-
     Examples:
         >>> delay = ObservationDelay(Uniform(3, 7), loss=0.1)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), delay)

@@ -99,9 +99,6 @@ class RewardDelay(RewardTransform):
     A bare name for one of these keys means an entry in the same TensorDict as the reward. After a reset, what
     ``delay_key`` and ``earned_key`` name is 0.
 
-    Raises:
-        InputError: the delay is not valid, or its law loses rewards or reads what has no key.
-
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardDelay(Uniform(0, 4)))
         >>> rollout = env.rollout(200)  # the sum of the rewards is that of the environment
@@ -239,11 +236,7 @@ class RewardDelay(RewardTransform):
         return observation_spec
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
-        """Credits a late reward to the step that earned it, as soon as it has been paid.
-
-        Raises:
-            InputError: the delays are not written, without which nobody knows what has been paid.
-        """
+        """Credits a late reward to the step that earned it, as soon as it has been paid."""
         if self.reward_key not in keys:
             return None
         if self.delay_key is None:
@@ -289,9 +282,6 @@ class CumulativeReward(RewardTransform):
         steps: number of rewards in the sum, T.
         gamma: discount per step, in (0, 1].
         reward_key: key of the reward.
-
-    Raises:
-        InputError: the number of steps or the discount is not valid.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), CumulativeReward(5, gamma=0.9))
