@@ -115,12 +115,10 @@ class DelayedEnv(TransformedEnv):
         env, (memories, entries) = self.uav_env, self._step_inputs(stateful, tensordict)
         step = self._method("_whole_step", *stateful, *entries)
         worlds, memories, outputs = step(env.worlds, memories, entries)
-        for transform in stateful:
-            while (
-                isinstance(transform, SkipUntilReady) and (skipped := transform.skipped_worlds(outputs)).any()
-            ):
-                step = self._method("_further_step", *stateful, *entries)
-                worlds, memories, outputs = step(transform, worlds, memories, entries, outputs, skipped)
+        skipping = next((each for each in stateful if isinstance(each, SkipUntilReady)), None)
+        while skipping is not None and (skipped := skipping.skipped_worlds(outputs)).any():
+            step = self._method("_further_step", *stateful, *entries)
+            worlds, memories, outputs = step(skipping, worlds, memories, entries, outputs, skipped)
         self._store(stateful, worlds, memories)
         return env.to_tensordict(outputs)
 
