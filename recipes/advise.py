@@ -54,19 +54,13 @@ def without_token(config: AdviseConfig) -> AdviseConfig:
     return kept
 
 
-def make_session(config: AdviseConfig, folder: Path | None, is_locked: bool = False) -> AdviceSession:
-    """The session of the policy that the settings name; journals lie in a folder, if there is one.
-
-    Args:
-        config: all settings.
-        folder: of the journals.
-        is_locked: it is the run folder, which is locked already.
-    """
+def make_session(config: AdviseConfig, folder: Path | None) -> AdviceSession:
+    """The session of the policy that the settings name; journals lie in a folder, if there is one."""
 
     @cache
     def parts(n_uavs: int) -> tuple[Node, TensorDictModuleBase]:
         node = Node(for_uavs(config.eval_scenario, n_uavs), config.seed)
-        return node, make_policy(config, node)
+        return node, stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
 
     def make_fleet(uavs: list[str]) -> Fleet:
         node, policy = parts(len(uavs))
@@ -74,24 +68,20 @@ def make_session(config: AdviseConfig, folder: Path | None, is_locked: bool = Fa
 
     overrides = without_token(config).overrides
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": overrides}
-    return AdviceSession(make_fleet, folder, about, config.durable, is_locked)
-
-
-def make_policy(config: AdviseConfig, node: Node) -> TensorDictModuleBase:
-    """The policy that flies."""
-    return stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
+    return AdviceSession(make_fleet, folder, about)
 
 
 def answer_table(config: AdviseConfig, folder: Path) -> None:
-    """Answer one table of reports: print the advice, and write it into the run folder."""
-    path = Path(str(config.reports))
-    now = time.time()
+    """Answer one table of reports: print the advice, and write it into the run folder.
+
+    Raises:
+        InputError: the table is wrong, or does not have every UAV.
+    """
+    path, now = Path(str(config.reports)), time.time()
+    session = make_session(config, None)
     with named(path):
         rows = read_file(path)
-    session = make_session(config, None)
-    with nullcontext() if config.uavs else named(path):
         session.create(FLEET, config.uavs or list(dict.fromkeys(report.id for _, report in rows)))
-    with named(path):
         session.report(FLEET, rows, now, file=True)
         try:
             answer = session.advise(FLEET, session.fleet(FLEET).clock)
@@ -106,7 +96,7 @@ def fit_delays(config: AdviseConfig, folder: Path) -> None:
     fitted = fit(read_log(Path(str(config.fit))))
     save_config(without_token(config), folder)
     trace = folder / "trace.csv"
-    write_atomically(trace, "\n".join(["delay", *trace_rows(fitted, config.fit_dt), ""]))
+    write_atomically(trace, "\n".join(["delay", *trace_rows(fitted), ""]))
     print(summary(fitted))
     print(f'train with "delay.obs={{law: trace, path: {trace}}}"')
 
@@ -123,26 +113,27 @@ def advise(config: AdviseConfig, folder: Path) -> None:
     if config.reports is not None:
         answer_table(config, folder)
         return
-    journals = Path(config.journal) if config.journal else folder / "journals"
     inbox = None if config.folder is None else Path(config.folder)
     if inbox is not None and not inbox.is_dir():
         raise InputError(f"folder: {inbox} is not there")
-    if inbox is not None and inbox.resolve() == journals.resolve():
-        raise InputError(f"journal: {journals} is the folder of the tables too: name another one")
-    alone = nullcontext() if inbox is None else locked(inbox, "folder")
-    in_run_folder = journals.resolve() == folder.resolve()
-    with alone, closing(make_session(config, journals, in_run_folder)) as session:
-        if inbox is not None:
+    journals = Path(config.journal) if config.journal else folder / "journals"
+    alone = locked(inbox, "folder") if inbox else nullcontext()
+    with alone, closing(make_session(config, journals)) as session:
+        if inbox:
             session.create(FLEET, config.uavs)
         save_config(without_token(config), folder)
-        if inbox is None:
-            serve(config, session)
-        else:
+        if inbox:
             watch(inbox, session)
+        else:
+            serve(config, session)
 
 
 def serve(config: AdviseConfig, session: AdviceSession) -> None:
-    """Answer over HTTP until the program is stopped."""
+    """Answer over HTTP until the program is stopped.
+
+    Raises:
+        InputError: the server library is not installed, or the address cannot be used.
+    """
     try:
         uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
     except ImportError as error:
@@ -151,31 +142,20 @@ def serve(config: AdviseConfig, session: AdviceSession) -> None:
     given = config.token or os.environ.get("DAMIAN_TOKEN")
     check_token("DAMIAN_TOKEN", given)
     token = given or secrets.token_urlsafe(24)
-    listener = listening(config)
+    try:
+        listener = socket.create_server((config.host, config.port or 0), backlog=1024)
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"port: {config.host}:{config.port} cannot be used: {error}") from None
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # or an answer in two parts takes 40 ms
     host, port = listener.getsockname()[:2]
     if given is None:
         print(f"token: {token}")
     print(f"listening on http://{host}:{port}", flush=True)
-    options = uvicorn.Config(
-        service.make_app(session, token),
-        log_level="warning",
-        access_log=False,
-        timeout_keep_alive=30,
-        ws="none",
-    )
+    app = service.make_app(session, token)
+    options = uvicorn.Config(app, log_level="warning", access_log=False, timeout_keep_alive=30, ws="none")
     gc.collect()
     gc.freeze()  # else every full collection looks through all of torch, for a tenth of a second
     uvicorn.Server(options).run(sockets=[listener])
-
-
-def listening(config: AdviseConfig) -> socket.socket:
-    """A socket that listens to the address of the settings."""
-    try:
-        listener = socket.create_server((config.host, config.port or 0), backlog=1024)
-    except OSError as error:
-        raise InputError(f"port: {config.host}:{config.port} cannot be used: {error.strerror}") from None
-    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # or an answer in two parts takes 40 ms
-    return listener
 
 
 def watch(inbox: Path, session: AdviceSession) -> None:

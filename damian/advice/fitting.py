@@ -2,18 +2,17 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from itertools import groupby, pairwise
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from damian.advice.fleet import step_at
 from damian.advice.journal import SUFFIX, Received, read_head, read_lines
 from damian.advice.rows import Report, read_file
 from damian.common.errors import InputError
 from damian.common.text_files import named
-from damian.delays.laws import LONGEST, LOST
+from damian.delays.laws import LOST
 
 REGULAR = 0.2
 """Share of a period by which the time between two reports may differ from whole periods."""
@@ -41,12 +40,6 @@ class Fit(NamedTuple):
     """Those of one UAV after those of another, each in the order of their generation."""
     losses: str
     """How lost messages were found."""
-    ahead: int
-    """Messages that came in before they were generated, by the clocks; their delay counts as 0."""
-    pauses: int
-    """Gaps in which more than ``LONGEST_GAP`` messages are missing; none of them counts as lost."""
-    start: float
-    """When steps begin to count [s]: when the fleet began."""
 
     @property
     def delays(self) -> np.ndarray:
@@ -88,51 +81,33 @@ def fit(reports: Iterable[Report]) -> Fit:
 
     Where reports of a UAV are numbered (``sequence``), a missing number is a lost message. Where they are
     not, but most come in whole periods, a gap of several periods has lost messages in it, unless the UAV was
-    in the air, where it is silent. Else no loss can be seen. Nothing is lost before the fleet begins.
+    in the air, where it is silent. Else no loss can be seen.
 
     Args:
         reports: which say when they came in.
     """
-    reports = list(reports)
     found: list[Message] = []
     kinds: set[str] = set()
-    start, pauses = _began(reports), 0
     by_uav = sorted(reports, key=lambda report: (report.id, report.time, report.received))
     for uav, own in groupby(by_uav, lambda report: report.id):
         first_copies = [next(copies) for _, copies in groupby(own, lambda report: report.time)]
         gaps, kind = _gaps(first_copies)
         kinds.add(kind)
-        pauses += sum(gap > LONGEST_GAP for gap in gaps)
-        for report, n_lost, after in zip(first_copies, [0, *gaps], [None, *first_copies], strict=False):
-            for i in range(n_lost if n_lost <= LONGEST_GAP else 0):
-                share = (i + 1) / (n_lost + 1)
-                time = after.time + share * (report.time - after.time)  # type: ignore[union-attr]
-                if time >= start:
-                    found.append(Message(uav, time, None))
+        times = [report.time for report in first_copies]
+        for i, report in enumerate(first_copies):
+            if i and gaps[i - 1] <= LONGEST_GAP:
+                between = np.linspace(times[i - 1], times[i], gaps[i - 1] + 2)[1:-1]
+                found += [Message(uav, time, None) for time in between.tolist()]
             found.append(Message(uav, report.time, report.received))
-    ahead = sum(m.received is not None and m.received < m.time for m in found)
-    return Fit(found, " and ".join(sorted(kinds)), ahead, pauses, start)
-
-
-def _began(reports: Sequence[Report]) -> float:
-    """When the fleet of these reports began [s], as ``damian advise`` has it: once a report of each UAV has
-    come in, at the oldest one of their newest ones."""
-    newest: dict[str, float] = {}
-    n_uavs = len({report.id for report in reports})
-    for report in sorted(reports, key=lambda report: report.received):
-        newest[report.id] = max(report.time, newest.get(report.id, -math.inf))
-        if len(newest) == n_uavs:
-            break
-    return min(newest.values())
+    return Fit(found, " and ".join(sorted(kinds)))
 
 
 def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
     """Number of messages that are missing between each report and the next one, and how this was found."""
     numbers = [report.sequence for report in reports]
     if len(numbers) > 1 and all(number is not None for number in numbers):
-        steps = [int(after) - int(before) for before, after in pairwise(numbers)]  # type: ignore[arg-type]
-        # A UAV that starts anew counts from the beginning.
-        return [max(step - 1, 0) for step in steps], "by their numbers"
+        steps = np.diff(np.array(numbers, dtype=int))
+        return (steps - 1).clip(min=0).tolist(), "by their numbers"  # a UAV that starts anew counts from 0
     between = np.diff([report.time for report in reports])
     if len(between) >= 2:
         period = float(np.median(between))
@@ -145,55 +120,24 @@ def _gaps(reports: Sequence[Report]) -> tuple[list[int], str]:
     return [0] * len(between), "not to be seen (no numbers, no period)"
 
 
-def trace_rows(fitted: Fit, dt: float | None = None) -> list[str]:
-    """The column ``delay`` of a trace, a row for each message.
-
-    Args:
-        fitted: the messages.
-        dt: length of a step [s]: delays are whole steps, as ``damian advise`` counts them: from the step in
-            which a message was generated to that in which it came in. None: delays are times, which a
-            simulation rounds up to whole steps.
-
-    Raises:
-        InputError: a delay is longer than any that can be simulated.
-    """
+def trace_rows(fitted: Fit) -> list[str]:
+    """The column ``delay`` of a trace, a row for each message: times, which a simulation rounds up."""
     rows = []
     for message in fitted.messages:
-        if message.received is None:
-            rows.append(LOST)
-            continue
-        delay = max(message.received - message.time, 0.0)
-        if dt is None:
-            rows.append(f"{delay:.6f}s" if delay >= 1e-6 else "0")
-            continue
-        generated, came_in = (step_at(time, fitted.start, dt) for time in (message.time, message.received))
-        steps = max(came_in - generated, 0)
-        if steps > LONGEST:
-            raise InputError(f"--dt: a delay of {delay:.6g} s is {steps} steps, more than {LONGEST}")
-        rows.append(str(steps))
+        delay = None if message.received is None else max(message.received - message.time, 0.0)
+        rows.append(LOST if delay is None else f"{delay:.6f}s" if delay >= 1e-6 else "0")
     return rows
 
 
 def summary(fitted: Fit) -> str:
-    """What was found, on two or three lines."""
+    """What was found, on two lines."""
     delays, n = fitted.delays, len(fitted.messages)
     uavs = {message.uav for message in fitted.messages}
     times = [message.time for message in fitted.messages]
-    quantiles = ", ".join(
-        f"{name} {value:.3f}"
-        for name, value in zip(("median", "90 %", "99 %"), np.quantile(delays, [0.5, 0.9, 0.99]), strict=True)
-    )
-    lines = [
+    median, most, nearly_all = np.quantile(delays, [0.5, 0.9, 0.99])
+    return (
         f"{n} messages of {len(uavs)} UAVs over {max(times) - min(times):.0f} s; lost: {fitted.n_lost} "
-        f"({fitted.n_lost / n:.1%}), {fitted.losses}",
-        f"delay [s]: mean {delays.mean():.3f}, {quantiles}, longest {delays.max():.3f}",
-    ]
-    if fitted.pauses:
-        lines.append(
-            f"{fitted.pauses} gaps of more than {LONGEST_GAP} messages are taken as pauses, not as losses"
-        )
-    if fitted.ahead:
-        lines.append(
-            f"{fitted.ahead} came in before they were generated: clocks differ; their delay counts as 0"
-        )
-    return "\n".join(lines)
+        f"({fitted.n_lost / n:.1%}), {fitted.losses}\n"
+        f"delay [s]: mean {delays.mean():.3f}, median {median:.3f}, 90 % {most:.3f}, 99 % {nearly_all:.3f}, "
+        f"longest {delays.max():.3f}"
+    )

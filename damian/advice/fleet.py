@@ -23,6 +23,7 @@ from damian.advice.node import LateMessage, Memories, Node, Reported
 from damian.advice.rows import Advice, FleetStatus, Report, UavStatus, written
 from damian.common.checks import SECONDS
 from damian.common.errors import InputError
+from damian.common.tensors import expand_mask
 from damian.common.text_files import listed, show
 from damian.learners.recurrent import AgentGRU
 from damian.world.messages import Messages
@@ -30,8 +31,6 @@ from damian.world.state import State
 
 FUTURE = 1.0
 """How far the clock of a UAV may be ahead of that of the server [s]."""
-FIRST = 3600.0
-"""How old a report may be when it comes in, while its fleet has not begun [s]: the fleet would begin then."""
 LIFE = SECONDS
 """How long a fleet lasts [s]."""
 SILENT_STEPS = 1000
@@ -78,11 +77,6 @@ class Choice(NamedTuple):
     """Actions of all UAVs; only those of these UAVs count, [1, N, ...]."""
     hidden: Tensor | None
     """Hidden states after the choice, [1, N, H]."""
-
-
-def step_at(time: float, start: float, dt: float) -> int:
-    """The step of ``dt`` seconds since ``start`` [s] in which a time [s] lies."""
-    return math.floor((time - start) / dt + _ROUNDING)
 
 
 class Waiting(Exception):
@@ -141,14 +135,10 @@ class Fleet:
 
     def step_of(self, time: float) -> int:
         """The step in which an instant lies."""
-        return step_at(time, self.start or 0.0, self.node.dt)
+        return math.floor((time - (self.start or 0.0)) / self.node.dt + _ROUNDING)
 
     def check(self, report: Report, now: float | None = None) -> None:
-        """Check a report before it is added.
-
-        Args:
-            report: the report; it came in by the clock of the fleet, which never goes back.
-            now: the time, if it comes in now; None for one that is recorded [s].
+        """Check a report before it is added, at the time ``now`` [s], or None for one that is recorded.
 
         Raises:
             InputError: the UAV is of another fleet, its clock is wrong, the report is from another region, or
@@ -156,16 +146,11 @@ class Fleet:
         """
         if report.id not in self.number:
             raise InputError(f"ID: {show(report.id)} is no UAV of this fleet: {listed(self.uavs)}")
+        came = report.received if now is None else now
         for name, time in (("time", report.time), ("source time", report.source_time)):
-            ahead = 0.0 if time is None else time - (report.received if now is None else now)
-            if ahead > FUTURE:
-                late = f"{time:.13g} s is {ahead:.1f} s after it came in"
+            if time is not None and time > came + FUTURE:
+                late = f"{time:.13g} s is {time - came:.1f} s after it came in"
                 raise InputError(f"{name}: {late}: set the clock of the UAV")
-        if now is not None and self.start is None and report.time < now - FIRST:
-            # A clock that was never set counts from 1970 or from when it was switched on.
-            early = f"{report.time:.13g} s is {now - report.time:.1f} s before it came in"
-            most = f"more than the {FIRST:g} s of a first report"
-            raise InputError(f"time: {early}, {most}: set the clock of the UAV")
         self._check_life(report.received)
         self.logs[self.number[report.id]].check(report)
 
@@ -188,28 +173,30 @@ class Fleet:
         if log.has(report.time):
             log.duplicates += 1
             return "duplicate"
-        newest = log.newest
-        late = newest is not None and report.time < newest.report.time
-        log.late += late
+        found = "late" if log.newest and report.time < log.newest.report.time else "new"
+        log.late += found == "late"
         if self.start is None:
             log.add(report, 0, None)
             if not self._missing():
                 self._begin()
-            return "late" if late else "new"
+            return found
         if report.time < self.start:
             return "old"
         now = self.step_of(self.clock)
         step = min(self.step_of(report.time), now)
-        detected = None if report.source_time is None else max(self.step_of(report.source_time), 0)
         sent = next((each for each in reversed(self.told[uav]) if each.step < step), None)
-        filled = log.add(report, step, detected, sent and (sent.origin, sent.goal))
+        filled = log.add(report, step, self._detected(report), sent and (sent.origin, sent.goal))
         due = max(now, self.step)
         if self.node.scenario.delay.hold == "max":
             due = max(due, step + self.node.law_longest)
         self.pending.append((due, uav, filled))
         self.outputs = self.sent = None
         self._collect()
-        return "late" if late else "new"
+        return found
+
+    def _detected(self, report: Report) -> int | None:
+        """The step of the detection that a report names."""
+        return None if report.source_time is None else max(self.step_of(report.source_time), 0)
 
     def _missing(self) -> list[str]:
         """The UAVs for which the fleet waits."""
@@ -221,9 +208,8 @@ class Fleet:
         self.start = min(report.time for report in newest)
         self.step = self.first_step = self.last_arrival = max(self.step_of(self.clock), 0)
         for log, report in zip(self.logs, newest, strict=True):
-            detected = None if report.source_time is None else max(self.step_of(report.source_time), 0)
             log.reports.clear()
-            log.add(report, min(self.step_of(report.time), self.step), detected)
+            log.add(report, min(self.step_of(report.time), self.step), self._detected(report))
         self.held = [log.reports[-1] for log in self.logs]
 
     def _collect(self) -> None:
@@ -280,21 +266,18 @@ class Fleet:
         return self.outputs
 
     def _reported(self) -> Reported:
-        late = {}
-        for uav, filled in self.arrived:
-            if self.first_step < filled.step < self.step:
-                late[uav, filled.step] = filled
+        arrived = {(uav, filled.step): filled for uav, filled in self.arrived}
+        late = {key: filled for key, filled in arrived.items() if self.first_step < key[1] < self.step}
         self.sent = self._messages(self.held)
         rows = self._messages([*late.values()]).pack() if late else ()
-        fresh = {uav for uav, filled in self.arrived if filled.step == self.step}
-        on_time = [uav in fresh and filled.step == self.step for uav, filled in enumerate(self.held)]
+        on_time = [
+            held.step == self.step and (uav, self.step) in arrived for uav, held in enumerate(self.held)
+        ]
         return Reported(
             state=self._state([]),
             age=self.step - torch.tensor([filled.step for filled in self.held]),
             on_time=torch.tensor(on_time),
-            late=[
-                LateMessage(row, uav, self.step - step) for row, (uav, step) in zip(rows, late, strict=True)
-            ],
+            late=[LateMessage(row, key[0], self.step - key[1]) for row, key in zip(rows, late, strict=True)],
         )
 
     def _messages(self, reports: Sequence[FilledReport]) -> Messages:
@@ -302,13 +285,11 @@ class Fleet:
 
     def _state(self, asking: Sequence[int]) -> State:
         """The state of the world, as far as it is known; the UAVs that ask are ready to choose."""
-        state, n = self.node.blank, len(self.uavs)
         if self.sent is None:
             self.sent = self._messages(self.held)
-        sent = self.sent
-        ready = torch.tensor([[uav in asking for uav in range(n)]])
-        goal = torch.tensor([[self._standing(uav, uav in asking) for uav in range(n)]])
-        return state._replace(
+        sent, ready = self.sent, self._mask(asking)
+        goal = torch.tensor([[self._standing(uav, uav in asking) for uav in range(len(self.uavs))]])
+        return self.node.blank._replace(
             steps=torch.tensor([self.step]),
             goal=goal,
             origin=goal,
@@ -330,15 +311,14 @@ class Fleet:
     # Advice.
 
     def choose(self, now: float, asking: Sequence[str] | None = None) -> Choice | None:
-        """Let UAVs choose; the fleet stays as it is until they are told (``tell``).
+        """Let UAVs choose that have not yet in this step; nothing changes until they are told (``tell``).
 
         Args:
             now: the time [s].
-            asking: IDs of those that are ready to choose; if not given, all that are not known to be in
-                flight.
+            asking: IDs of those that are ready; if not given, all that are not known to be in flight.
 
         Returns:
-            What those have chosen that have not chosen in this step before; None if there are none.
+            What they have chosen; None if there are none.
 
         Raises:
             InputError: a UAV is of another fleet, or the fleet began too long ago.
@@ -351,10 +331,9 @@ class Fleet:
         self._check_life(self.clock)
         if numbers is None:
             numbers = [uav for uav, held in enumerate(self.held) if not held.report.flies]
-        chosen = self.chosen[0].tolist()
-        choosing = [uav for uav in numbers if not chosen[uav]]
+        choosing = [uav for uav in numbers if not self.chosen[0, uav]]
         if choosing:  # else what has come in since then need not be looked at yet
-            ready = self._observe()[keys.READY][0].tolist()
+            ready = self._observe()[keys.READY][0]
             choosing = [uav for uav in choosing if ready[uav]]
         return self.choice(choosing, *self.ask_policy(choosing)) if choosing else None
 
@@ -378,32 +357,21 @@ class Fleet:
     def ask_policy(self, choosing: Sequence[int]) -> tuple[Tensor, Tensor | None]:
         """Actions of all UAVs, [1, N, ...], where only those that choose count; hidden states, [1, N, H]."""
         read = self.observe(choosing)
-        if self.drawn:
-            with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.RANDOM):
-                torch.default_generator.manual_seed(hash((self.seed, self.step, *choosing)) % 2**62)
-                chosen = self.policy(read)
-        else:
-            with set_exploration_type(ExplorationType.DETERMINISTIC):
-                chosen = self.policy(read)
+        kind = ExplorationType.RANDOM if self.drawn else ExplorationType.DETERMINISTIC
+        with torch.random.fork_rng(devices=[]), set_exploration_type(kind):
+            torch.default_generator.manual_seed(hash((self.seed, self.step, *choosing)) % 2**62)
+            chosen = self.policy(read)
         return chosen[keys.ACTION], None if self.hidden is None else chosen[keys.HIDDEN].detach()
 
     def choice(self, choosing: Sequence[int], action: Tensor, hidden: Tensor | None) -> Choice:
-        """To which landing points the actions of UAVs lead.
-
-        Args:
-            choosing: numbers of these UAVs.
-            action: actions of all UAVs, [1, N, ...].
-            hidden: hidden states after the choice, [1, N, H].
-        """
+        """To which landing points the actions of the UAVs of these numbers lead; tensors as of ``Choice``."""
         before = self._state(choosing)
         state = self.node.simulation.decide(before, action, self._mask(choosing))
         vehicles = self.node.simulation.vehicles
         length = vehicles.length(before.goal, state.goal)
         duration = (2 * vehicles.vertical + vehicles.shortest_time(length)) * (length > 0)
-        columns = zip(
-            *(each[0].tolist() for each in (action, before.goal, state.goal, duration)), strict=True
-        )
-        decided = [Decision(self.step, self.clock, *values) for values in columns]
+        columns = (each[0].tolist() for each in (action, before.goal, state.goal, duration))
+        decided = [Decision(self.step, self.clock, *values) for values in zip(*columns, strict=True)]
         return Choice({uav: decided[uav] for uav in choosing}, action, hidden)
 
     def tell(self, choice: Choice) -> None:
@@ -412,9 +380,7 @@ class Fleet:
             self.told[uav].append(decision)
         valid = self._mask([*choice.decisions])
         self.chosen = self.chosen | valid
-        self.action = torch.where(
-            valid.view(*valid.shape, *[1] * (choice.action.dim() - 2)), choice.action, self.action
-        )
+        self.action = torch.where(expand_mask(valid, choice.action), choice.action, self.action)
         self.hidden_after = choice.hidden
 
     def _mask(self, uavs: Sequence[int]) -> Tensor:
@@ -438,33 +404,27 @@ class Fleet:
     def advice_of(self, uav: int, decision: Decision | None) -> Advice:
         """What a decision tells a UAV."""
         place: tuple[Any, Any] = (None, None)
-        heading = distance = duration = arrival = step = None
+        told: dict[str, Any] = dict.fromkeys(("heading", "distance", "duration", "arrival", "step"))
         state = "none"
         if decision is not None:
-            moves, step = decision.goal != decision.origin, decision.step
+            moves, place = decision.goal != decision.origin, self.ground.place(decision.goal)
             distance, course = self.ground.way(decision.origin, decision.goal)
-            heading, place = course if moves else None, self.ground.place(decision.goal)
-            state = ("fly" if moves else "hold") if step == self.step else "bound"
-            duration, arrival = round(decision.duration, 2), written(decision.time + decision.duration)
-        return Advice(
-            ID=self.uavs[uav],
-            state=state,
-            **dict(zip(self.ground.columns, place, strict=True)),
-            heading=heading,
-            distance=distance,
-            duration=duration,
-            arrival=arrival,
-            step=step,
-            age=cast(float, self._age(self.held[uav])),
-        )
+            state = ("fly" if moves else "hold") if decision.step == self.step else "bound"
+            told["heading"], told["distance"] = course if moves else None, distance
+            told["duration"] = round(decision.duration, 2)
+            told["arrival"], told["step"] = written(decision.time + decision.duration), decision.step
+        where = dict(zip(self.ground.columns, place, strict=True))
+        age = cast(float, self._age(self.held[uav]))
+        return Advice(ID=self.uavs[uav], state=state, **where, **told, age=age)
 
     def status(self, name: str) -> FleetStatus:
         """What is known of the fleet of this name: where its UAVs are believed to be, how reports come in."""
         rows = []
         for uav, log in zip(self.uavs, self.logs, strict=True):
             newest, counts = log.newest, {"late": log.late, "duplicates": log.duplicates}
-            place = dict(zip(self.ground.columns, newest.report.place, strict=True)) if newest else {}
-            rows.append(UavStatus(ID=uav, age=self._age(newest), **place, reports=log.received, **counts))
+            place: Any = newest and newest.report.place()
+            where = dict(zip(self.ground.columns, place, strict=True)) if place else {}
+            rows.append(UavStatus(ID=uav, age=self._age(newest), **where, reports=log.received, **counts))
         start = None if self.start is None else written(self.start)
         return FleetStatus(fleet=name, start=start, step=self.step, dt=self.node.dt, uavs=rows)
 

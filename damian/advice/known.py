@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from damian.advice.rows import DEGREES, METRES, Place, Report
+from damian.common.counter_rng import number_of
 from damian.common.errors import InputError
 from damian.server.server import Server
 from damian.world.airspace import Airspace
@@ -24,8 +25,6 @@ from damian.world.regions.geodesy import to_latlon, to_local
 
 KEPT = 512
 """Reports of a UAV that are kept: a late one changes what newer ones left open."""
-REMEMBERED = 10_000
-"""Places whose landing points are remembered, because each is looked up several times."""
 DIGITS = {DEGREES: 8, METRES: 3}
 """Decimals of a place in answers: a millimetre."""
 
@@ -43,24 +42,18 @@ class Ground:
         self.columns = METRES if self.region.origin is None else DEGREES
         self.points = airspace.exact_points[0, : int(airspace.n_points[0])].numpy()
         self._tree = shapely.STRtree(np.asarray(shapely.points(self.points)))
-        self.landing_point = lru_cache(REMEMBERED)(self._landing_point)
+        # Each place is looked up several times.
+        self.landing_point = lru_cache(10_000)(self._landing_point)
         """Number of the landing point nearest to a place; ``InputError`` if it is farther than ``reach``."""
-        self.place = lru_cache(REMEMBERED)(self._place)
+        self.place = lru_cache(10_000)(self._place)
         """Where a landing point is, in ``columns``."""
-        self.way = lru_cache(REMEMBERED)(self._way)
+        self.way = lru_cache(10_000)(self._way)
         """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
 
-    def _landing_point(self, place: Place) -> int:
-        x, y = self.local(place)
-        point = int(self._tree.nearest(shapely.Point(x, y)))
-        away = float(np.hypot(*(self.points[point] - (x, y))))
-        if away > self.reach:
-            names, unit = self.columns, "m" if self.region.origin is None else "deg"
-            raise InputError(
-                f"{names[0]}, {names[1]}: {place[0]:.10g}, {place[1]:.10g} {unit} is {away:.0f} m away from "
-                f"the nearest landing point of {self.region.name}, more than {self.reach:.0f} m"
-            )
-        return point
+    @property
+    def mark(self) -> str:
+        """A text that stands for the landing points."""
+        return str(number_of(str(self.points.round(2).tolist())))
 
     def local(self, place: Place) -> tuple[float, float]:
         """A place, east and north of the origin of the region [m]."""
@@ -69,6 +62,15 @@ class Ground:
             return first - self.region.offset[0], second - self.region.offset[1]
         x, y = to_local(first, second, self.region.origin)
         return float(x), float(y)
+
+    def _landing_point(self, place: Place) -> int:
+        x, y = self.local(place)
+        point = int(self._tree.nearest(shapely.Point(x, y)))
+        away = float(np.hypot(*(self.points[point] - (x, y))))
+        if away > self.reach:
+            where = f"{', '.join(self.columns)}: {place[0]:.10g}, {place[1]:.10g}"
+            raise InputError(f"{where} is {away:.0f} m away from the landing points of {self.region.name}")
+        return point
 
     def _place(self, point: int) -> Place:
         x, y = self.points[point]
@@ -141,12 +143,14 @@ class UavLog:
         Raises:
             InputError: a place is far from any landing point, or there is another number of readings.
         """
-        if report.in_degrees != (self.ground.columns == DEGREES):
-            own, name = ", ".join(self.ground.columns), self.ground.region.name
-            raise InputError(f"places in {name} are {own}: give those of {report.id} in {own}")
-        for place in (report.place, report.source_place, report.target, *(report.previous or ())):
+        if report.columns != self.ground.columns:
+            own = ", ".join(self.ground.columns)
+            raise InputError(f"places in {self.ground.region.name} are {own}: give those of {report.id} so")
+        for place in (report.place(), report.place("source_"), report.place("target_")):
             if place is not None:
                 self.ground.landing_point(place)
+        for place in report.previous or ():
+            self.ground.landing_point(place)
         n = self.n_readings
         if report.readings is not None and len(report.readings) != n:
             raise InputError(f"readings: {len(report.readings)} numbers are not {n}, as in the training")
@@ -165,14 +169,7 @@ class UavLog:
     def add(
         self, report: Report, step: int, detected: int | None, sent: tuple[int, int] | None = None
     ) -> FilledReport:
-        """Add a report, in its place by the time when it was generated.
-
-        Args:
-            report: the report.
-            step: in which it was generated.
-            detected: the step of the detection that it names.
-            sent: landing points from which and to which the UAV had last been sent by then.
-        """
+        """Add a report, in its place by the time when it was generated; arguments as of ``FilledReport``."""
         filled = FilledReport(report, step, sent, detected=detected)
         at = self._place_of(report.time)
         self.reports.insert(at, filled)
@@ -184,14 +181,15 @@ class UavLog:
     def _fill(self, filled: FilledReport, before: FilledReport | None) -> None:
         """Fill in what a report leaves open."""
         report, near = filled.report, self.ground.landing_point
-        here = near(report.place)
-        filled.point = filled.target = here
+        here, target = report.place(), report.place("target_")
+        assert here is not None  # every report has it
+        filled.point = filled.target = near(here)
         if report.flies and filled.sent:  # it is on its way, and took off from where it was sent
             filled.point, filled.target = filled.sent
         elif report.flies and before:
             filled.point = filled.target = before.point
-        if report.target is not None:
-            filled.target = near(report.target)
+        if target is not None:
+            filled.target = near(target)
         track, battery, readings = 0.0, 100.0, (0.0,) * self.n_readings
         if before:
             track, battery, readings = before.track, before.battery, before.readings
@@ -207,47 +205,34 @@ class UavLog:
         filled.trail = self._trail(filled, before)
 
     def _fill_detection(self, filled: FilledReport, before: FilledReport | None) -> None:
-        report = filled.report
+        place = filled.report.place("source_")
         if filled.spotted:
             filled.detected, filled.detected_at = filled.step, filled.point
-        elif report.source_time is not None:
-            if report.source_place is not None:
-                filled.detected_at = self.ground.landing_point(report.source_place)
-            else:
-                held = before and before.detected_at
-                filled.detected_at = filled.point if held is None else held
-        elif before is not None:
-            filled.detected, filled.detected_at = before.detected, before.detected_at
+        elif filled.report.source_time is None:
+            if before is not None:
+                filled.detected, filled.detected_at = before.detected, before.detected_at
+        elif place is not None:
+            filled.detected_at = self.ground.landing_point(place)
+        else:
+            held = before and before.detected_at
+            filled.detected_at = filled.point if held is None else held
 
     def _trail(self, filled: FilledReport, before: FilledReport | None) -> tuple[int, ...]:
-        previous: Sequence[int] = before.trail if before else ()
+        trail = list(before.trail) if before else []
         if filled.report.previous is not None:
             trail = [filled.point, *map(self.ground.landing_point, filled.report.previous)]
-        elif previous and previous[0] == filled.point:
-            trail = [*previous]
-        else:
-            trail = [filled.point, *previous]
+        elif trail[:1] != [filled.point]:
+            trail = [filled.point, *trail]
         return tuple([*trail, *[trail[-1]] * self.window][: self.window])
 
 
 def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor, dt: float) -> Messages:
-    """Messages as the simulation would send them, [n].
-
-    Args:
-        reports: the reports.
-        server: gives the resolution of battery levels.
-        points: landing points, [L, 2] metres.
-        dt: length of a step [s].
-    """
+    """Messages [n] as the simulation would send them; landing points are [L, 2] and steps ``dt`` long [s]."""
     steps = torch.tensor([each.step for each in reports])
     detected = torch.tensor([-1 if each.detected is None else each.detected for each in reports])
     battery = torch.tensor([each.battery for each in reports])
-    nowhere = torch.zeros(len(reports), 2)
-    at = torch.tensor([each.detected_at or 0 for each in reports])
-    empty = torch.zeros(len(reports), dtype=torch.bool)
-    if server.battery.enabled:
-        empty = observed(battery, server.battery) <= 0
-    has_detected = detected >= 0
+    at = points[[each.detected_at or 0 for each in reports]]
+    is_empty = server.battery.enabled and observed(battery, server.battery) <= 0
     return Messages(
         time=steps * dt,
         position=points[[each.point for each in reports]],
@@ -255,10 +240,10 @@ def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor,
         track=torch.tensor([each.track for each in reports]),
         battery=battery,
         spotted=torch.tensor([each.spotted for each in reports]),
-        empty=empty,
+        empty=torch.zeros_like(steps, dtype=torch.bool) | is_empty,
         motions=torch.tensor([each.motions for each in reports]),
-        detected_time=torch.where(has_detected, detected * dt, -1.0),
-        detected_position=torch.where(has_detected.unsqueeze(-1), points[at], nowhere),
+        detected_time=torch.where(detected >= 0, detected * dt, -1.0),
+        detected_position=torch.where((detected >= 0).unsqueeze(-1), at, 0.0),
         trail=torch.tensor([each.trail for each in reports]),
         readings=torch.tensor([each.readings for each in reports]).view(len(reports), -1),
     )

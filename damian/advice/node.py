@@ -1,15 +1,15 @@
 """The server node of a fleet whose messages are reported from outside, instead of sent by a simulation.
 
-Its environment has the transforms that follow the delay in ``damian.envs.pipeline``, and takes its steps as
-any other one. So a policy observes the same, bit for bit, as in the simulation, if the same messages arrive
-at the same steps.
+It has the transforms that follow the delay in ``damian.envs.pipeline``, and takes steps as an environment
+does. So a policy observes the same, bit for bit, as in the simulation, if the same messages arrive at the
+same steps.
 """
 
 from dataclasses import replace
 from typing import NamedTuple, cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Compose
 
@@ -22,7 +22,8 @@ from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Features
 from damian.transforms import Belief, MessageHistory, ServerNode, StatefulTransform
-from damian.world.state import PackedState, State
+from damian.transforms.base import act, begin, observe
+from damian.world.state import State
 
 REMEMBERED_STEPS = 32
 """Steps that the belief looks back at least: real messages may be later than those of the training."""
@@ -56,7 +57,7 @@ class Reported(NamedTuple):
 
 
 class ReportedEnv(UavEnv):
-    """A single world that is, after every step, as UAVs have reported it.
+    """A single world of which nothing but messages is known; ``Node`` takes its steps.
 
     Args:
         scenario: all settings; its delays are not simulated.
@@ -64,25 +65,9 @@ class ReportedEnv(UavEnv):
         reward_terms: whether a transform writes the weighted terms of the reward.
     """
 
-    reported: Reported | None = None
-    """What the next step or reset brings; assign it before."""
-
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         extras = {"message", "reward_terms"} if reward_terms else {"message"}
         super().__init__(scenario, 1, seed, extras=extras, messages_only=True)
-
-    def step_fn(
-        self, worlds: PackedState, action: Tensor, valid: Tensor | None = None
-    ) -> tuple[PackedState, Outputs]:
-        assert self.reported is not None
-        return worlds, self._outputs_of(self.reported)
-
-    def reset_fn(self, worlds: PackedState, mask: Tensor) -> tuple[PackedState, Outputs]:
-        if self.reported is None:  # the first reset, which allocates the memories of the transforms
-            return super().reset_fn(worlds, mask)
-        state = self.reported.state
-        outputs = self._outputs_at_reset(state, self.server.features(state.sent, state.steps))
-        return worlds, outputs | self._outputs_of(self.reported)
 
     def _outputs_at_reset(self, initial: State, features: Features) -> Outputs:
         outputs = super()._outputs_at_reset(initial, features)
@@ -90,10 +75,15 @@ class ReportedEnv(UavEnv):
         age = torch.zeros_like(message[..., :1])
         return outputs | {keys.RECEIVED: message.clone(), keys.AGE: age, keys.DELAY: age.long()}
 
-    def _outputs_of(self, reported: Reported) -> Outputs:
-        """What a step outputs before any transform."""
-        held, on_time = reported.state.sent.pack(), reported.on_time.unsqueeze(0)
-        return self._state_outputs(reported.state) | {
+    def outputs_of(self, reported: Reported, first: bool = False) -> Outputs:
+        """What a step, or the first one, outputs before any transform."""
+        state, on_time = reported.state, reported.on_time.unsqueeze(0)
+        held = state.sent.pack()
+        if first:
+            outputs = self._outputs_at_reset(state, self.server.features(state.sent, state.steps))
+        else:
+            outputs = self._state_outputs(state)
+        return outputs | {
             keys.READY: torch.ones_like(on_time),
             keys.MESSAGE: held,
             keys.MESSAGE_SENT: on_time,
@@ -130,24 +120,27 @@ class Node:
             *observation_transforms(scenario),
         ]
         self.env = DelayedEnv(self.worlds, Compose(*transforms))  # type: ignore[arg-type]
+        """What the policy is made for; it is never stepped."""
         self.env.reset()
         self.transforms = cast(list[StatefulTransform], transforms)
-        self._unused = self._memories()
+        self._unused = [transform.memory for transform in self.transforms]
         self.blank = tree_map(lambda table: table[:1].clone(), self.simulation.initial)
 
+    @torch.no_grad()
     def begin(self, reported: Reported) -> tuple[Memories, TensorDictBase]:
         """The memories and the outputs of the first step, in which the first message of every UAV is known.
 
         The number of the step is in ``reported.state``, and need not be 0.
         """
-        self._remember(self._unused)
-        self.worlds.reported = reported
-        outputs = self.env.reset()
-        for transform in self.transforms:
+        outputs = self.worlds.outputs_of(reported, first=True)
+        everywhere = torch.ones(1, 1, dtype=torch.bool)
+        memories, outputs = begin(self.transforms, _copies(self._unused), outputs, everywhere)
+        for transform, memory in zip(self.transforms, memories, strict=True):
             if isinstance(transform, ServerNode):
-                transform.set_memory({"elapsed": reported.state.steps.clone()})
-        return self._memories(), outputs
+                memory["elapsed"] = reported.state.steps.clone()
+        return memories, self.worlds.to_tensordict(outputs)
 
+    @torch.no_grad()
     def step(
         self, memories: Memories, reported: Reported, action: Tensor, chosen: Tensor
     ) -> tuple[Memories, TensorDictBase]:
@@ -159,28 +152,24 @@ class Node:
             action: actions of the step before, [1, N, ...].
             chosen: which UAVs chose one in the step before, [1, N] bool.
         """
-        self._remember(memories)
-        for transform in self.transforms:
+        memories = _copies(memories)
+        for i, transform in enumerate(self.transforms):
             if isinstance(transform, Belief | MessageHistory):
                 for late in reported.late:
-                    transform.set_memory(transform.note_late(transform.memory, *late))
-        self.worlds.reported = reported
-        agents = TensorDict({keys.ACTION[-1]: action, keys.READY[-1]: chosen}, chosen.shape)
-        outputs = self.env.step(TensorDict({keys.AGENTS: agents}, chosen.shape[:1]))["next"]
-        return self._memories(), outputs
+                    memories[i] = transform.note_late(memories[i], *late)
+        memories, _ = act(self.transforms, memories, {keys.ACTION: action, keys.READY: chosen})
+        memories, outputs = observe(self.transforms, memories, self.worlds.outputs_of(reported))
+        return memories, self.worlds.to_tensordict(outputs)
 
     def skip(self, memories: Memories, n_steps: int) -> Memories:
         """The memories after steps in which nothing was reported and nobody chose; beliefs stay the same."""
         pairs = zip(self.transforms, memories, strict=True)
         return [transform.after_idle_steps(memory, n_steps) for transform, memory in pairs]
 
-    def _remember(self, memories: Memories) -> None:
-        """Give the transforms copies of memories, which steps may change in place."""
-        for transform, memory in zip(self.transforms, memories, strict=True):
-            transform.set_memory({name: value.clone() for name, value in memory.items()})
 
-    def _memories(self) -> Memories:
-        return [transform.memory for transform in self.transforms]
+def _copies(memories: Memories) -> Memories:
+    """Copies of memories, which steps may change in place."""
+    return [{name: value.clone() for name, value in memory.items()} for memory in memories]
 
 
 def scenario_of_service(scenario: ScenarioConfig) -> ScenarioConfig:

@@ -21,7 +21,7 @@ from damian import keys
 from damian.advice.fitting import fit
 from damian.advice.fleet import Decision, Fleet
 from damian.advice.journal import Line, Received, read_lines
-from damian.advice.rows import Report, written
+from damian.advice.rows import Place, Report, written
 from damian.advice.session import replay
 from damian.common.errors import InputError
 from damian.common.text_files import named
@@ -66,8 +66,7 @@ def episode_of(
 
     Args:
         path: the journal.
-        fleet: a new one of the UAVs of the journal, whose node writes the terms of the reward. Its policy is
-            not asked.
+        fleet: a new one of its UAVs, whose node writes the terms of the reward; its policy is not asked.
         about: where the episode comes from; the IDs of the UAVs and the time of its first instant are added.
         span: first and last time to keep, since every UAV had reported [s]; all if not given.
         progress: shows how far the journal has been read, as ``tqdm.tqdm``.
@@ -114,8 +113,7 @@ def _read(
             if fleet.start is not None:
                 end = fleet.first_step + span[1] / fleet.node.dt
             for report in line.reports if isinstance(line, Received) else ():
-                for uav in fleet.numbers_of([report.id]) or ():
-                    reports[uav].append(report)
+                reports[fleet.number[report.id]].append(report)
     if fleet.start is None:
         raise InputError(f"{path}: the fleet never began: not every UAV has reported")
     _advance(fleet, view, fleet.clock, span, is_last=True)
@@ -180,7 +178,9 @@ def _hindsight(fleet: Fleet, reports: Sequence[Report], steps: NDArray[np.int64]
     at = np.clip([fleet.step_of(report.time) for report in ordered], fleet.first_step, None)
     of_step = {int(step): report for step, report in zip(at, ordered, strict=True)}
     knots, latest = np.array(list(of_step)), list(of_step.values())
-    places = np.array([(*fleet.ground.local(each.place), max(each.fla or 0.0, 0.0)) for each in latest])
+    places = np.array(
+        [(*fleet.ground.local(cast(Place, each.place())), max(each.fla or 0.0, 0.0)) for each in latest]
+    )
     position = np.stack([np.interp(steps, knots, axis) for axis in places.T], -1)
     newest = np.clip(np.searchsorted(knots, steps, side="right") - 1, 0, None)
     spots = np.array([each.source_spotted and not each.flies for each in latest])

@@ -13,37 +13,23 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from damian import keys
 from damian.advice.fleet import Fleet, Waiting
 from damian.advice.journal import SUFFIX, About, Advised, Head, Journal, Line, Received, read_head, read_lines
-from damian.advice.rows import (
-    Advice,
-    FleetRequest,
-    FleetStatus,
-    Report,
-    Rows,
-    as_csv,
-    as_rows,
-    read_file,
-    validated,
-)
+from damian.advice.rows import Advice, Report, Rows, as_csv, as_rows, read_file, validated
 from damian.common.atomic_files import write_atomically, writing
-from damian.common.errors import InputError, RunError
+from damian.common.errors import InputError
 from damian.common.text_files import named, show
-from damian.runs.run_lock import LOCK, is_empty, locked
+from damian.runs.run_lock import locked
 
-MAX_FLEETS = 1000
 MAY_DIFFER = {
-    *("reports", "folder", "port", "host", "token", "uavs", "journal", "durable"),
+    *("reports", "folder", "port", "host", "token", "uavs", "journal"),
     *("policy", "checkpoint", "agents", "device", "frames", "episodes", "eval_episodes", "hydra"),
 }
 """Settings that a journal and a service need not share: those that say how reports come in and where journals
 lie, those that are compared apart, and those on which no advice depends."""
-TOLERANCE = 0.01
-"""Distance within which two places are the same [m]: those in journals are rounded to a millimetre."""
 
 
 class NoFleet(InputError):
@@ -58,8 +44,6 @@ class AdviceSession:
         folder: of the journals; those in it are restored, and no other session may use it until this one is
             closed. None: nothing is kept.
         about: which policy advises by which settings, for the journals, as ``About``.
-        durable: as in ``Journal``.
-        is_locked: the folder is locked by who makes the session.
 
     Raises:
         InputError: a journal is damaged, or of another policy or other settings, or another session uses the
@@ -72,20 +56,23 @@ class AdviceSession:
         make_fleet: Callable[[list[str]], Fleet],
         folder: Path | None = None,
         about: Mapping[str, Any] | None = None,
-        durable: bool = False,
-        is_locked: bool = False,
     ) -> None:
-        self.make, self._folder, self._durable = make_fleet, folder, durable
+        self.make, self._folder = make_fleet, folder
         self.about = About.model_validate(about or {})
         self.fleets: dict[str, Fleet] = {}
         self._journals: dict[str, Journal] = {}
         self._at_close = ExitStack()
-        if folder is not None:
-            try:
-                self._open(folder, is_locked)
-            except BaseException:
-                self.close()
-                raise
+        if folder is None:
+            return
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        self._at_close.enter_context(locked(folder, "journal"))
+        try:
+            for path in sorted(folder.glob(f"*{SUFFIX}")):
+                self._restore(path)
+        except BaseException:
+            self.close()
+            raise
 
     def fleet(self, name: str) -> Fleet:
         """The fleet of a name.
@@ -97,46 +84,22 @@ class AdviceSession:
             raise NoFleet(f"fleet: there is no fleet {show(name)}")
         return self.fleets[name]
 
-    def check_new(self, name: str, uavs: Any) -> Head:
-        """Check the name and the UAVs of a fleet.
-
-        Returns:
-            The first line of its journal, with the name and the IDs of the UAVs.
+    def create(self, name: str, uavs: Any) -> bool:
+        """Create a fleet of UAVs with these IDs; returns whether it is new.
 
         Raises:
-            InputError: they are not valid, or the fleet exists with other UAVs.
-        """
-        ids = validated(FleetRequest, {"uavs": uavs}).uavs
-        head = validated(Head, {"fleet": name, "uavs": ids, "about": self.about})
-        if name in self.fleets and self.fleets[name].uavs != ids:
-            raise InputError(f"fleet: {name} has other UAVs; end it first, or take another name")
-        if name not in self.fleets and len(self.fleets) >= MAX_FLEETS:
-            raise InputError(f"fleet: there are {MAX_FLEETS} fleets already; end one first")
-        return head
-
-    def create(self, name: str, uavs: Sequence[str], fleet: Fleet | None = None) -> bool:
-        """Create a fleet; returns whether it is new.
-
-        Args:
-            name: of the fleet.
-            uavs: IDs of its UAVs.
-            fleet: made of them, if it has been made already.
-
-        Raises:
-            InputError: as of ``check_new``.
+            InputError: the name or an ID is not valid, or the fleet exists with other UAVs.
             RunError: the journal cannot be written; there is no such fleet.
         """
-        head = self.check_new(name, list(uavs))
+        head = validated(Head, {"fleet": name, "uavs": uavs, "about": self.about})
         if name in self.fleets:
+            if self.fleets[name].uavs != head.uavs:
+                raise InputError(f"fleet: {name} has other UAVs; end it first, or take another name")
             return False
-        made = fleet or self.make(head.uavs)
+        made = self.make(head.uavs)
         if self._folder is not None:
-            journal = Journal(self._folder / f"{name}{SUFFIX}", self._durable)
-            try:
-                journal.append(head)
-            except BaseException:
-                journal.close()
-                raise
+            journal = Journal(self._folder / f"{name}{SUFFIX}")
+            journal.append(head.model_copy(update={"ground": made.ground.mark}))
             self._journals[name] = journal
         self.fleets[name] = made
         return True
@@ -156,7 +119,7 @@ class AdviceSession:
         del self.fleets[name]
 
     def report(self, name: str, rows: Rows, now: float, file: bool = False) -> list[str]:
-        """Take reports, all or none of them.
+        """Take reports, all or none of them; the journal has them when this returns.
 
         Args:
             name: of the fleet.
@@ -165,7 +128,7 @@ class AdviceSession:
             file: they are from a file, whose column ``receive time`` counts.
 
         Returns:
-            What was found of each, as ``Fleet.report`` says it. They are in the journal by then.
+            What was found of each, as ``Fleet.report`` says it.
 
         Raises:
             InputError: a row is wrong; none is taken.
@@ -186,13 +149,7 @@ class AdviceSession:
     def advise(
         self, name: str, now: float, asking: Sequence[str] | None = None, only: bool = False
     ) -> list[Advice]:
-        """Let UAVs choose, and say what all of them were told last; arguments as of ``Fleet.choose``.
-
-        Args:
-            name: of the fleet.
-            now: the time [s].
-            asking: IDs of the UAVs that are ready to choose.
-            only: answer only those that ask.
+        """Let the UAVs that ask (all, if None) choose, and say what all, or ``only`` those, were told last.
 
         Raises:
             InputError: a UAV is of another fleet, or the fleet began too long ago.
@@ -204,14 +161,9 @@ class AdviceSession:
         if choice is not None:
             told = {fleet.uavs[uav]: decision.action for uav, decision in choice.decisions.items()}
             advice = [fleet.advice_of(*each) for each in choice.decisions.items()]
-            line = Advised.model_construct(asked=fleet.clock, told=told, advice=advice)
-            self._write(name, line)
+            self._write(name, Advised.model_construct(asked=fleet.clock, told=told, advice=advice))
             fleet.tell(choice)
         return fleet.advice(fleet.numbers_of(asking) if only else None)
-
-    def status(self, name: str) -> FleetStatus:
-        """What is known of a fleet."""
-        return self.fleet(name).status(name)
 
     def advance(self, now: float) -> None:
         """Let all fleets take their steps, so that no answer has to wait for many of them."""
@@ -229,51 +181,26 @@ class AdviceSession:
         if self._folder is not None:
             self._journals[name].append(line)
 
-    def _open(self, folder: Path, is_locked: bool) -> None:
-        """Take a folder of journals, and restore the fleets in it."""
-        is_new = not folder.is_dir()
-        with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-        if not is_locked:
-            self._at_close.enter_context(locked(folder, "journal"))
-        if is_new:
-            self._at_close.callback(_remove_if_empty, folder)
-        for path in sorted(folder.glob(f"*{SUFFIX}")):
-            self._restore(path)
-
     def _restore(self, path: Path) -> None:
         """Restore a fleet from its journal."""
-        journal = Journal(path, self._durable)  # removes what is unfinished
-        try:
-            if not path.stat().st_size:  # it was killed before the fleet was there
-                path.unlink()
-                journal.close()
-                return
-            head = read_head(path)
-            with named(path):
-                check_same(head.about, self.about)
-                self.check_new(head.fleet, head.uavs)
-                if path.name != f"{head.fleet}{SUFFIX}":
-                    remedy = f"name it {head.fleet}{SUFFIX}, or move it to another folder"
-                    raise InputError(
-                        f"it is the journal of the fleet {head.fleet}, or a copy of it: {remedy}"
-                    )
-                fleet = self.make(head.uavs)
-            for number, line in read_lines(path):
-                with named(f"{path}: line {number}"):
-                    replay(fleet, line)
-                    check_goals(fleet, line)
-        except BaseException:
-            journal.close()
-            raise
-        self.fleets[head.fleet], self._journals[head.fleet] = fleet, journal
-
-
-def _remove_if_empty(folder: Path) -> None:
-    with suppress(OSError):
-        if is_empty(folder):
-            (folder / LOCK).unlink(missing_ok=True)
-            folder.rmdir()
+        journal = Journal(path)  # removes what is unfinished
+        self._journals[path.stem] = journal
+        if not path.stat().st_size:  # the service was killed before the fleet was there
+            path.unlink()
+            self._journals.pop(path.stem).close()
+            return
+        head = read_head(path)
+        with named(path):
+            if head.fleet != path.stem:
+                raise InputError(f"it is the journal of the fleet {head.fleet}: name it {head.fleet}{SUFFIX}")
+            check_same(head.about, self.about)
+            fleet = self.make(head.uavs)
+            if head.ground != fleet.ground.mark:
+                raise InputError("it is of other landing points: give the region and the lattice that it had")
+        for number, line in read_lines(path):
+            with named(f"{path}: line {number}"):
+                replay(fleet, line)
+        self.fleets[head.fleet] = fleet
 
 
 def replay(fleet: Fleet, line: Line) -> None:
@@ -288,7 +215,7 @@ def replay(fleet: Fleet, line: Line) -> None:
         _taken(fleet, line.reports)
         return
     if fleet.start is None:
-        raise InputError("it is damaged: advice before every UAV has reported")
+        raise InputError("advice before every UAV has reported")
     fleet.advance(line.asked)
     numbers, hidden = fleet.numbers_of(list(line.told)) or [], None
     if fleet.hidden is not None:
@@ -296,12 +223,9 @@ def replay(fleet: Fleet, line: Line) -> None:
     spec = fleet.node.env.full_action_spec[keys.ACTION]
     action = spec.zero()
     for uav, chosen in line.told.items():
-        given = torch.tensor(chosen, dtype=torch.float64 if isinstance(chosen, tuple) else torch.long)
-        like = action[0, fleet.number[uav]]
-        fits = given.shape == like.shape and given.is_floating_point() == like.is_floating_point()
-        action[0, fleet.number[uav]] = given if fits else -1
+        action[0, fleet.number[uav]] = torch.tensor(chosen)
     if not spec.is_in(action):
-        raise InputError(f"it is damaged: told: {show(line.told)} are not all actions of these settings")
+        raise InputError(f"told: {show(line.told)} are not all actions of these settings")
     fleet.tell(fleet.choice(numbers, action, hidden))
 
 
@@ -312,27 +236,22 @@ def _taken(fleet: Fleet, reports: Sequence[Report]) -> list[str]:
     return [found[i] for i in range(len(reports))]
 
 
-# Whether a journal is of a service like this one. It keeps actions and steps, which mean something else with
-# another lattice, other actions or another length of a step: UAVs would be booked where nobody has sent them.
-
-
 def check_same(then: About, now: About) -> None:
     """Check that a journal is of the policy and of the settings of this service.
+
+    It keeps actions and steps, which mean something else with other settings.
 
     Raises:
         InputError: it is of others.
     """
-    was, own = (
-        {**_settings_of(each), "policy": each.policy, "checkpoint": each.checkpoint} for each in (then, now)
-    )
+    was, own = ({**_settings_of(a), "policy": a.policy, "checkpoint": a.checkpoint} for a in (then, now))
     differ = [
         f"{key}: {was.get(key, 'not given')} then, {own.get(key, 'not given')} now"
         for key in {**was, **own}
         if was.get(key) != own.get(key)
     ]
     if differ:
-        remedy = "give the same, or name another journal=FOLDER"
-        raise InputError(f"it is of other settings: {'; '.join(differ)}: {remedy}")
+        raise InputError(f"it is of other settings: {'; '.join(differ)}: give the same")
 
 
 def _settings_of(about: About) -> dict[str, str | None]:
@@ -341,29 +260,8 @@ def _settings_of(about: About) -> dict[str, str | None]:
     return {key: value for key, _, value in parts if key.split(".")[0] not in MAY_DIFFER}
 
 
-def check_goals(fleet: Fleet, line: Line) -> None:
-    """Check that a line of a journal, which has been replayed, sends UAVs where they were sent.
-
-    Raises:
-        InputError: a UAV was told another landing point than its action leads to with these settings.
-    """
-    if isinstance(line, Received):
-        return
-    rows = {row.ID: row for row in line.advice}
-    for uav in line.told:
-        place, decision = uav in rows and rows[uav].place(), fleet.decision(fleet.number[uav])
-        if not place or decision is None:
-            raise InputError(f"it is damaged: it does not say where {uav} was sent")
-        away = float(np.hypot(*(fleet.ground.points[decision.goal] - fleet.ground.local(place))))
-        if not away <= TOLERANCE:
-            there = f"{place[0]:.10g}, {place[1]:.10g}"
-            wrong = f"{uav} was sent to {there}, {away:.2f} m from where its action leads"
-            raise InputError(f"it is damaged, or of another region, lattice or actions: {wrong}")
-
-
 # A folder as a source of reports: every table that is put into it is read once, and answered there.
 
-TABLES = (".csv", ".json", ".jsonl")
 ANSWERS = ("advice.csv", "advice.json")
 DONE, REFUSED, REASON = ".done", ".refused", ".refused.txt"
 """Added to the name of a table that was read, or refused, and to that of the file that says why."""
@@ -372,32 +270,27 @@ DONE, REFUSED, REASON = ".done", ".refused", ".refused.txt"
 def read_inbox(session: AdviceSession, name: str, folder: Path, now: float) -> bool:
     """Read the tables that have come into a folder, in the order of their names, and answer them.
 
-    A table must appear complete: write it under another name, such as one that begins with a dot, and rename
-    it. The answer is ``advice.csv`` and ``advice.json`` in the folder. A table that is wrong changes nothing.
-    Files ``NAME.done``, ``NAME.refused`` and ``NAME.refused.txt`` are of the newest table of that name; the
-    time is put into the names of those of an earlier one.
-
-    Args:
-        session: the fleets.
-        name: of the fleet.
-        folder: the folder.
-        now: the time [s].
+    A table must appear complete: write it under a name that begins with a dot, and rename it. The answer is
+    ``advice.csv`` and ``advice.json`` in the folder. A table becomes ``NAME.done``, or if it is wrong and so
+    changes nothing ``NAME.refused`` beside ``NAME.refused.txt``, in place of an earlier one of that name.
 
     Returns:
         Whether there was any table.
-
-    Raises:
-        RunError: the folder cannot be read any more, or an answer cannot be written.
     """
-    try:
-        paths = sorted(path for path in folder.iterdir() if _is_table(path))
-    except OSError as error:
-        raise RunError(f"folder: {folder}: it cannot be read: {error.strerror}") from None
-    taken = [_read_table(session, name, path, now) for path in paths]
-    if any(taken):
+    tables = [each for each in sorted(folder.glob("[!.]*")) if each.suffix.lower() in (".csv", ".json")]
+    tables = [each for each in tables if each.name not in ANSWERS and each.is_file()]
+    for path in tables:
+        end = DONE
+        try:
+            session.report(name, read_file(path), now)
+        except InputError as error:
+            end = REFUSED
+            write_atomically(path.with_name(path.name + REASON), f"{error}\n")
+        path.replace(path.with_name(path.name + end))
+    if tables:
         with suppress(Waiting):
             write_answer(folder, session.advise(name, now))
-    return bool(paths)
+    return bool(tables)
 
 
 def write_answer(folder: Path, answer: list[Advice]) -> str:
@@ -409,26 +302,3 @@ def write_answer(folder: Path, answer: list[Advice]) -> str:
     write_atomically(folder / "advice.json", json.dumps(as_rows(answer), indent=1))
     write_atomically(folder / "advice.csv", table := as_csv(answer))
     return table
-
-
-def _is_table(path: Path) -> bool:
-    hidden = path.name.startswith(".") or path.name in ANSWERS
-    return not hidden and path.suffix.lower() in TABLES and path.is_file()
-
-
-def _read_table(session: AdviceSession, name: str, path: Path, now: float) -> bool:
-    """Give a table to the session; returns whether it was taken."""
-    reason = ""
-    try:
-        session.report(name, read_file(path), now)
-    except InputError as error:
-        reason = str(error)
-    with writing(path):
-        for end in (DONE, REFUSED, REASON):  # those of an earlier table of this name
-            earlier = path.with_name(path.name + end)
-            if earlier.exists():
-                earlier.rename(path.with_name(f"{path.name}.{now:.3f}{end}"))
-        if reason:
-            write_atomically(path.with_name(path.name + REASON), f"{reason}\n")
-        path.rename(path.with_name(path.name + (REFUSED if reason else DONE)))
-    return not reason

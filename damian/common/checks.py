@@ -1,7 +1,7 @@
 """Checks of settings; a failed check raises one line that names the key, the value and its unit.
 
-Every number has a largest sensible value, even where a check names none, because single precision overflows,
-and time and memory run out, long before a computer refuses a number.
+Every number has a largest sensible value, even where a check names none, because single precision overflows
+long before a computer refuses a number.
 """
 
 import math
@@ -22,10 +22,7 @@ WORLDS = 1_000_000
 LARGEST = {"m": METRES, "m^2": METRES**2, "s": SECONDS, "dB": 300.0, "deg": 360.0}
 """Largest number allowed by its unit, where a check names none."""
 HUGE, TINY = 1e9, 1e-9
-"""Largest number of any other unit or of none, and smallest one where a check asks for one above 0.
-
-Products and ratios of a few such numbers do not overflow in single precision, nor vanish.
-"""
+"""Largest number of any other unit or of none, and smallest one where a check asks for one above 0."""
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -40,9 +37,9 @@ def require(condition: bool, key: str, value: Any, should: str) -> None:
 def in_range(key: str, value: float, low: float, high: float | None = None, unit: str = "") -> None:
     """Require a number ``low <= value <= high``; without ``high``, the largest number of the unit."""
     most = max(low, LARGEST.get(unit, HUGE)) if high is None else high
+    good = _is_number(value) and low <= value <= most
     one_sided = high is None and not (_is_number(value) and most < value < math.inf)
     bounds = f"at least {low:g}" if one_sided else f"between {low:g} and {most:g}"
-    good = _is_number(value) and low <= value <= most
     require(good, key, f"{value} {unit}".strip(), f"is not {bounds} {unit}".strip())
 
 
@@ -58,12 +55,6 @@ def above(key: str, value: float, low: float, unit: str = "") -> None:
     good = _is_number(value) and low < value < math.inf
     require(good, key, f"{value} {unit}".strip(), f"is not above {low:g} {unit}".strip())
     in_range(key, value, low + TINY, max(low + TINY, LARGEST.get(unit, HUGE)), unit)
-
-
-def weight(key: str, value: float) -> None:
-    """Require a weight of a reward or a loss: a finite number that is not huge."""
-    require(_is_number(value) and math.isfinite(value), key, value, "is not a finite weight")
-    in_range(key, value, -1e6, 1e6)
 
 
 def seed(key: str, value: Any, low: int | None = None) -> None:
@@ -116,16 +107,7 @@ def names(key: str, given: Any, known: Sequence[str]) -> frozenset[Any]:
 
 
 def known_keys(key: str, given: Any, known: Iterable[str]) -> dict[str, Any]:
-    """Require a mapping without unknown keys, such as the options of your own component.
-
-    Args:
-        key: of the setting, for errors.
-        given: the mapping, or None for an empty one.
-        known: the keys that it may have.
-
-    Returns:
-        The mapping.
-    """
+    """Require a mapping without unknown keys, such as the options of your own component; None is empty."""
     known = list(known)
     given = {} if given is None else given
     if not isinstance(given, Mapping):

@@ -27,16 +27,10 @@ class RunError(RuntimeError):
 
 @contextmanager
 def naming_errors(name: str) -> Iterator[None]:
-    """Turn an error raised inside by a component of a user's own into an ``InputError`` of one line.
+    """Turn an error that the first call of a component of the user's own raises into an ``InputError``.
 
-    The line has the name, the error, and the file and line of the component. It is meant for the first call
-    of a component, not for a step.
-
-    Args:
-        name: the setting and the component, such as ``delay.obs: law rush:BusyHour``.
-
-    Raises:
-        InputError: anything was raised inside; an ``InputError`` or a ``RunError`` stays as it is.
+    Its line has the name (such as ``delay.obs: law rush:BusyHour``), the error, and the
+    file and line of the component. An ``InputError`` or a ``RunError`` stays as it is.
     """
     try:
         yield

@@ -46,11 +46,7 @@ class Registry(Generic[T]):
         return add
 
     def get(self, name: Any, key: str) -> T:
-        """The component of a name or path.
-
-        Args:
-            name: registered, or ``package.module:Name``.
-            key: of the setting, for errors.
+        """The component of a name or path; ``key`` is that of the setting, for errors.
 
         Raises:
             InputError: there is none.
@@ -66,15 +62,7 @@ class Registry(Generic[T]):
         return component
 
     def read(self, written: Any, key: str, entry: str) -> tuple[str, T, dict[str, Any]]:
-        """Read ``{entry: package.module:name, parameter: value, ...}``.
-
-        Args:
-            written: what the configuration says.
-            key: of the setting, for errors.
-            entry: key under which the component stands.
-
-        Returns:
-            The name or path of the component, the component, and the parameters.
+        """Read ``{entry: package.module:name, parameter: value, ...}``: name or path, component, parameters.
 
         Raises:
             InputError: it is no such mapping, or there is no such component.
@@ -109,11 +97,7 @@ def name_of(parameters: dict[str, Any], default: str, key: str) -> str:
 
 
 def require_parentheses(first: Any, written: str) -> None:
-    """Refuse a decorator without parentheses, which gets the function as its first argument.
-
-    Raises:
-        InputError: it did.
-    """
+    """Refuse a decorator without parentheses, which gets the function as its first argument."""
     if inspect.isfunction(first):
         raise InputError(f"{first.__name__}: write {written} above it, with parentheses")
 
@@ -121,11 +105,7 @@ def require_parentheses(first: Any, written: str) -> None:
 def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str) -> None:
     """Require that the given parameters are keyword-only arguments of a function, and that none is missing.
 
-    Args:
-        function: the function of a component.
-        given: parameters by name.
-        path: name or path of the component, for errors.
-        key: of the setting, for errors.
+    ``path`` is the name or path of the component, and ``key`` that of the setting, for errors.
 
     Raises:
         InputError: the function has no such parameter, or one without a default is not given.

@@ -12,8 +12,6 @@ from typing import Any, NamedTuple
 
 from damian.common.errors import InputError
 
-MAX_BYTES = 50_000_000
-"""Size limit [bytes]; larger files are refused without reading them."""
 MAX_LINE = 1000
 """Characters of an error; the middle of a longer one is left out."""
 
@@ -22,13 +20,11 @@ def read_text(file: Path) -> str:
     """Read a whole UTF-8 file as text, with or without a byte order mark.
 
     Raises:
-        InputError: the file is missing, unreadable, too large, empty or not UTF-8.
+        InputError: the file is missing, unreadable, empty or not UTF-8.
     """
     if not file.is_file():  # reading a pipe would wait for ever
         raise InputError("is not a file" if file.exists() else "no such file")
     try:
-        if (size := file.stat().st_size) > MAX_BYTES:
-            raise InputError(f"{size} bytes are more than the {MAX_BYTES} that are read")
         text = file.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"byte {error.start} is not UTF-8 text") from None
@@ -36,8 +32,6 @@ def read_text(file: Path) -> str:
         raise InputError(f"cannot be read: {error.strerror}") from None
     if not text.strip():
         raise InputError("is empty")
-    if "\0" in text:
-        raise InputError(f"line {text[: text.index(chr(0))].count(chr(10)) + 1}: a NUL byte is not text")
     return text
 
 
@@ -64,9 +58,7 @@ def parse_table(text: str, columns: Iterable[str]) -> list[Row]:
     if missing := [column for column in columns if column not in header]:
         raise InputError(f"line {first}: no column {', '.join(missing)}; {near(missing[0], header)}")
     if doubled := [column for column in header if column and header.count(column) > 1]:
-        raise InputError(
-            f"line {first}: the column {show(doubled[0])} appears {header.count(doubled[0])} times"
-        )
+        raise InputError(f"line {first}: the column {show(doubled[0])} appears twice")
     for number, cells in lines:
         if len(cells) != len(header):
             raise InputError(f"line {number}: {len(cells)} values for {len(header)} columns")
@@ -83,10 +75,7 @@ def named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def one_line(text: str) -> str:
-    """Remove line breaks, escape what a terminal would not print, and leave out the middle of a long text.
-
-    Control characters and lone surrogates, which JSON may hold, are escaped as Python would.
-    """
+    """Remove line breaks, escape what a terminal would not print, and leave out the middle of a long text."""
     line = " ".join(text.split())
     if len(line) > MAX_LINE:
         line = f"{line[: MAX_LINE // 2]} ... {line[-MAX_LINE // 3 :]}"

@@ -92,7 +92,7 @@ def custom_term(written: Any, key: str) -> CustomTerm:
     for read in term.reads:
         FEATURES.get(read, f"{key}.term: reads of {path}")
     weight = parameters.pop("weight", 1.0)
-    checks.weight(f"{key}.weight", weight)
+    checks.in_range(f"{key}.weight", weight, -1e6, 1e6)
     name = name_of(parameters, path.rpartition(":")[2], key)
     check_parameters(term.compute, parameters, path, key)
     return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)

@@ -1,20 +1,19 @@
 """How a setting is declared: its default, meaning, bounds and choices stand in one place, its field.
 
-Every dataclass of settings derives from ``Settings``, which checks all of its fields when it is made. Checks
-between two settings stand in ``__post_init__`` of the dataclass that has both. Nothing here imports torch, so
-that a misspelt setting and a question for help are answered at once.
+Every dataclass of settings derives from ``Settings``, which checks its fields when it is made; a class checks
+in ``__post_init__`` only what its settings exclude in each other. Nothing here imports torch.
 """
 
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import UnionType
-from typing import Any, ClassVar, TypeGuard, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, TypeGuard, Union, get_args, get_origin, get_type_hints
 
 from damian.common import checks
-from damian.common.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -22,52 +21,44 @@ class Rule:
     """What a field declares beside its type and default."""
 
     meaning: str = ""
+    """One sentence, which ends with the unit in brackets if there is one: ``Longest flight [m].``"""
     low: float | None = None
     """Smallest value."""
     high: float | None = None
     """Largest value; that of the unit (``checks.LARGEST``) if not given."""
     above: float | None = None
     """The value must be greater than this."""
-    unit: str = ""
-    choices: Sequence[Any] = ()
+    choices: tuple[Any, ...] = ()
     """Allowed values; with ``paths`` also components of the user's own, ``package.module:Name``."""
     paths: bool = False
     kinds: tuple[str, ...] = ()
     """Kinds of the section that read this setting; all of them if empty. Another kind does not have it."""
     fixed: bool = False
     """A constant: no key of the command line or of a file, but Python programs may set it."""
+    unit: str = ""
+    """Unit, such as ``m/s``; that at the end of the meaning if not given."""
 
 
-def setting(
-    default: Any,
-    meaning: str = "",
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    above: float | None = None,
-    unit: str = "",
-    choices: Sequence[Any] = (),
-    paths: bool = False,
-    kinds: tuple[str, ...] = (),
-    fixed: bool = False,
-) -> Any:
-    """A field of a dataclass of settings; the arguments are those of ``Rule``.
+def setting(default: Any, meaning: str = "", **rule: Any) -> Any:
+    """A field of a dataclass of settings.
 
     Args:
-        default: the default value; a list or dataclass is copied for every instance.
-        meaning: what the setting does, with its unit, for ``--help`` and the documentation.
+        default: a list, mapping or dataclass is copied for every instance.
+        meaning: as of ``Rule``, for ``--help`` and the documentation.
+        rule: the other fields of ``Rule``.
     """
-    rule = Rule(meaning, low, high, above, unit, choices, paths, kinds, fixed)
+    unit = re.search(r"\[([^\[\]]+)\]\.$", meaning)
+    metadata = {"rule": Rule(meaning, **{"unit": unit[1] if unit else "", **rule})}
     if isinstance(default, type):
-        return field(default_factory=default, metadata={"rule": rule})
+        return field(default_factory=default, metadata=metadata)
     if isinstance(default, list | dict):
-        return field(default_factory=lambda: type(default)(default), metadata={"rule": rule})
-    return field(default=default, metadata={"rule": rule})
+        return field(default_factory=lambda: type(default)(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
-def constant(default: Any, reason: str, **bounds: Any) -> Any:
+def constant(default: Any, reason: str, **rule: Any) -> Any:
     """A field that is no key: a Python program may set it, but nobody needs to, for the reason given."""
-    return setting(default, reason, fixed=True, **bounds)
+    return setting(default, reason, fixed=True, **rule)
 
 
 @dataclass
@@ -80,11 +71,10 @@ class Settings:
     def __post_init__(self) -> None:
         hints = _hints(type(self))
         for name, rule in rules(type(self)).items():
-            key = f"{self.section}.{name}".lstrip(".")
-            value = _converted(key, getattr(self, name), hints[name])
+            value = _converted(self.key(name), getattr(self, name), hints[name])
             setattr(self, name, value)
             if value is not None:
-                _check_value(key, value, rule, _base(hints[name]))
+                _check_value(self.key(name), value, rule, _base(hints[name]))
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings alone, because what other modules have read from them may not be copied."""
@@ -95,19 +85,30 @@ class Settings:
         """The kind of this section, which decides what of it is read; empty if there is none."""
         return str(getattr(self, "kind", ""))
 
+    def key(self, name: str) -> str:
+        """The key of a field on the command line."""
+        return f"{self.section}.{name}".lstrip(".")
+
+    def refuse(self, wrong: Any, name: str, problem: str) -> None:
+        """Refuse a setting, or one of a section such as ``observation.own``, in a case that is wrong.
+
+        Raises:
+            InputError: it is; the line has the key, the value and the problem.
+        """
+        if wrong:
+            value = functools.reduce(getattr, name.split("."), self)
+            checks.require(False, self.key(name), "it" if value in (None, "", [], {}) else value, problem)
+
     def refuse_unread(self) -> None:
         """Refuse settings that only other kinds of this section read, if they were changed.
 
         A kind of the user's own, ``package.module:Name``, may read any of them.
         """
-        kind = self.variant
-        if ":" in kind:
-            return
         for each in dataclasses.fields(self):
-            kinds, value = rules(type(self))[each.name].kinds, getattr(self, each.name)
-            problem = f"means nothing with {self.section}={kind}: only {' or '.join(kinds)} reads it"
-            read = not kinds or kind in kinds or value == default_of(each)
-            checks.require(read, f"{self.section}.{each.name}", value, problem)
+            kinds = rules(type(self))[each.name].kinds
+            read = not kinds or self.variant in kinds or ":" in self.variant
+            problem = f"means nothing with {self.section}={self.variant}: only {' or '.join(kinds)} reads it"
+            self.refuse(not read and getattr(self, each.name) != default_of(each), each.name, problem)
 
 
 def default_of(each: "dataclasses.Field[Any]") -> Any:
@@ -151,15 +152,10 @@ def _base(hint: Any) -> Any:
 
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text", list: "a list"}
-_KINDS |= {dict: "a mapping such as {name: value}"}
 
 
 def _converted(key: str, value: Any, hint: Any) -> Any:
-    """A value of the declared type; arrays and numbers of NumPy and torch become plain ones.
-
-    Raises:
-        InputError: the value has another type.
-    """
+    """A value of the declared type; arrays and numbers of NumPy and torch become plain ones."""
     value, kind = plain(value), _base(hint)
     if kind is Any or (value is None and type(None) in get_args(hint)):
         return value
@@ -169,35 +165,29 @@ def _converted(key: str, value: Any, hint: Any) -> Any:
     if origin is str and is_number(value):
         return str(value)  # a time such as 2
     good = isinstance(value, origin) and not (isinstance(value, bool) and origin is not bool)
-    article = _KINDS.get(origin, f"a {getattr(origin, '__name__', origin)}")
-    checks.require(good, key, value, f"is not {article}")
-    if origin is list and inner:
-        return [_converted(key, each, inner[0]) for each in cast(Sequence[Any], value)]
+    checks.require(good, key, value, f"is not {_KINDS.get(origin, f'a {origin.__name__}')}")
+    if isinstance(value, list) and inner:
+        return [_converted(key, each, inner[0]) for each in value]
     return value
 
 
 def _check_value(key: str, value: Any, rule: Rule, kind: Any) -> None:
     """Check one value, or each one of a list, against its rule."""
     if isinstance(value, list) and kind is not Any:
-        inner = next(iter(get_args(kind)), Any)
         for each in value:
-            _check_value(key, each, rule, inner)
+            _check_value(key, each, rule, next(iter(get_args(kind)), Any))
         return
     if rule.choices and not (rule.paths and ":" in str(value)):
         checks.one_of(key, value, rule.choices)
-    if kind in (int, float) and is_number(value):
-        _check_number(key, value, rule)
-
-
-def _check_number(key: str, value: float, rule: Rule) -> None:
-    """Check a number against its bounds, or else the largest number of its unit."""
+    if kind not in (int, float) or not is_number(value):
+        return
     if rule.above is not None:
         checks.above(key, value, rule.above, rule.unit)
-    if rule.low is None and rule.high is None:
-        most = checks.LARGEST.get(rule.unit, checks.HUGE)
-        checks.in_range(key, value, -most, most, rule.unit)
-    else:
-        checks.in_range(key, value, -math.inf if rule.low is None else rule.low, rule.high, rule.unit)
+    low, high = rule.low, rule.high
+    if low is None and high is None:
+        high = checks.LARGEST.get(rule.unit, checks.HUGE)
+        low = -high
+    checks.in_range(key, value, -math.inf if low is None else low, high, rule.unit)
 
 
 def plain(value: Any) -> Any:
@@ -213,19 +203,15 @@ def is_number(value: Any) -> TypeGuard[float]:
 
 
 def check_place(key: str, place: Any) -> None:
-    """Require ``[x, y]`` of two finite numbers [m], or ``{lat: ..., lon: ...}`` in range [deg].
+    """Require a place: ``[x, y]`` in metres, or ``{lat: ..., lon: ...}`` in degrees.
 
     Raises:
-        InputError: it is something else.
+        InputError: it is something else, or out of range.
     """
     if not isinstance(place, Mapping):
-        good = isinstance(place, Sequence) and len(place) == 2 and all(map(is_number, place))
-        checks.require(good, key, place, "is not [x, y] in metres or {lat: ..., lon: ...} in degrees")
         checks.place(key, place)
         return
-    if set(place) != {"lat", "lon"}:
-        raise InputError(
-            f"{key}: {place} is not {{lat: ..., lon: ...}} in degrees, such as {{lat: 53.1, lon: -4.5}}"
-        )
+    good, example = set(place) == {"lat", "lon"}, "{lat: 53.1, lon: -4.5}"
+    checks.require(good, key, place, f"is not {{lat: ..., lon: ...}} in degrees, such as {example}")
     checks.in_range(f"{key}.lat", place["lat"], -90.0, 90.0, "deg")
     checks.in_range(f"{key}.lon", place["lon"], -180.0, 180.0, "deg")

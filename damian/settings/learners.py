@@ -27,9 +27,6 @@ def _not_a_learner(found: Any) -> str | None:
 
 LEARNERS = Registry[type["LearnerConfig"]]("learner", _not_a_learner)
 """Settings of learners, by name; the user's own as ``package.module:Name``."""
-_ENCODER = "does not go with learner=predictive_mappo, whose actor has an encoder of its own"
-_NEEDS = "needs backupdate=true and a message delay (delay.obs): what arrives late is what it predicts"
-_CONSTANT = "needs a constant action delay (delay.act): it predicts what each action leads to, and when"
 
 
 def resolved(path: str) -> Any:
@@ -45,40 +42,25 @@ class ModelConfig(Settings):
     section: ClassVar[str] = "model"
 
     hidden: list[int] = setting([256, 256], "Width of each hidden layer.", low=1, high=16384)
-    activation: str = setting(
-        "tanh", "Activation function: tanh, relu, elu or silu.", choices=("tanh", "relu", "elu", "silu")
-    )
+    activation: str = setting("tanh", "Activation function.", choices=("tanh", "relu", "elu", "silu"))
     rnn: str = setting(
         "none",
-        "none or gru. With gru the actor's last hidden layer is a gated recurrent unit, so that a UAV "
-        "remembers its observations of the episode.",
+        "Recurrence: with gru the actor's last hidden layer remembers its observations of the episode.",
         choices=("none", "gru"),
     )
-    skip: bool = setting(
-        False,
-        "The actor's logits are the network's outputs plus, times a learnt weight, the logarithm of the "
-        "feature that has a probability for each action (``observation.belief=[belief_gain]``). The actor "
-        "begins as one that prefers actions of high probability.",
-    )
+    skip: bool = setting(False, "The actor begins by preferring actions of high ``belief_gain``.")
     shared_value: bool = setting(
-        False,
-        "MAPPO's critic gives one value for all UAVs of a world, from the observations of all of them, "
-        "instead of a value for each UAV. Updates are faster, but it learns less where each UAV has a "
-        "reward of its own, and it ties the critic, not the policy, to the number of UAVs.",
+        False, "MAPPO's critic gives one value for all UAVs of a world; faster, but it learns less."
     )
     init: str = setting(
         "default",
-        "Initial weights: default (PyTorch's), or orthogonal: orthogonal matrices and biases of 0 (Saxe "
-        "et al. 2014), with a gain of sqrt(2) in hidden layers (1 in a recurrent one), of 0.01 at the "
-        "policy's output, so that it begins close to chance, and of 1 at a critic's output.",
+        "Initial weights: PyTorch's (default), or orthogonal matrices and biases of 0 (Saxe et al. 2014).",
         choices=("default", "orthogonal"),
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        problem = "needs at least one layer for model.rnn=gru"
-        checks.require(not self.recurrent or bool(self.hidden), "model.hidden", [], problem)
-        checks.in_range("model.hidden (number of layers)", len(self.hidden), 0, 64)
+        self.refuse(self.recurrent and not self.hidden, "hidden", "needs a layer for model.rnn=gru")
 
     @property
     def recurrent(self) -> bool:
@@ -139,17 +121,11 @@ class LearnerConfig(Settings):
 
     section: ClassVar[str] = "learner"
 
-    name: str = setting(
-        "",
-        "Name of the learner, or the path of its settings' class; the group ``learner`` sets it.",
-    )
+    name: str = setting("", "Name of the learner, or package.module:Name; the group ``learner`` sets it.")
     lr: float = setting(0.0003, "Learning rate of Adam.", above=0, high=1)
     gamma: float = setting(0.95, "Discount factor per step.", low=0, high=1)
     steps: int = setting(
-        32,
-        "Steps per world between two updates, unless ``clock.system`` sets the period.",
-        low=1,
-        high=checks.STEPS,
+        32, "Steps between two updates, if clock.system is not set.", low=1, high=checks.STEPS
     )
 
     reads: ClassVar[tuple[str, ...]] = ()
@@ -161,10 +137,8 @@ class LearnerConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        key, reads = f"{type(self).__name__}.reads", self.reads
-        checks.require(isinstance(reads, tuple | list), key, reads, "is not a tuple such as ('message',)")
-        for name in reads:
-            checks.one_of(key, name, READABLE)
+        for name in self.reads:
+            checks.one_of(f"{type(self).__name__}.reads", name, READABLE)
 
     def check(self, setup: LearningSetup) -> None:
         """Check that this learner can learn in such a run.
@@ -203,29 +177,15 @@ class MappoConfig(LearnerConfig):
     clip_epsilon: float = setting(0.2, "Clipping of the importance ratio.", low=0, high=1)
     entropy_coeff: float = setting(0.01, "Weight of the entropy bonus.", low=0)
     entropy_coeff_end: float | None = setting(
-        None,
-        "If set, the weight of the entropy bonus goes linearly from ``entropy_coeff`` to this, which it "
-        "reaches after ``frames`` environment steps; a run that is resumed with more frames reaches it "
-        "later.",
-        low=0,
+        None, "Weight of the entropy bonus after ``frames`` steps; constant if not given.", low=0
     )
-    critic_coeff: float = constant(
-        0.5, "Weight of the critic's loss. Actor and critic share no weights, so that Adam cancels it.", low=0
-    )
-    max_grad_norm: float = setting(
-        0.5, "The gradient is scaled down to this norm if its norm is larger.", above=0
-    )
+    critic_coeff: float = constant(0.5, "Weight of the critic's loss, which Adam cancels.", low=0)
+    max_grad_norm: float = setting(0.5, "Largest norm of the gradient, which is scaled down.", above=0)
     epochs: int = setting(4, "Passes over the batch per update.", low=1, high=checks.STEPS)
     minibatches: int = setting(4, "Minibatches per pass.", low=1, high=checks.STEPS)
-    normalize_advantage: bool = setting(
-        True,
-        "Whether to scale the advantages of a batch to mean 0 and standard deviation 1.",
-    )
+    normalize_advantage: bool = setting(True, "Scale the advantages of a batch to mean 0 and deviation 1.")
     normalize_value: bool = setting(
-        False,
-        "Whether the critic learns values of mean 0 and standard deviation 1, by running statistics of "
-        "its targets, so that learning does not depend on the scale of the rewards. Advantages that "
-        "``normalize_advantage`` does not scale are then divided by the same standard deviation.",
+        False, "The critic learns values of mean 0 and deviation 1, whatever the scale of the rewards."
     )
 
     learner: ClassVar[str] = "damian.learners.mappo:Mappo"
@@ -236,7 +196,7 @@ class MappoConfig(LearnerConfig):
         checks.in_range("learner.minibatches", self.minibatches, 1, most_minibatches)
         should = f"needs more than {longest} steps (longest delay) per update (learner.steps), not {shortest}"
         checks.require(not setup.settle or longest < shortest, "settle", True, should)
-        should = "does not go with model.rnn: hidden states are not recomputed from corrected observations"
+        should = "does not go with model.rnn: hidden states are not recomputed"
         checks.require(not (recurrent and setup.recompute_actor), "recompute_actor", True, should)
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
@@ -255,30 +215,25 @@ class PredictiveMappoConfig(MappoConfig):
     prediction_batch: int = setting(400, "Environment steps in each of them.", low=1, high=checks.STEPS)
     prediction_lr: float = setting(0.002, "Learning rate of the predictions.", above=0, high=1)
     prediction_buffer: int = setting(
-        32000,
-        "Environment steps, over all worlds, from which predictions are learnt.",
-        low=1,
-        high=checks.STEPS,
+        32000, "Environment steps from which predictions are learnt.", low=1, high=checks.STEPS
     )
-    heads: int = setting(
-        4, "Number of attention heads over the messages that an actor knows.", low=1, high=1024
-    )
+    heads: int = setting(4, "Number of attention heads over the messages.", low=1, high=1024)
     width: int = setting(32, "Size of the embedding of a message.", low=1, high=16384)
 
     learner: ClassVar[str] = "damian.learners.predictive_mappo:PredictiveMappo"
 
     def check(self, setup: LearningSetup) -> None:
         super().check(setup)
-        model = setup.model
-        checks.require(setup.backupdate, "learner", "predictive_mappo", _NEEDS)
-        checks.require(setup.action_delay is not None, "learner", "predictive_mappo", _CONSTANT)
-        for key, value, good in (
-            ("model.rnn", model.rnn, not model.recurrent),
-            ("model.skip", model.skip, not model.skip),
-            ("model.hidden", model.hidden, bool(model.hidden)),
-            ("recompute_actor", setup.recompute_actor, not setup.recompute_actor),
-        ):
-            checks.require(good, key, value, _ENCODER)
+        model, constant_delay = setup.model, setup.action_delay is not None
+        should = "needs backupdate=true and a message delay (delay.obs): it predicts what arrives late"
+        checks.require(setup.backupdate, "learner", self.name, should)
+        should = "needs a constant action delay (delay.act): it predicts when actions take effect"
+        checks.require(constant_delay, "learner", self.name, should)
+        should = "does not go with learner=predictive_mappo, whose actor has an encoder of its own"
+        checks.require(not model.recurrent, "model.rnn", model.rnn, should)
+        checks.require(not model.skip, "model.skip", True, should)
+        checks.require(bool(model.hidden), "model.hidden", [], should)
+        checks.require(not setup.recompute_actor, "recompute_actor", True, should)
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         least = super().buffer_size(setup)
@@ -295,54 +250,22 @@ class SacConfig(LearnerConfig):
     """Soft actor-critic (Haarnoja et al. 2018; discrete: Christodoulou 2019) with one shared policy."""
 
     name: str = "sac"
-    lr: float = setting(
-        0.001,
-        "Learning rate of Adam.",
-    )
-    steps: int = setting(
-        4,
-        "Steps per world between two rounds of updates, unless ``clock.system`` sets the period.",
-    )
-    alpha_lr: float = setting(
-        0.01,
-        "Learning rate of the temperature's logarithm; high, since the temperature must first find the "
-        "scale of the rewards.",
-        above=0,
-        high=1,
-    )
+    lr: float = 0.001
+    steps: int = 4
+    alpha_lr: float = setting(0.01, "Learning rate of the temperature's logarithm.", above=0, high=1)
     alpha_init: float = setting(0.01, "Initial temperature (weight of the entropy).", above=0)
-    tau: float = setting(
-        0.01,
-        "Share by which the target networks move towards the trained networks in each update.",
-        above=0,
-        high=1,
-    )
+    tau: float = setting(0.01, "Share by which the target networks follow in each update.", above=0, high=1)
     target_entropy: float = setting(
-        0.5,
-        "Target entropy for discrete actions, as a share of the entropy of a uniform choice among the "
-        "UAV's legal actions. For continuous actions it is minus the number of their dimensions, on [-1, "
-        "1].",
-        low=0,
-        high=1,
+        0.5, "Target entropy of discrete actions, as a share of that of a uniform choice.", low=0, high=1
     )
     n_steps: int = setting(
-        1,
-        "Number of decisions over which rewards are summed before a value is estimated (n-step returns).",
-        low=1,
-        high=checks.STEPS,
+        1, "Decisions whose rewards are summed (n-step returns).", low=1, high=checks.STEPS
     )
     updates: int = setting(4, "Updates per round.", low=1, high=checks.STEPS)
     batch_size: int = setting(512, "Decisions per update.", low=1, high=checks.STEPS)
-    buffer_steps: int = setting(
-        200000, "Capacity of the replay buffer [environment steps over all worlds].", low=1
-    )
-    warm_up: int = setting(5000, "Environment steps, over all worlds, before learning begins.", low=0)
-    normalize_reward: bool = setting(
-        False,
-        "Whether to divide rewards by the running root mean square of the discounted returns, so that "
-        "learning does not depend on their scale. The temperature is then the weight of the entropy "
-        "against such rewards.",
-    )
+    buffer_steps: int = setting(200000, "Environment steps in the replay buffer.", low=1)
+    warm_up: int = setting(5000, "Environment steps before learning begins.", low=0)
+    normalize_reward: bool = setting(False, "Divide rewards by the root mean square of the returns so far.")
 
     learner: ClassVar[str] = "damian.learners.sac:Sac"
 
@@ -351,11 +274,9 @@ class SacConfig(LearnerConfig):
         checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_steps)
 
     def check(self, setup: LearningSetup) -> None:
-        should = "is for learner=mappo only: SAC learns from single decisions, without the steps before them"
+        should = "is for learner=mappo only"
         checks.require(not setup.model.recurrent, "model.rnn", setup.model.rnn, should)
-        should = "is for learner=mappo only: SAC's critics value the actions of a single UAV"
         checks.require(not setup.model.shared_value, "model.shared_value", True, should)
-        should = "is for learner=mappo only: SAC has no importance ratios"
         checks.require(not setup.recompute_actor, "recompute_actor", True, should)
         checks.in_range("learner.buffer_steps", self.buffer_steps, setup.least_buffer, unit="steps")
         checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")

@@ -5,30 +5,24 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.common.errors import InputError
 from damian.settings.fields import Settings, setting
 from damian.settings.training import TrainConfig
 
 MISSING: Any = "???"
 """Hydra's and OmegaConf's mark of a value that must be given."""
 
-TRUE_SCORES = ("return", "success_rate", "steps")
-"""Measures of an evaluation from messages without delay."""
 PERCEIVED_SCORES = ("perceived_return", "perceived_success_rate", "perceived_steps")
-"""The same measures as the server perceived them."""
-SCORES = (*TRUE_SCORES, *PERCEIVED_SCORES)
-"""Measures by which arms can be compared."""
+"""Measures of an evaluation, as the server perceived them."""
+SCORES = ("return", "success_rate", "steps", *PERCEIVED_SCORES)
+"""Measures by which arms can be compared; the first ones are from messages without delay."""
 LESS_IS_BETTER = ("steps", "perceived_steps")
 """Scores for which lower values are better."""
 STORED = ("sampled", "deterministic")
 """Policies of a checkpoint: its actions are drawn, or the most likely ones."""
-KEPT = ("all", "extremes")
 FORMATS = ("gif", "mp4", "png", "html", "geojson")
 FILMS = FORMATS[:2]
-VIEWS = ("2d", "3d")
 MOST_EPISODES = 12
 """Episodes that one page can play side by side."""
-LAUNCHERS = ("local", "slurm")
 _HIDDEN = {"hidden": {"choices": [[64, 64], [128, 128], [256, 256]]}}
 _GAMMA = {"choices": [0.8, 0.9, 0.95, 0.98, 0.99]}
 _MAPPO = {
@@ -68,6 +62,8 @@ TAKEN = ("none", "random", "script")
 """Names of an undelayed arm's delay and of the policies that fly beside each arm."""
 SET_BY_COMPARISON = ("seed", "resume", "checkpoint", "logger", "hydra")
 """Keys that a comparison sets for each of its runs."""
+SCORE_MEANS = "The measure that counts, of what truly happened, or as the server perceived it."
+POLICY_MEANS = "The evaluated policy: actions drawn (sampled), or the most likely ones (deterministic)."
 
 
 @dataclass
@@ -81,16 +77,14 @@ class FlownPolicyConfig(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.resume is not None:
-            raise InputError("resume: nothing is trained; give the run folder as checkpoint")
-        if self.policy is None:
-            return
-        checks.one_of("policy", self.policy, self.policies)
-        stored = "|".join(name for name in self.policies if name in STORED)
-        problem = f"flies no checkpoint: choose policy={stored}, or leave out checkpoint"
-        checks.require(self.learnt or not self.checkpoint, "policy", self.policy, problem)
+        problem = "is for damian train: nothing is trained here; give the run folder as checkpoint"
+        self.refuse(self.resume is not None, "resume", problem)
+        if self.policy is not None:
+            checks.one_of("policy", self.policy, self.policies)
         problem = "needs checkpoint: the run folder with the policy to fly"
-        checks.require(bool(self.checkpoint) or not self.learnt, "policy", self.policy, problem)
+        self.refuse(self.learnt and not self.checkpoint, "policy", problem)
+        problem = "flies no checkpoint: leave it out"
+        self.refuse(self.policy and self.checkpoint and not self.learnt, "policy", problem)
 
     @property
     def flown(self) -> str:
@@ -107,118 +101,61 @@ class FlownPolicyConfig(TrainConfig):
 class FlyConfig(FlownPolicyConfig):
     """All settings of ``damian fly``: those of ``damian train``, and what to fly and to keep."""
 
-    eval_episodes: int = setting(
-        1,
-        "Episodes to fly.",
-    )
+    eval_episodes: int = setting(1, "Episodes to fly.")
     policy: str | None = setting(
-        None,
-        "The policy of ``checkpoint``: ``sampled`` actions, or its most likely ones (``deterministic``); the "
-        "``script``; or ``random``. If it is not given: ``sampled`` with a checkpoint, ``script`` without.",
+        None, "sampled (default with a checkpoint), deterministic, script (default without), or random."
     )
-    keep: str = setting(
-        "all",
-        "Which episodes to keep: ``all``, or the ``extremes``: the best, the median and the worst by return.",
-        choices=KEPT,
-    )
+    keep: str = setting("all", "Episodes to keep: all, or best, median, worst.", choices=("all", "extremes"))
     formats: list[str] = setting(
         ["gif", "png"],
-        "What to make of each: films as ``gif`` or ``mp4`` (which needs ffmpeg), the figure ``png``, "
-        "``html``, a page that plays it in any browser, and ``geojson`` for map tools, over a real "
-        "region.",
+        "What to make of each: films (gif, mp4), a figure (png), a page (html), or geojson for map tools.",
         choices=FORMATS,
     )
-    views: list[str] = setting(
-        ["2d"],
-        "Views of the films: ``2d``, from above, and ``3d``, with the space above the region.",
-        choices=VIEWS,
-    )
+    views: list[str] = setting(["2d"], "Views of the films: from above, or in space.", choices=("2d", "3d"))
     journal: str | None = setting(
-        None,
-        "Journal of ``damian advise`` whose flight to show, instead of flying; its settings apply too.",
+        None, "Journal of ``damian advise`` whose flight to show, instead of flying; its settings apply."
     )
     span: list[float] | None = setting(
-        None,
-        "First and last time of the journal to show, since every UAV had reported [s]; all if not given.",
+        None, "First and last time of the journal to show, since every UAV had reported [s]."
     )
-    replay: list[str] = setting(
-        [],
-        "Files of stored episodes to play side by side in one page, instead of flying.",
-    )
+    replay: list[str] = setting([], "Stored episodes to play side by side in one page, instead of flying.")
 
     policies: ClassVar[tuple[str, ...]] = ("sampled", "deterministic", "script", "random")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        sources = [name for name in ("journal", "replay") if getattr(self, name)]
-        problem = "does not go with journal: leave one out"
-        checks.require(len(sources) < 2, "replay", self.replay, problem)
-        for source in sources:
-            for key, none in (("checkpoint", None), ("policy", None), ("eval_episodes", 1), ("keep", "all")):
-                given, problem = getattr(self, key), f"means nothing with {source}, which flies nothing"
-                checks.require(given == none, key, given, problem)
-        if self.replay:
-            checks.in_range("replay", len(self.replay), 1, MOST_EPISODES, "episodes")
+        self.refuse(self.journal and self.replay, "replay", "does not go with journal: leave one out")
+        if self.journal or self.replay:
+            flies = {"checkpoint": None, "policy": None, "eval_episodes": 1, "keep": "all"}
+            for name, none in flies.items():
+                wrong = getattr(self, name) != none
+                self.refuse(wrong, name, "means nothing with journal or replay, which fly nothing")
+        problem = f"is more than {MOST_EPISODES} episodes"
+        self.refuse(len(self.replay) > MOST_EPISODES, "replay", problem)
         if self.span is not None:
-            good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal is not None
-            checks.require(good, "span", self.span, "is not [FIRST, LAST], two times of a journal [s]")
-        films = [kind for kind in self.formats if kind in FILMS]
-        problem = f"names no view for the films that formats={films} asks for: choose 2d or 3d"
-        checks.require(bool(self.views) or not films, "views", [], problem)
+            good = len(self.span) == 2 and 0 <= self.span[0] < self.span[1] and self.journal
+            self.refuse(not good, "span", "is not [FIRST, LAST], two times of a journal [s]")
+        films = {*self.formats} & {*FILMS}
+        self.refuse(films and not self.views, "views", "names no view for the films: choose 2d or 3d")
 
 
 @dataclass
 class AdviseConfig(FlownPolicyConfig):
     """All settings of ``damian advise``: those of ``damian train``, and where reports come from."""
 
-    policy: str | None = setting(
-        None,
-        "The policy of ``checkpoint``: its most likely actions (``deterministic``), or ``sampled`` ones; or "
-        "the ``script``. If it is not given: ``deterministic`` with a checkpoint, ``script`` without.",
-    )
-    reports: str | None = setting(
-        None,
-        "Table of reports to answer once, CSV or JSON.",
-    )
-    folder: str | None = setting(
-        None,
-        "Folder to watch for tables of reports; each is answered in ``advice.csv`` and ``advice.json`` "
-        "there.",
-    )
+    policy: str | None = setting(None, "deterministic (default with checkpoint), sampled, or script.")
+    reports: str | None = setting(None, "Table of reports to answer once, CSV or JSON.")
+    folder: str | None = setting(None, "Folder in which each table of reports is answered.")
     port: int | None = setting(None, "Port of the service over HTTP; 0: a free one.", low=0, high=65535)
     fit: str | None = setting(
-        None,
-        "Journal, or table of reports with the column receive time: nothing is advised, and a trace law of "
-        "its delays is written into the run folder as ``trace.csv``.",
+        None, "Journal, or table with receive times: only write its delays as a trace, ``trace.csv``."
     )
-    fit_dt: float | None = setting(
-        None,
-        "Length of a step, with ``fit``: delays of the trace are whole steps, as the journal counts them; "
-        "without it they are times, which a simulation rounds up to whole steps.",
-        above=0.0,
-        unit="s",
-    )
-    host: str = setting(
-        "127.0.0.1",
-        "Address that the service listens to: by default only programs of this machine reach it.",
-    )
+    host: str = setting("127.0.0.1", "Address of the service; other machines do not reach the default one.")
     token: str | None = setting(
-        None,
-        "Password of the service over HTTP; if not given, that of the environment variable "
-        "``DAMIAN_TOKEN``, or one that is made and printed. No file of the run folder keeps it.",
+        None, "Password of the service; DAMIAN_TOKEN of the environment, or made and printed, if not given."
     )
-    uavs: list[str] = setting(
-        [],
-        "IDs of the UAVs of a table or a folder; those of the table, in their order, if not given.",
-    )
-    journal: str | None = setting(
-        None,
-        "Folder of the journals, which are restored from it at the start; in the run folder if not given.",
-    )
-    durable: bool = setting(
-        False,
-        "Make every line of a journal last even if the machine stops; it takes milliseconds.",
-    )
+    uavs: list[str] = setting([], "IDs of the UAVs of a table or a folder; those of the table if not given.")
+    journal: str | None = setting(None, "Folder of the journals; in the run folder if not given.")
 
     policies: ClassVar[tuple[str, ...]] = ("deterministic", "sampled", "script")
 
@@ -233,22 +170,15 @@ class AdviseConfig(FlownPolicyConfig):
             InputError: there is none, or more than one, or a journal is named that nothing would write.
         """
         given = [name for name in ("reports", "folder", "port", "fit") if getattr(self, name) is not None]
-        if len(given) != 1:
-            problem = f"{' and '.join(given)} are given" if given else "is missing"
-            raise InputError(
-                f"reports: {problem}: give one of reports=FILE, folder=FOLDER, port=NUMBER, fit=FILE"
-            )
-        if self.reports is not None or self.fit is not None:
-            for name in ("journal", "durable"):
-                problem = "is for a service or a folder, which alone have a journal: leave it out"
-                checks.require(not getattr(self, name), name, getattr(self, name), problem)
+        problem = "is not the only one of reports=FILE, folder=FOLDER, port=NUMBER, fit=FILE: give one"
+        checks.require(len(given) == 1, "reports", " and ".join(given) or "nothing", problem)
+        unread = self.journal and given[0] in ("reports", "fit")
+        self.refuse(unread, "journal", "is for a service or a folder: leave it out")
 
 
 def check_token(key: str, token: str | None) -> None:
     """Require a password that nobody guesses and every header can carry, if there is one."""
-    good = token is None or (
-        len(token) >= 16 and token.isascii() and token.isprintable() and " " not in token
-    )
+    good = token is None or (len(token) >= 16 and token.isascii() and token.isprintable())
     checks.require(good, key, "it", "is not a password of at least 16 printable ASCII characters")
 
 
@@ -257,43 +187,21 @@ class TuneConfig(TrainConfig):
     """All settings of ``damian tune``: those of ``damian train``, and how to search."""
 
     search: dict[str, Any] = setting(
-        {},
-        "What to vary: settings of ``damian train``, each as ``{low: 1, high: 8}``, with ``log: true`` or "
-        "``step``, or as ``{choices: [...]}``; conf/search has a file for each learner.",
+        {}, "What to vary, each setting as {low: 1, high: 8, log: true, step: 1} or {choices: [...]}."
     )
     trials: int = setting(30, "Number of trainings, pruned ones included.", low=1, high=1_000_000)
-    processes: int = setting(
-        1,
-        "Number of trainings at the same time; each has one thread unless ``threads`` says otherwise.",
-        low=1,
-        high=1024,
-    )
-    prune: bool = setting(
-        True,
-        "Whether to stop trainings that are worse than the median.",
-    )
-    score: str = setting(
-        "return",
-        "The measure of the evaluation that is to be best (least, if it counts steps): return, "
-        "success_rate or steps, of what truly happened; perceived_return, perceived_success_rate or "
-        "steps, as the server perceived it.",
-        choices=SCORES,
-    )
-    policy: str = setting(
-        "sampled",
-        "The policy that is evaluated: actions ``sampled`` from it, or the most likely ones "
-        "(``deterministic``).",
-        choices=("sampled", "deterministic"),
-    )
+    processes: int = setting(1, "Trainings at the same time, of one thread each.", low=1, high=1024)
+    prune: bool = setting(True, "Whether to stop trainings that are worse than the median.")
+    score: str = setting("return", SCORE_MEANS, choices=SCORES)
+    policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        succeeds = self.episode.success_share is not None or "success" not in self.score
-        problem = "is the same for every policy: in this task nothing can be reached; choose return"
-        checks.require(succeeds, "score", self.score, problem)
-        for key in ("checkpoint", "resume"):
+        alike = self.episode.success_share is None and "success" in self.score
+        self.refuse(alike, "score", "is the same for every policy: in this task nothing can be reached")
+        for name in ("checkpoint", "resume"):
             problem = "is not for a search, which trains every policy from the beginning: leave it out"
-            checks.require(getattr(self, key) is None, key, getattr(self, key), problem)
+            self.refuse(getattr(self, name) is not None, name, problem)
 
     @property
     def sign(self) -> int:
@@ -305,39 +213,16 @@ class TuneConfig(TrainConfig):
 class Arm(Settings):
     """One way to train policies for a task, or to fly those of another arm."""
 
-    overrides: list[str] = setting(
-        [],
-        "Overrides of the settings of ``damian train``.",
-    )
-    delayed: bool = setting(
-        True,
-        "Whether the arm has delays. Exactly one arm has none: the reference, run once for each task.",
-    )
-    naive: bool = setting(
-        False,
-        "Whether the arm ignores the delay; recovery 0 is the score of the best such arm.",
-    )
-    policy_of: str | None = setting(
-        None,
-        "Arm whose policies this one flies, without any training of its own; None: this arm trains.",
-    )
-    untrained: bool = setting(
-        False,
-        "Whether the networks fly as they are before the first update, with their prior; nothing is trained.",
-    )
-    oracle: bool = setting(
-        False,
-        "Whether the script flies with ever more known on time (``damian oracle``), and nothing is trained.",
-    )
-    tasks: list[str] | None = setting(
-        None,
-        "Tasks of the experiment that the arm does; all of them if not given.",
-    )
+    overrides: list[str] = setting([], "Overrides of the settings of ``damian train``.")
+    delayed: bool = setting(True, "Whether it has delays; exactly one arm, the reference, has none.")
+    naive: bool = setting(False, "Whether it ignores the delay; the best such arm has recovery 0.")
+    policy_of: str | None = setting(None, "Arm whose policies it flies, without any training of its own.")
+    untrained: bool = setting(False, "Whether the networks fly as they are before the first update.")
+    oracle: bool = setting(False, "Whether the script flies with ever more known on time (damian oracle).")
+    tasks: list[str] | None = setting(None, "Tasks that the arm does; all of them if not given.")
     regime: str = setting(
         "",
-        "Information that the arm uses: R0: messages that have arrived; R1: the truth, for the critic; "
-        "R2: no delay in training; R3: no delay at all. If it is not given, ``delayed`` and ``policy_of`` "
-        "decide.",
+        "Information in training: R0 messages, R1 truth for the critic, R2 no delay; R3: never any delay.",
         choices=("", "R0", "R1", "R2", "R3"),
     )
 
@@ -346,15 +231,8 @@ class Arm(Settings):
 class HeldOut(Settings):
     """Changes of a task under which the policies that were trained without them are evaluated too."""
 
-    overrides: list[str] = setting(
-        [],
-        "Overrides of ``damian train``, such as another region or number of UAVs.",
-    )
-    tasks: list[str] | None = setting(
-        None,
-        "Tasks of the experiment to change; all of them if not given. In a task whose features depend on "
-        "the number of UAVs, a policy can fly only as many as it was trained with.",
-    )
+    overrides: list[str] = setting([], "Overrides of ``damian train``, such as another region.")
+    tasks: list[str] | None = setting(None, "Tasks to change; all of them if not given.")
 
 
 @dataclass
@@ -363,31 +241,13 @@ class Experiment(Settings):
 
     section: ClassVar[str] = "experiment"
 
-    tasks: dict[str, list[str]] = setting(
-        {},
-        "Overrides of ``damian train`` for each task.",
-    )
-    delays: dict[str, list[str]] = setting(
-        {},
-        "Overrides of ``damian train`` for each delay.",
-    )
-    arms: dict[str, Arm] = setting(
-        {},
-        "One of them, the reference, has ``delayed: false``.",
-    )
-    held_out: dict[str, HeldOut] = setting(
-        {},
-        "Changed tasks to evaluate all policies in; in the tables they are called TASK@NAME.",
-    )
+    tasks: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each task.")
+    delays: dict[str, list[str]] = setting({}, "Overrides of ``damian train`` for each delay.")
+    arms: dict[str, Arm] = setting({}, "Ways to train or fly; one of them has ``delayed: false``.")
+    held_out: dict[str, HeldOut] = setting({}, "Changed tasks, TASK@NAME, to evaluate all policies in.")
     first_seed: int = setting(0, "The seeds of every arm count from this one.", low=0)
-    best: dict[str, float] = setting(
-        {},
-        "Best possible value of a measure: a dashed line in its learning curves.",
-    )
-    panels: dict[str, list[str]] = setting(
-        {},
-        "Arms of each column of figure.png, which then shows scores over delays, by its title.",
-    )
+    best: dict[str, float] = setting({}, "Best possible value of a measure, drawn in its learning curves.")
+    panels: dict[str, list[str]] = setting({}, "Arms of each column of figure.png, by its title.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -397,10 +257,9 @@ class Experiment(Settings):
                 should = "cannot name a folder: use letters, digits, _ . - but not none, random or script"
                 checks.require(bool(good), f"experiment.{kind}", name, should)
         for kind in ("tasks", "arms"):
-            if not getattr(self, kind):
-                raise InputError(
-                    f"experiment.{kind}: it is missing or empty; an experiment needs at least one"
-                )
+            self.refuse(
+                not getattr(self, kind), kind, "is missing or empty; an experiment needs at least one"
+            )
         self._check_arms()
         for name, held_out in self.held_out.items():
             for task in held_out.tasks or ():
@@ -415,21 +274,18 @@ class Experiment(Settings):
         undelayed = [name for name, arm in self.arms.items() if not arm.delayed]
         should = "are not delayed: exactly one arm must have delayed=false"
         checks.require(len(undelayed) == 1, "experiment.arms", undelayed, should)
-        never = [name for name, arm in self.arms.items() if arm.delayed and not self.delays]
-        should = "run under no delay: name some under experiment.delays, or leave these arms out"
-        checks.require(not never, "experiment.arms", never, should)
+        never = not self.delays and len(self.arms) > len(undelayed)
+        self.refuse(never, "delays", "is empty, but there are delayed arms")
         for name, arm in self.arms.items():
-            should = "trains nothing: it has no policy_of and no oracle, and delayed is not false"
-            alone = arm.delayed and arm.policy_of is None and not arm.oracle
-            checks.require(alone or not arm.untrained, f"experiment.arms.{name}", "untrained", should)
-            if arm.oracle:
-                should = "flies the script under delay: it has no policy_of, and delayed is not false"
-                good = arm.policy_of is None and arm.delayed
-                checks.require(good, f"experiment.arms.{name}", "oracle", should)
+            key, flies_others = f"experiment.arms.{name}", arm.policy_of is not None
+            should = "goes with neither policy_of nor delayed=false"
+            checks.require((arm.delayed and not flies_others) or not arm.oracle, key, "oracle", should)
+            good = (arm.delayed and not flies_others and not arm.oracle) or not arm.untrained
+            checks.require(good, key, "untrained", f"{should} nor oracle")
             source = self.arms.get(arm.policy_of or "", arm)
             for task in self.tasks if arm.tasks is None else arm.tasks:
                 options = self.tasks if source.tasks is None else source.tasks
-                checks.one_of(f"experiment.arms.{name}.tasks", task, options)
+                checks.one_of(f"{key}.tasks", task, options)
 
 
 @dataclass
@@ -438,68 +294,31 @@ class CompareConfig(Settings):
 
     experiment: Experiment = MISSING
     seeds: int | None = setting(
-        None,
-        "Number of seeds, counted from ``experiment.first_seed``. If it is not given: 10, and with "
-        "``report_only`` as many as are stored.",
-        low=1,
-        high=10_000,
+        None, "Number of seeds; if not given 10, or with ``report_only`` all stored ones.", low=1, high=10_000
     )
-    processes: int = setting(
-        1,
-        "Number of runs at the same time; each has one thread unless ``overrides`` sets ``threads``.",
-        low=1,
-        high=1024,
-    )
+    processes: int = setting(1, "Runs at the same time, of one thread each.", low=1, high=1024)
     launcher: str = setting(
         "local",
-        "Where the runs are carried out: in processes of this machine (``local``), or as Slurm jobs "
-        "(``slurm``). All machines must see the folder of the comparison (docs/scaling.md).",
-        choices=LAUNCHERS,
+        "Where runs are carried out: in processes, or as Slurm jobs (docs/scaling.md).",
+        choices=("local", "slurm"),
     )
     slurm: Any = setting(
-        None,
-        "Parameters of submitit's executor with ``launcher=slurm``, such as ``{slurm_partition: cpu, "
-        "timeout_min: 600}``; ``{cluster: local}`` starts the jobs on this machine.",
+        None, "Parameters of submitit's executor, such as {slurm_partition: cpu, timeout_min: 600}."
     )
-    tasks: list[str] | None = setting(
-        None,
-        "Names of the tasks to run; all of the experiment's if not given.",
-    )
-    delays: list[str] | None = setting(
-        None,
-        "Names of the delays to run; all of the experiment's if not given.",
-    )
-    arms: list[str] | None = setting(
-        None,
-        "Names of the arms to run; all of the experiment's if not given.",
-    )
-    overrides: list[str] = setting(
-        [],
-        "Further overrides of ``damian train`` for every run.",
-    )
-    score: str = setting(
-        "return",
-        "The measure J that J_norm and recovery are computed from: return, success_rate or steps, of what "
-        "truly happened; perceived_return, perceived_success_rate or steps, as the server perceived it.",
-        choices=SCORES,
-    )
-    policy: str = setting(
-        "sampled",
-        "The evaluation that J comes from: actions ``sampled`` from the policy, or the most likely ones "
-        "(``deterministic``).",
-        choices=("sampled", "deterministic"),
-    )
-    report_only: bool = setting(
-        False,
-        "Train and fly nothing; write tables and figures from the finished or the stored results.",
-    )
+    tasks: list[str] | None = setting(None, "Tasks to run; all of the experiment's if not given.")
+    delays: list[str] | None = setting(None, "Delays to run; all of the experiment's if not given.")
+    arms: list[str] | None = setting(None, "Arms to run; all of the experiment's if not given.")
+    overrides: list[str] = setting([], "Further overrides of ``damian train`` for every run.")
+    score: str = setting("return", SCORE_MEANS, choices=SCORES)
+    policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
+    report_only: bool = setting(False, "Run nothing; write tables and figures from stored results.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        problem = "means nothing without launcher=slurm"
-        checks.require(self.slurm is None or self.launcher == "slurm", "slurm", self.slurm, problem)
+        unread = self.slurm is not None and self.launcher != "slurm"
+        self.refuse(unread, "slurm", "means nothing without launcher=slurm")
         mapping = self.slurm is None or isinstance(self.slurm, dict)
-        checks.require(mapping, "slurm", self.slurm, "is no mapping such as {slurm_partition: cpu}")
+        self.refuse(not mapping, "slurm", "is no mapping such as {slurm_partition: cpu}")
         for word in self.overrides:
             ours = word.lstrip("+~").partition("=")[0].partition(".")[0] in SET_BY_COMPARISON
             problem = "cannot be the same for every run: the comparison sets it; leave it out"
@@ -509,14 +328,11 @@ class CompareConfig(Settings):
             checks.require(not none, kind, [], "names none: leave it out, for all of them")
             for name in getattr(self, kind) or ():
                 checks.one_of(kind, name, getattr(self.experiment, kind))
-        for name, arm in self.chosen("arms").items():
+        arms = self.chosen("arms")
+        trained = [n for n, a in arms.items() if not (a.policy_of or a.oracle or a.untrained)]
+        for name, arm in arms.items():
             if arm.policy_of is not None:
-                sources = [
-                    n
-                    for n, a in self.chosen("arms").items()
-                    if a.policy_of is None and not (a.oracle or a.untrained)
-                ]
-                checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, sources)
+                checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, trained)
 
     def chosen(self, kind: str) -> dict[str, Any]:
         """The experiment's tasks, delays or arms (``kind``) that are asked for, by name."""

@@ -16,18 +16,10 @@ class LoggerConfig(Settings):
 
     section: ClassVar[str] = "logger"
 
-    tensorboard: bool = setting(
-        True,
-        "Write TensorBoard events.",
-    )
-    csv: bool = setting(
-        True,
-        "Write ``metrics.csv``.",
-    )
+    tensorboard: bool = setting(True, "Write TensorBoard events.")
+    csv: bool = setting(True, "Write ``metrics.csv``.")
     custom: list[Any] = setting(
-        [],
-        "Loggers of your own, each ``package.module:Name``, or ``{logger: package.module:Name, ...}`` "
-        "with its parameters.",
+        [], "Loggers of your own: package.module:Name, or {logger: package.module:Name, parameter: ...}."
     )
 
 
@@ -35,18 +27,11 @@ class LoggerConfig(Settings):
 class TrainConfig(ScenarioConfig):
     """All settings of ``damian train``, beside those of the scenario."""
 
-    learner: LearnerConfig = setting(
-        MappoConfig,
-        "Settings of the learner: ``MappoConfig``, ``SacConfig``, or a class of your own.",
-    )
-    model: ModelConfig = setting(
-        ModelConfig,
-        "Networks of actor and critic.",
-    )
+    learner: LearnerConfig = setting(MappoConfig)
+    model: ModelConfig = setting(ModelConfig)
     critic: str = setting(
         "server",
-        "The critic observes the messages that the ``server`` holds, or (``privileged``) the true state "
-        "without delay (regime R1, docs/protocol.md).",
+        "The critic observes the messages that the server holds, or the true state (privileged, regime R1).",
         choices=("server", "privileged"),
     )
     logger: LoggerConfig = setting(LoggerConfig)
@@ -54,71 +39,32 @@ class TrainConfig(ScenarioConfig):
     worlds: int = setting(64, "Number of parallel environments.", low=1, high=checks.WORLDS)
     frames: int = setting(300000, "Environment steps to learn from, over all worlds.", low=1, high=1e12)
     episodes: int | None = setting(
-        None,
-        "Stop training after this number of episodes, if that comes before ``frames``.",
-        low=1,
-        high=1e12,
+        None, "Stop after this number of episodes, if that comes before ``frames``.", low=1, high=1e12
     )
-    eval_episodes: int = setting(
-        200, "Episodes of each evaluation after the training.", low=1, high=checks.WORLDS
-    )
+    eval_episodes: int = setting(200, "Episodes of each evaluation.", low=1, high=checks.WORLDS)
     checkpoint_every: int = setting(
         20, "Updates between two checkpoints: what a killed run loses at most.", low=1, high=1e12
     )
     backupdate: bool = setting(
-        False,
-        "Back-updating (paper, section 3.4): late messages correct stored steps before the learner uses "
-        "them. They correct the critic's observations, rewards and ends of episodes, but not the actor's "
-        "observations. A late reward (``delay.rew``) counts for the step that earned it, as soon as it "
-        "has been paid.",
+        False, "Late messages and rewards correct stored steps before the learner uses them (section 3.4)."
     )
     settle: bool = setting(
-        False,
-        "With ``backupdate``: learn from a step only when neither its messages nor its reward can be in "
-        "transit any more.",
+        False, "With ``backupdate``: learn from a step only when nothing of it can be in transit any more."
     )
     recompute_actor: bool = setting(
-        False,
-        "With ``backupdate``, the original authors' variant: late messages correct the actor's "
-        "observations too, and the log-probabilities of its actions follow from these.",
+        False, "With ``backupdate``: correct the actor's observations and log-probabilities too."
     )
     checkpoint: str | None = setting(
-        None,
-        "Run folder of a policy, or the ``best.pt`` in it: the one with which a training begins, or that "
-        "another program flies. That run's overrides apply too, unless others are given.",
+        None, "Run folder, or the best.pt in it, of the policy to begin with or to fly; its overrides apply."
     )
-    overrides: list[str] = constant(
-        [],
-        "Overrides on the command line; the program fills them in.",
-    )
-    resume: str | None = setting(
-        None,
-        "Run folder of the run to continue.",
-    )
-    device: str = setting(
-        "cpu",
-        "Device of all tensors: cpu, cuda, cuda:1, ...",
-    )
-    threads: int | None = setting(
-        None,
-        "Number of threads with which the networks learn; all cores if not given. The worlds always step "
-        "with one, because their tensors are small. Another number of threads gives other rounding "
-        "errors.",
-        low=1,
-        high=1024,
-    )
+    overrides: list[str] = constant([], "Words of the command line; the program fills them in.")
+    resume: str | None = setting(None, "Run folder of the run to continue.")
+    device: str = setting("cpu", "Device of all tensors: cpu, cuda, cuda:1, ...")
+    threads: int | None = setting(None, "Threads of the learning; all cores if not given.", low=1, high=1024)
     compile: bool = setting(
-        False,
-        "Compile the environment's step, the actor's, and the loss of MAPPO (unless ``model.rnn`` is "
-        "set). The program then begins half a minute later, or a few seconds if it has run before; this "
-        "pays off from about a million environment steps on.",
+        False, "Compile the steps and MAPPO's loss; it pays off from about a million environment steps on."
     )
-
-    trust: bool = setting(
-        False,
-        "Import the components (``package.module:Name``) that the stored settings of ``checkpoint``, "
-        "``resume`` or a journal name. Nothing that a run folder names is imported without it.",
-    )
+    trust: bool = setting(False, "Import the components package.module:Name that a run folder names.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

