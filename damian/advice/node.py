@@ -158,7 +158,7 @@ class Node:
                 for late in reported.late:
                     memories[i] = transform.note_late(memories[i], *late)
         memories, _ = act(self.transforms, memories, {keys.ACTION: action, keys.READY: chosen})
-        memories, outputs = observe(self.transforms, memories, self.worlds.outputs_of(reported))
+        memories, outputs = observe(self.transforms, memories, self.worlds.outputs_of(reported), {})
         return memories, self.worlds.to_tensordict(outputs)
 
     def skip(self, memories: Memories, n_steps: int) -> Memories:
