@@ -1,9 +1,8 @@
 """A scripted policy: fly to where the source probably is, else over ground not covered recently.
 
-Every UAV weights all landing points and flies to the one whose footprint contains the largest total weight.
-While a detection is recent, a landing point's weight is how likely the source is there. Otherwise weight lies
-on the UAV's own ground (the landing points nearer to it than to other UAVs) outside its latest footprints. If
-no landing point within reach gains anything, the UAV flies as near to the best one as it can.
+Every UAV flies to the landing point whose footprint contains the largest total weight. While a detection is
+recent, a landing point's weight is how likely the source is there; otherwise weight lies on the UAV's own
+ground outside its latest footprints.
 """
 
 import math
@@ -43,8 +42,7 @@ MAX_PAIRS = 400_000_000
 def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     """Build the scripted policy, which reads the messages that the server holds and the action mask.
 
-    It is stateless and deterministic: equal messages give equal actions. It writes ``("agents", "action")``
-    [B, N], or [B, N, 2] if actions are continuous. The environment must have ``message`` among its extras.
+    It is stateless and deterministic. The environment must have ``message`` among its extras.
     """
     n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
     shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
@@ -81,13 +79,7 @@ class Greedy:
         self.near = (near & self.real.unsqueeze(-1)).float()
 
     def __call__(self, message: Tensor, age: Tensor | None = None, mask: Tensor | None = None) -> Tensor:
-        """Choose actions, [B, N] or, if continuous, [B, N, 2].
-
-        Args:
-            message: packed messages that the server holds, [B, N, M].
-            age: their age [steps], [B, N, 1]; 0 if not given.
-            mask: legal discrete actions, [B, N, A]; all if not given.
-        """
+        """Actions, [B, N] or [B, N, 2], from packed messages [B, N, M], ages [steps] and legal actions."""
         held = self.unpack(message)
         region = self.region_of(held)
         ground = self.points[region]
@@ -100,11 +92,7 @@ class Greedy:
         return self.choose(held, gain, region, mask)
 
     def choose(self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None) -> Tensor:
-        """Actions that lead to the landing points of most gain, [B, N] or, if continuous, [B, N, 2].
-
-        The UAVs begin at the targets of the messages ``held`` [B, N]; ``gain`` is won on each landing point,
-        [B, N, L].
-        """
+        """Actions to the landing points of most ``gain`` [B, N, L], for UAVs at the targets of ``held``."""
         ground = self.points[region]
         gain = gain.where(self.real[region].unsqueeze(1), -torch.inf)
         flown = _distances(held.target, ground)
@@ -127,9 +115,8 @@ class Greedy:
         """How likely the source is at each landing point [B, L, 2], relative to the best one, [B, 1, L].
 
         The place of a detection grows uncertain with its age: the way of the source at full speed counts as
-        two standard deviations. A footprint in which a UAV on the ground hears nothing ``now`` [s], [B, 1],
-        makes the source less likely there, but by less if the source may be there without emitting. Also
-        returns whether the latest detection is recent, [B, 1, 1].
+        two standard deviations. A footprint in which a UAV on the ground hears nothing ``now`` [s] makes it
+        less likely there. Also returns whether the latest detection is recent, [B, 1, 1].
         """
         has_detection = held.detected_time >= 0
         since = torch.where(has_detection, now - held.detected_time, torch.inf).unsqueeze(-1)
@@ -147,8 +134,8 @@ class Greedy:
     def best_action(self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
         """The best legal discrete action of UAVs that stand on points of these flat ids, [B, N].
 
-        ``gain`` and ``left`` are the weight in the footprint of each landing point, and its distance to the
-        best one [m], [B, N, L].
+        From the weight in the footprint of each landing point, and its distance to the best one [m], [B, N,
+        L].
         """
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = standing.unsqueeze(-1) * len(action) + action
@@ -157,11 +144,7 @@ class Greedy:
         return _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)
 
     def best_move(self, held: Messages, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor) -> Tensor:
-        """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2].
-
-        ``gain`` and ``left`` are as for ``best_action``, ``flown`` is the distance to each landing point of
-        ``ground`` [m], [B, N, L].
-        """
+        """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2]."""
         best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
         east, north = (_places_at(ground, best) - held.target).unbind(-1)
         heading = torch.remainder(torch.atan2(east, north) / (2 * math.pi), 1.0)
@@ -186,10 +169,9 @@ def _distances(places: Tensor, others: Tensor) -> Tensor:
 
 
 class Searcher(Greedy):
-    """Function from the belief to actions: each UAV flies where it most probably detects the source next.
+    """From the belief to actions: each UAV flies where it most probably detects the source next.
 
-    Unless that is probable enough somewhere, it searches its own ground: the landing points nearer to it than
-    to any other UAV, as far as it knows.
+    Unless that is probable enough somewhere, it searches its own ground, nearer to it than to any other UAV.
     """
 
     def __call__(  # type: ignore[override]
@@ -200,14 +182,10 @@ class Searcher(Greedy):
         own_belief: Tensor | None = None,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """Choose actions, [B, N] or, if continuous, [B, N, 2].
+        """Actions, [B, N] or [B, N, 2], from packed messages [B, N, M] and beliefs [B, K].
 
-        Args:
-            message: packed messages that the server holds, [B, N, M].
-            belief: that of the server, [B, K].
-            own_message: packed messages that the UAVs have sent last, if each knows its own, [B, N, M].
-            own_belief: that of each UAV, [B, N, K].
-            mask: legal discrete actions, [B, N, A]; all if not given.
+        Where each UAV knows its own messages, ``own_message`` [B, N, M] are these, and ``own_belief`` [B, N,
+        K].
         """
         known = self.unpack(message)
         own = known if own_message is None else self.unpack(own_message)

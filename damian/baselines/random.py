@@ -8,10 +8,7 @@ from damian import keys
 
 
 def random_policy(env: EnvBase) -> TensorDictModule:
-    """Build a policy that draws uniformly from the legal actions.
-
-    It writes ``("agents", "action")`` [B, N], or [B, N, 2] if actions are continuous.
-    """
+    """Build a policy that draws uniformly from the legal actions."""
     spec = env.full_action_spec_unbatched[keys.ACTION]
     masked = keys.ACTION_MASK in env.observation_spec.keys(True, True)
 

@@ -1,8 +1,7 @@
 """Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"0.5m"``).
 
-``Law.sampler`` turns a law into a table from which delays are drawn, with one hash and one search per
-message, or into a function of the message's context (``ContextSampler``). The transforms that delay
-observations, actions and rewards are in ``damian.transforms``.
+``Law.sampler`` turns a law into a table from which delays are drawn, or into a function of the message's
+context (``ContextSampler``).
 """
 
 import math
@@ -48,12 +47,10 @@ class Law(ABC):
 
     @abstractmethod
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        """Build the sampler that draws delays from this law.
+        """Build the sampler that draws delays from this law, in steps of ``dt`` seconds.
 
-        Args:
-            dt: length of a step [s].
-            loss: probability that a message is lost, whatever its delay.
-            key: config key of the law, for error messages.
+        ``loss`` is the probability that a message is lost, whatever its delay; ``key`` names the law in
+        errors.
         """
 
 
@@ -337,9 +334,6 @@ def law_of(written: Any, key: str = "delay") -> Law:
     ``{law: uniform, low: 3s, high: 7s}`` names a registered law and its settings; ``{law:
     my_lab.delays:Satellite, mean: 2s}`` a frozen dataclass derived from ``Law`` in a module that can be
     imported.
-
-    Raises:
-        InputError: the law or one of its parameters does not exist.
     """
     if isinstance(written, Law):
         return written
@@ -381,14 +375,9 @@ def _rounded_up(low: float, high: float) -> list[float]:
 
 
 def link_sampler(delay: Any, loss: Any, dt: float = 1.0, key: str = "delay") -> Sampler:
-    """Build the sampler of a law for all links, or of a law or a loss for each link.
+    """Build the sampler of one law for all links, or of N x N nested lists of laws or losses.
 
-    Args:
-        delay: what ``law_of`` takes, or an N x N nested list of it (receiver, sender); its diagonal is not
-            used.
-        loss: probability that a message is lost, or an N x N nested list or tensor of it.
-        dt: length of a step [s].
-        key: name of the delay, for errors.
+    ``delay[receiver][sender]`` is the law of a link; the diagonal is not used.
     """
     n = same_size({key: delay, "loss": loss})
     if n is None:

@@ -31,30 +31,25 @@ class Delivery(NamedTuple):
 class DelayLine:
     """Delays the messages of M senders, each of which sends at most one message per step.
 
-    A message is written at once into the slot of the step at which it will arrive, where a later message
-    that arrives at the same step replaces it. The slots form a ring. Steps and resets are pure functions of
-    the memory, except that a step writes the slots in place.
+    A message is written at once into the slot of the step at which it will arrive, where a later message that
+    arrives at the same step replaces it. The slots form a ring. Steps and resets are pure functions of the
+    memory, except that a step writes the slots in place.
 
     A worked timeline. At the reset, t = 0, the receiver holds the first message m0. The messages m1, m2, m3
     and m4 are sent at t = 1, 2, 3, 4, with delays of 3, 1, 0 and 2 steps:
 
     - t = 1: m1 is written into the slot of t = 4; the receiver holds m0, of age 1.
     - t = 2: m2 is written into the slot of t = 3; the receiver holds m0, of age 2.
-    - t = 3: m3 is written into the slot of t = 3 too, where it replaces the older m2; it arrives at once: the
-      receiver holds m3, of age 0.
+    - t = 3: m3 replaces the older m2 in the slot of t = 3, and arrives at once: the receiver holds m3, of age
+      0.
     - t = 4: m1 arrives. By ``generation`` the receiver keeps the newer m3, now of age 1; by ``arrival`` it
       holds m1, of age 3. m4 is written into the slot of t = 6.
 
-    The memory, [M] each if nothing else is said: ``clock``, the number of steps so far; ``place`` of the
-    current slot among all slots (slot times M, plus the sender's number); random ``streams``; state of the
-    ``channel``, [M, ...]; clock of the latest reset, ``reset_at``, and of the held message, ``generated_at``;
-    ``senders``, 0 to M - 1; ``stamps``, the clock of the message in a slot, [K + 1, M]: K slots for the
-    current and the coming steps, and one for messages that never arrive; values of the messages in the slots,
-    ``slots_i`` [K + 1, M, ...], and of the held ones, ``held_i`` [M, ...].
-
-    Args:
-        sampler: draws the delays.
-        order: one of ``ORDERS``.
+    The memory, [M] if nothing else is said: ``clock``, the number of steps so far; ``place`` of the current
+    slot (slot times M, plus the sender's number); random ``streams``; state of the ``channel``, [M, ...];
+    clock of the latest reset, ``reset_at``, and of the held message, ``generated_at``; ``senders``, 0 to M -
+    1; ``stamps``, the clock of the message in each of K slots, and in one for messages that never arrive, [K
+    + 1, M]; values in the slots, ``slots_i`` [K + 1, M, ...], and of the held messages, ``held_i`` [M, ...].
     """
 
     def __init__(self, sampler: Sampler, order: str) -> None:
@@ -105,14 +100,9 @@ class DelayLine:
     ) -> tuple[Memory, Delivery]:
         """Send one message per sender, and deliver the messages that arrive in this step.
 
-        Args:
-            memory: the memory before the step.
-            values: values of the messages, [M, ...] each.
-            sent: mask of the messages that are really sent, [M] bool; all of them if not given.
-            context: circumstances of the messages; needed only if the sampler sees them.
-
-        Returns:
-            The memory after the step, and what the receivers then hold.
+        ``values`` [M, ...] each; ``sent`` [M] bool: which are really sent, all if not given; ``context``:
+        needed only if the sampler sees it. Returns the memory after the step, and what the receivers then
+        hold.
         """
         clock, generated_at = memory["clock"] + 1, memory["generated_at"]
         n_slots, n_senders = self.sampler.lost, len(generated_at)
@@ -161,30 +151,21 @@ class BroadcastLine:
     A receiver holds the message of the link that was generated last. A ``DelayLine`` delays only the time of
     generation; the contents of the latest messages lie in a ring, once for each sender.
 
-    A worked timeline: a sender writes m0 at t = 0, and the delays of its links to receivers A and B are 1
-    and 3 steps. The contents of m0 lie in the ring once. At t = 1 the time of generation 0 arrives on the
-    link to A, which copies m0 from the ring; at t = 3 it arrives on the link to B, which copies it too. At
-    t = 4 the sender's next message takes the slot of m0, as the ring has 3 + 1 slots.
+    A worked timeline: a sender writes m0 at t = 0, and the delays of its links to receivers A and B are 1 and
+    3 steps. At t = 1 the time of generation 0 arrives on the link to A, which copies m0 from the ring; at t =
+    3 it arrives on the link to B, which copies it too. At t = 4 the sender's next message takes the slot of
+    m0, as the ring has 3 + 1 slots.
 
     The memory has that of the ``DelayLine``; the ``sender`` of each link, [L]; a ``link`` of each sender,
-    [S]; contents of the latest K messages of each sender, ``contents_i`` [K, S, ...], where K is the longest
-    delay plus 1; and of the message that each link's receiver holds, ``held_i`` [L, ...], zeros at first.
-
-    Args:
-        sampler: draws the delays.
+    [S]; the latest K messages of each sender, ``contents_i`` [K, S, ...]; and those held, ``held_i`` [L,
+    ...].
     """
 
     def __init__(self, sampler: Sampler) -> None:
         self.line, self._n_slots = DelayLine(sampler, "generation"), sampler.longest + 1
 
     def init_memory(self, contents: list[Tensor], streams: Tensor, sender: Tensor) -> Memory:
-        """Create the memory.
-
-        Args:
-            contents: examples of what is sent, [S, ...] each.
-            streams: random stream of each link, [L].
-            sender: sender of each link, [L]; every sender has a link.
-        """
+        """Create the memory, from examples of what S senders send and the streams and senders of L links."""
         memory = self.line.init_memory([], streams)
         links = torch.arange(len(sender), device=sender.device)
         link = links.new_zeros(len(contents[0])).scatter_reduce(0, sender, links, "amax")
@@ -207,13 +188,7 @@ class BroadcastLine:
             memory[f"contents_{i}"].flatten(0, 1).index_copy_(0, rows, content)
 
     def step(self, memory: Memory, sent: Tensor, context: MessageContext | None = None) -> Memory:
-        """Send the messages written last, and deliver those that arrive in this step.
-
-        Args:
-            memory: the memory before the step.
-            sent: mask of the links that carry a message, [L] bool.
-            context: circumstances of the messages; needed only if the sampler sees them.
-        """
+        """Send what was written last over the links ``sent`` [L] bool, and deliver what arrives now."""
         memory, delivery = self.line.step(memory, [], sent, context)
         return self._hold(memory, delivery.fresh)
 

@@ -1,7 +1,6 @@
 """Samplers draw one delay per message, from a table or by a function of the message's context.
 
-Drawing is a pure function of random streams and clocks, so it can be compiled, and a sender draws the same
-delays alone as in a batch.
+Drawing is a pure function of random streams and clocks: a sender draws the same delays alone as in a batch.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,14 +37,14 @@ class MessageContext(NamedTuple):
 class Sampler(nn.Module):
     """Draws delays from a table of probabilities.
 
-    A worked timeline: with the table ``[[0.5, 0, 0, 0.5]]`` half of the messages have no delay, and half of
-    them have 3 steps: one sent at t = 0 arrives at t = 0 or at t = 3, whatever the delays of the others.
+    A worked timeline: with the table ``[[0.5, 0, 0, 0.5]]`` a message sent at t = 0 arrives at t = 0 or at t
+    = 3, each with probability 0.5, whatever the delays of the others.
 
     Args:
         states: for each of S channel states, the probabilities of the delays 0, 1, ... [steps]; if they sum
             to less than 1, the rest is the probability that the message is lost.
-        transitions: probabilities of the transitions between the channel states per step, [S, S]; there is
-            one state if they are not given.
+        transitions: probabilities of the transitions between the channel states per step, [S, S]; for one,
+            none.
         loss: probability that a message is lost, whatever its delay.
     """
 
@@ -109,11 +108,8 @@ class Sampler(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Draw the delays [M] of the messages sent at ``clock``, and the channels' next states [M, ...].
 
-        Args:
-            streams: random stream of each sender, [M].
-            clock: step, [M] or a scalar.
-            memory: state of each channel, [M, ...].
-            context: circumstances of the messages; needed only if ``sees_context``.
+        From the senders' random streams [M], the step [M] or [], the channels' states, and if it sees it the
+        context.
         """
         if self.constant_delay is not None:
             return torch.full_like(streams, self.constant_delay), memory
@@ -126,12 +122,7 @@ class Sampler(nn.Module):
 
 
 class Recorded(Sampler):
-    """Plays back recorded delays; each sender starts at a random position, which is its channel state.
-
-    Args:
-        delays: recorded delays [steps], -1 for a lost message.
-        loss: probability that a message is lost in addition.
-    """
+    """Plays back recorded delays [steps], -1 if lost; each sender starts at a random one, its state."""
 
     _delays: Tensor
 
@@ -157,11 +148,7 @@ class Recorded(Sampler):
 
 
 class HeldSampler(Sampler):
-    """Gives every message the longest delay of another sampler; the same messages are lost.
-
-    Args:
-        drawn: the other sampler.
-    """
+    """Gives every message the longest delay of another sampler; the same messages are lost."""
 
     def __init__(self, drawn: Sampler) -> None:
         arrival_chances = (1 - drawn.chances[:, -1]).tolist()
@@ -190,17 +177,10 @@ class HeldSampler(Sampler):
 
 
 class LagSampler(Sampler):
-    """Draws a delay (a lag) from a table, and holds it; losses are drawn for each message.
+    """Draws a delay (a lag) from a table, and holds it for a period (None: an episode); losses are not held.
 
     The state of a channel is [M, 2] long: the lag, -1 before the first message of an episode, and the number
     of steps that it is still held.
-
-    Args:
-        law: the law ``Lag``, whose ``hold_probability``, ``shared`` and ``stagger`` are read.
-        chances: probabilities of the lags 0, 1, ... [steps]; if they sum to less than 1, the rest is the
-            probability that a message is lost.
-        loss: probability that a message is lost in addition, whatever its delay.
-        period: steps between two updates; None: one lag per episode.
     """
 
     def __init__(self, law: Any, chances: list[float], loss: float, period: int | None) -> None:
@@ -252,15 +232,13 @@ class ContextSampler(Sampler):
 
     Args:
         delay_fn: pure function of a ``MessageContext``, without branches on data, that returns the delays
-            [steps], [M]; they are rounded up (less a share of 1e-5 for rounding errors) and cut to
-            ``longest``, and a message of negative delay is lost. A method of the law can be pickled, as
-            worker processes need.
+            [steps], [M]; they are rounded up and cut to ``longest``, and a message of negative delay is lost.
         longest: longest delay [steps].
         loss: probability that a message is lost, whatever its delay.
-        loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, so that the
-            sampler can delay rewards, none of which may be lost.
-        reads: names of the entries that ``delay_fn`` reads, such as ``position``.
-        optional_reads: names of the entries that it reads if the transform has a key for them.
+        loses: whether ``delay_fn`` can lose a message. With False, negative delays count as 0, as rewards
+            need it.
+        reads, optional_reads: names of the entries that ``delay_fn`` reads, such as ``position``, always or
+            if the transform has a key for them.
 
     Examples:
         >>> ContextSampler(lambda context: context.n_sending // 4, longest=5, loses=False)
@@ -303,17 +281,12 @@ class ContextSampler(Sampler):
 class LinkSampler(Sampler):
     """Draws the delays of messages on the links between N agents, by a law and a loss for each link.
 
-    Links are numbered receiver * N + sender; of the M messages of a step, message m belongs to link m modulo
-    N * N. Every distinct law has one sampler, which draws for all links. The state of a channel is that of
-    all samplers, side by side, [M, S].
+    Links are numbered receiver * N + sender; message m of the M of a step belongs to link m modulo N * N.
+    Every distinct law has one sampler, which draws for all links. The states of all samplers lie side by
+    side, [M, S].
 
     A worked timeline: the link from agent 0 to agent 1 has a constant delay of 3 steps, the link to agent 2
     one of 1 step. What agent 0 sends at t = 0 arrives at agent 2 at t = 1, and at agent 1 at t = 3.
-
-    Args:
-        samplers: one for each distinct law.
-        law_index: index of each link's sampler, [N * N] long.
-        loss: probability that a message of each link is lost, beside what its sampler loses, [N * N].
     """
 
     _law_index: Tensor
@@ -371,10 +344,7 @@ def _side_by_side(states: list[Tensor]) -> Tensor:
 
 
 def streams_for(sampler: Sampler, streams: Tensor, n_rows: int) -> Tensor:
-    """The random streams [M] from which a sampler draws, if a world has so many rows.
-
-    With ``same_draws_for_all_agents`` all rows of a world get the stream of the first one.
-    """
+    """The random streams [M] from which a sampler draws: for ``n_rows`` rows of a world, maybe one."""
     if not sampler.same_draws_for_all_agents:
         return streams
     return streams.view(-1, n_rows)[:, :1].expand(-1, n_rows).reshape(-1)

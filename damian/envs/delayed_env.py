@@ -26,8 +26,7 @@ _BASE = "base_env."
 class DelayedEnv(TransformedEnv):
     """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function.
 
-    The result is that of TorchRL's ``TransformedEnv``, which calls one transform after the other; but no
-    TensorDict is built between two transforms, so that a step compiles into one graph.
+    The result is that of TorchRL's ``TransformedEnv``; but no TensorDict is built between two transforms.
     """
 
     _compiled: CompiledMethods | None = None
@@ -44,22 +43,16 @@ class DelayedEnv(TransformedEnv):
         return self.uav_env.server
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world its own random streams, so that it evolves the same alone as among others.
+        """Give every world [B] its own random streams, so that it evolves the same alone as among others.
 
         A belief is the same up to rounding: some processors multiply one row in another order than many.
-
-        Args:
-            seeds: integers, one for each world, [B].
         """
         self.uav_env.seed_worlds(seeds)
         for transform in self._all_stateful():
             transform.seed_worlds(seeds)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> OrderedDict[str, Any]:
-        """The state of the transforms, as that of a ``TransformedEnv``, and of the environment under them.
-
-        An equal environment that loads it continues in the same way, with the TensorDict of the latest step.
-        """
+        """The state of the transforms and of the environment under them; an equal one continues with it."""
         state = cast(OrderedDict[str, Any], super().state_dict(*args, **kwargs))
         self.base_env.state_dict(destination=state, prefix=kwargs.get("prefix", "") + _BASE)
         return state
@@ -73,10 +66,7 @@ class DelayedEnv(TransformedEnv):
         super().load_state_dict(others, **kwargs)
 
     def compile(self, **options: Any) -> "DelayedEnv":
-        """Compile a step of ``UavEnv`` with its transforms as one graph.
-
-        ``options`` are for ``torch.compile``, instead of the default ones, which suit a CPU.
-        """
+        """Compile a step with its transforms as one graph; ``options`` are for ``torch.compile``."""
         object.__setattr__(self, "_compiled", CompiledMethods(options))  # TransformedEnv's own is for specs
         return self
 
@@ -89,10 +79,7 @@ class DelayedEnv(TransformedEnv):
         return tensordict
 
     def _method(self, name: str, *variant: Any) -> Callable[..., Any]:
-        """The method of this name, compiled if ``compile`` was called.
-
-        Each variant (its transforms and entries) has its own graph, because no guard checks these.
-        """
+        """The method of this name, compiled if ``compile`` was called: a graph for each variant."""
         method = getattr(self, name)
         return method if self._compiled is None else self._compiled.get(method, *variant)
 
@@ -143,8 +130,8 @@ class DelayedEnv(TransformedEnv):
     ) -> tuple[PackedState, list[Memory], Outputs]:
         """One step of the worlds and of the leading stateful transforms; a pure function.
 
-        If there is a mask ``stepped`` [B], only its worlds send messages and actions: the others will make
-        this step later, and what is in transit is written in place.
+        Only the worlds of the mask ``stepped`` [B] send messages and actions: what is in transit is written
+        in place.
         """
         stateful, _ = self._split_transforms()
         mask: Entries = {} if stepped is None else {keys.STEPPED: stepped}
@@ -198,10 +185,7 @@ class DelayedEnv(TransformedEnv):
 
     @torch.no_grad()
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """As TorchRL's: the step, and the TensorDict with which the next one begins; but in one graph.
-
-        What a policy has written stays in that TensorDict, also after a reset; the policy replaces it.
-        """
+        """As TorchRL's, in one graph; what a policy has written stays after a reset."""
         stateful, others = self._split_transforms()
         partial = "_step" in tensordict or "next" in tensordict or tensordict.device != self.device
         if others or partial or _may_skip(stateful):
@@ -218,11 +202,7 @@ class DelayedEnv(TransformedEnv):
     def _whole_step_and_reset(
         self, worlds: PackedState, memories: list[Memory], entries: Entries
     ) -> tuple[PackedState, list[Memory], Outputs, Outputs]:
-        """One step, and a reset of the worlds whose episode it ends; a pure function.
-
-        Returns:
-            Worlds and memories, the outputs of the step, and those with which the next step begins.
-        """
+        """One step, and a reset of the worlds that it ends: also the outputs that begin the next step."""
         worlds, memories, outputs = self._whole_step(worlds, memories, entries)
         begin = {key: value for key, value in outputs.items() if key != keys.REWARD}
         done = outputs[keys.DONE]

@@ -9,8 +9,6 @@ What a step passes, in this order (a transform is there only if the scenario ask
     observation -> SampleAndHold (server) -> ObservationDelay (broadcast) -> SampleAndHold (agents)
                 -> ActionHistory -> policy
     SkipUntilReady repeats all of it until a UAV can choose again
-
-Without a delayed message, a belief and a history of messages, ``UavEnv`` computes what ``ServerNode`` would.
 """
 
 from collections.abc import Collection
@@ -57,19 +55,10 @@ def make_env(
 ) -> DelayedEnv:
     """Build the environment of a scenario with all of its delays.
 
-    Args:
-        scenario: all settings, ``delay`` and ``clock`` included.
-        num_worlds: number of parallel environments, B.
-        seed: of the worlds and of the delays; at least 0.
-        device: of all tensors.
-        extras: as in ``UavEnv``; if messages are delayed, ``message`` also outputs ``received`` (the messages
-            that the server holds), their ``age`` [steps], and the ``delay`` [steps] of the messages sent, and
-            if rewards are delayed, ``reward_delay`` [steps] and, without a message delay, ``earned_reward``,
-            all under ``"agents"``.
-
-    Raises:
-        InputError: the scenario asks for something impossible, or combines ``clock.skip`` with ``message``,
-            or another argument is not valid.
+    The arguments are those of ``UavEnv``. If messages are delayed, the extra ``message`` also outputs
+    ``received`` (the messages that the server holds), their ``age`` [steps], and the ``delay`` [steps] of the
+    messages sent, and if rewards are delayed, ``reward_delay`` [steps] and, without a message delay,
+    ``earned_reward``, all under ``"agents"``.
     """
     extras = checks.names("extras", extras, ALL_EXTRAS)
     problem = "skips steps, but back-updating and evaluation need the messages of every step"
@@ -151,11 +140,7 @@ def server_transforms(scenario: ScenarioConfig, server: Server, extras: Collecti
 
 
 def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_delay: bool) -> ObservationDelay:
-    """The delay of the messages to the server.
-
-    ``output_messages``: write the age of the messages held and the delay of those sent; ``reads_delay``: a
-    later transform reads that delay.
-    """
+    """The delay of the messages to the server; ``reads_delay``: a later transform reads that delay."""
     delay = scenario.delay
     return ObservationDelay(
         delay_law(delay, "obs"),
@@ -174,12 +159,7 @@ def uplink_transform(scenario: ScenarioConfig, output_messages: bool, reads_dela
 def remembering_transforms(
     scenario: ScenarioConfig, server: Server, longest: int, delayed: bool
 ) -> list[Transform]:
-    """What keeps messages of earlier steps: the belief, and the history of messages to learn a belief from.
-
-    Args:
-        longest: longest delay of a message [steps].
-        delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is delayed.
-    """
+    """What keeps messages of earlier steps: the belief, and the history to learn a belief from."""
     own, transforms = scenario.observation.own, list[Transform]()
     if server.grid is not None:
         transforms.append(Belief(server, longest, delayed=delayed, own=own))
@@ -199,10 +179,7 @@ def remembering_transforms(
 
 
 def scaled_messages(server: Server, rows: Tensor) -> Tensor:
-    """Position, way to the target, spotted and battery of packed messages [*, N, M], [*, N, 6].
-
-    All are about 1 in size: lengths are over the largest vertex distance of the region.
-    """
+    """Position and way to the target (over the region's size), spotted and battery, [*, N, 6]."""
     messages = server.messages(rows)
     scale = server.scales(messages)[..., None, None]
     way = messages.target - messages.position
@@ -302,9 +279,9 @@ def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[T
 def history_since_message(scenario: ScenarioConfig) -> bool:
     """Whether a UAV's action history holds only actions newer than its message that the server holds.
 
-    The server's observation cannot reflect these actions yet. With delayed actions, slow clocks or a delayed
-    broadcast a UAV cannot tell which actions are newer, and with ``observation.own`` or ``links=matrix`` it
-    knows its own latest message anyway: in these cases the history holds all of its latest actions.
+    With delayed actions, slow clocks or a delayed broadcast a UAV cannot tell which actions are newer, and
+    with ``observation.own`` or ``links=matrix`` it knows its own latest message anyway: then it holds all of
+    them.
     """
     delay, clock = scenario.delay, scenario.clock
     slow = clock.steps("server") > 1 or clock.steps("agents") > 1 or scenario.links.kind != "server"
@@ -313,11 +290,7 @@ def history_since_message(scenario: ScenarioConfig) -> bool:
 
 
 def has_server_node(scenario: ScenarioConfig) -> bool:
-    """Whether a ``ServerNode`` computes observations and rewards instead of ``UavEnv``.
-
-    It must if messages are delayed, or if a feature reads the belief or an actor the history of messages,
-    which depend on all earlier messages.
-    """
+    """Whether a ``ServerNode`` computes observations and rewards, instead of ``UavEnv``."""
     remembers = bool(scenario.observation.belief) or scenario.delay.messages > 0
     return has_message_delay(scenario) or remembers
 
@@ -339,10 +312,9 @@ def hold_action(actions: ActionConfig) -> int:
 
 
 def action_codes(actions: ActionConfig) -> Tensor | None:
-    """Codes of the discrete actions in the action history: displacement east and north in [0, 1], [A, 2].
+    """Codes of the discrete actions in the history: displacement east and north in [0, 1], [A, 2]; or None.
 
-    They are displacements rather than distances and headings, because the sum of displacements tells where a
-    UAV must be by now. None for continuous actions, which the history holds unchanged.
+    Displacements, because their sum tells where a UAV must be by now. Continuous actions need no codes.
     """
     if actions.kind == "continuous":
         return None

@@ -6,11 +6,6 @@ from damian.world.simulation import Simulation
 
 
 def make_simulation(scenario: ScenarioConfig, seed: int) -> Simulation:
-    """Build the physics of a scenario.
-
-    Args:
-        scenario: all settings.
-        seed: of the regions, the start positions and the source's walks; at least 0.
-    """
+    """Build the physics of a scenario; ``seed`` is that of regions, start positions and walks."""
     checks.seed("seed", seed, 0)
     return Simulation(scenario, scenario.clock.dt, scenario.observation.window, seed)

@@ -37,9 +37,8 @@ ALL_EXTRAS = (*EXTRAS, "position", "privileged")
 class UavEnv(EnvBase):
     """B worlds, in each of which N UAVs search for and track a source or cover a region, without any delay.
 
-    ``damian.envs.pipeline.make_env`` adds the delays and slower clocks of a scenario as transforms.
-
-    The batch size is ``[B]``. Entries of the UAVs lie under ``"agents"``, with batch size ``[B, N]``:
+    ``damian.make_env`` adds the delays and slower clocks of a scenario as transforms. The batch size is
+    ``[B]``. Entries of the UAVs lie under ``"agents"``, with batch size ``[B, N]``:
 
     - ``action``: discrete [B, N], or continuous [B, N, 2] in [0, 1]: distance and heading (paper, section
       4.2);
@@ -48,17 +47,15 @@ class UavEnv(EnvBase):
     - ``observation``, ``global_observation``: features of the actor [B, N, F] and of the critic [B, N, G];
     - ``message``: the latest message of each UAV, [B, N, M] (``server.messages`` names its fields), and
       ``message_sent``: whether it was sent in this step, [B, N];
-    - ``position``: true position of each UAV, east and north in the coordinates of the settings [m], which
-      delay laws may read, [B, N, 2];
+    - ``position``: true position, east and north in the coordinates of the settings [m], [B, N, 2];
     - ``privileged_observation``: ``global_observation`` as if nothing were delayed or lost, with the belief
       that the source is in its cell, and the offset to it (over the region's size, [-1, 1]), [B, N, G + 2];
     - ``reward``: paper, eq. 8, [B, N, 1]; ``reward_terms``: its weighted terms by name, [B, N].
 
-    At the root lie ``state`` (the simulator's truth, for drawing and reference experiments, never for an
-    actor), ``success``, and TorchRL's ``done``, ``terminated``, ``truncated``; with
-    ``episode.end_with_source`` also ``source_over``. Besides the action, a step reads the flag
-    ``("agents", "action_valid")`` [B, N] if it exists: a UAV with a false flag does not act, as if it were
-    not ready; and TorchRL's ``_step`` [B]: a world with a false flag does not step.
+    At the root lie ``state`` (the simulator's truth, never for an actor), ``success``, and TorchRL's
+    ``done``, ``terminated``, ``truncated``; with ``episode.end_with_source`` also ``source_over``. A step
+    also reads the flag ``("agents", "action_valid")`` [B, N], if it exists: a UAV with a false flag does not
+    act; and TorchRL's ``_step`` [B].
 
     Args:
         scenario: all settings; the defaults if not given.
@@ -67,10 +64,8 @@ class UavEnv(EnvBase):
         device: of all tensors.
         extras: which of ``message``, ``state``, ``reward_terms``, ``position`` and (reference experiments
             only) ``privileged`` are output; each costs time. Delays need ``message``.
-        simulation: the physics; built from the scenario and the seed if not given.
-        server: computes observations, rewards and ends of episodes from messages; built if not given.
-        messages_only: a step outputs no observation, reward or end, because a ``ServerNode`` transform
-            computes them from the messages that have arrived.
+        simulation, server: the physics and the server node; built from the scenario if not given.
+        messages_only: a step outputs no observation, reward or end: a ``ServerNode`` computes them.
     """
 
     def __init__(
@@ -144,13 +139,10 @@ class UavEnv(EnvBase):
         self.worlds = PackedState(**loaded)
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world its own random stream; the next reset begins its first episode.
+        """Give every world its own random stream, [B] integers; the next reset begins its first episode.
 
-        Until then, a world that has been reset goes on from where it is: TorchRL's collectors reset an
-        environment when they are made, and are seeded afterwards.
-
-        Args:
-            seeds: integers, one for each world, [B].
+        Until then, a world that has been reset goes on: TorchRL's collectors reset first, and seed
+        afterwards.
         """
         seeds = seeds.to(self.device, torch.long)
         zero = torch.zeros_like(seeds)
@@ -192,12 +184,7 @@ class UavEnv(EnvBase):
     # Pure functions of the state, which can be compiled.
 
     def reset_fn(self, worlds: PackedState, mask: Tensor) -> tuple[PackedState, Outputs]:
-        """Begin new episodes in the worlds of the mask [B].
-
-        Returns:
-            The worlds, and the outputs with which the new episodes begin. TorchRL keeps the entries of the
-            other worlds.
-        """
+        """Begin new episodes in the worlds of the mask [B]; the outputs are those of the new episodes."""
         if torch.compiler.is_compiling() or not devices.data_dependent(mask.device):
             fresh = self.simulation.next_episode(worlds)
             worlds = tree_map(lambda new, old: torch.where(mask.unsqueeze(-1), new, old), fresh, worlds)
@@ -215,13 +202,7 @@ class UavEnv(EnvBase):
     def step_fn(
         self, worlds: PackedState, action: Tensor, valid: Tensor | None = None
     ) -> tuple[PackedState, Outputs]:
-        """One step of the physics, then the server's outputs for the messages.
-
-        Args:
-            worlds: their state before the step.
-            action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
-            valid: which UAVs act, [B, N] bool; all of them if not given.
-        """
+        """One step of the physics, then the server's outputs; inputs as in ``Simulation.step``."""
         before = self.simulation.layout.unpack(worlds)
         state = self.simulation.step(before, action, valid)
         if self.messages_only:

@@ -1,7 +1,4 @@
-"""The environments for users of Gymnasium and PettingZoo; docs/interop.md has examples.
-
-Importing this package registers the tasks with Gymnasium, such as ``damian/Spotting-v0``.
-"""
+"""The environments for PettingZoo and Gymnasium; importing this registers ``damian/Spotting-v0``."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

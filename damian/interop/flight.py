@@ -41,15 +41,7 @@ class Instant(NamedTuple):
 
 
 class Flight:
-    """The environment of a scenario, with its delays, stepped with NumPy arrays, after a ``reset``.
-
-    Args:
-        scenario: all settings, delays included.
-        num_worlds: number of parallel worlds, B.
-        seed: of the regions and initial conditions that are drawn now.
-        render_mode: ``rgb_array``, for one world, or None.
-        view: of the pictures: ``2d``, from above, or ``3d``.
-    """
+    """A scenario's environment, with its delays, stepped with NumPy arrays; ``seed`` as in ``UavGymEnv``."""
 
     _now: TensorDictBase
     """What the environment has output last, with which its next step begins; there after a reset."""
@@ -88,14 +80,9 @@ class Flight:
 
     @torch.no_grad()
     def step(self, action: Array, *, reset: bool = False) -> tuple[Instant, Instant]:
-        """Take a step.
+        """Take a step; returns what it outputs, and what the next one begins with.
 
-        Args:
-            action: [B, N], or [B, N, 2] if actions are continuous.
-            reset: begin a new episode in each world whose episode the step ends.
-
-        Returns:
-            What the step outputs, and what the next step begins with.
+        ``reset``: begin a new episode in each world whose episode the step ends.
         """
         self._now[keys.ACTION] = torch.as_tensor(action)
         if reset:

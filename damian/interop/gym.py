@@ -61,16 +61,11 @@ class UavGymEnv(gymnasium.Env[Array, Any]):
 
 
 class UavVectorEnv(gymnasium.vector.VectorEnv[Array, Any, Array]):
-    """B worlds of one UAV as a Gymnasium vector environment.
+    """B = ``num_envs`` worlds of one UAV as a Gymnasium vector environment.
 
     A world whose episode ends begins a new one in the same step (``AutoresetMode.SAME_STEP``); ``infos`` then
     has its last observation as ``final_obs``, and its last infos as ``final_info``. World number i equals a
     ``UavGymEnv`` that is reset with ``seed + i``.
-
-    Args:
-        scenario: all settings, with ``agents=1``.
-        num_envs: number of worlds, B.
-        seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides the rest.
     """
 
     def __init__(self, scenario: ScenarioConfig, num_envs: int = 1, seed: int = 0) -> None:

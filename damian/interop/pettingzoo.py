@@ -21,14 +21,9 @@ class UavParallelEnv(ParallelEnv[str, Array, Any]):
     """The UAVs of a scenario, with its delays, as a PettingZoo ``ParallelEnv``.
 
     Agents are ``uav_0``, ``uav_1`` and so on; all of their episodes end together. Observations are float32
-    [F], rewards those that the server perceives; infos are those of ``UavGymEnv``. ``state()`` is what a
-    central critic may know: the observations that the server makes of the messages it holds, of all UAVs.
-
-    Args:
-        scenario: all settings.
-        seed: of the regions and initial conditions that are drawn now; ``reset(seed=...)`` decides the rest.
-        render_mode: ``rgb_array``, or None.
-        view: of the pictures: ``2d``, from above, or ``3d``.
+    [F], rewards those that the server perceives; infos, and the arguments, are those of ``UavGymEnv``.
+    ``state()`` is what a central critic may know: the observations that the server makes of the messages it
+    holds.
     """
 
     def __init__(

@@ -19,25 +19,19 @@ class Learner(Protocol):
     """The policy that the collector uses; ``LearnerConfig.make_actor`` makes an equal one for evaluations."""
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Update the networks.
+        """Update the networks from consecutive steps [B, T]; returns numbers to log, by name.
 
-        Args:
-            batch: consecutive steps [B, T] of the environment, with the entries of ``damian.keys`` that the
-                environment outputs, the extras that the learner's settings name in ``reads``, and what the
-                actor has written.
-
-        Returns:
-            Numbers to log, by name.
+        The batch has what the environment outputs, the extras that the learner's settings name in ``reads``,
+        and what the actor has written.
         """
         ...
 
     def components(self) -> dict[str, Any]:
-        """What a checkpoint stores, by name: networks, optimisers, and all else that changes in training.
+        """What a checkpoint stores, by name, ``actor`` among them: everything that changes in training.
 
-        One of them is ``actor``. Each has ``state_dict`` and ``load_state_dict``; its state consists of
-        tensors, numbers, strings, lists and dicts. A resumed run equals one that was never stopped only if
-        everything that changes is among the components. The replay buffer of ``LearnerConfig.make`` is stored
-        without them; what it holds must not be changed in place.
+        Each has ``state_dict`` (of tensors, numbers, strings, lists and dicts) and ``load_state_dict``. The
+        replay buffer of ``LearnerConfig.make`` is stored without them; what it holds must not be changed in
+        place.
         """
         ...
 
@@ -48,14 +42,9 @@ LARGEST_WEIGHT = 1e5
 
 @torch.no_grad()
 def divergence(components: Mapping[str, Any], numbers: Mapping[str, float]) -> str | None:
-    """Say which number shows that a learner has diverged; None if it has not.
+    """Which number shows that a learner has diverged; None if it has not.
 
-    A logged nan may only mean that nothing is known yet, as before SAC's warm-up; that of a loss has made the
-    weights nan as well.
-
-    Args:
-        components: of the learner, by name.
-        numbers: that the learner has logged, by name.
+    A logged nan may only mean that nothing is known yet; that of a loss makes the weights nan as well.
     """
     for name, number in numbers.items():
         if math.isinf(number):

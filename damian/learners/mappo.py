@@ -42,12 +42,7 @@ LOSS_KEYS: list[NestedKey] = [
 class Mappo:
     """Multi-agent PPO: learns from each batch once, as soon as it is collected.
 
-    Args:
-        env: its specs give the sizes of the networks.
-        config: settings of the learner.
-        setup: properties of the run.
-        buffer: replay buffer on a ``BackupdateStorage``, from which the learner reads the corrected batches.
-            None: the learner uses batches as they were collected.
+    With a replay ``buffer`` on a ``BackupdateStorage``, it reads the corrected batches from there.
     """
 
     loss_keys: Sequence[NestedKey] = LOSS_KEYS
@@ -75,8 +70,8 @@ class Mappo:
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Make one update from a batch [B, T].
 
-        It logs what ``optimize`` returns, the critic's ``explained_variance`` before the update, and with a
-        replay buffer the share of ``backupdated`` messages.
+        It logs what ``optimize`` returns, ``explained_variance``, and with a buffer the share
+        ``backupdated``.
         """
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
@@ -91,9 +86,9 @@ class Mappo:
     def backupdated_batch(self, batch: TensorDictBase) -> TensorDictBase:
         """Store a batch [B, T], and return it as corrected by all messages that have arrived by now, [B, T].
 
-        With ``settle`` the returned steps are earlier ones: they end ``settle_steps`` before the latest step
-        (the first batch is shorter). Steps between the end of an episode and the time at which the server
-        learnt of it stay in the batch: until then a UAV must not undo the success.
+        With ``settle`` the returned steps end ``settle_steps`` before the latest step. Steps between the end
+        of an episode and the time at which the server learnt of it stay: until then a UAV must not undo the
+        success.
         """
         if self.buffer is None:
             return batch
@@ -106,11 +101,9 @@ class Mappo:
         return batch
 
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make ``epochs`` passes over a batch [B, T] with advantages.
+        """Make ``epochs`` passes over a batch [B, T] with advantages, in minibatches of steps or of worlds.
 
-        Minibatches are drawn over steps; for a recurrent actor, over worlds with their whole sequences. It
-        returns means over all minibatches of ``LOSSES``, ``NUMBERS`` and the norm of the gradient before it
-        is scaled down, ``gradient_norm``.
+        It returns the means of ``LOSSES``, ``NUMBERS`` and the norm of the gradient, ``gradient_norm``.
         """
         terms = []
         for entries in self._minibatches(batch):
@@ -152,17 +145,12 @@ def mappo_losses(
     """Mean terms of the loss on steps [*], named in ``LOSSES``, [3], and what ``NUMBERS`` names, [3].
 
     The terms of the loss are the clipped objective of PPO and the entropy (Schulman et al. 2017), over
-    decisions, and the error of the critic, over all steps. The numbers are means over decisions, without
-    gradients: an estimate of the Kullback-Leibler divergence from the policy that collected the steps
-    (ratio - 1 - log ratio), the share of importance ratios beyond the clipping, and the entropy [nats].
+    decisions, and the error of the critic, over all steps. The numbers are means over decisions: an estimate
+    of the Kullback-Leibler divergence from the policy that collected the steps (ratio - 1 - log ratio), the
+    share of importance ratios beyond the clipping, and the entropy [nats].
 
-    Args:
-        entries: what the networks read, and ``LOSS_KEYS``, by key. They are no TensorDict, so that a compiled
-            function works with any number of steps.
-        actor: the policy; if it is recurrent, steps are sequences [B, T].
-        critic: its network writes ``("agents", "state_value")``.
-        config: settings of the learner.
-        entropy_coeff: weight of the entropy bonus, [].
+    The ``entries`` by key, what the networks read and ``LOSS_KEYS``, are no TensorDict, so that a compiled
+    function works with any number of steps; for a recurrent actor they are sequences [B, T].
     """
     ready = entries[keys.READY].float()
     steps = TensorDict(cast(Any, entries), ready.shape[:-1])
@@ -186,10 +174,7 @@ def mappo_losses(
 
 
 def policy_terms(steps: TensorDictBase, actor: ProbabilisticActor) -> tuple[Tensor, Tensor]:
-    """Logarithms of the importance ratios, and entropies of the policy, both [*, N], on steps [*].
-
-    The entropy of continuous actions is estimated by one draw.
-    """
+    """Log-ratios of importance, and entropies (estimated by one draw if continuous), [*, N], on steps [*]."""
     with set_recurrent_mode(True):
         policy = actor.get_dist(steps)
     log_ratio = policy.log_prob(steps[keys.ACTION]) - steps[keys.ACTION_LOG_PROB]
@@ -203,9 +188,9 @@ def add_advantages(batch: TensorDictBase, critic: TensorDictModule, config: Mapp
     """Write values, advantages and value targets into a batch [B, T], in place.
 
     The return of a decision sums the rewards until the UAV's next decision, k steps later, whose value is
-    discounted by gamma^k (a semi-Markov decision process; Sutton, Precup and Singh 1999). Values at the steps
-    between two decisions are not used: there lambda of the generalised advantage estimate (Schulman et al.
-    2016) is 1. A step at which the UAV was not ready is no decision, and its advantage is 0.
+    discounted by gamma^k (a semi-Markov decision process; Sutton, Precup and Singh 1999). At the steps
+    between two decisions lambda of the generalised advantage estimate (Schulman et al. 2016) is 1, and the
+    advantage is 0.
     """
     next_step = cast(TensorDictBase, batch["next"])
     value, next_value = state_values(batch, critic)
@@ -237,10 +222,7 @@ def explained_variance(batch: TensorDictBase) -> Tensor:
 
 
 def state_values(batch: TensorDictBase, critic: TensorDictModule) -> tuple[Tensor, Tensor]:
-    """Values before and after each step of a batch [B, T], both [B, T, N, 1].
-
-    An observation after a step that is also the one before the next step is evaluated once.
-    """
+    """Values before and after each step of a batch [B, T], [B, T, N, 1]; equal observations count once."""
     (key,) = critic.in_keys
     before, after = (cast(Tensor, batch[at]) for at in (key, keys.next_key(key)))
     followed = after[:, :-1].eq(before[:, 1:]).flatten(2).all(-1)

@@ -74,7 +74,7 @@ def initialized(config: ModelConfig, network: Network, gain: float) -> Network:
 class LegalCategorical(Distribution):
     """Categorical distribution over the legal actions ``mask`` [*, A] bool (all if None), of logits [*, A].
 
-    TorchRL's ``MaskedCategorical`` is the same, but its log-probability and entropy take four times as long.
+    TorchRL's ``MaskedCategorical`` is the same, but takes four times as long.
     """
 
     def __init__(self, logits: Tensor, mask: Tensor | None = None) -> None:
@@ -122,8 +122,7 @@ def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
 def with_distribution(env: EnvBase, make_network: Callable[..., TensorDictModule]) -> ProbabilisticActor:
     """Make a policy of a network that writes the parameters of the actions' distribution.
 
-    ``make_network`` gets the number of outputs for an agent, and the keys under which they are written:
-    logits, or means and scales (half of the outputs each).
+    ``make_network`` gets the number of outputs for an agent, and the keys under which they are written.
     """
     spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
@@ -173,10 +172,9 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
 
 
 class SkipConnection(nn.Module):
-    """Logits that are the outputs of a network plus, times a learnt weight, the logarithm of a probability.
+    """Logits that are a network's outputs plus, times a learnt weight, the logs of probabilities.
 
-    The policy begins as one that prefers actions of high probability, however small all of them are: the last
-    layer begins with zeros. ``columns`` of the observation hold a probability for each action.
+    These are in the ``columns`` of the observation. The last layer begins with zeros.
     """
 
     def __init__(self, network: nn.Module, columns: slice) -> None:

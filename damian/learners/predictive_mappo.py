@@ -1,9 +1,7 @@
 """A learnt belief: MAPPO whose actor predicts, from the messages that have arrived, what arrives later.
 
-The actor asks the messages that a receiver holds questions, by attention: one for each action that it might
-choose. From the answers it predicts what the messages will have said when that action has ended, once they
-have arrived, and chooses. It learns to predict from the replay buffer, in which the late messages have
-arrived. Nothing here depends on what the messages mean.
+The actor asks the messages, by attention, one question for each action, predicts what they will have said
+when that action has ended, and chooses. It learns to predict from the replay buffer.
 """
 
 from typing import Any, cast
@@ -32,10 +30,8 @@ from damian.settings.learners import PredictiveMappoConfig
 class PredictiveMappo(Mappo):
     """MAPPO that after each update also learns to predict, from random steps of the replay buffer.
 
-    The target of a decision is the critic's observation when its action has ended (after the step in which it
-    is executed; with real flight times after the landing), as the back-updating storage knows it by now. A
-    decision whose last message has not arrived by now has no weight. What follows from an action does not
-    depend on the policy, so that steps of earlier policies serve too.
+    The target of a decision is the critic's observation when its action has ended, as the back-updating
+    storage knows it by now. A decision whose last message has not arrived by now has no weight.
     """
 
     config: PredictiveMappoConfig
@@ -54,10 +50,7 @@ class PredictiveMappo(Mappo):
         return {**super().components(), "head_optimizer": self.head_optimizer}
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make one update of MAPPO from a batch [B, T], then ``prediction_steps`` of learning to predict.
-
-        It also logs the mean ``prediction_error``: 1 for predictions that are no better than the mean.
-        """
+        """As ``Mappo.learn``; also the mean ``prediction_error``, 1 if no better than the targets' mean."""
         # What is known after a step is what is known before the next one: it need not be stored twice.
         numbers = super().learn(batch.exclude(next_key(keys.HISTORY)))
         last = self.last_steps()
@@ -81,11 +74,7 @@ class PredictiveMappo(Mappo):
         return cast(BackupdateStorage, self.buffer.storage)
 
     def last_steps(self) -> Tensor:
-        """The last step of the action that each UAV has chosen, or carries on, in each stored step.
-
-        It is an index among the T stored steps in order of time, [T, B, N]; T if the action has not ended
-        yet, or was never executed.
-        """
+        """The last step of each UAV's action in each stored step, as in ``ends_of_actions``, [T, B, N]."""
         steps, rows = self.storage.steps, self.storage.latest()
         ready, reset = (cast(Tensor, steps[key])[rows] for key in (next_key(keys.READY), keys.RESET_AFTER))
         return ends_of_actions(ready, reset, cast(int, self.setup.action_delay))
@@ -93,10 +82,9 @@ class PredictiveMappo(Mappo):
     def sample(self, last: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
         """Draw K stored steps: what predictions are made from, what came after, and what of it counts.
 
-        Returns:
-            observations, histories and actions of the steps, [K, N, ...]; the critic's observation when these
-            actions had ended, [K, N, G]; and whether it counts, [K, N, 1] bool: the UAV could choose in this
-            step and has completed its action, and its last message has arrived by now.
+        Returns observations, histories and actions, [K, N, ...]; the critic's observation when these actions
+        had ended, [K, N, G]; and whether the UAV could choose, has completed its action, and its last message
+        has arrived by now, [K, N, 1] bool.
         """
         steps, rows, n_samples = self.storage.steps, self.storage.latest(), self.config.prediction_batch
         n_rows, device = len(rows), rows.device
@@ -134,19 +122,11 @@ FORGETTING = 0.99
 
 
 class MessageEncoder(nn.Module):
-    """Encodes an observation, a set of messages with ages, and a code of what is asked, by attention.
+    """Encodes F features, a set of messages of C columns, and a code [K] of what is asked, by attention.
 
     Each message is given as it is and relative to the newest known message of the first sender, which with
-    ``MessageHistory`` is the receiver itself. Queries follow from the observation and the code; keys and
-    values are an embedding of the messages. Messages that are not known have no influence.
-
-    Args:
-        n_features: number of features of the observation, F.
-        n_columns: number of columns of a row of the history, C.
-        n_code: size of a code, K.
-        config: the hidden layers follow the attention; the last one is the encoding.
-        heads: number of queries for a code.
-        width: size of the embedding of a message, E.
+    ``MessageHistory`` is the receiver itself. Messages that are not known have no influence. ``heads``
+    queries of size ``width`` follow from the observation and the code; hidden layers follow the attention.
     """
 
     def __init__(
@@ -235,15 +215,7 @@ class BeliefHead(TensorDictModuleBase):
 
     The predictions are normalised targets. Code 0 asks what will have been whatever the action; its encoding
     is for the policy. While acting it writes ``("agents", "encoding")`` [*, H] and, with discrete actions,
-    ``("agents", "prediction")`` [*, A G]. In TorchRL's recurrent mode, which the losses of a policy switch
-    on, it does nothing: what the policy has read stays as it was, like an observation.
-
-    Args:
-        encoder: from observations, histories and codes to encodings [*, Q, H].
-        n_encoding: size of the encodings, H.
-        n_targets: number of numbers to predict, G.
-        n_actions: number of discrete actions, A; None if they are continuous, and codes of themselves.
-        n_code: size of a code, K.
+    ``("agents", "prediction")`` [*, A G]; in TorchRL's recurrent mode, which losses switch on, nothing.
     """
 
     def __init__(
@@ -277,10 +249,7 @@ class BeliefHead(TensorDictModuleBase):
         return tensordict
 
     def predict(self, observation: Tensor, history: Tensor, action: Tensor) -> Tensor:
-        """Normalised predictions, whatever the action and for this one, [*, 2, G].
-
-        Of observations [*, F], histories [*, L, C] and actions, [*] or, if they are continuous, [*, K].
-        """
+        """Normalised predictions, whatever the action and for this one, [*, 2, G]."""
         code = action if self.n_actions is None else gather_rows(self.codes, action + 1)
         codes = torch.stack([self.codes[0].expand_as(code), code], -2)
         return self.predictor(self.encoder(observation, history, codes))
@@ -335,14 +304,10 @@ def make_belief_actor(env: EnvBase, config: ModelConfig, heads: int, width: int)
 
 
 def ends_of_actions(ready: Tensor, reset: Tensor, delay: int) -> Tensor:
-    """The last step of the action that is chosen in each of T steps, [T, ...].
+    """The last step of the action chosen in each of T steps, [T, ...]; T if it comes later, or never.
 
-    It is T if it comes later, or if a reset came before the action was executed.
-
-    Args:
-        ready: whether the UAV could choose after each step, [T, ...] bool.
-        reset: whether the episode was reset after each step, bool, broadcast to ``ready``.
-        delay: steps until an action is executed, d.
+    ``ready`` [T, ...] and ``reset`` tell whether the UAV could choose, and the episode was reset, after each
+    step; an action is executed ``delay`` steps later.
     """
     ends, n_steps = next_true(ready | reset), len(ready)
     executed = torch.arange(n_steps, device=ready.device) + delay

@@ -19,17 +19,10 @@ RECURRENT_KEYS: list[NestedKey] = [keys.HIDDEN_BEFORE, keys.IS_INIT]
 class AgentGRU(TensorDictModuleBase):
     """Gated recurrent unit from observations to hidden states, for each UAV by itself (Cho et al. 2014).
 
-    A single step, batch [B]: reads ``("agents", "observation")`` [B, N, F] and the previous hidden state
-    ``("agents", "hidden")`` [B, N, H]; writes the next one under the same key, and the previous one as
-    ``("agents", "hidden_before")``. A whole sequence [B, T], in TorchRL's recurrent mode, which the losses
-    switch on: starts from the first ``hidden_before``, and from zeros where ``is_init`` [B, T, 1] marks a new
-    episode.
-
-    Args:
-        encoder: network from observations [*, F] to features [*, E].
-        n_features: number of features, E.
-        n_hidden: size of the hidden state, H.
-        device: device of the recurrent cell.
+    A single step [B]: reads ``("agents", "observation")`` [B, N, F] and ``("agents", "hidden")`` [B, N, H];
+    writes the next hidden state, and the previous one as ``("agents", "hidden_before")``. A whole sequence
+    [B, T], in TorchRL's recurrent mode: starts from the first ``hidden_before``, and from zeros where
+    ``is_init`` [B, T, 1] marks a new episode.
     """
 
     def __init__(
@@ -52,11 +45,7 @@ class AgentGRU(TensorDictModuleBase):
         return self.cell(features.flatten(0, -2), hidden.flatten(0, -2)).view_as(hidden)
 
     def replay(self, features: Tensor, hidden: Tensor, begins: Tensor) -> Tensor:
-        """Recompute the hidden states after every step of a sequence, [B, T, N, H].
-
-        From features [B, T, N, E], the hidden state before the first step [B, N, H], and whether an episode
-        begins with a step [B, T, 1].
-        """
+        """The hidden states [B, T, N, H] of a sequence; ``begins`` [B, T, 1] restarts them."""
         states: list[Tensor] = []
         # This loop is as fast as nn.GRU, which cannot restart within a sequence. TorchRL's GRUModule can,
         # but pads episodes and takes twice the time.

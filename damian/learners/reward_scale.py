@@ -18,12 +18,7 @@ _SMALLEST_VARIANCE = 1e-16
 
 
 class NormalizedValue(nn.Module):
-    """Values from a network whose outputs are values of mean 0 and standard deviation 1 (Yu et al. 2022).
-
-    Args:
-        network: from observations [*, N, G] to normalised values [*, N, 1].
-        device: device of the running statistics.
-    """
+    """Values from a network whose outputs are values of mean 0 and standard deviation 1 (Yu et al. 2022)."""
 
     def __init__(self, network: nn.Module, device: torch.device | None) -> None:
         super().__init__()
@@ -49,13 +44,9 @@ def value_scale(critic: TensorDictModule) -> Tensor | float:
 
 
 class ReturnScale(nn.Module):
-    """Running root mean square of the discounted returns, by which to divide rewards.
+    """Running root mean square of the discounted returns, by which to divide rewards [B, N, 1].
 
     Gymnasium's ``NormalizeReward`` divides by their standard deviation, which is 0 if all are equal.
-
-    Args:
-        like: rewards of a step, [B, N, 1].
-        gamma: discount factor per step.
     """
 
     returns: Tensor

@@ -32,14 +32,8 @@ N_CRITICS = 2
 class Sac:
     """Soft actor-critic: stores steps as they are collected, and learns from decisions drawn from these.
 
-    Each decision of a UAV is one sample; steps at which a UAV is not ready never enter a loss.
-
-    Args:
-        env: its specs give the sizes of the networks.
-        config: settings of the learner.
-        setup: properties of the run.
-        buffer: replay buffer on a ``TimeStorage``; on a ``BackupdateStorage``, late messages correct the
-            stored steps.
+    Each decision of a UAV is one sample; steps at which a UAV is not ready never enter a loss. On a
+    ``BackupdateStorage``, late messages correct the stored steps.
     """
 
     def __init__(
@@ -136,10 +130,7 @@ _UNREAD: list[NestedKey] = [
 
 
 def make_action_value(env: EnvBase, model: ModelConfig, read: list[NestedKey]) -> TensorDictModule:
-    """Make a critic of actions (Q-function), which reads the entries ``read``.
-
-    It writes ``action_value`` [*, A] of all discrete actions, or ``state_action_value`` [*, 1] of the one.
-    """
+    """Make a Q-function of the entries ``read``: values of all discrete actions, or of the one."""
     n_features = sum(env.observation_spec[key].shape[-1] for key in read)
     spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
@@ -174,10 +165,9 @@ def sac_loss(
 
 
 class MaskedDiscreteSACLoss(DiscreteSACLoss):
-    """Discrete SAC loss with a target entropy for each state, relative to the number of its legal actions.
+    """Discrete SAC loss with a target entropy for each state: a share of that of its legal actions.
 
-    The target is a share of the entropy of a uniform choice among the legal actions. TorchRL's single target
-    for all states would exceed the largest possible entropy where few actions are legal.
+    TorchRL's single target would exceed the largest possible entropy where few actions are legal.
     """
 
     def __init__(self, actor: Any, critics: Any, n: int, share: float, **options: Any) -> None:
@@ -186,11 +176,10 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
         self.share, self.n_actions = share, n
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return TorchRL's losses of transitions [K], with a target entropy for each state.
+        """TorchRL's losses of transitions [K], with a target entropy for each state.
 
-        TorchRL evaluates the critics twice on the same observations, for their own loss and for the actor's;
-        to do it once, this reads private parts of TorchRL (``_compute_target``, ``_vmap_qnetworkN0`` and
-        ``_alpha``), as nothing else in the package does. A test compares the losses with TorchRL's own.
+        To evaluate the critics once, this reads private parts of TorchRL (``_compute_target``,
+        ``_vmap_qnetworkN0`` and ``_alpha``). A test compares the losses with TorchRL's own.
         """
         target = self._compute_target(tensordict)
         values = self._action_values(tensordict)

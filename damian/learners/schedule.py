@@ -11,12 +11,7 @@ from damian.settings.delays import ClockConfig
 
 
 class SystemClock:
-    """Period between two updates of the learner [steps], fixed or triggered (paper, sections 3.6 and 4.3).
-
-    Args:
-        config: settings of the clocks.
-        period: the first period [steps].
-    """
+    """Period between two updates of the learner [steps], fixed or triggered (paper, sections 3.6 and 4.3)."""
 
     def __init__(self, config: ClockConfig, period: int) -> None:
         self.period, self.change = period, 0
@@ -35,11 +30,7 @@ class SystemClock:
         return math.gcd(self.period, self.change, self.shortest, self.longest)
 
     def tick(self, spotting: Tensor) -> None:
-        """Set the next period: shorter if a UAV spots the source in half of the worlds or more, else longer.
-
-        Args:
-            spotting: whether each UAV spots the source, as the server knows, [B, N] bool.
-        """
+        """Shorten the period if a UAV spots the source, [B, N], in half of the worlds; else lengthen it."""
         in_half_of_worlds = spotting.any(-1).float().mean() >= 0.5
         changed = self.period - self.change if in_half_of_worlds else self.period + self.change
         self.period = min(max(changed, self.shortest), self.longest)
@@ -54,14 +45,7 @@ class SystemClock:
 
 
 class LinearSchedule:
-    """A coefficient that goes linearly from one value to another as a run learns, and stays there.
-
-    Args:
-        first: value before the first environment step.
-        last: value after ``frames`` environment steps.
-        frames: environment steps of the run, over all worlds.
-        device: device of the value.
-    """
+    """A coefficient that goes linearly from one value to another in the ``frames`` of a run."""
 
     def __init__(self, first: float, last: float, frames: int, device: torch.device | None = None) -> None:
         self.first, self.last, self.frames, self.learnt = first, last, frames, 0

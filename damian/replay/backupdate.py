@@ -51,14 +51,9 @@ class StepKeys(NamedTuple):
 
 
 def corrections_of(transform: Transform, recomputed: Collection[NestedKey]) -> list[Correction]:
-    """The corrections that follow from the transforms of an environment, in their order.
+    """The corrections that follow from a transform or a ``Compose`` (``env.transform``), in their order.
 
-    Args:
-        transform: a transform, or a ``Compose`` of several (``env.transform``).
-        recomputed: keys of the entries that ``recompute`` returns, without ``"next"``, and of the rewards.
-
-    Raises:
-        InputError: a transform does not write what its correction reads, or its clocks are staggered.
+    ``recomputed``: keys of what ``recompute`` returns, without ``"next"``, and of the rewards.
     """
     leaves = [leaf for leaf in leaf_transforms(transform) if isinstance(leaf, StatefulTransform)]
     found = (leaf.hindsight(recomputed) for leaf in leaves)
@@ -72,39 +67,32 @@ class BackupdateStorage(TimeStorage):
     still concern, from all messages that have arrived by the last step. The entries that ``recompute``
     returns replace the stored ones, once ``corrections`` have changed them as the transforms after the
     receiver did. Where the steps have such an entry before the step too, as observations are, it becomes that
-    after the previous step of the same episode; ``done``, ``terminated`` and ``truncated`` before a step
-    stay. All other entries stay, such as the actor's action and log-probability.
+    after the previous step of the same episode; the ends before a step stay, and so do all other entries.
 
     The storage adds: ``valid`` [T, B, 1], false where the episode had ended already, as the receiver knows
     now; ``reset_after`` [T, B, 1], true where the environment was reset (such a step is truncated if the task
-    had not ended after all); ``backupdated`` beside ``delay_key``, [T, B, 1] or [T, B, N, 1], true where a
-    late message replaced the one that the receiver held (without messages: where a late reward has been
-    paid); and the messages of ``hindsight_key`` with their ages.
+    had not ended after all); ``backupdated`` beside ``delay_key``, true where a late message replaced the one
+    that the receiver held (without messages: where a late reward has been paid); and the messages of
+    ``hindsight_key`` with their ages.
 
     The entries of messages are at the root (one sender in each world: [T, B, M], delay and age [T, B, 1]) or
-    in a group of N agents ([T, B, N, M], delay and age [T, B, N, 1]). ``ObservationDelay`` writes all but the
-    message.
+    in a group of N agents ([T, B, N, M], delay and age [T, B, N, 1]).
 
     Args:
         max_size: T times B; T must be at least the steps of a batch plus twice ``longest`` plus ``lookback``.
-        recompute: computes the entries that depend on messages (for UAVs ``server_recompute``). None if only
-            rewards are late: the ``corrections`` then credit them, and no entry of messages is needed.
+        recompute: computes the entries that depend on messages (``server_recompute``); None if only rewards
+            are late, which ``corrections`` then credit.
         longest: longest delay of a message or of a reward [steps].
-        corrections: for what transforms after the receiver do to these entries, in their order: late rewards,
-            sums of rewards, slow clocks (``corrections_of``).
-        message_key: the message sent in each step; its entry, and the next three, are under ``"next"``.
-        received_key: the message that the receiver held after the step.
-        delay_key: delay of the message sent in the step [steps], -1 if it never arrives.
-        age_key: age of the message that the receiver held [steps].
+        corrections: for what transforms after the receiver do to these entries, in order
+            (``corrections_of``).
+        message_key, received_key, delay_key, age_key: the message sent in each step, that which the receiver
+            held after it, the delay of the first [steps], -1 if it never arrives, and the age of the second
+            [steps], all under ``"next"``, as ``ObservationDelay`` writes them.
         step_count_key: earlier steps of the episode, [T, B, 1] (``StepCounter``); 0 where it begins.
         hindsight_key: if given, the entry ``("next", hindsight_key)`` is added: the newest message sent by
-            that step that has arrived by now, as ``received_key`` in shape; and its age ``hindsight_age``
-            beside ``delay_key``, as the delay in shape. Give it with ``order="arrival"`` if a sender may be
-            silent for more than ``longest`` steps.
+            that step that has arrived by now; and its age ``hindsight_age`` beside ``delay_key``. Give it
+            with ``order="arrival"`` if a sender may be silent for more than ``longest`` steps.
         options: of ``LazyTensorStorage``.
-
-    Raises:
-        InputError: there is nothing to correct.
     """
 
     def __init__(
@@ -149,12 +137,7 @@ class BackupdateStorage(TimeStorage):
     def set(  # type: ignore[override]
         self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True
     ) -> None:
-        """Write steps [T, B] at the indices ``cursor`` of the first dimension, and back-update.
-
-        Raises:
-            InputError: an entry is missing, the storage is too small for the batch, a message or a reward is
-                later than ``longest``, or the steps were joined to n-step returns.
-        """
+        """Write steps [T, B] at the indices ``cursor`` of the first dimension, and back-update."""
         if data.dim() != 2:
             raise InputError(f"steps: a batch of shape {list(data.shape)} is not [T, B]")
         should = "joins steps before they are corrected: leave it out, and join the steps that are read"
@@ -218,10 +201,7 @@ class BackupdateStorage(TimeStorage):
     def recomputed(self, steps: TensorDictBase, n_right: int = 0) -> dict[NestedKey, Tensor]:
         """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step.
 
-        Args:
-            steps: stored steps, the last of which is the latest one.
-            n_right: how many of the first steps are stored as they should be. What is recomputed for these
-                may be wrong, because a message that came late may have been sent before all of the steps.
+        The first ``n_right`` steps are stored as they should be: what is recomputed for these may be wrong.
         """
         begins = steps[self.step_keys.step_count].squeeze(-1) == 0
         entries, added = self._recompute_latest(steps)
@@ -284,13 +264,7 @@ def _first_of(first: Tensor, others: Tensor) -> Tensor:
 
 
 def _before(steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor) -> dict[NestedKey, Tensor]:
-    """Entries before each step, as far as the steps have them: those after the previous step.
-
-    Args:
-        steps: stored steps, [T, B]; their entries stay where there is no previous step.
-        after: corrected entries after each step, under ``"next"``.
-        begins: whether the episode begins with the step, [T, B].
-    """
+    """Entries before each step [T, B], as far as the steps have them: those after the previous step."""
     no_previous = begins.clone()
     no_previous[0] = True  # the step before the first one is not among these steps
     before: dict[NestedKey, Tensor] = {}

@@ -1,7 +1,7 @@
 """Finds the newest message that the server can use for each past step (back-updating; paper, section 3.4).
 
-Pure functions of T consecutive steps, with any batch dimensions behind them. A message that is generated at
-step g with a delay of d steps is available from step g + d on, even if its episode has ended meanwhile.
+Pure functions of T consecutive steps. A message that is generated at step g with a delay of d steps is
+available from step g + d on, even if its episode has ended meanwhile.
 """
 
 from typing import NamedTuple
@@ -26,17 +26,10 @@ class MessageLog(NamedTuple):
 
 
 def latest_arrived(log: MessageLog, now: int | None = None) -> tuple[Tensor, Tensor]:
-    """For each step, the newest message sent in its episode by then that has arrived by ``now``.
+    """For each step, the newest message sent in its episode that has arrived by step ``now`` (the last).
 
-    The function finds messages that were held at some step of the log, and messages sent within it. To miss
-    none, the log must begin earlier than the first step of interest, by the longest delay.
-
-    Args:
-        log: messages sent and held.
-        now: index of a step, the last one if not given; no message that arrives later is used.
-
-    Returns:
-        the messages, [T, *, M], and the age of each at its step [steps], [T, *].
+    It returns the messages, [T, *, M], and the age of each at its step [steps], [T, *]. To miss none, the log
+    must begin earlier than the first step of interest, by the longest delay.
     """
     steps = _steps(log.delay)
     arrived = arrived_by_now(log.delay, (len(steps) - 1 if now is None else now) - steps)
@@ -51,12 +44,7 @@ def latest_arrived(log: MessageLog, now: int | None = None) -> tuple[Tensor, Ten
 
 
 def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:
-    """Whether messages have arrived by now, as ``delay``, bool.
-
-    Args:
-        delay: of the messages [steps], -1 if they never arrive, [K, ...].
-        since: steps since each was sent, one for each delay or the first dimensions of them, [K, ...].
-    """
+    """Whether messages of delays [K, ...] (-1: never), sent ``since`` [K, ...] steps ago, have arrived."""
     return (delay >= 0) & (delay <= expand_mask(since, delay))
 
 
@@ -68,10 +56,8 @@ def episode_starts(begins: Tensor) -> Tensor:
 def ended_before(ended: Tensor, begins: Tensor, already: Tensor) -> Tensor:
     """Whether the episode of each step had ended at an earlier step, [T, *] bool.
 
-    Args:
-        ended: whether the episode ends with this step, as the server knows now, [T, *].
-        begins: whether this step is the first after a reset, [T, *].
-        already: whether the episode of the first step had ended before that step, [*].
+    By whether it ends with a step ``ended`` [T, *], whether a step is the first after a reset ``begins`` [T,
+    *], and whether the episode of the first step had ended ``already`` [*].
     """
     ends = torch.where(ended, _steps(ended), -1)
     before = torch.cat([already.unsqueeze(0).long() - 1, ends[:-1]]).cummax(0).values

@@ -13,16 +13,10 @@ from damian.server.server import Server
 
 
 def server_recompute(server: Server, reward_terms: bool = False, actor: bool = False) -> Recompute:
-    """A function that computes what the server would have output at stored steps, had it held other messages.
+    """A ``BackupdateStorage.recompute``: what the server would have output, had it held other messages.
 
-    Args:
-        server: server node of the environment.
-        reward_terms: recompute ``reward_terms`` too.
-        actor: recompute the actors' observations too, without what ``ActionHistory`` appends to them
-            (``corrections_of`` keeps that).
-
-    Returns:
-        The function, for ``BackupdateStorage(recompute=...)``.
+    ``reward_terms`` and ``actor`` recompute also the terms of the reward, and the actors' observations
+    without what ``ActionHistory`` appends to them (``corrections_of`` keeps that).
     """
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
@@ -54,15 +48,9 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
 
 
 def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
-    """The server's belief after each step, had it known all messages up to it that have arrived by now.
+    """The server's belief after each step, from all messages up to it that have arrived by now, [T, B, K].
 
-    Args:
-        server: server node of the environment.
-        steps: stored steps [T, B], the last of which is the latest one. The belief after the first of them
-            must be final, unless its episode begins with it.
-
-    Returns:
-        Probability that the source is in each cell of ``server.grid``, [T, B, K].
+    The belief after the first of the stored steps [T, B] must be final, unless its episode begins with it.
     """
     assert server.grid is not None
     grid, messages = server.grid, server.messages(steps[next_key(keys.MESSAGE)])

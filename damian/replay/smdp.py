@@ -34,15 +34,10 @@ def find_decisions(
 ) -> Decisions:
     """All decisions in T consecutive steps that have ended by the last of these steps.
 
-    Decisions that a time limit truncates in flight are left out, because their outcome is unknown.
-
-    Args:
-        ready: whether the UAV could choose before each step, [T, B, N].
-        ready_next: whether the UAV could choose after each step, [T, B, N].
-        done: whether the episode ended with the step, [T, B].
-        terminated: whether the episode ended with the step, but not by a time limit, [T, B].
-        n_decisions: number of consecutive decisions to join into one, for n-step returns; fewer are joined
-            where the episode ends earlier.
+    Decisions that a time limit truncates in flight are left out, because their outcome is unknown. ``ready``
+    and ``ready_next`` [T, B, N] tell whether a UAV could choose before and after each step, ``done`` and
+    ``terminated`` [T, B] how the episode ended; ``n_decisions`` consecutive ones are joined, for n-step
+    returns.
     """
     n_steps = len(ready)
     ended = done.unsqueeze(-1).expand_as(ready)
@@ -60,17 +55,12 @@ def find_decisions(
 def transitions(
     steps: TensorDictBase, order: Tensor, decisions: Decisions, gamma: float, observed: list[str]
 ) -> TensorDict:
-    """Turn decisions into transitions of single agents, [K], in the form that TorchRL's losses read.
+    """Turn K decisions into transitions of single agents, [K], in the form that TorchRL's losses read.
 
     The reward of a transition is the sum of the rewards from ``begin`` to ``end``, discounted by step;
-    ``steps_to_next_obs`` [K, 1] is the number of steps by which the next value is to be discounted.
-
-    Args:
-        steps: stored steps, [*, B], with ``"agents"`` [*, B, N].
-        order: index in ``steps`` of each of T consecutive steps, [T].
-        decisions: decisions among these consecutive steps, which count from 0 to T - 1.
-        gamma: discount of a simulation step.
-        observed: names of the agents' entries that a transition has before and after the decision.
+    ``steps_to_next_obs`` [K, 1] is the number of steps by which the next value is to be discounted. ``order``
+    is the index in ``steps`` [*, B] of each of T consecutive steps, from which the decisions count;
+    ``observed`` names the agents' entries that a transition has before and after the decision.
     """
     begin, world, agent, end = decisions
     before, last = (order[begin], world, agent), (order[end], world, agent)

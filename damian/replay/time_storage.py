@@ -15,13 +15,9 @@ _LAST = "latest_step.json"
 
 
 class TimeStorage(LazyTensorStorage):
-    """Keeps the latest steps of B worlds in order of time, [T, B].
+    """Keeps the latest ``max_size`` = T times B steps of B worlds in order of time, [T, B].
 
     The writer must be a round robin (TorchRL's default), and all batches must have the same B worlds.
-
-    Args:
-        max_size: number of environment steps, T times B.
-        options: of ``LazyTensorStorage``.
     """
 
     def __init__(self, max_size: int, **options: Any) -> None:

@@ -1,16 +1,8 @@
 """Where the source is, as far as messages tell: a Bayes filter over the cells of a grid.
 
-Three parts: ``SourceGrid`` tabulates what a server assumes of the source (its place, its moves, and who
-detects it), the filter turns reports into probabilities, and a ``Window`` repeats its latest steps when
-messages of them come in late. All functions of the filter are pure and batched.
-
-One step of the filter moves the probability as the source may have moved, and weighs it with how likely each
-cell makes what the UAVs have reported of that step. Messages may arrive late, out of order or never: a belief
-is exact for the messages that have arrived, because the filter runs again over all steps since the oldest of
-those that came in late.
-
-How silence counts is decided here alone: ``report_rows`` makes a row of a table of a report, ``repeated``
-marks the reports that say the same again, ``_log_reports`` tabulates their probabilities.
+``SourceGrid`` tabulates what a server assumes of the source, the filter turns reports into probabilities, and
+a ``Window`` repeats its latest steps when messages of them come in late: a belief is exact for the messages
+that have arrived. All functions of the filter are pure and batched.
 
 Everywhere, ``grid`` is a ``SourceGrid``, ``rows`` are rows of its table ``log_reports`` [*, N], a ``belief``
 is the probability of each of its K cells [*, K], and ``region`` the index of the region [*].
@@ -93,11 +85,10 @@ class SourceGrid(NamedTuple):
 def build_source_grid(
     airspace: Airspace, source: SourceConfig, radius: float, dt: float, cell: float | None = None
 ) -> SourceGrid:
-    """Lay the grid over all regions, and tabulate what is known of the source.
+    """Lay the grid over all regions, and tabulate what is known of the source (lengths in metres).
 
-    How it moves is counted from walks as the settings draw them, which are not those of any episode. Whether
-    it emits is taken as drawn anew at every step: with ``emission=per_stop``, silence counts for too much.
-    Lengths (``radius`` of a footprint, edge of a ``cell``) are in metres, ``dt`` in seconds.
+    How it moves is counted from walks as the settings draw them. Whether it emits is taken as drawn anew at
+    every step: with ``emission=per_stop``, silence counts for too much.
     """
     polygons = [region.polygon for region in airspace.regions]
     area = max(polygon.area for polygon in polygons)
@@ -184,10 +175,8 @@ def _renewed(centres: Tensor, moves: Tensor | None, edge: float) -> float:
 def _log_reports(detects: Tensor, emits: float, renewed: float) -> Tensor:
     """The table ``SourceGrid.log_reports``, from the probability of a detection if it emits, [P, K].
 
-    A cell that a footprint covers in part would be ruled out by the same silence again and again, although a
-    source that stays may be in its other part. So a repeated report counts only as far as the source may have
-    moved since: with probability ``renewed``, the share of a cell by which it moves in a step, it is anywhere
-    in its cell, else it is where it was.
+    A source that stays may be in the part of its cell that a footprint does not cover. So a repeated report
+    counts only as far as it may have moved: with probability ``renewed`` it is anywhere in its cell.
     """
     silent = 1 - detects
     again = renewed * silent + (1 - renewed) * silent / (1 - emits * detects)
@@ -292,10 +281,7 @@ def certain_belief(grid: SourceGrid, source: Tensor) -> Tensor:
 
 
 def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor:
-    """Probability that a UAV which lands on a landing point of the region next detects the source, [*, L].
-
-    The belief is that of now, one step before the landing.
-    """
+    """Probability, one step before, that a UAV detects the source on each landing point, [*, L]."""
     if len(grid.prior) == 1:
         return belief @ grid.next_detection.T
     here = gather_rows(grid.next_detection.view(len(grid.prior), -1, belief.shape[-1]), region)
@@ -303,9 +289,8 @@ def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor
 
 
 def chance_of_staying(grid: SourceGrid, belief: Tensor, rows: Tensor) -> Tensor:
-    """Probability that a UAV which stays where it is detects the source in the next step, [*, N].
+    """Probability that a UAV which stays detects the source next, [*, N]; 0 for one in flight.
 
-    That is less than for a UAV which lands there, if it has just detected nothing; and 0 for one in flight.
     The rows are what the UAVs report now, not marked as repeated.
     """
     chance = gather_rows(grid.next_staying, rows.clamp(max=len(grid.next_staying) - 1))
@@ -329,13 +314,10 @@ def _(belief: Tensor) -> Tensor:
 class Window(NamedTuple):
     """The latest steps, in a ring of S slots, for B worlds and V receivers of the messages in each world.
 
-    Each slot holds the beliefs after its step, and what the messages of that step report with their delays. A
-    message that comes in late changes what is known of its step; from there the filter runs again. No message
-    is later than the longest delay, so that older beliefs are final.
-
-    The first receiver is the server. If there are more, the others are the N UAVs, each of which knows its
-    own messages at once. The filter runs for a UAV only from where it knows more than the server: before,
-    their beliefs are one.
+    A message that comes in late changes what is known of its step; from there the filter runs again. No
+    message is later than the longest delay, so that older beliefs are final. The first receiver is the
+    server. The others, if any, are the N UAVs, each of which knows its own messages at once: the filter runs
+    for a UAV only from where it knows more than the server.
     """
 
     belief: Tensor
@@ -379,15 +361,10 @@ def begin(grid: SourceGrid, window: Window, messages: Messages, region: Tensor, 
 def advance(
     grid: SourceGrid, window: Window, report: Tensor, delay: Tensor, region: Tensor, stepped: Tensor
 ) -> tuple[Window, Beliefs]:
-    """Take one step: note what is sent, and correct the beliefs by what arrives, in place.
+    """Take one step in the worlds ``stepped`` [B], and correct the beliefs by what arrives, in place.
 
-    Args:
-        grid: cells and tables.
-        window: beliefs of the latest steps.
-        report: what the messages of this step report (``report_rows``), [B, N].
-        delay: their delays [steps], negative if they never arrive, [B, N].
-        region: of each world, [B].
-        stepped: worlds that take the step, [B] bool; nothing of the others changes.
+    ``report`` [B, N]: what the messages of this step report (``report_rows``); ``delay`` [B, N]: their delays
+    [steps], negative if they never arrive.
     """
     slot, *beliefs = _advance(*_parts(grid, window), report, delay, region, stepped)
     return window._replace(slot=slot), Beliefs(*beliefs)
@@ -468,11 +445,11 @@ def _(tables, emits, ring, slot, sent, sent_delay, region, stepped):
 
 
 def _first_outdated(grid: SourceGrid, window: Window, slot_age: Tensor, stepped: Tensor) -> Tensor:
-    """How long ago the first step was after which each receiver's belief is outdated, or -1, [V, B] steps.
+    """How many steps ago the first step was after which each receiver's belief is outdated, or -1, [V, B].
 
     A UAV has the server's belief as long as it had it in the step before and the server has all that the UAV
-    has reported since; this is noted in place. ``slot_age`` tells how long ago the step of each slot was,
-    [S, B]; read the other way, it is the slot of the step that was so long ago.
+    has reported since; this is noted in place. ``slot_age`` [S, B] tells how long ago each slot's step was,
+    and is also the slot of the step that was so long ago.
     """
     sent, age = window.report != grid.no_report, slot_age.unsqueeze(1)
     arrives = (sent & (window.delay == age)).amax(1)
@@ -494,10 +471,8 @@ def _to_compute(
 ) -> Iterator[tuple[Tensor, ...]]:
     """The C beliefs to compute from those of the step before, step by step, the oldest step first.
 
-    Yields:
-        For each step the rows in the flattened ring of the beliefs of the step before [C], those of the
-        beliefs [C], which of them change [C] bool, their regions [C], and what their receivers know of the
-        step, as rows of ``SourceGrid.log_reports`` [C, N].
+    Yields the rows in the flattened ring of the beliefs before [C] and after [C], which change [C] bool,
+    their regions [C], and what their receivers know of the step, as rows of ``log_reports`` [C, N].
     """
     n_worlds, n_steps = outdated.shape[1], len(slot_age) - 1
     due = torch.arange(n_steps, device=slot_age.device).view(-1, 1, 1) <= outdated

@@ -1,7 +1,6 @@
 """Features of messages: those of the paper's Table 2, and those of where the source is believed to be.
 
-``observe`` is pure and batched, and reads nothing but the messages it is given: the caller decides whether
-these are the latest messages sent or the latest received.
+``observe`` is pure and batched, and reads nothing but the messages that it is given.
 """
 
 import math
@@ -76,11 +75,8 @@ class ServerContext(NamedTuple):
 class FeatureCache:
     """Messages, and intermediate results that several features share, each computed once and on demand.
 
-    Args:
-        messages: of N UAVs, [*, N].
-        context: with the leading dimensions [*] of the messages.
-        own_only: messages are [*, N, N] (receiver, sender), and of the values of UAV j that follow from what
-            receiver i knows, only those with i = j are wanted.
+    With ``own_only``, messages are [*, N, N] (receiver, sender), and of the values of UAV j that follow from
+    what receiver i knows, only those with i = j are wanted.
     """
 
     def __init__(self, messages: Messages, context: ServerContext, own_only: bool = False) -> None:
@@ -94,21 +90,14 @@ class FeatureCache:
         return self._shared[compute]
 
     def wanted(self, field: Tensor) -> Tensor:
-        """A field [*, N, ...] of the UAVs whose values are wanted: of all, or of one for each *, [*, 1, ...].
-
-        A feature that compares every UAV with every other one computes only these; any other may compute all.
-        """
+        """A field [*, N, ...] of the UAVs whose values are wanted: of all, or of one for each *."""
         if not self.own_only:
             return field
         sender = self.context.now.dim()
         return field.diagonal(0, sender - 1, sender).movedim(-1, sender - 1).unsqueeze(sender)
 
     def reading(self, name: str) -> Tensor:
-        """Values of a sensor of the settings (``damian.sensor``), [*, N], or [*, N, width] if it has several.
-
-        Raises:
-            InputError: the settings have no such sensor.
-        """
+        """Values of a sensor of the settings (``damian.sensor``), [*, N] or, if several, [*, N, width]."""
         known = self.context.readings
         if name not in known:
             problem = f"is not one of {', '.join(known)}" if known else "is missing: no sensor is given"
@@ -179,9 +168,8 @@ def feature(
             knows its own messages), ``global`` (from the messages of all UAVs) or ``belief`` (from all
             messages so far, by ``cache.belief`` and ``cache.grid``).
         width: number of values for each UAV. With 1 the function returns [*, N], with more [*, N, width];
-            None if the number depends on the number of UAVs, as with the distances to the other UAVs.
-        low: lowest possible value.
-        high: highest possible value. Networks learn best from values about 1 in size.
+            None if it depends on the number of UAVs.
+        low, high: lowest and highest possible value; networks learn best from values about 1 in size.
 
     Examples:
         >>> @feature("local")
@@ -216,32 +204,16 @@ def check_features(config: ObservationConfig) -> None:
 
 
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
-    """Features by name.
+    """Features by name, each [*, N], or in the shape and range that it declares, of messages [*, N].
 
-    Args:
-        messages: one message of each of N UAVs, [*, N].
-        context: with the leading dimensions [*] of the messages.
-        names: features to compute.
-
-    Returns:
-        Each feature [*, N], in [0, 1] if it is one of Table 2; but ``agent_distances`` [*, N, N-1], to the
-        other UAVs in index order, and others in the shape and range that they declare.
+    Those of Table 2 are in [0, 1]; ``agent_distances`` [*, N, N-1] are to the other UAVs in index order.
     """
     cache = FeatureCache(messages, context)
     return {name: feature_of(name).compute(cache) for name in names}
 
 
 def observe_own(known: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
-    """Features by name, as each UAV computes its own from the messages that it knows.
-
-    Args:
-        known: messages [*, N, N] (receiver, sender).
-        context: with the leading dimensions [*, N] of the messages.
-        names: features to compute.
-
-    Returns:
-        As ``observe``, each feature [*, N] or [*, N, width].
-    """
+    """As ``observe``, but each UAV computes its own from messages [*, N, N] (receiver, sender)."""
     cache, sender = FeatureCache(known, context, own_only=True), known.time.dim() - 1
     values = {name: feature_of(name).compute(cache) for name in names}
     return {
@@ -423,10 +395,10 @@ SECTORS = 8
 @FEATURES.register("belief_gain")
 @feature("belief", width=None)
 def _belief_gain(v: FeatureCache) -> Tensor:
-    """Probability of detecting the source in the next step from where each discrete action leads, [*, N, A].
+    """Probability of detecting the source next from where each discrete action leads, [*, N, A].
 
-    Actions begin at the landing point that the UAV has reached last, are taken to be flown at once, and lead
-    to the nearest landing point, or to the second nearest if another UAV is known to stand there.
+    Actions begin at the latest landing point, are taken to be flown at once, and lead to the nearest landing
+    point, or to the second nearest if another UAV is known to stand there.
     """
     everyone, n_points = v.messages.trail[..., 0] % v.context.n_points, v.context.n_points
     standing = v.wanted(v.messages.trail[..., 0])
@@ -445,10 +417,7 @@ def _belief_gain(v: FeatureCache) -> Tensor:
 @FEATURES.register("belief_moments")
 @feature("belief", width=4, low=-1.0)
 def _belief_moments(v: FeatureCache) -> Tensor:
-    """Way from the UAV to the mean place (east, north), spread, and entropy over its maximum, [*, N, 4].
-
-    Lengths are over the largest vertex distance of the region, and at most 1.
-    """
+    """Way to the mean place (east, north), spread (over the region's size), share of the largest entropy."""
     belief, centres = v.belief, v.grid.centres
     *mean, square = (belief @ torch.cat([centres, centres.square().sum(-1, True)], -1)).unbind(-1)
     mean = torch.stack(mean, -1)

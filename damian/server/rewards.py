@@ -1,7 +1,7 @@
 """The terms of the reward, computed from features (paper, eq. 5-8), and terms from outside the package.
 
-``reward`` is pure and batched, as ``observe`` is. A term has the name of its feature; its weight in the
-configuration and its tag in the logs have the same name.
+A term has the name of its feature; its weight in the configuration and its tag in the logs have the same
+name.
 """
 
 import itertools
@@ -44,14 +44,10 @@ def reward_term(
 ) -> Callable[[Callable[..., Tensor]], RewardTerm]:
     """Decorator that makes a reward term of a function.
 
-    The function gets features by name, and ``Counters``; its keyword-only arguments are parameters that a
-    configuration may set. A feature has the shape and the range that it declares: [*, N] in [0, 1] unless it
-    says otherwise, and [*, N, width] if it has several values. The function returns [*, N], and must be pure,
-    batched over * and, for ``env.compile()``, free of branches on data.
-
-    Args:
-        reads: names of the features that it reads, built-in or your own (``package.module:name``).
-        scope: ``individual`` or ``system``.
+    The function gets the features that it ``reads`` by name (built-in or ``package.module:name``), [*, N] or
+    in the shape that they declare, and ``Counters``; its keyword-only arguments are parameters that a
+    configuration may set. It returns [*, N], and must be pure, batched over * and, for ``env.compile()``,
+    free of branches on data. Its ``scope`` is ``individual`` or ``system``.
 
     Examples:
         >>> # in lab.py, used as reward.custom=[{term: lab:low_battery, weight: -1, below: 0.5}]
@@ -136,16 +132,7 @@ def value_of(config: RewardConfig, name: str, features: dict[str, Tensor], count
 
 
 def reward(features: dict[str, Tensor], counters: Counters, config: RewardConfig) -> dict[str, Tensor]:
-    """Weighted reward terms by name (eq. 6 and 7); their sum is the reward (eq. 8).
-
-    Args:
-        features: as ``observe`` returns them; those of the built-in terms [*, N].
-        counters: steps [*] and motions [*, N].
-        config: weights of the terms.
-
-    Returns:
-        Each term whose weight is not 0, [*, N].
-    """
+    """Weighted reward terms by name, [*, N] (eq. 6 and 7); their sum is the reward (eq. 8)."""
     return {
         name: weight_of(config, name) * value_of(config, name, features, counters) for name in config.terms
     }

@@ -1,8 +1,7 @@
 """The server node computes observations, rewards and the task's status from messages (paper, section 3.2).
 
-Every formula exists once: the environment calls the server with the latest messages sent, the
-``ServerNode`` transform with the latest received, and the replay storage with those that have arrived by the
-time of learning.
+The environment calls it with the latest messages sent, ``ServerNode`` with the latest received, and the
+replay storage with those that have arrived by the time of learning.
 """
 
 import itertools
@@ -64,10 +63,6 @@ class Server:
     [*], ``source_over`` tells whether the source has finished its walk [*], ``coverage`` is that of an
     earlier step of the same worlds, which saves time, and ``belief`` the probability that the source is in
     each cell of ``grid`` [*, K]; without it, these are the first messages of the episode.
-
-    Args:
-        scenario: its settings of observations, rewards, ends of episodes, batteries and the source.
-        simulation: its regions, landing points, sensors and kind of motion.
     """
 
     def __init__(self, scenario: ScenarioConfig, simulation: Simulation) -> None:
@@ -184,14 +179,9 @@ class Server:
     ) -> Tensor:
         """Observations of actors that receive some messages without delay, [*, N, F].
 
-        Args:
-            received: packed messages that the server holds, [*, N, M].
-            sent: packed messages that the UAVs sent last, [*, N, M].
-            steps: elapsed steps of the episode, [*].
-            on_time: element (i, j) tells whether UAV i receives the messages of UAV j without delay, [N, N]
-                bool; if not given, each UAV receives only its own without delay.
-            fields: fields of these messages that are received without delay; the server provides the others.
-            belief: that of each UAV, [*, N, K].
+        ``received`` and ``sent`` are packed messages [*, N, M] as the server holds them, and as the UAVs sent
+        them last. Element (i, j) of ``on_time`` [N, N] tells whether UAV i receives the ``fields`` of UAV j
+        without delay; if not given, each receives its own. ``belief``: that of each UAV, [*, N, K].
         """
         n_agents = received.shape[-2]
         if on_time is None:
@@ -202,13 +192,7 @@ class Server:
         return self.observe_each(known._replace(**{name: timely[name] for name in fields}), steps, belief)
 
     def observe_each(self, known: Messages, steps: Tensor, belief: Tensor | None = None) -> Tensor:
-        """Observations of actors each of which knows messages of its own, [*, N, F].
-
-        Args:
-            known: the message of each UAV that each UAV knows, [*, N, N] (receiver, sender).
-            steps: elapsed steps of the episode, [*].
-            belief: that of each UAV, [*, N, K].
-        """
+        """Observations [*, N, F] from messages [*, N, N] (receiver, sender) and beliefs [*, N, K]."""
         context = self._context(known, steps.unsqueeze(-1).expand(known.time.shape[:-1]))
         context = context._replace(belief=belief)
         return stack(observe_own(known, context, self.observation.actor), self.observation.actor)

@@ -35,16 +35,9 @@ def status(
     dt: float,
     config: EpisodeConfig,
 ) -> Status:
-    """Success and the end of the episode, as the server knows them.
+    """Success and the end of the episode, from the messages [*, N] that the server holds.
 
     A time limit truncates, every other end terminates. A success in the last step counts as a success.
-
-    Args:
-        messages: messages that the server holds, [*, N].
-        steps: elapsed steps of the episode, [*].
-        source_over: has the source finished its walk, [*].
-        dt: length of a step [s].
-        config: conditions that end an episode.
     """
     n_agents = messages.spotted.shape[-1]
     success = ended = timed_out = torch.zeros_like(source_over)

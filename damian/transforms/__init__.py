@@ -1,7 +1,6 @@
 """Delays, action histories and slow clocks as TorchRL transforms, on any TorchRL environment.
 
-Only ``ServerNode``, ``Belief``, and ``SkipUntilReady`` in ``damian.transforms.hold``, need a ``UavEnv``. The
-world of the UAVs is loaded when one of the first two is first used.
+Only ``ServerNode``, ``Belief`` and ``SkipUntilReady`` (in ``damian.transforms.hold``) need a ``UavEnv``.
 """
 
 import importlib

@@ -52,14 +52,7 @@ class _Range(NamedTuple):
 
 
 def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs:
-    """Read the action spec of an environment.
-
-    Args:
-        env: environment that has the action.
-        key: key of the action.
-        default: default action: a number, or values in the shape of an action (indices for one-hot actions);
-            if None, the legal value nearest to 0.
-    """
+    """Read the action spec of an environment; ``default`` is that of ``ActionDelay``."""
     specs = env.full_action_spec
     spec, rows = specs[key], spec_rows(specs, key)
     if isinstance(spec, OneHot):
@@ -104,13 +97,7 @@ def _default_action(space: _Range, default: Any) -> Tensor:
 
 
 class ActionTransform(StatefulTransform):
-    """Base class of transforms that remember actions.
-
-    Args:
-        action_key: key of the action.
-        default: default action, as in ``read_action_specs``.
-        keys: further arguments of ``StatefulTransform``.
-    """
+    """Base class of transforms that remember actions; ``keys`` are arguments of ``StatefulTransform``."""
 
     def __init__(self, action_key: NestedKey, default: Any, **keys: Any) -> None:
         super().__init__(in_keys_inv=[action_key], **keys)
@@ -152,23 +139,20 @@ class ActionDelay(ActionTransform):
     begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
-            A delay is drawn for each world, each agent (under a nested key) and each step.
-        action_key: key of the action.
+        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``). A
+            delay is drawn for each world, each agent (under a nested key) and each step.
+        action_key: key of the action. A bare name for another key means an entry beside it.
         default: action that is executed until the first one arrives: a number, or values in the shape of an
             action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
         loss: probability that an action never arrives.
         dt: length of a step [s], for delays given as times.
-        sent_key: key of a flag in the policy's input, [...] bool: an action is sent only where it is true.
-            If not given, every action is sent.
+        sent_key: key of a flag in the policy's input, [...] bool: which actions are sent; if not given, all.
         valid_key: key of a flag that is written for the environment, [...] bool: true if the action is
-            executed for the first time, or is the default. The environment must read it itself; a
-            ``SerialEnv`` passes it on, a ``ParallelEnv`` only if its specs name it.
-        context_keys: key of each entry that the law may read, by the name that the law gives it
-            (``ContextSampler``). The policy's input and the outputs of a reset must have the entry.
+            executed for the first time, or is the default. A ``ParallelEnv`` passes it on only if its specs
+            name it.
+        context_keys: keys of the entries that the law may read, by name (``ContextSampler``); the policy's
+            input and the outputs of a reset must have them.
         seed: as in ``StatefulTransform``.
-
-    A bare name for one of the three keys above means an entry in the same TensorDict as the action.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ActionDelay(2))

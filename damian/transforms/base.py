@@ -1,10 +1,7 @@
 """The base class of transforms with memory, the order in which they must stand, and how seeds reach them.
 
-Outputs of the environment pass the transforms of a ``Compose`` from the first to the last, and actions from
-the last to the first. ``STAGES`` says which of damian's transforms must come before which.
-
 Importing this module extends ``TransformedEnv.set_seed`` for the whole process, in workers too: it then also
-seeds the transforms of damian that the environment contains. All else stays as it is.
+seeds the transforms of damian that the environment contains.
 """
 
 import itertools
@@ -68,25 +65,21 @@ class Correction(NamedTuple):
 class StatefulTransform(Transform):
     """Base class of transforms that remember earlier steps of each world, or of each agent of each world.
 
-    The memory has M rows: for an entry under a nested key, such as ``("agents", "observation")``, one for
-    each element of the batch size of its innermost TensorDict; for an entry at the root, one for each world.
-    It is allocated at the first reset and kept in buffers: ``state_dict`` saves it (by reference; clone the
-    tensors before the next step, as some of them are written in place), and ``to`` moves it.
+    The memory has M rows: one for each element of the innermost TensorDict of a nested key, such as
+    ``("agents", "observation")``; for an entry at the root, one for each world. It is allocated at the first
+    reset and kept in buffers, which ``state_dict`` saves by reference: clone them before the next step, as
+    some are written in place.
 
     A subclass implements pure functions of its memory and of entries: ``on_reset``, ``on_action`` (before the
-    environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one transform, and
-    ``act``, ``observe`` and ``begin`` below for several at once, so that all transforms of an environment
-    compile into one graph. No gradient flows through the memory, and what a transform writes shares no memory
-    with its buffers.
+    environment steps) and ``on_step`` (after it). TorchRL's hooks call them for one transform; ``act``,
+    ``observe`` and ``begin`` below for several, which compile into one graph. No gradient flows through the
+    memory.
 
     Args:
-        in_keys: keys of the entries that the transform reads, as in TorchRL's ``Transform``: one key (a name,
-            or a tuple of names), or a list of keys.
-        out_keys: keys of the entries that it writes.
-        in_keys_inv: keys of the actions that it reads.
-        out_keys_inv: keys of the actions that it writes.
-        seed: seed of everything that the transform draws, until ``set_seed`` of the environment seeds it; if
-            not given, it is drawn from torch's global generator at the first reset.
+        in_keys, out_keys, in_keys_inv, out_keys_inv: as in TorchRL's ``Transform``; the last two are of
+            actions.
+        seed: of all draws, until ``set_seed`` of the environment seeds it; if not given, it is drawn from
+            torch's global generator at the first reset.
     """
 
     stage: str = "delay"
@@ -147,13 +140,9 @@ class StatefulTransform(Transform):
         return memory
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
-        """How stored entries are corrected where this transform has changed them.
+        """How stored entries are corrected where this transform changed any of ``keys``; else None.
 
-        Args:
-            keys: entries that are computed again from late messages, without ``"next"``, and the rewards.
-
-        Returns:
-            The correction, or None if the transform changes none of these entries.
+        ``keys``: entries that are computed again from late messages, without ``"next"``, and the rewards.
         """
         return None
 
@@ -189,7 +178,7 @@ class StatefulTransform(Transform):
 
     @property
     def has_memory(self) -> bool:
-        """Has the memory been allocated, by a reset or by ``load_state_dict``."""
+        """Whether the memory has been allocated, by a reset or by ``load_state_dict``."""
         return self._rows is not None
 
     @property
@@ -305,10 +294,7 @@ class StatefulTransform(Transform):
     def _only_stepped(
         self, change: Change, stepped: Tensor, before: TensorDictBase, after: TensorDictBase
     ) -> Change:
-        """Undo a change in the worlds that do not step: they keep their memory and their entries.
-
-        ``before`` has the entries from before the step, and ``after`` those that it lacks.
-        """
+        """Undo a change in the worlds that do not step: ``before`` has their entries, or else ``after``."""
         memory, entries = change
         stepped = stepped.reshape(-1)
         memory = self.merge_worlds(self.memory, memory, stepped)
@@ -428,11 +414,7 @@ class StatefulTransform(Transform):
     # Random streams.
 
     def set_seed(self, seed: int | None) -> None:
-        """Set the seed and delete the memory; the next reset counts as the first.
-
-        If all worlds have just been reset, they need not be reset again, as TorchRL's collectors reset an
-        environment when they are made, and are seeded afterwards.
-        """
+        """Set the seed and delete the memory; the next step or reset begins it anew."""
         self._seed, self._world_seeds = seed, None
         self.clear_memory()
 
@@ -476,10 +458,7 @@ def act(
 def observe(
     transforms: Sequence[StatefulTransform], memories: Sequence[Memory], outputs: Entries, extra: Entries
 ) -> tuple[list[Memory], Entries]:
-    """Pass the outputs of a step through the transforms, after ``act``.
-
-    ``extra`` are entries that the transforms read, but that are no outputs.
-    """
+    """Pass the outputs of a step through the transforms, which also read ``extra``, after ``act``."""
     changed_memories = list(memories)
     for i, transform in enumerate(transforms):
         changed_memories[i], changed = transform.on_step(changed_memories[i], outputs | extra)
@@ -503,15 +482,11 @@ def begin(
 
 
 def check_order(transforms: Sequence[Transform]) -> None:
-    """Refuse an order in which one transform undoes or misses the effect of another.
+    """Refuse an order, as outputs pass the transforms, in which one undoes or misses what another does.
 
-    Args:
-        transforms: transforms in the order in which they process the environment's outputs.
-
-    Raises:
-        InputError: a transform of damian's reads what one of an earlier stage changes after it; rewards in
-            transit would be lost at an end of the episode; or a transform of TorchRL's takes or skips steps
-            of which the others do not know.
+    Raises ``InputError`` if a transform reads what one of an earlier stage changes after it, if rewards in
+    transit would be lost at an end of the episode, or if TorchRL's transforms take or skip steps unknown to
+    others.
     """
     for first, second in itertools.combinations(transforms, 2):
         problem = None
@@ -557,11 +532,7 @@ def all_transforms(env: EnvBase | None) -> list[Transform]:
 
 
 def stream_name(transform: Transform) -> str:
-    """The name that keeps the random streams of a transform apart from all others in its environment.
-
-    Transforms of one class and with the same keys are told apart by their order, so that adding another
-    transform changes no draws.
-    """
+    """The name that keeps the random streams of a transform apart from all others in its environment."""
     name = _class_and_keys(transform)
     others = all_transforms(transform.container)
     alike = [other for other in others if type(other) is type(transform) and _class_and_keys(other) == name]
@@ -632,10 +603,7 @@ def drop_keys(entries: Entries, keys: Sequence[NestedKey]) -> Entries:
 
 
 def sibling_key(key: NestedKey, name: NestedKey | None) -> NestedKey | None:
-    """The key of an entry that has this bare name in the TensorDict of another entry.
-
-    A nested key, or None, is returned as it is.
-    """
+    """The key of the bare ``name`` beside the entry ``key``; a nested key, or None, is returned as it is."""
     if name is None or not isinstance(name, str) or isinstance(key, str):
         return name
     return (*key[:-1], name)
@@ -659,9 +627,8 @@ def require_keys(transform: str, keys: Sequence[NestedKey], present: Iterable[Ne
 def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[NestedKey]:
     """The keys among ``present`` of the flags of this name that apply to an entry, the outermost first.
 
-    These are the flags in the TensorDict of the entry and in those that contain it. If there are none, they
-    are all flags within the innermost TensorDict around the entry that contains any: a world is done, or is
-    reset, if any of its agents is, as TorchRL aggregates flags.
+    These are the flags in the TensorDict of the entry and in those around it; if there are none, all flags
+    within the innermost TensorDict around the entry that contains any: TorchRL aggregates flags in this way.
     """
     path = path_of(key)
     flags = [flag for flag in present if last_part(flag) == name]
@@ -673,10 +640,7 @@ def flag_keys(name: str, key: NestedKey, present: Iterable[NestedKey]) -> list[N
 
 
 def reset_rows(tensordict: TensorDictBase, key: NestedKey, rows: torch.Size) -> Tensor | None:
-    """The rows of an entry that are reset, [M] bool, or None if the TensorDict does not say which.
-
-    If there are flags ``_reset`` at several levels, the outermost one decides, as in TorchRL.
-    """
+    """The rows that are reset, [M] bool, by the outermost flag ``_reset``; None if there is none."""
     keys = flag_keys("_reset", key, list(tensordict.keys(True, True)))
     if not keys:
         return None

@@ -36,13 +36,12 @@ class Channel(StatefulTransform):
     In each step an agent sends entries of its own (``in_keys``), or what its policy chooses (``action_key``).
     Each receiver holds, of each sender, the message that was generated last of those that have arrived, and
     observes it, its age, and whether any has arrived in this episode. An agent knows its own message at once.
-    The outputs of a reset are sent like those of a step; a chosen message exists from the first step on, in
-    whose outputs it arrives with delay 0. With delay 0 everyone sees everyone's current message. No gradient
-    flows through the channel.
+    The outputs of a reset are sent like those of a step; a chosen message exists from the first step on. No
+    gradient flows through the channel.
 
     A worked timeline, with a delay of 3 steps: the messages of the reset, t = 0, arrive at t = 3, and those
-    of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds their messages of
-    t = 0, of age 3.
+    of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds their messages of t =
+    0, of age 3.
 
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``); or an
@@ -50,28 +49,25 @@ class Channel(StatefulTransform):
             drawn for each receiver and message. With a ``position_key``, a law may read ``position`` and
             ``receiver_position``.
         in_keys: keys of the entries [*B, N, ...] of a group of agents that every agent sends together; if
-            neither this nor ``action_key`` is given, ``("agents", "observation")``.
+            neither this nor ``action_key`` is given, ``("agents", "observation")``. A bare name for another
+            key means an entry beside these.
         out_keys: keys under which the received entries are written, [*B, N, N, ...] (receiver, sender); if
             not given, ``received``, and with several in_keys ``received_`` and the name of each.
         loss: probability that a message does not reach a receiver, or an N x N nested list of it.
-        hears: which sender each receiver hears, a nested list or tensor [N, N] of bool; all if not given.
+        hears: which sender each receiver hears, [N, N] of bool; all if not given.
         comm_range: an agent hears only agents within this distance [m] when they send.
         position_key: key of an entry [*B, N, ...] whose first two numbers are the agent's position [m].
-        limit: so many agents of a world may send in a step, as on a shared medium; a random draw decides
-            among those that want to.
+        limit: so many agents of a world may send in a step, as on a shared medium, drawn from those that want
+            to.
         sent_key: key of a flag [*B, N] bool: does the agent send in this step.
-        action_key: key of an action [*B, N, message_size] in [-1, 1] that the transform adds to the action
-            spec, and sends.
+        action_key: key of an action [*B, N, message_size] in [-1, 1], which the transform adds to the specs.
         message_size: how many numbers ``action_key`` has.
         known_at_reset: everyone knows everyone's first message, whatever the delay and the links.
         dt: length of a step [s], for delays given as times.
-        age_key: key for the age of the held messages, in steps, [*B, N, N] float; before one has arrived,
-            steps since the reset; None to leave it out.
-        mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived; None to leave it
-            out.
+        age_key: key for the age of the held messages [steps], [*B, N, N] float, or steps since the reset; or
+            None.
+        mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived; or None.
         seed: as in ``StatefulTransform``.
-
-    A bare name for one of the keys means an entry in the same TensorDict as ``in_keys[0]`` or ``action_key``.
 
     Examples:
         >>> env = VmasEnv("navigation", num_envs=32, n_agents=3)

@@ -16,16 +16,10 @@ from damian.transforms.base import Entries, Memory, as_rows, sibling_key
 class ContextReader:
     """Builds the context of the messages that a transform delays; does nothing if their law sees none.
 
-    The memory of the transform must hold ``streams``, ``channel``, ``clock`` and ``reset_at`` (as in
-    ``DelayLine``); ``init_memory`` adds ``agents``: 0, 1, ..., N - 1.
-
-    Args:
-        law: of the delays; errors name it.
-        sampler: of the law.
-        context_keys: keys of the entries that the law may read, by name.
-        dt: length of a step [s].
-        beside: key of the delayed entry; a bare name in ``context_keys`` means an entry beside it.
-        before_step: the messages are sent before the environment steps, as actions are.
+    The transform's memory must hold ``streams``, ``channel``, ``clock`` and ``reset_at``, as in
+    ``DelayLine``. ``context_keys`` are those of the entries that the law may read, by name; a bare name means
+    an entry beside ``beside``. ``before_step``: the messages are sent before the environment steps, as
+    actions are.
     """
 
     def __init__(
@@ -57,10 +51,7 @@ class ContextReader:
     def read(
         self, memory: Memory, entries: Entries, sent: Tensor | None, rows: torch.Size
     ) -> MessageContext | None:
-        """The context of the messages of this step, or None if the law sees none.
-
-        ``sent`` [M] bool: which are really sent; all of them if not given.
-        """
+        """The context of the messages ``sent`` [M] (None: all) in this step; None if the law sees none."""
         if not self._sees_context:
             return None
         agents, streams, clock = memory["agents"], memory["streams"], memory["clock"]

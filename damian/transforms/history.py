@@ -32,27 +32,23 @@ _NEVER = 2**31
 class ActionHistory(ActionTransform):
     """Lets an agent observe its own latest actions, which make a delayed environment Markovian again.
 
-    The transform records actions as the policy chose them, so it must come after transforms that delay or
-    hold actions. The latest action comes last. Sources: Katsikopoulos and Engelbrecht (2003); paper, section
-    3.3.
+    It records actions as the policy chose them, so it must come after transforms that delay or hold actions.
+    The latest action comes last. Sources: Katsikopoulos and Engelbrecht (2003); paper, section 3.3.
 
     Args:
         steps: number of actions.
         action_key: key of the action.
-        out_key: key of the history, [..., steps * A] float32; a bare name means an entry beside the action.
-        append_to: key of an entry to which the history is appended in its own type; ``out_key`` is then
-            not used.
-        codes: vectors that represent discrete actions, [n_actions, A]. If not given, actions are scaled to
-            [0, 1]; one-hot actions are already.
-        default: action that fills the history before the first one: a number, or values in the shape of an
-            action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
-        recorded_key: key of a flag in the policy's input, [...] bool: an action is recorded only where it is
-            true; a bare name means an entry beside the action. If not given, every action is recorded.
-        age_key: key of the age of the observation [steps], [..., 1], as ``ObservationDelay`` writes it. The
-            history then contains only the actions that the observation cannot reflect yet: older ones are
-            replaced by the default.
-        reflected_after: an observation reflects an action if it was generated at least this many steps after
-            the action was chosen (only with ``age_key``).
+        out_key: key of the history, [..., steps * A] float32. A bare name, here and below, means an entry
+            beside the action.
+        append_to: key of an entry to which the history is appended in its own type, instead of ``out_key``.
+        codes: vectors that represent discrete actions, [n_actions, A]; if not given, actions are scaled to
+            [0, 1].
+        default: action that fills the history at first, as in ``ActionDelay``.
+        recorded_key: key of a flag in the policy's input, [...] bool: which actions are recorded; if not
+            given, all.
+        age_key: key of the age of the observation [steps], [..., 1], as ``ObservationDelay`` writes it.
+            Actions that the observation reflects already are then replaced by the default.
+        reflected_after: an observation reflects an action that was chosen at least this many steps before.
 
     Examples:
         >>> history = ActionHistory(2, append_to="observation")
@@ -194,14 +190,10 @@ class ActionHistory(ActionTransform):
 class MessageHistory(StatefulTransform):
     """Writes the messages of the latest steps that have arrived, those that came late or out of order too.
 
-    ``ObservationDelay`` lets a receiver hold one message, the newest; this transform keeps all that were sent
-    in the latest ``steps`` steps of the episode. It comes after ``ObservationDelay(..., delay_key=...)``,
-    which draws the delays. A row of the history has D + 3 numbers: those of the message, which are 0 before
-    it arrives; whether it has arrived; its age over ``steps``; and whether it is the receiver's own. The
-    newest message comes first. The message of a reset arrives at once.
-
-    With ``group`` every agent gets the messages of all agents of its world: its own first, then those of the
-    agents after it.
+    It comes after ``ObservationDelay(..., delay_key=...)``, which draws the delays. A row of the history has
+    D + 3 numbers: those of the message, 0 before it arrives; whether it has arrived; its age over ``steps``;
+    and whether it is the receiver's own. The newest message comes first. The message of a reset arrives at
+    once.
 
     Args:
         steps: number of latest steps, K.
@@ -212,7 +204,7 @@ class MessageHistory(StatefulTransform):
             arrives; None if messages are not delayed.
         sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
         encode: function from messages [..., M] to the D numbers to keep; if not given, these are the message.
-        group: whether agents get the messages of all agents of their world.
+        group: every agent gets the messages of all agents: its own first, then those of the agents after it.
         own: whether an agent knows its own messages as soon as they are sent.
 
     Examples:
@@ -276,13 +268,10 @@ class MessageHistory(StatefulTransform):
         return memory, self._written(memory)
 
     def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-        """Note a message whose delay nobody knew when it was sent, before the step in which it arrives.
+        """Note the message [...] of an agent that arrives in the next step, ``lag`` >= 1 steps late.
 
-        Args:
-            memory: of a single world, before the step.
-            message: the packed message, [...].
-            agent: number of its sender, the row of the memory.
-            lag: the delay, at least 1 step; one above ``steps`` changes nothing.
+        For a memory of one world, and delays that nobody knew at sending; a lag above ``steps`` changes
+        nothing.
         """
         if lag > self.steps:
             return memory
@@ -293,10 +282,7 @@ class MessageHistory(StatefulTransform):
         return memory
 
     def _added(self, memory: Memory, message: Tensor, due: Tensor, sent: Tensor) -> Memory:
-        """The memory with the messages [*rows, ...] of a step as the newest ones.
-
-        ``due`` [M]: steps until they arrive; ``sent`` [M] bool: which of them are really sent.
-        """
+        """The memory with the messages [*rows, ...] of a step, ``due`` [M] steps later, as the newest."""
         newest = {
             "kept": as_rows(self._encoded(message), self.rows),
             "due": torch.where(sent, due, _NEVER),

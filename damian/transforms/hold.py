@@ -31,7 +31,7 @@ class SampleAndHold(StatefulTransform):
 
     The clock ticks every ``period`` steps, and at every reset. Between two ticks, the entries ``in_keys``
     keep the values of the last tick, and the environment executes the actions ``in_keys_inv`` of the last
-    tick again. With a period of one step nothing changes.
+    tick again.
 
     A worked timeline, with a period of 3 steps: the clock ticks at t = 0, 3 and 6. The observation of t = 0
     is shown at t = 0, 1 and 2, and that of t = 3 at t = 3, 4 and 5. The action chosen at t = 0 is executed in
@@ -39,13 +39,10 @@ class SampleAndHold(StatefulTransform):
 
     Args:
         period: time between two ticks: steps (``4``), or a time (``"2s"``).
-        in_keys: keys of the entries that are sampled and held.
-        in_keys_inv: keys of the actions that are held: an action chosen between two ticks is not executed.
-        ready_key: key of a flag, [...] bool, that is set to false between two ticks, as an agent cannot
-            choose then; None to leave it out.
-        age_key: key of the age of the entries that are held [steps], [..., 1], as ``ObservationDelay`` writes
-            it: between two ticks it grows by one in each step. A bare name means an entry in the same
-            TensorDict as ``in_keys[0]``; None to leave ages as they are.
+        in_keys, in_keys_inv: keys of the entries that are sampled and held, and of the actions that are held.
+        ready_key: key of a flag, [...] bool, that is set to false between two ticks; or None.
+        age_key: key of the age of the held entries [steps], [..., 1], which grows between two ticks; or None.
+            A bare name means an entry beside ``in_keys[0]``.
         dt: length of a step [s], for a period given as a time.
 
     Examples:
@@ -155,25 +152,15 @@ class SampleAndHold(StatefulTransform):
 
 
 class SkipUntilReady(StatefulTransform):
-    """Steps each world until some agent can choose an action again, or the episode ends.
+    """Steps each world until some agent can choose an action again, or the episode ends (``clock.skip``).
 
-    The outputs equal, bit for bit, those of stepping the environment until then with actions that no agent
-    executes. Only the reward is the sum of gamma^k r_k over the merged steps k = 0, 1, ..., and ``duration``,
-    [B, 1] long, is the number of these steps (0 after a reset). A learner that discounts the next state value
-    by gamma^duration learns in a semi-Markov decision process (Sutton, Precup and Singh, 1999).
+    The outputs equal, bit for bit, those of stepping until then with actions that no agent executes. Only the
+    rewards ``reward_keys`` are the sums of gamma^k r_k over the merged steps k = 0, 1, ..., and ``duration``,
+    [B, 1] long, is the number of these steps (0 after a reset), as in a semi-Markov decision process (Sutton,
+    Precup and Singh, 1999).
 
-    The transform works only in a ``DelayedEnv`` on a ``UavEnv``, where worlds with a ready agent can pause,
-    with all of their messages in transit, while the others step on. Its place among damian's own transforms
-    does not matter, but these must come before all others. Transforms of TorchRL that come later process only
-    the merged steps: ``StepCounter`` counts decisions.
-
-    Args:
-        gamma: discount per merged step, in [0, 1]; with 1, returns are those of the single steps.
-        reward_keys: keys of the rewards to sum.
-
-    Examples:
-        >>> clock = ClockConfig(skip=True)  # adds the transform
-        >>> env = make_env(ScenarioConfig(motion=MotionConfig("polynomial"), clock=clock))
+    It works only in a ``DelayedEnv`` on a ``UavEnv``, before all transforms that are not damian's. Transforms
+    of TorchRL that come later process only the merged steps: ``StepCounter`` counts decisions.
     """
 
     per_world = True

@@ -38,30 +38,25 @@ class ObservationDelay(StatefulTransform):
     t = 4 shows observation 1, of age 3.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
-            A delay is drawn for each world, each agent (under a nested key) and each step.
-        in_keys: keys of the entries that are sent together, or one key.
-        out_keys: keys under which the received entries are written; if not given, ``in_keys``, so that the
-            current entries are overwritten.
+        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``). A
+            delay is drawn for each world, each agent (under a nested key) and each step.
+        in_keys: keys of the entries that are sent together, or one key. A bare name for another key means an
+            entry beside the first one.
+        out_keys: keys under which the received entries are written; if not given, ``in_keys``.
         loss: probability that a message is lost.
         order: ``generation``: the receiver holds the message that was generated last, so that the age grows
             by at most one per step. ``arrival``: it holds the message that arrived last.
         dt: length of a step [s], for delays given as times.
-        age_key: key for the age of the held message [steps], [..., 1] float; None to leave it out.
-        fresh_key: key for a flag, [..., 1] bool: did the held message arrive in this step; None to leave it
-            out.
+        age_key: key for the age of the held message [steps], [..., 1] float; or None.
+        fresh_key: key for a flag, [..., 1] bool: did the held message arrive in this step; or None.
         delay_key: key for the delay of the message sent in this step [steps], [..., 1] long, -1 if it never
-            arrives; None to leave it out. An actor must not observe it; back-updating needs it.
+            arrives; or None. An actor must not observe it; back-updating needs it.
         sent_key: key of a flag, [...] bool: which rows send a message in this step; if not given, all do.
-        context_keys: key of each entry that the law may read, by the name that the law gives it
-            (``ContextSampler``).
+        context_keys: keys of the entries that the law may read, by name (``ContextSampler``).
         seed: as in ``StatefulTransform``.
 
-    A bare name for one of the five keys above means an entry in the same TensorDict as ``in_keys[0]``.
-
     Examples:
-        >>> delay = ObservationDelay(Uniform(3, 7), loss=0.1)
-        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), delay)
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(Uniform(3, 7), loss=0.1))
         >>> env.rollout(100)["age"]  # steps since each observation was generated
     """
 

@@ -33,12 +33,7 @@ from damian.transforms.context import ContextReader
 
 
 class RewardTransform(StatefulTransform):
-    """Base class of transforms that remember rewards, in the buffer ``past`` [K, M, ...].
-
-    Args:
-        reward_key: key of the reward.
-        seed: as in ``StatefulTransform``.
-    """
+    """Base class of transforms that remember rewards, in the buffer ``past`` [K, M, ...]."""
 
     n_slots: int
     """Number of rewards that are remembered for each of the M rows, K."""
@@ -68,36 +63,32 @@ class RewardTransform(StatefulTransform):
 class RewardDelay(RewardTransform):
     """Delays rewards: each reward is received some steps after it was earned.
 
-    Rewards that are received in the same step are added up. In the last step of an episode, all rewards that
-    are still in transit are received, so that none is lost. Hence the transform must come after every
-    transform that ends episodes, such as ``StepCounter(max_steps=100)``, and not in a worker if these end
-    around the workers. With delay 0 the rollout is the same, bit for bit, as without the transform.
+    Rewards that are received in the same step are added up. In the last step of an episode, all rewards in
+    transit are received, so that none is lost. Hence the transform must come after every transform that ends
+    episodes, such as ``StepCounter(max_steps=100)``. With delay 0 the rollout is the same, bit for bit, as
+    without it.
 
     A worked timeline, with a delay of 3 steps: the reward r1 of the first step is earned at t = 1 and
     received at t = 4; the steps before receive 0. If the episode ends at t = 5, that step receives r2 + r3 +
     r4 + r5.
 
-    Rewards in transit lie in a ring of K slots (``past``), one for each coming step; ``due`` [K, M] is the
-    time at which those in a slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a
-    reset and at the end of an episode: whatever is in transit then is never received, and a later reward
-    takes its place. So a step writes one slot of each row, in place.
+    Rewards in transit lie in a ring of K slots (``past``); ``due`` [K, M] is the time at which those in a
+    slot arrive. A row's ``time`` [M] is the number of its steps, and jumps by K at a reset and at the end of
+    an episode: whatever is in transit then is never received. So a step writes one slot of each row, in
+    place.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``).
-            The law must not lose rewards. A delay is drawn for each world, each agent (under a nested key)
-            and each step.
+        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``) that
+            loses nothing. A delay is drawn for each world, each agent (under a nested key) and each step.
         reward_key: key of the reward.
         dt: length of a step [s], for delays given as times.
-        context_keys: key of each entry that the law may read, by the name that the law gives it
-            (``ContextSampler``).
-        delay_key: key for the delay of the reward earned in this step [steps], [..., 1] long; None to leave
-            it out. An actor must not observe it; back-updating needs it.
-        earned_key: key for the reward earned in this step, whenever it is received; None to leave it out. An
-            actor must not observe it; back-updating needs it if no messages tell the reward.
+        context_keys: keys of the entries that the law may read, by name (``ContextSampler``).
+        delay_key: key for the delay of the reward earned in this step [steps], [..., 1] long, 0 after a
+            reset. A bare name, here and below, means an entry beside the reward. An actor must not observe
+            either.
+        earned_key: key for the reward earned in this step, whenever it is received; 0 after a reset.
+            Back-updating needs it if no messages tell the reward.
         seed: as in ``StatefulTransform``.
-
-    A bare name for one of these keys means an entry in the same TensorDict as the reward. After a reset, what
-    ``delay_key`` and ``earned_key`` name is 0.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), RewardDelay(Uniform(0, 4)))
@@ -185,11 +176,7 @@ class RewardDelay(RewardTransform):
         return memory, {self.reward_key: from_rows(received, self.rows)} | self._report(delay, reward)
 
     def _send(self, memory: Memory, reward: Tensor, delay: Tensor, stepped: Tensor | None) -> Tensor:
-        """Add rewards [M, ...] to what arrives after the delays [M], except in rows that do not step.
-
-        Returns:
-            The slots, [K, M, ...].
-        """
+        """The slots [K, M, ...] with rewards [M, ...] that arrive after delays [M], in rows that step."""
         past, arrival = memory["past"], memory["time"] + delay
         flat, due = past.flatten(0, 1), memory["due"].view(-1)
         row = slot_rows(advance_slot(memory["slot"], delay, self.n_slots))
@@ -275,13 +262,8 @@ def sum_in_transit(past: Tensor, due: Tensor, time: Tensor) -> Tensor:
 class CumulativeReward(RewardTransform):
     """Replaces the reward by the discounted sum of the latest rewards (paper, eq. 4).
 
-    R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode. With ``steps=1``
-    nothing changes. Sums of integers are float32.
-
-    Args:
-        steps: number of rewards in the sum, T.
-        gamma: discount per step, in (0, 1].
-        reward_key: key of the reward.
+    R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode, with gamma in (0,
+    1]. Sums of integers are float32.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), CumulativeReward(5, gamma=0.9))
@@ -337,12 +319,7 @@ class EpisodeTotals(StatefulTransform):
     """Writes the sum of the rewards, and the number of steps, of each world's episode so far.
 
     The entries are those of TorchRL's ``RewardSum`` and ``StepCounter``, bit for bit; but a ``DelayedEnv``
-    computes them in the same function as the rest of a step and the resets after it, which saves time.
-
-    Examples:
-        >>> env = make_env(ScenarioConfig(), num_worlds=64)
-        >>> env.append_transform(EpisodeTotals())
-        >>> env.rollout(50)["next", "agents", "episode_reward"]  # [64, 50, N, 1]
+    computes them in the same function as the rest of a step, which saves time.
     """
 
     stage = "history"

@@ -26,21 +26,15 @@ from damian.world.coverage import KnownCoverage
 class ServerNode(StatefulTransform):
     """Computes observations, rewards and the task's status from the messages that have arrived.
 
-    The transform writes the entries that ``UavEnv`` writes itself when no message is delayed. After a reset
-    the server holds the first message of every UAV, so the outputs of the environment's reset stay as they
-    are. ``damian.make_env`` adds the transform where a scenario delays or loses messages.
+    It writes the entries that ``UavEnv`` writes itself when no message is delayed; after a reset, the server
+    holds the first message of every UAV. ``damian.make_env`` adds it where a scenario delays or loses
+    messages.
 
     Args:
         server: server node that does the computations.
         message_key: key of the packed messages that the server holds, [B, N, M].
-        dropped_keys: keys of entries to remove from the outputs, because nothing reads them later and each
-            one costs time in every step.
+        dropped_keys: keys of entries to remove, because nothing reads them later and each one costs time.
         reward_terms: also write the weighted terms of the reward, ``("agents", "reward_terms")``.
-
-    Examples:
-        >>> env = UavEnv(scenario, num_worlds=64, extras=["message"], messages_only=True)
-        >>> uplink = ObservationDelay(3, [("agents", "message")], [("agents", "received")])
-        >>> env = TransformedEnv(env, Compose(uplink, ServerNode(env.server)))
     """
 
     stage = "server"
@@ -108,21 +102,10 @@ class ServerNode(StatefulTransform):
 
 
 class OnboardNode(StatefulTransform):
-    """Computes each UAV's observation from the messages that have reached it, by the server's formulas.
+    """Computes each UAV's observation from ``("agents", "linked")``, by the server's formulas.
 
     Rewards, the task's status and the critic's observation stay those of the server node. After a reset every
-    UAV knows the first message of every other, so the outputs of the environment's reset stay as they are.
-    What each UAV holds of each other is in ``("agents", "linked")``, as ``Channel`` writes it.
-    ``damian.make_env`` adds the transform with ``links=matrix``.
-
-    Args:
-        server: server node whose features are computed.
-        dropped_keys: keys of entries to remove from the outputs, because nothing reads them later.
-
-    Examples:
-        >>> env = UavEnv(scenario, num_worlds=64, extras=["message"])
-        >>> channel = Channel(Uniform(1, 5), keys.MESSAGE, keys.LINKED, known_at_reset=True)
-        >>> env = TransformedEnv(env, Compose(channel, OnboardNode(env.server)))
+    UAV knows the first message of every other. ``damian.make_env`` adds the transform with ``links=matrix``.
     """
 
     stage = "server"
@@ -149,25 +132,15 @@ class OnboardNode(StatefulTransform):
 class Belief(StatefulTransform):
     """Writes the probability that the source is in each cell of a grid, by Bayes' rule.
 
-    The belief of the server is exact for the messages that have arrived by now, whenever they were sent, and
-    it knows no others. For each world the memory holds the beliefs of the latest steps, as they follow from
-    what is known now, and the messages sent in them; when a message comes in late, the filter runs again from
-    the step in which it was sent. ``damian.make_env`` adds the transform if a feature reads the belief.
-
-    It writes ``belief`` [B, K] and, if ``own``, ``("agents", "belief")`` [B, N, K]: that of each UAV, which
-    knows its own messages at once.
+    The belief is exact for the messages that have arrived by now, whenever they were sent: when one comes in
+    late, the filter runs again from the step in which it was sent. It writes ``belief`` [B, K] and, if
+    ``own``, that of each UAV, which knows its own messages at once, ``("agents", "belief")`` [B, N, K].
 
     Args:
         server: server node, whose grid the belief is about.
         longest: longest delay of a message [steps].
         delayed: whether the delays of the messages are in ``("agents", "delay")``; if not, none is delayed.
         own: compute the belief of each UAV too.
-
-    Examples:
-        >>> env = UavEnv(scenario, num_worlds=64, extras=["message"], messages_only=True)
-        >>> uplink = ObservationDelay(3, keys.MESSAGE, keys.RECEIVED, delay_key=keys.DELAY)
-        >>> believe = Belief(env.server, longest=3, delayed=True)
-        >>> env = TransformedEnv(env, Compose(uplink, believe, ServerNode(env.server)))
     """
 
     per_world = True
@@ -203,13 +176,10 @@ class Belief(StatefulTransform):
         return window._asdict(), self._written(beliefs)
 
     def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-        """Note a message whose delay nobody knew when it was sent, before the step in which it arrives.
+        """Note, in place, the packed message [M] of a UAV that arrives in the next step, ``lag`` steps late.
 
-        Args:
-            memory: of a single world, before the step; it is changed in place.
-            message: the packed message, [M].
-            agent: number of its UAV.
-            lag: the delay, at least 1 step; one above ``longest`` changes nothing.
+        For a memory of one world, and delays that nobody knew at sending; a lag above ``longest`` changes
+        nothing.
         """
         if lag <= self.longest:
             messages = self.server.messages(message.view(1, 1, -1))

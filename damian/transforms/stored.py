@@ -27,25 +27,18 @@ def delay_trajectories(
 ) -> TensorDictBase:
     """Apply transforms to stored steps, as if the environment had had them when the steps were collected.
 
-    The stored steps are played back in their order. The result equals, bit for bit, what the same transforms
-    with the same seeds give in the environment, if the actions are the same. A row of ``data`` is a world,
-    and may contain several episodes. A step begins an episode if it is the first of its row, if the step
-    before it is done, if the number ``("collector", "traj_ids")`` says so, or if an entry differs from the
-    one under ``"next"`` one step before, as where rows were cut and joined. The message of such a step has no
-    delay. Rewards in transit where the data ends or is cut are not paid.
+    The result equals, bit for bit, what the same transforms with the same seeds give in the environment, if
+    the actions are the same. A row of ``data`` is a world, and may contain several episodes. A step begins an
+    episode if it is the first of its row, if the step before it is done, if the number ``("collector",
+    "traj_ids")`` says so, or if an entry differs from the one under ``"next"`` one step before. The message
+    of such a step has no delay. Rewards in transit where the data ends or is cut are not paid.
 
     Args:
-        data: steps as TorchRL stores them, [T] or [*, T] with time last: entries, actions, and under
-            ``"next"`` the outputs of each step. TensorDicts of agents have batch size [*, T, N].
-        transform: a transform, or a ``Compose`` of several. It is copied, so it can be used again.
-        action_spec: ``env.full_action_spec`` of the environment of the steps, of any number of worlds; only
-            ``ActionHistory`` needs it, for the range of the actions.
-
-    Returns:
-        The steps with what the transforms change or add; ``data`` stays as it is.
-
-    Raises:
-        InputError: the transform would have changed what happened, as ``ActionDelay`` does.
+        data: steps as TorchRL stores them, [T] or [*, T]; TensorDicts of agents have batch size [*, T, N].
+        transform: a transform or a ``Compose``; it is copied. ``InputError`` if it changes what happened, as
+            ``ActionDelay`` does.
+        action_spec: ``env.full_action_spec``, which only ``ActionHistory`` needs, for the range of the
+            actions.
 
     Examples:
         >>> steps = GymEnv("Pendulum-v1").rollout(400, break_when_any_done=False)
@@ -78,12 +71,7 @@ def _play(env: EnvBase, playback: "_Playback", starts: Tensor) -> TensorDictBase
 
 
 class _Playback(EnvBase):
-    """An environment that outputs stored steps in their order, whatever the actions are.
-
-    Args:
-        data: stored steps, [*, T].
-        action_spec: specs of the actions of one step.
-    """
+    """An environment that outputs stored steps [*, T] in their order, whatever the actions are."""
 
     def __init__(self, data: TensorDictBase, action_spec: Composite) -> None:
         super().__init__(device=data.device, batch_size=data.batch_size[:-1])

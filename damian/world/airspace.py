@@ -27,10 +27,7 @@ _SLOTS = 2**18
 
 
 class Cells(NamedTuple):
-    """The landing points that may be among the nearest ones of a place, by the square cell in which it lies.
-
-    There are C cells in all R regions; U of them are used, because they meet the polygon.
-    """
+    """The landing points that may be nearest to a place, by the cell in which it lies: C in all, U used."""
 
     point: Tensor
     """Ids of landing points within their region, W for each used cell, -1 behind the last, [U, W] int32."""
@@ -53,14 +50,13 @@ class Airspace:
     A landing point's *flat id* is ``region * L + point``; padded points lie infinitely far away.
 
     Attributes:
-        points: landing points, [R, L, 2] metres east and north of the local origin of their region.
-        exact_points: the same in double precision, by which the nearest ones are found.
+        points, exact_points: landing points, [R, L, 2] metres east and north of the local origin of their
+            region, in single and in double precision; the nearest ones are found by the latter.
         cells: those that may be nearest to a place.
         n_points: number of real landing points, [R].
         edges: polygon edges ``x1, y1, x2, y2`` (holes included), [R, E, 4] metres, double precision.
         scale: largest distance between two vertices, [R] metres; features divide distances by it.
         offset: place of the local origin in the coordinates of the settings, [R, 2] metres.
-        regions: the R regions, with their polygons and names.
     """
 
     points: Tensor
@@ -107,15 +103,7 @@ def build_airspace(regions: list[Region], config: RegionConfig, n_agents: int) -
 
 
 def inside(edges: Tensor, target: Tensor) -> Tensor:
-    """Whether each target lies inside its polygon (even-odd rule); concave polygons and holes are allowed.
-
-    Args:
-        edges: polygon edges ``x1, y1, x2, y2``, [*, E, 4] metres.
-        target: [*, 2] metres.
-
-    Returns:
-        Bool, [*].
-    """
+    """Whether targets [*, 2] lie in polygons (even-odd rule) of edges [*, E, 4]; [*] bool."""
     x1, y1, x2, y2 = edges.unbind(-1)
     x, y = target[..., :1], target[..., 1:]
     straddles = (y1 > y) != (y2 > y)
@@ -125,20 +113,11 @@ def inside(edges: Tensor, target: Tensor) -> Tensor:
 
 
 def nearest_points(cells: Cells, points: Tensor, region: Tensor, target: Tensor, n: int) -> Tensor:
-    """The ``n`` landing points nearest to each target, nearest first.
+    """The ``n`` landing points nearest to each target [M, 2] m in its region [M], nearest first, [M, n].
 
-    The nearest landing point is the one at the smallest distance in whole centimetres and, of several, the
-    one with the lowest id, so that ties depend neither on rounding errors nor on the origin.
-
-    Args:
-        cells: of the airspace.
-        points: ``Airspace.exact_points``, [R, L, 2] metres.
-        region: indices of the regions, [M].
-        target: places inside their regions, [M, 2] metres, float64.
-        n: number of points, at most as many as ``build_cells`` was told.
-
-    Returns:
-        Ids within their region, [M, n]; -1 behind the last one of a region that has fewer than n.
+    The nearest one is that at the smallest distance in whole centimetres and, of several, the one with the
+    lowest id, so that ties do not depend on rounding errors. Ids are within the region; -1 if there are fewer
+    than n.
     """
     at_once = max(_SLOTS // cells.point.shape[1], 1)
     parts = zip(region.split(at_once), target.split(at_once), strict=True)
@@ -166,11 +145,6 @@ def build_cells(lattices: list[Floats], polygons: list[Polygon | MultiPolygon], 
 
     The n points nearest to a cell's centre are at most half a diagonal farther from any place in the cell, so
     the n nearest ones of that place are at most two halves farther from the centre than the n-th of these.
-
-    Args:
-        lattices: landing points of each region, [L, 2] metres.
-        polygons: of the regions.
-        n: number of points.
     """
     tables, rows_of_cells, shapes, corners, sides = [], [], [], [], []
     n_used = 0

@@ -39,12 +39,7 @@ def used_so_far(
 ) -> Tensor:
     """Battery drain of a flight so far, [*] percent; ``flight_drain`` from its end on.
 
-    Args:
-        elapsed: time since takeoff, [*] seconds.
-        vertical: duration of the takeoff, the same as of the landing, [*] seconds.
-        cruise: duration of the cruise, [*] seconds.
-        cruised: distance cruised so far, [*] metres.
-        battery: parameters of the battery.
+    From times [s] since takeoff, of the takeoff (and the landing) and of the cruise, and the way cruised [m].
     """
     took_off = torch.minimum(elapsed, vertical)
     landing = torch.minimum((elapsed - vertical - cruise).clamp(min=0), vertical)

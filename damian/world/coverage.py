@@ -1,10 +1,8 @@
 """Coverage: the share of a UAV's footprint that is new, lies in the region and belongs to no other UAV.
 
-A footprint is a disc of radius R. It is always sampled at the same ``64 * words`` points, so that a
-part of the disc is a bit mask, and set operations on discs and polygons are bitwise operations on
-a few int64 words. Two kinds of masks are tabulated once: the samples outside the polygon, for each
-landing point, and the samples inside a second disc, for each offset of two discs (in cells of 4R/320).
-A step only has to look masks up, combine them with OR and count the bits that stay 0.
+A footprint is always sampled at the same ``64 * words`` points, so that a part of it is a bit mask. Masks of
+two kinds are tabulated once: the samples outside the polygon, for each landing point, and the samples inside
+a second disc, for each offset of two discs. A step combines them with OR and counts bits.
 """
 
 import functools
@@ -33,10 +31,9 @@ _POINTS_AT_ONCE = 1024
 class FootprintTables(NamedTuple):
     """Bit masks of a sampled footprint; a bit of 1 marks a sample that does not count.
 
-    ``masks`` is ``[G * G + P, words]`` int64, for G offsets per axis and P landing points. Row
-    ``x * G + y``: samples of a disc that lie in a second disc, whose centre is ``(x - G // 2, y - G // 2)``
-    cells further (east, north); rows on the border of this grid are 0. Row ``G * G + p``: samples of
-    the disc at landing point p that lie outside its polygon. ``cells_per_metre`` is ``(G - 1) / 4R``.
+    ``masks`` is ``[G * G + P, words]`` int64, for G offsets per axis and P landing points. Row ``x * G + y``:
+    samples of a disc in a second disc, whose centre is ``(x - G // 2, y - G // 2)`` cells further (east,
+    north); 0 on the border. Row ``G * G + p``: samples of the disc at landing point p outside its polygon.
     """
 
     masks: Tensor
@@ -53,18 +50,11 @@ def build_tables(
     radius: float,
     words: int = 16,
 ) -> FootprintTables:
-    """Tabulate the masks of all landing points.
+    """Tabulate the masks of all landing points [R, L, 2] in polygons, for a ``radius`` of footprints [m].
 
-    With 16 words, over random polygons and up to 5 other discs, the error of one footprint's area is
-    0.2 % (rms) of pi R^2, and below 0.9 % in 3000 random placements. A search for the worst placement, which
-    moves UAVs to raise the error, finds 1.1 %. More words cost time, fewer cost accuracy.
-
-    Args:
-        polygons: one for each of R regions; may be concave, in several parts and have holes.
-        points: landing points of ``polygons[r]``, ``[R, L, 2]`` [m]; the flat id of ``points[r, l]`` is
-            ``r * L + l``. Rows of NaN are padding, where nothing counts as covered.
-        radius: radius of the footprint [m].
-        words: number of int64 words of a mask, with 64 samples each.
+    With 16 words, over random polygons and up to 5 other discs, the error of one footprint's area is 0.2 %
+    (rms) of pi R^2, and below 0.9 % in 3000 random placements; the worst placement that a search has found
+    gives 1.1 %. Points of NaN are padding, where nothing counts as covered.
     """
     offsets = radius * _unit_disc_samples(64 * words)
     outside = [_outside(*pair, offsets) for pair in zip(polygons, points, strict=True)]
@@ -75,14 +65,10 @@ def build_tables(
 def covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
     """Coverage c_a in [0, 1], ``[*, N]``: mean share of each UAV's last n footprints that counts.
 
-    The part of the footprint at ``positions[..., i, k, :]`` (index 0 newest, n - 1 oldest) counts that
-    lies inside the polygon, in the footprint of no other UAV at the same index k, and in no older
-    footprint (index > k) of UAV i itself. Shares are fractions of pi R^2 (paper, Table 2).
-
-    Args:
-        tables: from :func:`build_tables`, on the same device as the positions.
-        point_ids: ``[*, N, n]`` int64, flat ids of the landing points where the UAVs stood.
-        positions: ``[*, N, n, 2]`` [m], positions of these landing points; finite (not checked).
+    The part of the footprint at ``positions[..., i, k, :]`` (index 0 newest) counts that lies inside the
+    polygon, in the footprint of no other UAV at the same index k, and in no older footprint of UAV i itself.
+    Shares are fractions of pi R^2 (paper, Table 2). ``point_ids`` ``[*, N, n]`` are the landing points of the
+    ``positions`` ``[*, N, n, 2]`` [m].
     """
     lead, (n_uavs, n_last) = point_ids.shape[:-2], point_ids.shape[-2:]
     ids, xy = point_ids.reshape(-1, n_uavs, n_last), positions.reshape(-1, n_uavs, n_last, 2)
@@ -101,10 +87,7 @@ class KnownCoverage(NamedTuple):
 
 
 def updated_share(tables: FootprintTables, point_ids: Tensor, points: Tensor, known: KnownCoverage) -> Tensor:
-    """As :func:`covered_share`, but computed only for worlds that have changed since ``known``, ``[*, N]``.
-
-    ``points`` are the positions of all landing points, ``[R * L, 2]`` [m].
-    """
+    """As ``covered_share``, from all ``points`` [m], but computed only for worlds that have changed."""
     changed = (point_ids != known.trail).flatten(-2).any(-1) | (known.share[..., 0] < 0)
     n_uavs, n_last = point_ids.shape[-2:]
     ids, share = point_ids.reshape(-1, n_uavs, n_last), known.share.reshape(-1, n_uavs)
@@ -138,11 +121,7 @@ def _worlds_at_once(tables: FootprintTables, point_ids: Tensor) -> int:
 
 
 def own_covered_share(tables: FootprintTables, point_ids: Tensor, positions: Tensor) -> Tensor:
-    """Coverage c_a in [0, 1], ``[*, N]``, of each UAV as far as it knows the footprints of the others.
-
-    The arguments are those of :func:`covered_share`, with dimensions ``[*, N, N, ...]`` (receiver, sender);
-    the result is its diagonal.
-    """
+    """The diagonal of ``covered_share`` of what each UAV knows, ``[*, N, N, ...]`` (receiver, sender)."""
     lead, (n_uavs, n_last) = point_ids.shape[:-3], point_ids.shape[-2:]
     uav = torch.arange(n_uavs, device=point_ids.device)
     # The receiver i itself, then i + 1, i + 2, ... (modulo N).

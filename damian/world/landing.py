@@ -46,8 +46,7 @@ class Ranking(NamedTuple):
 class Candidates:
     """Landing points to which an action of one of N UAVs may lead, nearest its target first.
 
-    UAVs choose only while they stand on a landing point, so for discrete actions the candidates of every
-    (landing point, action) are computed once. Among ``2N - 1`` candidates, one is always free: the other
+    For discrete actions they are computed once. Among ``2N - 1`` candidates, one is always free: the other
     UAVs stand on at most ``N - 1`` points and have booked at most ``N - 1`` more.
     """
 
@@ -60,15 +59,10 @@ class Candidates:
             self._rank_all()
 
     def rank(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Ranking, Tensor]:
-        """Rank the landing points to which the actions may lead.
+        """Rank the landing points to which actions [B, N] or, in [0, 1], [B, N, 2] may lead.
 
-        Args:
-            flat: flat id of the landing point each UAV stands on, [B, N].
-            region: index of each world's region, [B].
-            action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
-
-        Returns:
-            Candidates as M lists, and the row of each UAV among them, [B, N].
+        From the flat ids of the landing points [B, N] in regions [B]. Returns candidates as M lists, and the
+        row of each UAV among them, [B, N].
         """
         if self.config.kind == "discrete":
             return self.ranking, flat * self.config.n_actions + action
@@ -150,10 +144,7 @@ class Candidates:
 def _nearest_inside(
     edges: Tensor, cells: list[Tensor], points: Tensor, region: Tensor, target: Tensor, own: Tensor, n: int
 ) -> Tensor:
-    """Landing points nearest to targets [M, 2], [M, n]; ``own`` [M] instead of missing ones or outside.
-
-    A custom operator, because the number of targets inside depends on data, which a compiler cannot trace.
-    """
+    """Landing points nearest to targets, [M, n]; ``own`` [M] instead of missing ones or outside."""
     at_once = max(_EDGES_AT_ONCE // edges.shape[1], 1)
     parts = zip(region.split(at_once), target.split(at_once), strict=True)
     within = torch.cat([inside(edges.index_select(0, r), t) for r, t in parts])
@@ -183,15 +174,9 @@ def assign_landing_points(
 ) -> Tensor:
     """Give every UAV its best free candidate, in index order, so that no two book one point, [B, N].
 
-    A point is free to a UAV if no other UAV stands on it or flies to it; its own point always is.
-
-    Args:
-        ranking: candidates, as M lists of K.
-        row: row of each UAV among these lists, [B, N].
-        standing: point on which each UAV stands or to which it flies, [B, N].
-        reach: largest distance that the UAV may fly now [m], negative if it may not choose, [B, N]. A
-            candidate farther away does not count, and stays free for other UAVs.
-        n_points: largest number of landing points of a region.
+    A point is free to a UAV if no other UAV stands on it or flies to it (``standing`` [B, N]); its own point
+    always is. ``row`` [B, N] is that of each UAV in the ranking, ``reach`` [B, N] the largest distance that
+    it may fly [m], negative if it may not choose: candidates farther away stay free for other UAVs.
     """
     if row.shape[1] <= _FEW_AGENTS or not devices.data_dependent(row.device):
         return _assign_one_by_one(ranking, row, standing, reach)
@@ -217,8 +202,7 @@ def _assign_in_rounds(
     """The same by deferred acceptance (Gale and Shapley, 1962), as a custom operator.
 
     All UAVs ask for their best candidate. Each point keeps the earliest UAV that has asked for it; all others
-    ask for their next one, and so does a UAV that has to yield to an earlier one. As the earliest UAV that
-    ever asks for a free point keeps it, this ends with what the UAVs would take one after the other.
+    ask for their next one, so that this ends with what the UAVs would take one after the other.
     """
     at_once, points, distances = max(BOOKING_CHUNK // n_points, 1), point.flatten(), distance.flatten()
     first = row * point.shape[1]

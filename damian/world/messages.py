@@ -1,7 +1,6 @@
 """The messages that UAVs send to the server node: their fields, and each message as one row of numbers.
 
-To add a field, declare it in ``Messages`` and fill it in ``Simulation._sense``; packing, delays and replay
-follow from the declaration. Values that a user's sensor reads (``damian.sensor``) lie in ``readings``.
+To add a field, declare it in ``Messages`` and fill it in ``Simulation._sense``.
 """
 
 from typing import Annotated, NamedTuple, get_type_hints
@@ -25,8 +24,7 @@ class Column(NamedTuple):
 class Messages(NamedTuple):
     """One message of each UAV, with any leading dimensions; each field [*, N] or [*, N, width].
 
-    A message carries what the paper lists (section 3.2) and, so that features and rewards follow from
-    messages alone, the number of motions of the UAV and its latest landing points.
+    It carries what the paper lists (section 3.2), the number of motions and the latest landing points.
     """
 
     time: Annotated[Tensor, Column()]
@@ -62,24 +60,16 @@ class Messages(NamedTuple):
         return blank._replace(detected_time=blank.detected_time - 1, trail=trail)
 
     def pack(self) -> Tensor:
-        """Messages as rows of M numbers, fields in order, [*, N, M] float32.
-
-        Integers up to ``MAX_EXACT_INTEGER`` come through exactly, and floats with about seven digits.
-        """
+        """Messages as rows [*, N, M] float32; integers up to ``MAX_EXACT_INTEGER`` come through exactly."""
         fields = zip(self, _COLUMNS, strict=True)
         parts = [(field.unsqueeze(-1) if width == 1 else field).float() for field, (width, _) in fields]
         return torch.cat(parts, -1)
 
     @classmethod
     def unpack(cls, rows: Tensor, n_readings: int = 0) -> "Messages":
-        """Messages from their rows; float fields are views of the rows.
+        """Messages from rows [*, N, M] with K = ``n_readings`` columns of readings; floats are views.
 
-        A row does not say where the trail ends, so ``Server.messages``, which knows it, is the way to unpack
-        the messages of an environment.
-
-        Args:
-            rows: packed messages, [*, N, M].
-            n_readings: number of columns of readings, K.
+        ``Server.messages``, which knows how many there are, is the way to unpack messages of an environment.
         """
         window = rows.shape[-1] - _FIXED - n_readings
         parts = rows.split([*(column.width for column in _COLUMNS[:-2]), window, n_readings], -1)
@@ -91,19 +81,11 @@ class Messages(NamedTuple):
         return (self.position != self.target).any(-1)
 
     def region(self, n_points: int) -> Tensor:
-        """Index of the region to which the landing points of each world belong, [*].
-
-        Args:
-            n_points: largest number of landing points in a region.
-        """
+        """Index of the region of each world, [*], by the largest number of landing points in a region."""
         return self.trail[..., 0, 0] // n_points
 
     def age(self, now: Tensor) -> Tensor:
-        """Age of information: time since each message was generated [s], [*, N].
-
-        Args:
-            now: current time [s], [*].
-        """
+        """Age of information: time since each message was generated [s], [*, N]; ``now`` is in s, [*]."""
         return now.unsqueeze(-1) - self.time
 
 

@@ -1,8 +1,4 @@
-"""Flights: takeoff, cruise and landing as rest-to-rest polynomials, and the shortest times of each.
-
-A flight starts and ends at rest on a landing point: takeoff to the flight level, cruise at that
-level, landing (paper, eq. 1). Each phase follows a polynomial time law of degree 3, 5 or 7.
-"""
+"""Flights (paper, eq. 1): takeoff to the flight level, cruise and landing as rest-to-rest polynomials."""
 
 import math
 from typing import NamedTuple
@@ -28,14 +24,7 @@ class Pose(NamedTuple):
 
 
 def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> list[float]:
-    """One flight level per UAV [m], from the lowest upward.
-
-    Args:
-        config: settings of the levels.
-        n_agents: number of UAVs.
-        shared: where the levels are too few, begin with the lowest one again, as for UAVs that never meet in
-            the air.
-    """
+    """One flight level per UAV [m], from the lowest upward; if ``shared``, UAVs may have the same one."""
     room = (config.max_level - config.min_level) / config.level_separation
     n_fit = math.floor(room + _TINY) + 1
     checks.require(
@@ -49,14 +38,10 @@ def flight_levels(config: MotionConfig, n_agents: int, shared: bool = False) -> 
 
 
 def time_law(tau: Tensor, degree: int) -> Tensor:
-    """Share of a phase's length covered at the share ``tau`` of its time (paper, eq. 1).
+    """Share of a phase's length covered at the share ``tau`` of its time, any shape (paper, eq. 1).
 
-    The polynomial of lowest degree with s(0) = 0, s(1) = 1 and 1, 2 or 3 vanishing derivatives at
+    The polynomial of lowest degree (3, 5 or 7) with s(0) = 0, s(1) = 1 and 1, 2 or 3 vanishing derivatives at
     both ends. ``tau`` is clamped to [0, 1].
-
-    Args:
-        tau: share of the time, any shape.
-        degree: 3, 5 or 7.
     """
     t = tau.clamp(0.0, 1.0)
     if degree == 3:
@@ -67,18 +52,9 @@ def time_law(tau: Tensor, degree: int) -> Tensor:
 
 
 def minimum_time(length: Tensor, degree: int, max_speed: float, max_acceleration: float) -> Tensor:
-    """Shortest time of a rest-to-rest phase within both limits; 0 for length 0.
+    """Shortest time [s] of a rest-to-rest phase [m] within limits of speed and acceleration, [*].
 
     Closed form: the time law's largest derivatives are constants, so each limit gives one time.
-
-    Args:
-        length: [*] metres.
-        degree: 3, 5 or 7.
-        max_speed: limit of the speed [m/s].
-        max_acceleration: limit of the acceleration [m/s^2].
-
-    Returns:
-        Seconds, [*].
     """
     for_speed = length * (_PEAK_SPEED[degree] / max_speed)
     for_acceleration = (length * (_PEAK_ACCELERATION[degree] / max_acceleration)).sqrt()
@@ -94,16 +70,10 @@ def fly(
     cruise: Tensor,
     degree: int,
 ) -> Pose:
-    """Poses of UAVs some time after takeoff; from the end of their flights on, they stand at the targets.
+    """Poses of UAVs ``elapsed`` seconds after takeoff; after their flights, they stand at the targets.
 
-    Args:
-        origin: takeoff points, [*, 2] metres.
-        target: landing points, [*, 2] metres.
-        level: flight levels above 0, [*] metres.
-        elapsed: time since takeoff, [*] seconds; long flights need double precision.
-        vertical: duration of takeoff, and of landing, above 0, [*] seconds.
-        cruise: duration of the cruise, [*] seconds; 0 if origin and target are the same.
-        degree: degree of the time law, 3, 5 or 7.
+    ``origin`` and ``target`` [*, 2] m, ``level`` above 0 [*] m, and durations [s] of takeoff or landing,
+    above 0, and of the cruise, 0 for no flight; ``elapsed`` in double precision.
     """
     # A landing is a takeoff reversed in time, s(1 - tau) = 1 - s(tau), so one evaluation serves both.
     remaining = torch.add(cruise, vertical, alpha=2) - elapsed

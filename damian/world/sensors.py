@@ -36,8 +36,7 @@ def sensor(width: int = 1) -> Callable[[Callable[..., Tensor]], Sensor]:
     It must be pure, batched over B and, for ``env.compile()``, free of branches on data. Random numbers come
     from ``damian.common.counter_rng`` with ``state.seed``, ``state.episode`` and ``state.steps``.
 
-    Every message carries the reading of the time at which it was generated, as float32. Features read it as
-    ``cache.reading("name")``, by the name of the function.
+    Features read the reading, as float32, as ``cache.reading("name")``, by the name of the function.
 
     Examples:
         >>> # in lab.py, used as sensors=[{sensor: lab:loudness, reach: 50}]
@@ -60,13 +59,7 @@ SENSORS = Registry[Sensor]("sensor", _not_a_sensor)
 
 
 def sensors_of(written: Sequence[Any]) -> dict[str, Sensor]:
-    """Read a list of ``package.module:name`` and ``{sensor: package.module:name, strength: 3}``.
-
-    A ``name`` among the parameters tells the readings of one function apart.
-
-    Returns:
-        The sensors with their parameters, by the names of their readings.
-    """
+    """Read ``package.module:name`` or ``{sensor: package.module:name, strength: 3}``; sensors by name."""
     found: dict[str, Sensor] = {}
     for number, each in enumerate(written):
         key = f"sensors[{number}]"

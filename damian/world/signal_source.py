@@ -1,8 +1,7 @@
 """The signal source (paper, section 3.2): the radius within which UAVs detect it, and its walk.
 
-A dynamic source visits hotspots in a random order and, around each, a few inner points; it waits
-at every stop and goes straight to the next one with a trapezoidal speed profile. Walks are drawn
-once as padded tensors, from which the position at any time follows in closed form. In a concave
+A dynamic source visits hotspots in a random order and, around each, a few inner points; it waits at every
+stop. Walks are drawn once as padded tensors, from which positions follow in closed form. In a concave
 polygon, the straight line between two stops may leave the polygon.
 """
 
@@ -26,18 +25,14 @@ _FULL_DISC_ROUNDS, _ROUNDS = 256, 320
 class Walk(NamedTuple):
     """Walks of ``W`` sources over at most ``K`` stops; a static source has one stop and never leaves it.
 
-    Walks end with at least one padded stop if they begin anew, and may if not. Their places are that of the
-    first stop, to which the walk then returns, or of the last one; their departure time is the end of the
-    walk, and their arrival time is infinite.
+    Padded stops, of which walks that begin anew have one at least, lie at the first stop, to which the walk
+    then returns, or at the last one; they are left at the end of the walk and never reached.
 
     Attributes:
         stop: places, [W, K, 2] metres.
-        arrive: arrival times, [W, K] seconds, increasing; the first is 0.
-        depart: departure times, [W, K] seconds; infinite for a static source.
-        speed: largest speed on the leg that leaves the stop, [W, K] m/s.
-        acceleration: acceleration on the leg that leaves the stop, [W, K] m/s^2.
-        emits: whether the source emits from its arrival until it arrives at the next stop, [W, K]
-            bool (always true unless ``source.emission`` is ``per_stop``).
+        arrive, depart: times, [W, K] seconds; the first arrival is 0, and a static source never departs.
+        speed, acceleration: largest ones on the leg that leaves the stop, [W, K] m/s and m/s^2.
+        emits: whether the source emits until it arrives at the next stop, [W, K] bool.
     """
 
     stop: Tensor
@@ -53,8 +48,7 @@ class Located(NamedTuple):
 
     Attributes:
         position: [B, 2] metres.
-        stop: index of the latest stop, [B] int64.
-        tour: number of walks that the source has finished before this one, [B] int64.
+        stop, tour: index of the latest stop, and number of walks finished before this one, [B] int64.
         finished: whether the source has stopped for good, [B] bool.
     """
 
@@ -86,9 +80,8 @@ def draw_walks(
 ) -> Walk:
     """Draw the walks of ``W = n_walks`` sources in a polygon of local metres, float32 on the CPU.
 
-    Hotspots are uniform in the polygon (hence in random order), inner points uniform in the part of
-    the disc around their hotspot that lies in the polygon. Where that part is very thin (under
-    about 1 % of the disc), inner points lie nearer their hotspot than uniform ones would.
+    Hotspots are uniform in the polygon, inner points uniform in the part of the disc around their hotspot
+    that lies in it, or nearer where that part is very thin (under about 1 % of the disc).
     """
     shapely.prepare(polygon)
     if config.motion == "static":
@@ -98,14 +91,9 @@ def draw_walks(
 
 
 def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
-    """Positions of sources at a time.
+    """Positions of sources ``time`` [B] seconds after their first walks began (in double precision).
 
-    Args:
-        walk: one walk per world, leading dimension ``B``.
-        time: time since the first walk began, not negative, [B] seconds; in double precision, the last of
-            many walks is as exact as the first one.
-        loops: whether a source whose walk is over begins it anew (``draw_walks`` must have drawn it so); if
-            not, it stays at its last stop.
+    A source whose walk is over stays at its last stop, or ``loops``, if ``draw_walks`` has drawn it so.
     """
     last, end = walk.stop.shape[-2] - 1, walk.depart[..., -1].to(time.dtype)
     finished, tour = time >= end, torch.zeros_like(time)
@@ -131,12 +119,7 @@ def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
 def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
     """Duration of the acceleration, and of a whole rest-to-rest leg [s], [*].
 
-    The speed profile is trapezoidal, or triangular if the leg is too short to reach ``speed``.
-
-    Args:
-        length: [*] metres.
-        speed: largest speed, [*] m/s.
-        acceleration: acceleration and deceleration, [*] m/s^2.
+    The speed profile is trapezoidal, or triangular if the leg [m] is too short to reach ``speed`` [m/s].
     """
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration

@@ -1,7 +1,4 @@
-"""The physics of B parallel worlds: decisions, flights, the source, and the messages that the UAVs send.
-
-Steps are pure functions of (state, action) over tensors, so that a step compiles into a few kernels.
-"""
+"""The physics of B parallel worlds: decisions, flights, the source, and the messages that the UAVs send."""
 
 import copy
 import math
@@ -42,11 +39,8 @@ class InitialConditions(NamedTuple):
 class Simulation:
     """The constants of the worlds, and the functions that reset and step their state.
 
-    Args:
-        config: settings of the world.
-        dt: length of a simulation step [s].
-        trail: number of its latest landing points that a UAV reports.
-        seed: seed of the regions, start points and walks, which are drawn here, on the CPU.
+    A UAV reports its latest ``trail`` landing points. Regions, start points and walks are drawn here, on the
+    CPU.
     """
 
     def __init__(self, config: WorldConfig, dt: float, trail: int, seed: int) -> None:
@@ -104,12 +98,10 @@ class Simulation:
         return self._read_anew(fresh) if self.sensors else fresh
 
     def step(self, state: State, action: Tensor, action_valid: Tensor | None = None) -> State:
-        """Simulate one step of ``dt``; actions of UAVs that are not ready change nothing.
+        """Simulate one step; actions of UAVs that are not ready change nothing.
 
-        Args:
-            state: state before the step.
-            action: discrete [B, N], or continuous [B, N, 2] in [0, 1].
-            action_valid: whether each UAV's action counts, [B, N] bool; all count if not given.
+        Actions are discrete [B, N], or continuous [B, N, 2] in [0, 1]; only those of ``action_valid`` [B, N]
+        count.
         """
         state = self.decide(state, action, action_valid)
         state = self.vehicles.move(state)

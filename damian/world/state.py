@@ -70,11 +70,7 @@ class PackedState(NamedTuple):
 
 
 class StateLayout:
-    """The layout of a state's fields in its packed rows.
-
-    Args:
-        example: a state of any number of worlds, from which shapes and dtypes are read.
-    """
+    """The layout of a state's fields in its packed rows, read from an example of any number of worlds."""
 
     def __init__(self, example: State) -> None:
         self._fields = [(leaf.dtype, leaf.shape[1:]) for leaf in _leaves(example)]

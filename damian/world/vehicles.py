@@ -30,13 +30,7 @@ Model = TypeVar("Model", bound="MotionModel")
 
 
 class MotionModel(ABC):
-    """Motion of N UAVs in B worlds, as pure functions of their state.
-
-    Args:
-        config: settings of the world; motion, battery and the number of UAVs are used.
-        airspace: regions and their landing points.
-        dt: length of a simulation step [s].
-    """
+    """Motion of N UAVs in B worlds with steps of ``dt`` seconds, as pure functions of their state."""
 
     instant: bool
     """Whether a UAV is at its target as soon as a step ends; if not, no two UAVs share a flight level, and
@@ -75,13 +69,10 @@ class MotionModel(ABC):
 
     @abstractmethod
     def take_off(self, state: State, goal: Tensor, ready: Tensor, departs: Tensor) -> State:
-        """Start flights to the landing points ``goal``.
+        """Start flights of the UAVs that have just chosen to fly (``departs``) to ``goal``, [B, N].
 
-        Args:
-            state: state before; in its ``goal`` is the point on which each UAV stands or to which it flies.
-            goal: flat ids of the assigned landing points, [B, N].
-            ready: whether the UAV has just chosen an action, [B, N] bool.
-            departs: whether the UAV has just chosen to fly, [B, N] bool.
+        ``ready`` [B, N]: which UAVs have just chosen; in the state's ``goal`` is where each stands or flies
+        to.
         """
 
     @abstractmethod
@@ -92,10 +83,8 @@ class MotionModel(ABC):
     def latest_messages(self, state: State, on_ground: Tensor, messages: Messages) -> tuple[Tensor, Messages]:
         """Which UAVs send a message in this step [B, N] bool, and the latest message of each UAV [B, N].
 
-        Args:
-            state: after the step; ``state.sent`` are the latest messages before it.
-            on_ground: whether each UAV stands on its landing point, [B, N] bool.
-            messages: what each UAV would send now, [B, N]; one in flight must not spot the source in it.
+        ``state.sent`` are the latest ones before, ``messages`` what each would send; none in flight spots the
+        source.
         """
 
     @abstractmethod
