@@ -26,9 +26,9 @@ if TYPE_CHECKING:
         ObservationDelay,
         RewardDelay,
         SampleAndHold,
-        ServerNode,
         delay_trajectories,
     )
+    from damian.transforms.server_node import ServerNode
     from damian.world.sensors import sensor
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it is imported
@@ -54,9 +54,9 @@ _MODULES = {
         "ObservationDelay",
         "RewardDelay",
         "SampleAndHold",
-        "ServerNode",
         "delay_trajectories",
     ],
+    "damian.transforms.server_node": ["ServerNode"],
     "damian.world.sensors": ["sensor"],
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

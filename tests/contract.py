@@ -15,15 +15,14 @@ from damian.server.features import ObservationConfig
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
-    Belief,
     Channel,
     CumulativeReward,
     MessageHistory,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
-    ServerNode,
 )
+from damian.transforms.server_node import Belief, ServerNode
 
 LATE = {"law": "uniform", "low": 1, "high": 3}
 ACTION, OBSERVATION, REWARD = ("agents", "action"), ("agents", "observation"), ("agents", "reward")

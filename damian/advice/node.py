@@ -21,8 +21,9 @@ from damian.envs.pipeline import observation_transforms, remembering_transforms,
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import Outputs, UavEnv
 from damian.server.server import Features
-from damian.transforms import Belief, MessageHistory, ServerNode, StatefulTransform
+from damian.transforms import MessageHistory, StatefulTransform
 from damian.transforms.base import act, begin, observe
+from damian.transforms.server_node import Belief, ServerNode
 from damian.world.state import State
 
 REMEMBERED_STEPS = 32

@@ -33,17 +33,13 @@ _LEAST_GAIN = 1e-3
 PROBABLE = 0.1
 """If a UAV detects the source with this probability somewhere in the next step, it leaves its own ground."""
 WORTH = 0.3
-"""A UAV does not fly where it detects the source with less than this share of the highest probability, but as
-near to the best landing point as it can."""
+"""Least share of the highest probability of a detection for which a UAV flies to a landing point."""
 MAX_PAIRS = 400_000_000
 """Most pairs of landing points: the script weighs each of them against every other one of its region."""
 
 
 def greedy_policy(env: DelayedEnv) -> TensorDictModule:
-    """Build the scripted policy, which reads the messages that the server holds and the action mask.
-
-    It is stateless and deterministic. The environment must have ``message`` among its extras.
-    """
+    """Build the stateless scripted policy, for an environment with ``message`` among its extras."""
     n_regions, n_points = env.uav_env.simulation.airspace.points.shape[:2]
     shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
     checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
@@ -132,11 +128,7 @@ class Greedy:
         return (log - log.amax(-1, keepdim=True)).exp(), moved <= RECENT * self.radius
 
     def best_action(self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
-        """The best legal discrete action of UAVs that stand on points of these flat ids, [B, N].
-
-        From the weight in the footprint of each landing point, and its distance to the best one [m], [B, N,
-        L].
-        """
+        """The best legal discrete action of UAVs that stand on points of these flat ids, [B, N]."""
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = standing.unsqueeze(-1) * len(action) + action
         point, flown = (gather_rows(table[:, 0], row) for table in self.candidates.ranking)
@@ -169,10 +161,7 @@ def _distances(places: Tensor, others: Tensor) -> Tensor:
 
 
 class Searcher(Greedy):
-    """From the belief to actions: each UAV flies where it most probably detects the source next.
-
-    Unless that is probable enough somewhere, it searches its own ground, nearer to it than to any other UAV.
-    """
+    """Each UAV flies where it most probably detects the source, or else searches its own ground."""
 
     def __call__(  # type: ignore[override]
         self,

@@ -245,8 +245,7 @@ class Lag(Law):
     shared: bool = False
     """All agents of a world have the same lags and losses."""
     stagger: bool = False
-    """Each sender has its own time until its second draw, random and at most a period, so that senders do not
-    all update in the same step."""
+    """Each sender has its own time until its second draw, random and at most a period."""
 
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
         period, draws_again = None, bool(self.hold_probability) or self.stagger

@@ -1,7 +1,4 @@
-"""Samplers draw one delay per message, from a table or by a function of the message's context.
-
-Drawing is a pure function of random streams and clocks: a sender draws the same delays alone as in a batch.
-"""
+"""Samplers draw one delay per message: pure functions of random streams, clocks and contexts."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
@@ -65,11 +62,15 @@ class Sampler(nn.Module):
         super().__init__()
         checks.in_range("loss", loss, 0.0, 1.0)
         self.longest = max(map(len, states)) - 1
+        self.lost = self.longest + 1
+        """Delay value that marks a message that never arrives."""
         arrive = torch.zeros(len(states), self.longest + 1, dtype=torch.float64)
         for row, chances in zip(arrive, states, strict=True):
             row[: len(chances)] = torch.tensor(chances, dtype=torch.float64) * (1 - loss)
         chances = torch.cat([arrive, (1 - arrive.sum(-1, keepdim=True)).clamp(min=0)], -1)
         self.register_buffer("chances", chances, persistent=False)
+        self.loses = bool((chances[:, -1] > 1e-9).any())
+        """Whether messages can be lost."""
         change = torch.tensor(transitions or [[1.0]], dtype=torch.float64)
         # The next state and the delay are one outcome, so that a message takes a single draw.
         joint = (change.unsqueeze(-1) * chances.unsqueeze(0)).flatten(1)
@@ -79,16 +80,6 @@ class Sampler(nn.Module):
         likeliest = int(chances[0].argmax())
         self.constant_delay = likeliest if bool((chances[:, likeliest] == 1).all()) else None
         """The delay [steps] if it is always the same, else None."""
-
-    @property
-    def lost(self) -> int:
-        """Delay value that marks a message that never arrives: ``longest + 1``."""
-        return self.longest + 1
-
-    @property
-    def loses(self) -> bool:
-        """Whether messages can be lost."""
-        return bool((self.chances[:, -1] > 1e-9).any())
 
     @property
     def memoryless(self) -> bool:
@@ -106,11 +97,7 @@ class Sampler(nn.Module):
     def forward(
         self, streams: Tensor, clock: Tensor, memory: Tensor, context: MessageContext | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw the delays [M] of the messages sent at ``clock``, and the channels' next states [M, ...].
-
-        From the senders' random streams [M], the step [M] or [], the channels' states, and if it sees it the
-        context.
-        """
+        """Draw the delays [M] of the messages sent at ``clock``, and the channels' next states [M, ...]."""
         if self.constant_delay is not None:
             return torch.full_like(streams, self.constant_delay), memory
         draw = counter_rng.bits(streams, clock)

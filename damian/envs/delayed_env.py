@@ -1,7 +1,7 @@
 """A transformed environment that steps with its transforms as one compiled graph."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import torch
@@ -24,10 +24,7 @@ _BASE = "base_env."
 
 
 class DelayedEnv(TransformedEnv):
-    """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function.
-
-    The result is that of TorchRL's ``TransformedEnv``; but no TensorDict is built between two transforms.
-    """
+    """A ``TransformedEnv`` that steps a ``UavEnv`` and its transforms in one function, with equal results."""
 
     _compiled: CompiledMethods | None = None
     """The compiled methods; None if nothing is compiled."""
@@ -43,13 +40,11 @@ class DelayedEnv(TransformedEnv):
         return self.uav_env.server
 
     def seed_worlds(self, seeds: Tensor) -> None:
-        """Give every world [B] its own random streams, so that it evolves the same alone as among others.
-
-        A belief is the same up to rounding: some processors multiply one row in another order than many.
-        """
+        """Give every world [B] its own random streams: it evolves the same alone as among others."""
         self.uav_env.seed_worlds(seeds)
-        for transform in self._all_stateful():
-            transform.seed_worlds(seeds)
+        for module in self.transform.modules():
+            if isinstance(module, StatefulTransform):
+                module.seed_worlds(seeds)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> OrderedDict[str, Any]:
         """The state of the transforms and of the environment under them; an equal one continues with it."""
@@ -128,11 +123,7 @@ class DelayedEnv(TransformedEnv):
     def _whole_step(
         self, worlds: PackedState, memories: list[Memory], entries: Entries, stepped: Tensor | None = None
     ) -> tuple[PackedState, list[Memory], Outputs]:
-        """One step of the worlds and of the leading stateful transforms; a pure function.
-
-        Only the worlds of the mask ``stepped`` [B] send messages and actions: what is in transit is written
-        in place.
-        """
+        """One step, in the worlds ``stepped`` [B] or all, of worlds and stateful transforms; pure."""
         stateful, _ = self._split_transforms()
         mask: Entries = {} if stepped is None else {keys.STEPPED: stepped}
         memories, entries = act(stateful, memories, entries | mask)
@@ -224,11 +215,6 @@ class DelayedEnv(TransformedEnv):
             n = next((i for i, t in enumerate(stateful) if t.sees_merged_steps_only), len(stateful))
             stateful, others = stateful[:n], [*stateful[n:], *others]
         return stateful, others
-
-    def _all_stateful(self) -> Iterator[StatefulTransform]:
-        for module in self.transform.modules():
-            if isinstance(module, StatefulTransform):
-                yield module
 
 
 def _may_skip(transforms: list[StatefulTransform]) -> bool:

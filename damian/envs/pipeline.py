@@ -29,17 +29,15 @@ from damian.server.server import Server
 from damian.transforms import (
     ActionDelay,
     ActionHistory,
-    Belief,
     Channel,
     CumulativeReward,
     MessageHistory,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
-    ServerNode,
 )
 from damian.transforms.hold import SkipUntilReady
-from damian.transforms.server_node import OnboardNode
+from damian.transforms.server_node import Belief, OnboardNode, ServerNode
 from damian.world.landing import ActionConfig, action_table, displacement
 from damian.world.vehicles import MOTION_MODELS
 
@@ -94,8 +92,11 @@ def make_transforms(scenario: ScenarioConfig, server: Server, extras: Collection
         *(link_transforms(scenario, server, extras) if scenario.links.kind == "matrix" else []),
         *reward_transforms(scenario, extras),
         *observation_transforms(scenario),
-        *skip_transforms(scenario, extras),
     ]
+    if scenario.clock.skip:
+        names = scenario.reward.terms if "reward_terms" in extras else []
+        rewards = [keys.REWARD, *((*keys.REWARD_TERMS, name) for name in names)]
+        transforms.append(SkipUntilReady(scenario.clock.skip_discount, rewards))
     return Compose(*transforms)  # type: ignore[arg-type]
 
 
@@ -267,15 +268,6 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
     return transforms
 
 
-def skip_transforms(scenario: ScenarioConfig, extras: Collection[str]) -> list[Transform]:
-    """The transform that lets a step last until some UAV can choose again, if ``clock.skip`` is set."""
-    if not scenario.clock.skip:
-        return []
-    names = scenario.reward.terms if "reward_terms" in extras else []
-    terms = [(*keys.REWARD_TERMS, name) for name in names]
-    return [SkipUntilReady(scenario.clock.skip_discount, [keys.REWARD, *terms])]
-
-
 def history_since_message(scenario: ScenarioConfig) -> bool:
     """Whether a UAV's action history holds only actions newer than its message that the server holds.
 
@@ -312,10 +304,7 @@ def hold_action(actions: ActionConfig) -> int:
 
 
 def action_codes(actions: ActionConfig) -> Tensor | None:
-    """Codes of the discrete actions in the history: displacement east and north in [0, 1], [A, 2]; or None.
-
-    Displacements, because their sum tells where a UAV must be by now. Continuous actions need no codes.
-    """
+    """Codes of discrete actions, whose sums tell where a UAV is: displacements in [0, 1], [A, 2]."""
     if actions.kind == "continuous":
         return None
     distance, heading = action_table(actions).unbind(-1)

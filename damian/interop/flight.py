@@ -36,8 +36,7 @@ class Instant(NamedTuple):
     truncated: Array
     """Whether it has reached its time limit, [B] bool."""
     infos: dict[str, Array]
-    """``ready``: may a UAV choose an action now, [B, N] bool; ``is_success``: is the task accomplished as far
-    as the server knows, [B] bool; with masked discrete actions ``action_mask`` [B, N, A], 0 or 1, int8."""
+    """``ready`` [B, N] and ``is_success`` [B] bool, and if masked ``action_mask`` [B, N, A] int8."""
 
 
 class Flight:
@@ -80,10 +79,7 @@ class Flight:
 
     @torch.no_grad()
     def step(self, action: Array, *, reset: bool = False) -> tuple[Instant, Instant]:
-        """Take a step; returns what it outputs, and what the next one begins with.
-
-        ``reset``: begin a new episode in each world whose episode the step ends.
-        """
+        """Take a step, and if ``reset`` begin new episodes; its outputs, and those that come next."""
         self._now[keys.ACTION] = torch.as_tensor(action)
         if reset:
             stepped, self._now = self.env.step_and_maybe_reset(self._now)

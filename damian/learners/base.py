@@ -42,10 +42,7 @@ LARGEST_WEIGHT = 1e5
 
 @torch.no_grad()
 def divergence(components: Mapping[str, Any], numbers: Mapping[str, float]) -> str | None:
-    """Which number shows that a learner has diverged; None if it has not.
-
-    A logged nan may only mean that nothing is known yet; that of a loss makes the weights nan as well.
-    """
+    """Which number shows that a learner has diverged; None if none does. A logged nan need not."""
     for name, number in numbers.items():
         if math.isinf(number):
             return f"{name} is {number}"

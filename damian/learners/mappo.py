@@ -40,10 +40,7 @@ LOSS_KEYS: list[NestedKey] = [
 
 
 class Mappo:
-    """Multi-agent PPO: learns from each batch once, as soon as it is collected.
-
-    With a replay ``buffer`` on a ``BackupdateStorage``, it reads the corrected batches from there.
-    """
+    """Multi-agent PPO, which with a replay ``buffer`` on a ``BackupdateStorage`` reads corrected batches."""
 
     loss_keys: Sequence[NestedKey] = LOSS_KEYS
 
@@ -68,11 +65,7 @@ class Mappo:
         return {**networks, "entropy_coeff": self.entropy_coeff} if anneals else networks
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make one update from a batch [B, T].
-
-        It logs what ``optimize`` returns, ``explained_variance``, and with a buffer the share
-        ``backupdated``.
-        """
+        """Make one update from a batch [B, T]; also logs ``explained_variance`` and ``backupdated``."""
         corrected = self.backupdated_batch(batch)
         add_advantages(corrected, self.critic, self.config)
         numbers = self.optimize(corrected)

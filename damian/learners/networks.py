@@ -42,13 +42,6 @@ def make_mlp(
     return initialized(config, network, gain)
 
 
-def make_gru(config: ModelConfig, n_in: int, device: torch.device | None) -> AgentGRU:
-    """Make all hidden layers for features [*, n_in]; the last one is recurrent."""
-    *widths, n_hidden = config.hidden
-    encoder = hidden_layers(config, n_in, widths, device) if widths else nn.Identity()
-    return initialized(config, AgentGRU(encoder, widths[-1] if widths else n_in, n_hidden, device), 1.0)
-
-
 def hidden_layers(config: ModelConfig, n_in: int, widths: Sequence[int], device: torch.device | None) -> MLP:
     """Make layers of these widths, each with its activation, for features [*, n_in]."""
     *inner, n_out = widths
@@ -112,18 +105,12 @@ class LegalCategorical(Distribution):
 
 
 def make_actor(env: EnvBase, config: ModelConfig) -> ProbabilisticActor:
-    """Make the policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``.
-
-    Discrete actions [*, N] are categorical over the legal ones, continuous ones [*, N, 2] tanh-normal.
-    """
+    """Make the policy from ``("agents", "observation")`` [*, N, F] to ``("agents", "action")``."""
     return with_distribution(env, lambda *out: _actor_network(env, config, *out))
 
 
 def with_distribution(env: EnvBase, make_network: Callable[..., TensorDictModule]) -> ProbabilisticActor:
-    """Make a policy of a network that writes the parameters of the actions' distribution.
-
-    ``make_network`` gets the number of outputs for an agent, and the keys under which they are written.
-    """
+    """Make a policy of a network, which is made from its number of outputs and their keys."""
     spec = env.full_action_spec_unbatched[keys.ACTION]
     if isinstance(spec, Categorical):
         masked = keys.ACTION_MASK in env.observation_spec.keys(True, True)
@@ -167,8 +154,10 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
     if not config.recurrent:
         return head(make_mlp(config, n_features, n_out, env.device, POLICY_GAIN), keys.OBSERVATION)
     linear = initialized(config, nn.Linear(config.hidden[-1], n_out, device=env.device), POLICY_GAIN)
-    gru = make_gru(config, n_features, env.device)
-    return TensorDictSequential([gru, head(linear, keys.HIDDEN)])  # type: ignore[list-item]
+    *widths, n_hidden = config.hidden
+    encoder = hidden_layers(config, n_features, widths, env.device) if widths else nn.Identity()
+    gru = AgentGRU(encoder, widths[-1] if widths else n_features, n_hidden, env.device)
+    return TensorDictSequential([initialized(config, gru, 1.0), head(linear, keys.HIDDEN)])  # type: ignore[list-item]
 
 
 class SkipConnection(nn.Module):

@@ -113,8 +113,7 @@ FLAGS = 3
 CODE_SIZE = 8
 """Size of the learnt code of a discrete action."""
 PREFERENCE_UNIT = 30.0
-"""Logits per unit of the learnt weights of predictions: weights move slowly, and a policy that relies on
-predictions needs large logits."""
+"""Logits per unit of the learnt weights of predictions, which move slowly."""
 LARGEST = 5.0
 """Largest magnitude of a normalised target, so that a number that hardly ever changes weighs no more."""
 FORGETTING = 0.99
@@ -125,8 +124,7 @@ class MessageEncoder(nn.Module):
     """Encodes F features, a set of messages of C columns, and a code [K] of what is asked, by attention.
 
     Each message is given as it is and relative to the newest known message of the first sender, which with
-    ``MessageHistory`` is the receiver itself. Messages that are not known have no influence. ``heads``
-    queries of size ``width`` follow from the observation and the code; hidden layers follow the attention.
+    ``MessageHistory`` is the receiver itself. Messages that are not known have no influence.
     """
 
     def __init__(

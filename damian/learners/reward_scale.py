@@ -44,10 +44,7 @@ def value_scale(critic: TensorDictModule) -> Tensor | float:
 
 
 class ReturnScale(nn.Module):
-    """Running root mean square of the discounted returns, by which to divide rewards [B, N, 1].
-
-    Gymnasium's ``NormalizeReward`` divides by their standard deviation, which is 0 if all are equal.
-    """
+    """Running root mean square of the discounted returns, by which to divide rewards [B, N, 1]."""
 
     returns: Tensor
     """Sum of the rewards of the episode so far, each discounted by the simulation steps since, [B, N, 1]."""

@@ -30,11 +30,7 @@ N_CRITICS = 2
 
 
 class Sac:
-    """Soft actor-critic: stores steps as they are collected, and learns from decisions drawn from these.
-
-    Each decision of a UAV is one sample; steps at which a UAV is not ready never enter a loss. On a
-    ``BackupdateStorage``, late messages correct the stored steps.
-    """
+    """Soft actor-critic on decisions drawn from a replay buffer, which may be a back-updating one."""
 
     def __init__(
         self, env: EnvBase, config: SacConfig, setup: LearningSetup, buffer: ReplayBuffer | None
@@ -165,10 +161,7 @@ def sac_loss(
 
 
 class MaskedDiscreteSACLoss(DiscreteSACLoss):
-    """Discrete SAC loss with a target entropy for each state: a share of that of its legal actions.
-
-    TorchRL's single target would exceed the largest possible entropy where few actions are legal.
-    """
+    """Discrete SAC loss with a target entropy for each state: a share of that of its legal actions."""
 
     def __init__(self, actor: Any, critics: Any, n: int, share: float, **options: Any) -> None:
         options |= {"target_entropy": 0.0}  # ``forward`` adds the target itself
@@ -176,13 +169,11 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
         self.share, self.n_actions = share, n
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """TorchRL's losses of transitions [K], with a target entropy for each state.
-
-        To evaluate the critics once, this reads private parts of TorchRL (``_compute_target``,
-        ``_vmap_qnetworkN0`` and ``_alpha``). A test compares the losses with TorchRL's own.
-        """
+        """TorchRL's losses of transitions [K], by private parts of it, so that critics are evaluated once."""
         target = self._compute_target(tensordict)
-        values = self._action_values(tensordict)
+        evaluate: Any = self._vmap_qnetworkN0
+        observed = tensordict.select(*self.qvalue_network.in_keys)
+        values = evaluate(observed, self.qvalue_network_params)["action_value"]  # [2, K, A]
         action = tensordict[keys.ACTION].expand(values.shape[:-1]).unsqueeze(-1)
         error = values.gather(-1, action).squeeze(-1) - target
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
@@ -200,12 +191,6 @@ class MaskedDiscreteSACLoss(DiscreteSACLoss):
                 "entropy": entropy.mean(),
             }
         )
-
-    def _action_values(self, tensordict: TensorDictBase) -> Tensor:
-        """Values of all actions by each critic, [2, K, A]."""
-        evaluate: Any = self._vmap_qnetworkN0
-        observed = tensordict.select(*self.qvalue_network.in_keys)
-        return evaluate(observed, self.qvalue_network_params)["action_value"]
 
     def target_entropies(self, tensordict: TensorDictBase) -> Tensor:
         """Target entropy of each state, [K], or one for all of them if all actions are legal."""

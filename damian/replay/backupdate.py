@@ -1,7 +1,7 @@
 """A replay-buffer storage that corrects stored steps as late messages arrive (paper, section 3.4)."""
 
 from collections.abc import Callable, Collection, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -18,43 +18,15 @@ from damian.replay.time_storage import TimeStorage
 from damian.transforms.base import Correction, Entries, StatefulTransform, leaf_transforms, sibling_key
 
 Recompute = Callable[[TensorDictBase, Tensor], dict[NestedKey, Tensor]]
-"""Function from steps [T, B], and the newest message that the receiver can hold after each step, [T, B, M] or
-[T, B, N, M], to entries after the steps, by key, such as ``{("next", "reward"): reward}``.
-
-Each entry has the shape and dtype of the stored one. ``("next", "done")``, ``("next", "terminated")`` and
-``("next", "truncated")`` [T, B, 1] are all among them, or none of them: then the stored ends stay.
-"""
+"""Function from steps [T, B], and the newest message that the receiver can hold after each of them, to new
+values of entries by key, as ``{("next", "reward"): reward}``; the flags that end an episode: all, or none."""
 
 ENDS = tuple(map(next_key, keys.ENDS))
 """Keys of the flags that end an episode after a step."""
 
 
-class StepKeys(NamedTuple):
-    """Keys of the entries that the storage reads and writes; all but ``step_count`` are under ``"next"``."""
-
-    message: NestedKey
-    received: NestedKey
-    delay: NestedKey
-    age: NestedKey
-    step_count: NestedKey
-    hindsight: NestedKey | None
-
-    @property
-    def backupdated(self) -> NestedKey:
-        """The flag beside ``delay`` that the storage adds, but not under ``"next"``."""
-        return cast(NestedKey, sibling_key(self.delay, "backupdated"))
-
-    @property
-    def hindsight_age(self) -> NestedKey:
-        """The age of the messages of ``hindsight``, which the storage adds, but not under ``"next"``."""
-        return cast(NestedKey, sibling_key(self.delay, "hindsight_age"))
-
-
 def corrections_of(transform: Transform, recomputed: Collection[NestedKey]) -> list[Correction]:
-    """The corrections that follow from a transform or a ``Compose`` (``env.transform``), in their order.
-
-    ``recomputed``: keys of what ``recompute`` returns, without ``"next"``, and of the rewards.
-    """
+    """The corrections of ``recomputed`` entries and rewards by a transform or a ``Compose``, in order."""
     leaves = [leaf for leaf in leaf_transforms(transform) if isinstance(leaf, StatefulTransform)]
     found = (leaf.hindsight(recomputed) for leaf in leaves)
     return [correction for correction in found if correction is not None]
@@ -119,14 +91,15 @@ class BackupdateStorage(TimeStorage):
                 should = "needs corrections that credit late rewards, and goes without hindsight_key"
                 raise InputError(f"recompute: None {should}")
             delay_key = cast(NestedKey, self._late_rewards.delay_key)
-        self.step_keys = StepKeys(
-            unravel_key(message_key),
-            unravel_key(received_key),
-            unravel_key(delay_key),
-            unravel_key(age_key),
-            unravel_key(step_count_key),
-            None if hindsight_key is None else unravel_key(hindsight_key),
-        )
+        self._message_keys = unravel_key(message_key), unravel_key(received_key)
+        delay_key = unravel_key(delay_key)
+        self._sent, self._held = (next_key(key) for key in self._message_keys)
+        self._delay, self._age = next_key(delay_key), next_key(unravel_key(age_key))
+        self._count = unravel_key(step_count_key)
+        self._hindsight = None if hindsight_key is None else next_key(unravel_key(hindsight_key))
+        # The storage adds these, but not under "next".
+        self._backupdated = cast(NestedKey, sibling_key(delay_key, "backupdated"))
+        self._hindsight_age = cast(NestedKey, sibling_key(delay_key, "hindsight_age"))
         self._n_worlds: int | None = None
 
     @property
@@ -148,20 +121,18 @@ class BackupdateStorage(TimeStorage):
 
     def _check(self, data: TensorDictBase) -> None:
         """Require that steps [T, B] have the entries that the storage reads, and fit into it."""
-        names, late, present = self.step_keys, self._late_rewards, data.keys(True)
-        needed = [
-            ("step_count_key", names.step_count, "StepCounter()"),
-            ("done", ENDS[0], "every environment"),
-        ]
-        delays = [("reward", late.delay_key, "RewardDelay(delay_key=...)")] if late and late.delay_key else []
+        late, present = self._late_rewards, data.keys(True)
+        needed = [("step_count_key", self._count, "StepCounter()"), ("done", ENDS[0], "every environment")]
+        delays = []
+        if late and late.delay_key:
+            delays.append(("reward", next_key(late.delay_key), "RewardDelay(delay_key=...)"))
         if self.recompute is not None:
-            writer = f"ObservationDelay(delay, {names.message!r}, {names.received!r}, delay_key=...)"
-            needed += [("message_key", next_key(names.message), "the environment")]
-            needed += [("received_key", next_key(names.received), writer)]
-            needed += [("age_key", next_key(names.age), writer)]
-            delays.append(("message", names.delay, writer))
-        needed += [("delay_key", next_key(key), writer) for _, key, writer in delays]
-        for name, key, writer in needed:
+            sent, held = self._message_keys
+            writer = f"ObservationDelay(delay, {sent!r}, {held!r}, delay_key=...)"
+            needed += [("message_key", self._sent, "the environment")]
+            needed += [("received_key", self._held, writer), ("age_key", self._age, writer)]
+            delays.append(("message", self._delay, writer))
+        for name, key, writer in [*needed, *(("delay_key", *delay[1:]) for delay in delays)]:
             checks.require(key in present, name, key, f"is not in the steps: {writer} writes it")
         n_worlds = self._n_worlds = data.shape[1] if self._n_worlds is None else self._n_worlds
         if data.shape[1] != n_worlds:
@@ -176,18 +147,20 @@ class BackupdateStorage(TimeStorage):
                 f"up to {self.longest} steps: {needs} steps of {n_worlds} worlds need {needs * n_worlds}"
             )
         for name, key, _ in delays:
-            longest = int(data[next_key(key)].max())
+            longest = int(data[key].max())
             if longest > self.longest:
                 raise InputError(f"longest: a {name} takes {longest} steps, more than {self.longest} steps")
 
     def _with_added_entries(self, data: TensorDictBase) -> TensorDictBase:
         """Copy of steps [T, B], with the entries that the storage adds, before any back-updating."""
-        done, delay = data[ENDS[0]], data[next_key(self.step_keys.delay)]
+        done, delay = data[ENDS[0]], data[self._delay]
         data = data.copy().update({keys.VALID: torch.ones_like(done), keys.RESET_AFTER: done.clone()})
-        data[self.step_keys.backupdated] = torch.zeros_like(delay, dtype=torch.bool)
-        if self.step_keys.hindsight is not None:
-            data[next_key(self.step_keys.hindsight)] = data[next_key(self.step_keys.received)].clone()
-            data[self.step_keys.hindsight_age] = data[next_key(self.step_keys.age)].long()
+        data[self._backupdated] = torch.zeros_like(delay, dtype=torch.bool)
+        if self._hindsight is not None:
+            data[self._hindsight], data[self._hindsight_age] = (
+                data[self._held].clone(),
+                data[self._age].long(),
+            )
         return data
 
     def backupdate(self, n_steps: int) -> None:
@@ -203,7 +176,7 @@ class BackupdateStorage(TimeStorage):
 
         The first ``n_right`` steps are stored as they should be: what is recomputed for these may be wrong.
         """
-        begins = steps[self.step_keys.step_count].squeeze(-1) == 0
+        begins = steps[self._count].squeeze(-1) == 0
         entries, added = self._recompute_latest(steps)
         after = self._correct(entries, steps)
         done, terminated, truncated = ENDS
@@ -220,25 +193,24 @@ class BackupdateStorage(TimeStorage):
 
     def _recompute_latest(self, steps: TensorDictBase) -> tuple[Entries, Entries]:
         """What ``recompute`` returns for all that has arrived, and ``backupdated`` and ``hindsight_key``."""
-        names = self.step_keys
-        delay = steps[next_key(names.delay)]
+        delay = steps[self._delay]
         if self.recompute is None:
             late = cast(Correction, self._late_rewards)
-            paid = cast(Callable[..., Tensor], late.paid)(steps, steps[names.step_count].squeeze(-1))
-            return {}, {names.backupdated: paid & (delay > 0)}
-        held, age = steps[next_key(names.received)], steps[next_key(names.age)].long()
-        log = MessageLog(steps[next_key(names.message)], delay.squeeze(-1), held, age.squeeze(-1))
-        if names.hindsight is not None:
+            paid = cast(Callable[..., Tensor], late.paid)(steps, steps[self._count].squeeze(-1))
+            return {}, {self._backupdated: paid & (delay > 0)}
+        held, age = steps[self._held], steps[self._age].long()
+        log = MessageLog(steps[self._sent], delay.squeeze(-1), held, age.squeeze(-1))
+        if self._hindsight is not None:
             # At the first step, the storage may know a newer message than the receiver held; its sender may
             # have sent it before that step, so that it is in no row of these steps.
-            known, known_age = steps[next_key(names.hindsight)], steps[names.hindsight_age]
-            held, age = _first_of(known, held), _first_of(known_age, age)
+            held = torch.cat([steps[self._hindsight][:1], held[1:]])
+            age = torch.cat([steps[self._hindsight_age][:1], age[1:]])
             log = log._replace(held=held, age=age.squeeze(-1))
         latest, age = latest_arrived(log)
-        replaced = latest != steps[next_key(names.received)]
-        added: Entries = {names.backupdated: replaced.any(-1, keepdim=True)}
-        if names.hindsight is not None:
-            added |= {next_key(names.hindsight): latest, names.hindsight_age: age.unsqueeze(-1)}
+        replaced = latest != steps[self._held]
+        added: Entries = {self._backupdated: replaced.any(-1, keepdim=True)}
+        if self._hindsight is not None:
+            added |= {self._hindsight: latest, self._hindsight_age: age.unsqueeze(-1)}
         return self.recompute(steps, latest), added
 
     def _correct(self, entries: Entries, steps: TensorDictBase) -> Entries:
@@ -247,7 +219,7 @@ class BackupdateStorage(TimeStorage):
         some = [key in entries for key in ENDS]
         should = "are returned in part: return all or none"
         checks.require(all(some) or not any(some), "recompute", ENDS, should)
-        count = steps[self.step_keys.step_count].squeeze(-1)
+        count = steps[self._count].squeeze(-1)
         for correction in self.corrections:
             entries = correction.correct(entries, steps, count)
         for key, value in entries.items():
@@ -256,11 +228,6 @@ class BackupdateStorage(TimeStorage):
             same = stored is not None and (value.shape, value.dtype) == (stored.shape, stored.dtype)
             checks.require(same and key[0] == "next", "recompute", key, should)
         return entries
-
-
-def _first_of(first: Tensor, others: Tensor) -> Tensor:
-    """Row 0 of one tensor [T, ...], then the other rows of another one."""
-    return torch.cat([first[:1], others[1:]])
 
 
 def _before(steps: TensorDictBase, after: dict[NestedKey, Tensor], begins: Tensor) -> dict[NestedKey, Tensor]:

@@ -48,20 +48,11 @@ def arrived_by_now(delay: Tensor, since: Tensor) -> Tensor:
     return (delay >= 0) & (delay <= expand_mask(since, delay))
 
 
-def episode_starts(begins: Tensor) -> Tensor:
-    """Index of the first step of each step's episode, [T, *]; 0 if the episode began before these steps."""
-    return torch.where(begins, _steps(begins), 0).cummax(0).values
-
-
 def ended_before(ended: Tensor, begins: Tensor, already: Tensor) -> Tensor:
-    """Whether the episode of each step had ended at an earlier step, [T, *] bool.
-
-    By whether it ends with a step ``ended`` [T, *], whether a step is the first after a reset ``begins`` [T,
-    *], and whether the episode of the first step had ended ``already`` [*].
-    """
+    """Whether each step's episode had ended earlier, [T, *]; that of the first step ``already`` [*]."""
     ends = torch.where(ended, _steps(ended), -1)
     before = torch.cat([already.unsqueeze(0).long() - 1, ends[:-1]]).cummax(0).values
-    return before >= episode_starts(begins)
+    return before >= torch.where(begins, _steps(begins), 0).cummax(0).values  # the first step of each episode
 
 
 def _steps(like: Tensor) -> Tensor:

@@ -15,8 +15,7 @@ from damian.server.server import Server
 def server_recompute(server: Server, reward_terms: bool = False, actor: bool = False) -> Recompute:
     """A ``BackupdateStorage.recompute``: what the server would have output, had it held other messages.
 
-    ``reward_terms`` and ``actor`` recompute also the terms of the reward, and the actors' observations
-    without what ``ActionHistory`` appends to them (``corrections_of`` keeps that).
+    ``actor``: also the actors' observations, without what ``ActionHistory`` appends to them.
     """
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:

@@ -40,8 +40,7 @@ _SAMPLES = 6
 _WALKS, _STEPS, _SEED = 512, 128, 0
 """Walks, and their steps, from which the moves are counted, and the seed with which they are drawn."""
 STEPS_PER_MOVE = 4
-"""Number of steps over which a move is measured: a source that goes on straight gets further in them than
-one that takes a new direction in each step, as the filter assumes."""
+"""Steps over which a move is measured: straight moves get further than those that turn in each step."""
 _RARE = 1e-6
 """Weight of a move that was never counted."""
 _POINTS_AT_ONCE = 256
@@ -60,15 +59,13 @@ class SourceGrid(NamedTuple):
     staying: Tensor
     """Sum of the weights of the moves from each cell that end in the region, [R, K]."""
     next_detection: Tensor
-    """Probability that a UAV which lands on a landing point in the next step detects the source there, if the
-    source is in a cell now, [R*L, K]."""
+    """Probability that a UAV that lands next on a point detects the source in a cell now, [R*L, K]."""
     next_staying: Tensor
-    """The same for a UAV which stays where it is, [2*R*L + 1, K]. For the landing point of flat id p, row 2p:
-    it detects nothing now; row 2p + 1: it detects the source now. The last row, of zeros: it is in flight."""
+    """The same for one that stays, [2*R*L + 1, K]: row 2p if it detects nothing now on the landing point of
+    flat id p, row 2p + 1 if it detects the source. The last row, of zeros: it is in flight."""
     log_reports: Tensor
-    """Log-probability of what a UAV on a landing point reports if the source emits in a cell,
-    [4*R*L + 1, K]. For the landing point of flat id p, row 2p: it detects nothing; row 2p + 1: it detects the
-    source; 2*R*L further: the same, and so it did in the step before. The last row, of zeros: no report."""
+    """Log-probability of what a UAV reports if the source emits in a cell, [4*R*L + 1, K]: rows as above;
+    2*R*L further: the same, and so it did in the step before. The last row, of zeros: no report."""
     emits: float
     """Probability that the source emits in a step."""
 
@@ -289,10 +286,7 @@ def detection_chance(grid: SourceGrid, belief: Tensor, region: Tensor) -> Tensor
 
 
 def chance_of_staying(grid: SourceGrid, belief: Tensor, rows: Tensor) -> Tensor:
-    """Probability that a UAV which stays detects the source next, [*, N]; 0 for one in flight.
-
-    The rows are what the UAVs report now, not marked as repeated.
-    """
+    """Probability that a UAV which stays, now of report ``rows``, detects the source next, [*, N]."""
     chance = gather_rows(grid.next_staying, rows.clamp(max=len(grid.next_staying) - 1))
     return chance.mul_(belief.unsqueeze(-2)).sum(-1)
 

@@ -61,13 +61,11 @@ class ServerContext(NamedTuple):
     n_points: int = 0
     """Largest number of landing points in a region, L."""
     goals: Tensor | None = None
-    """For ``belief_gain``: the preferred landing points to which each discrete action may lead, as indices in
-    their region, by the flat id of the landing point on which it begins, [C, R*L, A], C at most 2."""
+    """For ``belief_gain``: landing points to which discrete actions lead, as ``Candidates.goals``."""
     grid: SourceGrid | None = None
     """Cells in which the source may be; None if no feature reads the belief."""
     belief: Tensor | None = None
-    """Probability that the source is in each cell, [*, K]; if not given, that after these messages, as if
-    they were the first ones."""
+    """Probability that the source is in each cell, [*, K]; None: as after these first messages."""
     coverage: KnownCoverage | None = None
     """The coverage of an earlier step of the same worlds, [*]; None if all of it is to be computed."""
 
@@ -143,8 +141,7 @@ class Feature(NamedTuple):
     compute: Callable[[FeatureCache], Tensor]
     """From messages [*, N] to values [*, N] or, if it has several for each UAV, [*, N, width]."""
     scope: str
-    """``local`` (of the UAV itself), ``global`` (of all UAVs), ``belief`` (of all UAVs' messages so far) or
-    ``actor`` (never for the critic)."""
+    """``local``, ``global`` or ``belief``, as in ``feature``, or ``actor``: never for the critic."""
     width: int | None = 1
     """Number of values for each UAV; None if it depends on the settings."""
     low: float = 0.0
@@ -204,10 +201,7 @@ def check_features(config: ObservationConfig) -> None:
 
 
 def observe(messages: Messages, context: ServerContext, names: list[str]) -> dict[str, Tensor]:
-    """Features by name, each [*, N], or in the shape and range that it declares, of messages [*, N].
-
-    Those of Table 2 are in [0, 1]; ``agent_distances`` [*, N, N-1] are to the other UAVs in index order.
-    """
+    """Features by name of messages [*, N], each [*, N], or in the shape and range that it declares."""
     cache = FeatureCache(messages, context)
     return {name: feature_of(name).compute(cache) for name in names}
 

@@ -1,8 +1,4 @@
-"""The terms of the reward, computed from features (paper, eq. 5-8), and terms from outside the package.
-
-A term has the name of its feature; its weight in the configuration and its tag in the logs have the same
-name.
-"""
+"""The terms of the reward, by the names of their features (paper, eq. 5-8), and terms of users."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -31,8 +27,7 @@ class RewardTerm(NamedTuple):
     """A function that computes a reward term, and what it needs."""
 
     compute: Callable[..., Tensor]
-    """From features by name, each [*, N] or [*, N, width], and counters to the term before it is weighted,
-    [*, N]."""
+    """From features by name and ``Counters`` to the term before it is weighted, [*, N]."""
     reads: Sequence[str]
     """Names of the features that it reads."""
     scope: str
@@ -75,11 +70,9 @@ class CustomTerm(NamedTuple):
     """Key of the term in logs: ``name`` in the settings, or else the function's name."""
     weight: float
     """Weight of the term within its scope."""
-    compute: Callable[..., Tensor]
-    reads: Sequence[str]
-    scope: str
+    term: RewardTerm
     parameters: Mapping[str, Any]
-    """Keyword arguments of ``compute``."""
+    """Keyword arguments of the function."""
 
 
 def custom_term(written: Any, key: str) -> CustomTerm:
@@ -91,7 +84,7 @@ def custom_term(written: Any, key: str) -> CustomTerm:
     checks.in_range(f"{key}.weight", weight, -1e6, 1e6)
     name = name_of(parameters, path.rpartition(":")[2], key)
     check_parameters(term.compute, parameters, path, key)
-    return CustomTerm(name, float(weight), term.compute, term.reads, term.scope, parameters)
+    return CustomTerm(name, float(weight), term, parameters)
 
 
 def own_terms(config: RewardConfig) -> dict[str, CustomTerm]:
@@ -111,22 +104,22 @@ def own_terms(config: RewardConfig) -> dict[str, CustomTerm]:
 def features_read(config: RewardConfig) -> list[str]:
     """Names of the features that the terms read; a built-in term reads the feature of its name."""
     own = own_terms(config)
-    reads = [own[name].reads if name in own else [name] for name in config.terms]
+    reads = [own[name].term.reads if name in own else [name] for name in config.terms]
     return list(dict.fromkeys(itertools.chain(*reads)))
 
 
 def weight_of(config: RewardConfig, name: str) -> float:
     """The weight of a term in the total reward (eq. 8)."""
-    if term := own_terms(config).get(name):
-        return term.weight * (config.individual if term.scope == "individual" else config.system)
+    if own := own_terms(config).get(name):
+        return own.weight * (config.individual if own.term.scope == "individual" else config.system)
     group = config.individual if name in INDIVIDUAL else config.system
     return getattr(config, name) * group
 
 
 def value_of(config: RewardConfig, name: str, features: dict[str, Tensor], counters: Counters) -> Tensor:
     """A term before it is weighted, [*, N]."""
-    if term := own_terms(config).get(name):
-        value = term.compute({n: features[n] for n in term.reads}, counters, **term.parameters)
+    if own := own_terms(config).get(name):
+        value = own.term.compute({n: features[n] for n in own.term.reads}, counters, **own.parameters)
         return value.float().view_as(counters.motions)  # another shape would be broadcast without a word
     return _TERMS[name](features[name], counters, config)
 

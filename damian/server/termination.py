@@ -35,10 +35,7 @@ def status(
     dt: float,
     config: EpisodeConfig,
 ) -> Status:
-    """Success and the end of the episode, from the messages [*, N] that the server holds.
-
-    A time limit truncates, every other end terminates. A success in the last step counts as a success.
-    """
+    """Success and the end of the episode: a time limit truncates, every other end terminates."""
     n_agents = messages.spotted.shape[-1]
     success = ended = timed_out = torch.zeros_like(source_over)
     if config.success_share is not None:

@@ -36,19 +36,9 @@ class ActionSpecs(NamedTuple):
     low: Tensor
     """Lower bound of each number of an action, [*rows, ...] float32."""
     width: Tensor
-    """Upper minus lower bound of each number of an action, [*rows, ...] float32; 1 where actions have no
-    bounds, can take one value only, or are one-hot."""
+    """Upper minus lower bound, [*rows, ...] float32; 1 without bounds, with one value only, or one-hot."""
     bounded: bool
     """Whether (action - low) / width lies in [0, 1] for every number of an action."""
-
-
-class _Range(NamedTuple):
-    """Range of each number of an action, in the shape of the spec and the type of the actions."""
-
-    low: Tensor
-    high: Tensor
-    bounded: Tensor
-    """Whether the spec sets these bounds, bool; if not, they are those of the type of the actions."""
 
 
 def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs:
@@ -61,32 +51,28 @@ def read_action_specs(env: EnvBase, key: NestedKey, default: Any) -> ActionSpecs
         low = torch.zeros_like(initial, dtype=torch.float32)
         return ActionSpecs(rows, initial, low, torch.ones_like(low), True)
     space = _range(spec)
-    low = space.low.float()
-    width = space.high.float() - low
-    bounded = space.bounded & width.isfinite()
+    low, high = (bound.float() for bound in space)
+    width = high - low
+    bounded = isinstance(spec, Categorical | Bounded) & width.isfinite()
     low, width = torch.where(bounded, low, 0), torch.where(bounded & (width > 0), width, 1)
     return ActionSpecs(rows, _default_action(space, default), low, width, bool(bounded.all()))
 
 
-def _range(spec: TensorSpec) -> _Range:
-    """The range of each number of an action."""
-    bounded = isinstance(spec, Categorical | Bounded)
+def _range(spec: TensorSpec) -> tuple[Tensor, Tensor]:
+    """Lowest and highest values of each number of an action, in the shape and type of the actions."""
     if isinstance(spec, MultiCategorical):  # before Categorical, which is its base class
         low, high = 0, spec.nvec - 1
     elif isinstance(spec, Categorical):
         low, high = 0, spec.n - 1
     else:
         low, high = spec.space.low, spec.space.high  # type: ignore[union-attr]
-    low, high = (
-        torch.as_tensor(bound, dtype=spec.dtype, device=spec.device).expand(spec.shape)
-        for bound in (low, high)
-    )
-    return _Range(low, high, torch.full_like(low, bounded, dtype=torch.bool))
+    low, high = (torch.as_tensor(each, dtype=spec.dtype, device=spec.device) for each in (low, high))
+    return low.expand(spec.shape), high.expand(spec.shape)
 
 
-def _default_action(space: _Range, default: Any) -> Tensor:
+def _default_action(space: tuple[Tensor, Tensor], default: Any) -> Tensor:
     """The default action in the shape and type of the range."""
-    low, high = space.low, space.high
+    low, high = space
     if default is None:
         return torch.maximum(torch.minimum(torch.zeros_like(low), high), low)
     value = torch.as_tensor(default, dtype=low.dtype, device=low.device).expand(low.shape)
@@ -174,9 +160,7 @@ class ActionDelay(ActionTransform):
     ) -> None:
         super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed)
         law = law_of(delay)
-        self.sampler = sampler_of(law, dt, loss)
-        self.draws = self.sampler.constant_delay is None
-        self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
+        self.draw_from(sampler_of(law, dt, loss))
         self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, NoReturn, cast
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import (
     Compose,
     ConditionalSkip,
@@ -30,12 +30,11 @@ from damian.common import counter_rng
 from damian.common.errors import InputError
 from damian.common.tensors import expand_mask
 from damian.common.text_files import listed
+from damian.delays.samplers import Sampler
 from damian.keys import DONE, STEPPED, last_part
 
 STAGES = ("server", "delay", "history")
-"""The order of damian's transforms that share a key, from the environment outwards: nodes that compute
-observations and rewards anew, then delays, clocks and sums of them, then what must not be delayed itself,
-such as the actions as they were chosen."""
+"""The order of damian's transforms that share a key, from the environment outwards."""
 
 Memory = dict[str, Tensor]
 """The memory of a transform: its buffers by name."""
@@ -51,9 +50,8 @@ class Correction(NamedTuple):
     """How the entries that a transform has changed are corrected in stored steps (``BackupdateStorage``)."""
 
     correct: Callable[[Entries, TensorDictBase, Tensor], Entries]
-    """Pure function of: the entries after the steps as they are known by now, by keys that begin with
-    ``"next"``; the stored steps [T, B], the last of which is the latest one; and the number of earlier steps
-    in the episode of each step, [T, B]. It returns the entries as the transform would have written them."""
+    """Pure function of the entries after the steps as they are known by now, the stored steps [T, B], and the
+    number of earlier steps in each episode [T, B]: the entries as the transform would have written them."""
     lookback: int = 0
     """Number of earlier steps on which the entries after a step depend."""
     paid: Callable[[TensorDictBase, Tensor], Tensor] | None = None
@@ -89,7 +87,7 @@ class StatefulTransform(Transform):
     action_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are passed to ``on_action``, if they exist."""
     step_keys: Sequence[NestedKey] = ()
-    """Keys of the entries that are passed to ``on_reset`` and ``on_step``, if they exist."""
+    """Keys of the entries that are passed to ``on_reset`` and ``on_step``; see ``required_keys``."""
     extra_keys: Sequence[NestedKey] = ()
     """Keys of the entries that are written beside ``out_keys``."""
     dropped_keys: Sequence[NestedKey] = ()
@@ -155,7 +153,7 @@ class StatefulTransform(Transform):
     @property
     def required_keys(self) -> Sequence[NestedKey]:
         """Keys of the entries that the environment must output before this transform."""
-        return self.in_keys
+        return self.step_keys or self.in_keys
 
     @property
     def row_key(self) -> NestedKey:
@@ -173,6 +171,11 @@ class StatefulTransform(Transform):
         if self.stage == "server":  # it writes what the environment has written, anew
             return []
         return [*(key for key in self.out_keys if key not in self.in_keys), *self.extra_keys]
+
+    def draw_from(self, sampler: Sampler) -> None:
+        """Let a sampler draw the delays."""
+        self.sampler, self.draws = sampler, sampler.constant_delay is None
+        self.same_draws_for_all_agents = sampler.same_draws_for_all_agents
 
     # The memory.
 
@@ -399,16 +402,8 @@ class StatefulTransform(Transform):
         inner = {k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)}
         saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
         own = self.memory
-        for name, value in saved.items():
-            if name in own and own[name].shape != value.shape:
-                raise RuntimeError(
-                    f"{type(self).__name__}: the loaded {name} has the shape {list(value.shape)}, not "
-                    f"{list(own[name].shape)}: load it into a transform with the settings that it had"
-                )
         self.clear_memory()
-        self.set_memory(
-            {k: v.detach().clone().to(own[k].device if k in own else v.device) for k, v in saved.items()}
-        )
+        self.set_memory({k: own.get(k, v).detach().clone() for k, v in saved.items()})
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Random streams.
@@ -612,6 +607,15 @@ def sibling_key(key: NestedKey, name: NestedKey | None) -> NestedKey | None:
 def existing(keys: Iterable[NestedKey | None]) -> list[NestedKey]:
     """The keys that are not None."""
     return [key for key in keys if key is not None]
+
+
+def add_spec(
+    specs: Composite, key: NestedKey | None, shape: Sequence[int], dtype: torch.dtype = torch.float32
+) -> None:
+    """Add the spec of an entry without bounds; nothing if the key is None."""
+    if key is not None:
+        size, kind = torch.Size(shape), Binary if dtype == torch.bool else Unbounded
+        specs[key] = kind(shape=size, dtype=dtype, device=specs.device)
 
 
 def require_keys(transform: str, keys: Sequence[NestedKey], present: Iterable[NestedKey]) -> None:

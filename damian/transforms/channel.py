@@ -6,19 +6,20 @@ from typing import Any, cast
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec
 
 from damian.common import checks, counter_rng
 from damian.common.tensors import expand_mask
 from damian.delays.laws import link_sampler, same_size
 from damian.delays.line import BroadcastLine
-from damian.delays.samplers import MessageContext, Sampler, streams_for
+from damian.delays.samplers import MessageContext, streams_for
 from damian.keys import STEPPED
 from damian.transforms.base import (
     Change,
     Entries,
     Memory,
     StatefulTransform,
+    add_spec,
     as_rows,
     existing,
     select_entries,
@@ -122,19 +123,18 @@ class Channel(StatefulTransform):
         links = {"delay": delay, "loss": loss} | ({} if hears is None else {"hears": hears})
         self.n_agents = same_size(links)
         """The number of agents for which links are given one by one, if any are."""
-        self.sampler = _sampler(delay, loss, dt, placed)
+        self.sampler = link_sampler(delay, loss, dt)
+        for name in self.sampler.reads:
+            given = placed and name in ("position", "receiver_position")
+            checks.require(given, "delay", f"a law that reads {name}", "needs a position_key")
         self.line = BroadcastLine(self.sampler)
         self.draws = self.sampler.constant_delay is None or limit is not None
         self.action_keys = existing([self.action_key])
-        self.step_keys = self.required_keys
+        self.step_keys = existing([*self.in_keys, self.position_key, self.sent_key])
 
     @property
     def row_key(self) -> NestedKey:
         return self._beside
-
-    @property
-    def required_keys(self) -> Sequence[NestedKey]:
-        return existing([*self.in_keys, self.position_key, self.sent_key])
 
     def find_rows(self, tensordict: TensorDictBase) -> torch.Size:
         """The shape of the rows: there is one for each link (receiver, sender), [*B, N, N]."""
@@ -278,24 +278,13 @@ class Channel(StatefulTransform):
         return input_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        agents, device = spec_rows(observation_spec, self._beside), observation_spec.device
-        pairs = torch.Size((*agents, agents[-1]))
+        agents = spec_rows(observation_spec, self._beside)
+        pairs = (*agents, agents[-1])
         sent = [observation_spec[key] for key in self.in_keys]
         kinds = [(spec.shape[len(agents) :], spec.dtype) for spec in sent]
         kinds += [((self.message_size,), torch.float32)] if self.message_size else []
         for key, (size, dtype) in zip(self.out_keys, kinds, strict=True):
-            observation_spec[key] = Unbounded(torch.Size((*pairs, *size)), dtype=dtype, device=device)
-        if self.age_key:
-            observation_spec[self.age_key] = Unbounded(pairs, dtype=torch.float32, device=device)
-        if self.mask_key:
-            observation_spec[self.mask_key] = Binary(pairs[-1], pairs, dtype=torch.bool, device=device)
+            add_spec(observation_spec, key, (*pairs, *size), dtype)
+        add_spec(observation_spec, self.age_key, pairs)
+        add_spec(observation_spec, self.mask_key, pairs, torch.bool)
         return observation_spec
-
-
-def _sampler(delay: Any, loss: Any, dt: float, has_position: bool) -> Sampler:
-    """A sampler of the links, whose laws read nothing but positions."""
-    sampler = link_sampler(delay, loss, dt, "delay")
-    offered = ["position", "receiver_position"] if has_position else []
-    for name in sampler.reads:
-        checks.require(name in offered, "delay", f"a law that reads {name}", "needs a position_key")
-    return sampler

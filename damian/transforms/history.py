@@ -1,6 +1,6 @@
 """Transforms that let an agent observe its latest actions (paper, section 3.3), and late messages."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from typing import Any
 
 import torch
@@ -18,6 +18,7 @@ from damian.transforms.base import (
     Entries,
     Memory,
     StatefulTransform,
+    add_spec,
     as_rows,
     existing,
     from_rows,
@@ -81,10 +82,6 @@ class ActionHistory(ActionTransform):
         self.action_keys = existing([self.action_key, self.recorded_key])
         self.age_key, self.reflected_after = sibling_key(self.action_key, age_key), reflected_after
         self.step_keys = existing([*self.in_keys, self.age_key])
-
-    @property
-    def required_keys(self) -> Sequence[NestedKey]:
-        return self.step_keys
 
     @property
     def _n_numbers(self) -> int:
@@ -159,10 +156,9 @@ class ActionHistory(ActionTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
         rows, width = self.actions.rows, self.steps * self._n_numbers
-        key, device = self.out_keys[0], observation_spec.device
+        key = self.out_keys[0]
         if not self.in_keys:
-            shape = torch.Size((*rows, width))
-            observation_spec[key] = Unbounded(shape, dtype=torch.float32, device=device)
+            add_spec(observation_spec, key, (*rows, width))
             return observation_spec
         old = observation_spec[key]
         flat = old.dtype.is_floating_point and len(old.shape) == len(rows) + 1
@@ -235,10 +231,6 @@ class MessageHistory(StatefulTransform):
         self.out_keys = [written]
         self.step_keys = existing([self.row_key, self.delay_key, self.sent_key])
 
-    @property
-    def required_keys(self) -> Sequence[NestedKey]:
-        return self.step_keys
-
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         message = as_rows(self._encoded(tensordict.get(self.row_key)), self.rows)
         kept = message.new_zeros(len(message), self.steps, message.shape[-1])
@@ -268,11 +260,7 @@ class MessageHistory(StatefulTransform):
         return memory, self._written(memory)
 
     def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-        """Note the message [...] of an agent that arrives in the next step, ``lag`` >= 1 steps late.
-
-        For a memory of one world, and delays that nobody knew at sending; a lag above ``steps`` changes
-        nothing.
-        """
+        """Note the message [...] of an agent that arrives in the next step, ``lag`` >= 1 steps late."""
         if lag > self.steps:
             return memory
         row = {"kept": self._encoded(message.view(1, 1, -1)).view(-1), "due": 1, "sent": True}
@@ -318,9 +306,6 @@ class MessageHistory(StatefulTransform):
         spec, rows = observation_spec[self.row_key], spec_rows(observation_spec, self.row_key)
         encoded = self._encoded(spec.zero())
         shape = (*rows, self.steps * (rows[-1] if self.group else 1), encoded.shape[-1] + 3)
-        observation_spec[self.out_keys[0]] = Unbounded(
-            torch.Size(shape),
-            dtype=torch.promote_types(encoded.dtype, torch.float32),
-            device=observation_spec.device,
-        )
+        dtype = torch.promote_types(encoded.dtype, torch.float32)
+        add_spec(observation_spec, self.out_keys[0], shape, dtype)
         return observation_spec

@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite
 
 from damian import keys
 from damian.common import checks
@@ -18,6 +18,7 @@ from damian.transforms.base import (
     Entries,
     Memory,
     StatefulTransform,
+    add_spec,
     as_rows,
     existing,
     from_rows,
@@ -69,10 +70,6 @@ class SampleAndHold(StatefulTransform):
         self.ready_key, self.age_key = ready_key, sibling_key(self.row_key, age_key)
         self.action_keys = self.in_keys_inv
         self.step_keys = existing([*self.in_keys, ready_key, self.age_key])
-
-    @property
-    def required_keys(self) -> Sequence[NestedKey]:
-        return self.step_keys
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         first = select_entries(tensordict, self.in_keys)
@@ -197,6 +194,5 @@ class SkipUntilReady(StatefulTransform):
         )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        shape, device = torch.Size((*observation_spec.shape, 1)), observation_spec.device
-        observation_spec[keys.DURATION] = Unbounded(shape, dtype=torch.long, device=device)
+        add_spec(observation_spec, keys.DURATION, (*observation_spec.shape, 1), torch.long)
         return observation_spec

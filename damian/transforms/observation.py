@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Composite
 
 from damian.common import checks
 from damian.delays.laws import law_of, sampler_of
@@ -16,6 +16,7 @@ from damian.transforms.base import (
     Entries,
     Memory,
     StatefulTransform,
+    add_spec,
     as_rows,
     existing,
     from_rows,
@@ -79,24 +80,18 @@ class ObservationDelay(StatefulTransform):
         checks.one_of("order", order, ORDERS)
         super().__init__(in_keys, out_keys or in_keys, seed=seed)
         law = law_of(delay)
-        self.sampler = sampler_of(law, dt, loss)
-        self.draws = self.sampler.constant_delay is None
-        self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
+        self.draw_from(sampler_of(law, dt, loss))
         self.line = DelayLine(self.sampler, order)
         self.age_key, self.fresh_key, self.delay_key, self.sent_key = (
             sibling_key(self.row_key, key) for key in (age_key, fresh_key, delay_key, sent_key)
         )
         self.extra_keys = existing([self.age_key, self.fresh_key, self.delay_key])
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.row_key)
-        self.step_keys = self.required_keys
+        self.step_keys = existing([*self.in_keys, self.sent_key, *self.contexts.keys.values()])
 
     @property
     def row_dims(self) -> dict[str, int]:
         return self.line.row_dims(len(self.in_keys))
-
-    @property
-    def required_keys(self) -> Sequence[NestedKey]:
-        return existing([*self.in_keys, self.sent_key, *self.contexts.keys.values()])
 
     def init_memory(self, tensordict: TensorDictBase) -> Memory:
         values = self._values(select_entries(tensordict, self.in_keys))
@@ -135,12 +130,8 @@ class ObservationDelay(StatefulTransform):
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             if out_key != key:
                 observation_spec[out_key] = observation_spec[key].clone()
-        shape = torch.Size((*spec_rows(observation_spec, self.row_key), 1))
-        device = observation_spec.device
-        if self.age_key:
-            observation_spec[self.age_key] = Unbounded(shape, dtype=torch.float32, device=device)
-        if self.fresh_key:
-            observation_spec[self.fresh_key] = Binary(1, shape=shape, dtype=torch.bool, device=device)
-        if self.delay_key:
-            observation_spec[self.delay_key] = Unbounded(shape, dtype=torch.long, device=device)
+        shape = (*spec_rows(observation_spec, self.row_key), 1)
+        add_spec(observation_spec, self.age_key, shape)
+        add_spec(observation_spec, self.fresh_key, shape, torch.bool)
+        add_spec(observation_spec, self.delay_key, shape, torch.long)
         return observation_spec

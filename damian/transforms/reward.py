@@ -21,6 +21,7 @@ from damian.transforms.base import (
     Entries,
     Memory,
     StatefulTransform,
+    add_spec,
     any_flag,
     as_rows,
     existing,
@@ -44,6 +45,10 @@ class RewardTransform(StatefulTransform):
 
     @property
     def step_keys(self) -> Sequence[NestedKey]:  # type: ignore[override]
+        return [self.reward_key]
+
+    @property
+    def required_keys(self) -> Sequence[NestedKey]:
         return [self.reward_key]
 
     @property
@@ -114,9 +119,7 @@ class RewardDelay(RewardTransform):
         )
         self.extra_keys = existing([self.delay_key, self.earned_key])
         law = law_of(delay)
-        self.sampler = sampler_of(law, dt)
-        self.draws = self.sampler.constant_delay is None
-        self.same_draws_for_all_agents = self.sampler.same_draws_for_all_agents
+        self.draw_from(sampler_of(law, dt))
         checks.require(not self.sampler.loses, "delay", delay, LOSES)
         self.n_slots = self.sampler.longest + 1
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.reward_key)
@@ -166,11 +169,16 @@ class RewardDelay(RewardTransform):
         slot = advance_slot(memory["slot"], 1, self.n_slots)
         memory = memory | {"clock": clock, "slot": slot, "channel": channel, "time": memory["time"] + 1}
         memory["past"] = self._send(memory, reward, delay, self.sending_rows(entries))
-        received = self._received(memory)
+        row = slot_rows(slot)
+        here, due = (memory[name].flatten(0, 1).index_select(0, row) for name in ("past", "due"))
+        received = torch.where(expand_mask(due == memory["time"], here), here, 0)
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
             ended = any_flag(done, self.rows)
-            in_transit = sum_in_transit(memory["past"], memory["due"], memory["time"])
+            past, in_transit = memory["past"], expand_mask(memory["due"] > memory["time"], memory["past"])
+            # In double precision, so that the order of the sum, which depends on the batch, does not matter.
+            precise = torch.float64 if past.is_floating_point() else past.dtype
+            in_transit = torch.where(in_transit, past, 0).sum(0, dtype=precise).to(past.dtype)
             received = torch.where(expand_mask(ended, received), received + in_transit, received)
             memory["time"] = memory["time"] + self.n_slots * ended
         return memory, {self.reward_key: from_rows(received, self.rows)} | self._report(delay, reward)
@@ -191,12 +199,6 @@ class RewardDelay(RewardTransform):
         flat.index_copy_(0, row, added)
         return past
 
-    def _received(self, memory: Memory) -> Tensor:
-        """The rewards that arrive in this step, [M, ...]."""
-        row = slot_rows(memory["slot"])
-        here, due = (memory[name].flatten(0, 1).index_select(0, row) for name in ("past", "due"))
-        return torch.where(expand_mask(due == memory["time"], here), here, 0)
-
     def _report(self, delay: Tensor, earned: Tensor) -> Entries:
         """The entries of ``delay_key`` and ``earned_key``, from the delays [M] and the rewards [M, ...]."""
         entries: Entries = {}
@@ -213,13 +215,10 @@ class RewardDelay(RewardTransform):
         return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        rewards, device = self.env.full_reward_spec, observation_spec.device
-        if self.delay_key:
-            shape = torch.Size((*spec_rows(rewards, self.reward_key), 1))
-            observation_spec[self.delay_key] = Unbounded(shape, dtype=torch.long, device=device)
-        if self.earned_key:
-            earned = rewards[self.reward_key]
-            observation_spec[self.earned_key] = Unbounded(earned.shape, dtype=earned.dtype, device=device)
+        rewards = self.env.full_reward_spec
+        earned = rewards[self.reward_key]
+        add_spec(observation_spec, self.delay_key, (*spec_rows(rewards, self.reward_key), 1), torch.long)
+        add_spec(observation_spec, self.earned_key, earned.shape, earned.dtype)
         return observation_spec
 
     def hindsight(self, keys: Collection[NestedKey]) -> Correction | None:
@@ -250,13 +249,6 @@ class RewardDelay(RewardTransform):
         last = torch.cat([next_true(begins)[1:], torch.full_like(step[:1], len(step))]) - 1
         done = expand_mask(steps[keys.RESET_AFTER].squeeze(-1), delay).expand_as(step)
         return (step + delay <= last) | done.gather(0, last)
-
-
-def sum_in_transit(past: Tensor, due: Tensor, time: Tensor) -> Tensor:
-    """Sums of the rewards [K, M, ...] that are due [K, M] after a time [M], [M, ...]."""
-    # In double precision, so that the order of the sum, which depends on the batch, does not matter.
-    precise = torch.float64 if past.is_floating_point() else past.dtype
-    return torch.where(expand_mask(due > time, past), past, 0).sum(0, dtype=precise).to(past.dtype)
 
 
 class CumulativeReward(RewardTransform):
@@ -316,11 +308,7 @@ def discounted_sum(past: Tensor, gamma: float) -> Tensor:
 
 
 class EpisodeTotals(StatefulTransform):
-    """Writes the sum of the rewards, and the number of steps, of each world's episode so far.
-
-    The entries are those of TorchRL's ``RewardSum`` and ``StepCounter``, bit for bit; but a ``DelayedEnv``
-    computes them in the same function as the rest of a step, which saves time.
-    """
+    """Writes each episode's sum of rewards and number of steps, within the step of a ``DelayedEnv``."""
 
     stage = "history"
     sees_merged_steps_only = True
@@ -347,8 +335,7 @@ class EpisodeTotals(StatefulTransform):
         return {keys.EPISODE_REWARD: memory["total"].clone(), keys.STEP_COUNT: memory["count"].clone()}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:  # type: ignore[override]
-        reward, device = self.env.full_reward_spec[keys.REWARD], observation_spec.device
-        observation_spec[keys.EPISODE_REWARD] = Unbounded(reward.shape, dtype=reward.dtype, device=device)
-        shape = torch.Size((*observation_spec.shape, 1))
-        observation_spec[keys.STEP_COUNT] = Unbounded(shape, dtype=torch.long, device=device)
+        reward = self.env.full_reward_spec[keys.REWARD]
+        add_spec(observation_spec, keys.EPISODE_REWARD, reward.shape, reward.dtype)
+        add_spec(observation_spec, keys.STEP_COUNT, (*observation_spec.shape, 1), torch.long)
         return observation_spec

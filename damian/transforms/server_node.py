@@ -176,11 +176,7 @@ class Belief(StatefulTransform):
         return window._asdict(), self._written(beliefs)
 
     def note_late(self, memory: Memory, message: Tensor, agent: int, lag: int) -> Memory:
-        """Note, in place, the packed message [M] of a UAV that arrives in the next step, ``lag`` steps late.
-
-        For a memory of one world, and delays that nobody knew at sending; a lag above ``longest`` changes
-        nothing.
-        """
+        """Note, in place, a UAV's packed message [M] that arrives in the next step, ``lag`` steps late."""
         if lag <= self.longest:
             messages = self.server.messages(message.view(1, 1, -1))
             slot = (memory["slot"] + 1 - lag) % len(memory["report"])

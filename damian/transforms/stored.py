@@ -53,21 +53,17 @@ def delay_trajectories(
                 "but stored steps show what followed: use it where the steps are collected"
             )
     playback = _Playback(data, _read_action_specs(data, leaves, action_spec))
-    played = _play(TransformedEnv(playback, transform.clone()), playback, _find_starts(data))
-    if not played["next", "done"].equal(data["next", "done"]):
-        raise InputError("transform: it ends episodes where the stored steps go on")
-    return played
-
-
-def _play(env: EnvBase, playback: "_Playback", starts: Tensor) -> TensorDictBase:
-    """Step through all stored steps, and reset the rows of the mask of first steps [*, T]."""
+    env, starts = TransformedEnv(playback, transform.clone()), _find_starts(data)
     now, steps = env.reset(), []
     for time, any_starts in enumerate(starts.reshape(-1, starts.shape[-1]).any(0).tolist()):
         if time and any_starts:
             now = env.reset(now.set("_reset", starts[..., time].unsqueeze(-1)))
         steps.append(env.step(playback.add_inputs(now)))
         now = env.step_mdp(steps[-1])
-    return cast(TensorDictBase, torch.stack(steps, starts.dim() - 1)).refine_names(..., "time")
+    played = cast(TensorDictBase, torch.stack(steps, starts.dim() - 1)).refine_names(..., "time")
+    if not played["next", "done"].equal(data["next", "done"]):
+        raise InputError("transform: it ends episodes where the stored steps go on")
+    return played
 
 
 class _Playback(EnvBase):

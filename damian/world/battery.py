@@ -37,10 +37,7 @@ def flight_drain(vertical: Tensor, distance: Tensor, battery: BatteryConfig) -> 
 def used_so_far(
     elapsed: Tensor, vertical: Tensor, cruise: Tensor, cruised: Tensor, battery: BatteryConfig
 ) -> Tensor:
-    """Battery drain of a flight so far, [*] percent; ``flight_drain`` from its end on.
-
-    From times [s] since takeoff, of the takeoff (and the landing) and of the cruise, and the way cruised [m].
-    """
+    """Battery drain of a flight so far, [*] percent, from times [s] and the way cruised [m]."""
     took_off = torch.minimum(elapsed, vertical)
     landing = torch.minimum((elapsed - vertical - cruise).clamp(min=0), vertical)
     return vertical_drain(took_off + landing, battery) + cruise_drain(cruised, battery)

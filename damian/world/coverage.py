@@ -21,9 +21,7 @@ from damian.common.tensors import gather_rows
 _GRID = 321
 """Number of offsets from -2R to 2R along each axis; it is odd so that offset 0 is exact."""
 _CHUNK_WORDS, _CHUNK_WORDS_LARGE = 2**18, 2**24
-"""Words and table rows of the worlds computed at once, which bounds the memory of many UAVs in many worlds:
-2 MiB on a CPU, to stay in its cache; 128 MiB on a GPU and in compiled graphs, which grow with the number of
-chunks."""
+"""Words and table rows computed at once: 2 MiB on a CPU; 128 MiB on a GPU and in compiled graphs."""
 _POINTS_AT_ONCE = 1024
 """Landing points whose samples are tested at once, which bounds the memory: arrays of 16 MiB."""
 

@@ -1,7 +1,4 @@
-"""The messages that UAVs send to the server node: their fields, and each message as one row of numbers.
-
-To add a field, declare it in ``Messages`` and fill it in ``Simulation._sense``.
-"""
+"""The messages that UAVs send; to add a field, declare it in ``Messages`` and fill it in ``_sense``."""
 
 from typing import Annotated, NamedTuple, get_type_hints
 

@@ -117,10 +117,7 @@ def locate(walk: Walk, time: Tensor, loops: bool = False) -> Located:
 
 
 def leg_profile(length: Tensor, speed: Tensor, acceleration: Tensor) -> tuple[Tensor, Tensor]:
-    """Duration of the acceleration, and of a whole rest-to-rest leg [s], [*].
-
-    The speed profile is trapezoidal, or triangular if the leg [m] is too short to reach ``speed`` [m/s].
-    """
+    """Duration of the acceleration, and of a whole rest-to-rest leg, trapezoidal or triangular [s], [*]."""
     peak = torch.minimum(speed, (length * acceleration).sqrt())
     ramp = peak / acceleration
     return ramp, length / peak.clamp_min(torch.finfo(peak.dtype).tiny) + ramp

@@ -320,15 +320,9 @@ def _given_starts(config: WorldConfig, airspace: Airspace, region: int) -> Tenso
     local = torch.as_tensor(local_places("region.start_positions", given, airspace.regions[region]))
     regions = torch.full((len(local),), region)
     points = nearest_points(airspace.cells, airspace.exact_points, regions, local, 1).squeeze(-1)
-    taken: dict[int, int] = {}
-    for i, point in enumerate(points.tolist()):
-        first = taken.setdefault(point, i)
-        checks.require(
-            first == i or config.region.start_together,
-            "region.start_positions",
-            f"{given[first]} and {given[i]}",
-            f"lead to the same landing point of {name}: take others, or region.start_together=true",
-        )
+    distinct = config.region.start_together or len(points.unique()) == len(points)
+    problem = f"lead to the same landing point of {name}: take others, or region.start_together=true"
+    checks.require(distinct, "region.start_positions", given, problem)
     return points
 
 

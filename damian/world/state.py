@@ -46,8 +46,7 @@ class State(NamedTuple):
     source_over: Tensor
     """Whether the source has finished its walk, [B]."""
     coverage: Tensor
-    """Coverage of each UAV in the latest step, as an undelayed server computed it; negative if it has not,
-    [B, N]. The next one follows from it faster than from nothing (``updated_share``)."""
+    """Coverage of each UAV, as an undelayed server computed it last; negative if it has not, [B, N]."""
     message_sent: Tensor
     """Whether the UAV sent a message in this step, [B, N]."""
     sent: Messages

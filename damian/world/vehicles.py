@@ -33,8 +33,7 @@ class MotionModel(ABC):
     """Motion of N UAVs in B worlds with steps of ``dt`` seconds, as pure functions of their state."""
 
     instant: bool
-    """Whether a UAV is at its target as soon as a step ends; if not, no two UAVs share a flight level, and
-    all levels lie within those of the region."""
+    """Whether a UAV is at its target as soon as a step ends; if not, no two UAVs share a flight level."""
 
     def __init__(self, config: WorldConfig, airspace: Airspace, dt: float) -> None:
         self.motion, self.battery, self.dt = config.motion, config.battery, dt

@@ -22,9 +22,8 @@ from torchrl.envs import ParallelEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
-from damian.transforms import (
-    StatefulTransform,
-)
+from damian.transforms import StatefulTransform
+from damian.transforms.server_node import Belief, ServerNode
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 AGENTS = {name: case for name, case in CASES.items() if case.env in (uavs, unserved)}
@@ -33,6 +32,7 @@ BATCHED = {name: case for name, case in CASES.items() if case.env is not cartpol
 
 def test_the_cases_cover_every_exported_transform():
     exported = {name: getattr(damian.transforms, name) for name in damian.transforms.__all__}
+    exported |= {"Belief": Belief, "ServerNode": ServerNode}
     concrete = {
         name
         for name, value in exported.items()

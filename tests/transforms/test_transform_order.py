@@ -22,8 +22,8 @@ from damian.transforms import (
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
-    ServerNode,
 )
+from damian.transforms.server_node import ServerNode
 
 
 def delay() -> Transform:
