@@ -173,8 +173,8 @@ class Searcher(Greedy):
     ) -> Tensor:
         """Actions, [B, N] or [B, N, 2], from packed messages [B, N, M] and beliefs [B, K].
 
-        Where each UAV knows its own messages, ``own_message`` [B, N, M] are these, and ``own_belief`` [B, N,
-        K].
+        Where each UAV knows its own messages, ``own_message`` [B, N, M] are these, and
+        ``own_belief`` [B, N, K] follows from them.
         """
         known = self.unpack(message)
         own = known if own_message is None else self.unpack(own_message)

@@ -47,9 +47,9 @@ class DelayLine:
 
     The memory, [M] if nothing else is said: ``clock``, the number of steps so far; ``place`` of the current
     slot (slot times M, plus the sender's number); random ``streams``; state of the ``channel``, [M, ...];
-    clock of the latest reset, ``reset_at``, and of the held message, ``generated_at``; ``senders``, 0 to M -
-    1; ``stamps``, the clock of the message in each of K slots, and in one for messages that never arrive, [K
-    + 1, M]; values in the slots, ``slots_i`` [K + 1, M, ...], and of the held messages, ``held_i`` [M, ...].
+    clock of the latest reset, ``reset_at``, and of the held message, ``generated_at``; numbers of
+    the ``senders``; ``stamps``, the clock of the message in each of K slots, and in one for messages that
+    never arrive, [K + 1, M]; values in these, ``slots_i`` [K + 1, M, ...], and held, ``held_i`` [M, ...].
     """
 
     def __init__(self, sampler: Sampler, order: str) -> None:
@@ -152,13 +152,13 @@ class BroadcastLine:
     generation; the contents of the latest messages lie in a ring, once for each sender.
 
     A worked timeline: a sender writes m0 at t = 0, and the delays of its links to receivers A and B are 1 and
-    3 steps. At t = 1 the time of generation 0 arrives on the link to A, which copies m0 from the ring; at t =
-    3 it arrives on the link to B, which copies it too. At t = 4 the sender's next message takes the slot of
-    m0, as the ring has 3 + 1 slots.
+    3 steps. At t = 1 the time of generation 0 arrives on the link to A, which copies m0 from the ring; at
+    t = 3 it arrives on the link to B, which copies it too. At t = 4 the sender's next message takes the slot
+    of m0, as the ring has 3 + 1 slots.
 
     The memory has that of the ``DelayLine``; the ``sender`` of each link, [L]; a ``link`` of each sender,
-    [S]; the latest K messages of each sender, ``contents_i`` [K, S, ...]; and those held, ``held_i`` [L,
-    ...].
+    [S]; the latest K messages of each sender, ``contents_i`` [K, S, ...]; and what is held,
+    ``held_i`` [L, ...].
     """
 
     def __init__(self, sampler: Sampler) -> None:

@@ -34,14 +34,14 @@ class MessageContext(NamedTuple):
 class Sampler(nn.Module):
     """Draws delays from a table of probabilities.
 
-    A worked timeline: with the table ``[[0.5, 0, 0, 0.5]]`` a message sent at t = 0 arrives at t = 0 or at t
-    = 3, each with probability 0.5, whatever the delays of the others.
+    A worked timeline: with the table ``[[0.5, 0, 0, 0.5]]`` a message sent at t = 0 arrives at t = 0 or, as
+    likely, at t = 3, whatever the delays of the others.
 
     Args:
         states: for each of S channel states, the probabilities of the delays 0, 1, ... [steps]; if they sum
             to less than 1, the rest is the probability that the message is lost.
-        transitions: probabilities of the transitions between the channel states per step, [S, S]; for one,
-            none.
+        transitions: probabilities of the transitions between the channel states per step, [S, S]; None for
+            one state.
         loss: probability that a message is lost, whatever its delay.
     """
 

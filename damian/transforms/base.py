@@ -400,10 +400,10 @@ class StatefulTransform(Transform):
     ) -> None:
         """Load the memory. A state without entries of this transform makes the next reset the first."""
         inner = {k.removeprefix(prefix): v for k, v in state_dict.items() if k.startswith(prefix)}
-        saved = {k: v for k, v in inner.items() if "." not in k and k != "_extra_state"}
+        saved: Memory = {k: v.detach() for k, v in inner.items() if "." not in k and k != "_extra_state"}
         own = self.memory
         self.clear_memory()
-        self.set_memory({k: own.get(k, v).detach().clone() for k, v in saved.items()})
+        self.set_memory({k: own.get(k, v).clone() for k, v in saved.items()})
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Random streams.

@@ -41,8 +41,8 @@ class Channel(StatefulTransform):
     gradient flows through the channel.
 
     A worked timeline, with a delay of 3 steps: the messages of the reset, t = 0, arrive at t = 3, and those
-    of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds their messages of t =
-    0, of age 3.
+    of t = 1 at t = 4. Until t = 2 an agent holds zeros of the others; at t = 3 it holds their messages of
+    t = 0, of age 3.
 
     Args:
         delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``); or an
@@ -65,8 +65,8 @@ class Channel(StatefulTransform):
         message_size: how many numbers ``action_key`` has.
         known_at_reset: everyone knows everyone's first message, whatever the delay and the links.
         dt: length of a step [s], for delays given as times.
-        age_key: key for the age of the held messages [steps], [*B, N, N] float, or steps since the reset; or
-            None.
+        age_key: key for the age of the held messages [steps], [*B, N, N] float; before one has arrived,
+            steps since the reset; or None.
         mask_key: key for a flag, [*B, N, N] bool: has a message of this episode arrived; or None.
         seed: as in ``StatefulTransform``.
 

@@ -175,10 +175,11 @@ class RewardDelay(RewardTransform):
         done = [entries[key] for key in self.done_keys if key in entries]
         if done:
             ended = any_flag(done, self.rows)
-            past, in_transit = memory["past"], expand_mask(memory["due"] > memory["time"], memory["past"])
+            past = memory["past"]
+            late = torch.where(expand_mask(memory["due"] > memory["time"], past), past, 0)
             # In double precision, so that the order of the sum, which depends on the batch, does not matter.
             precise = torch.float64 if past.is_floating_point() else past.dtype
-            in_transit = torch.where(in_transit, past, 0).sum(0, dtype=precise).to(past.dtype)
+            in_transit = late.sum(0, dtype=precise).to(past.dtype)
             received = torch.where(expand_mask(ended, received), received + in_transit, received)
             memory["time"] = memory["time"] + self.n_slots * ended
         return memory, {self.reward_key: from_rows(received, self.rows)} | self._report(delay, reward)
@@ -254,8 +255,8 @@ class RewardDelay(RewardTransform):
 class CumulativeReward(RewardTransform):
     """Replaces the reward by the discounted sum of the latest rewards (paper, eq. 4).
 
-    R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode, with gamma in (0,
-    1]. Sums of integers are float32.
+    R(t) = sum of gamma^(t - t') r(t') over the last ``steps`` steps t' <= t of the episode; gamma is in
+    (0, 1]. Sums of integers are float32.
 
     Examples:
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), CumulativeReward(5, gamma=0.9))
