@@ -1,8 +1,6 @@
 """A scripted policy: fly to where the source probably is, else over ground not covered recently.
 
-Every UAV flies to the landing point whose footprint contains the largest total weight. While a detection is
-recent, a landing point's weight is how likely the source is there; otherwise weight lies on the UAV's own
-ground outside its latest footprints.
+Every UAV flies to the landing point whose footprint contains the largest total weight.
 """
 
 import math

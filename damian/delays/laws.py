@@ -1,8 +1,4 @@
-"""Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"0.5m"``).
-
-``Law.sampler`` turns a law into a table from which delays are drawn, or into a function of the message's
-context (``ContextSampler``).
-"""
+"""Delay laws: distributions of message delays, in steps (``3``) or as a time (``"3s"``, ``"0.5m"``)."""
 
 import math
 from abc import ABC, abstractmethod
@@ -47,11 +43,7 @@ class Law(ABC):
 
     @abstractmethod
     def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:
-        """Build the sampler that draws delays from this law, in steps of ``dt`` seconds.
-
-        ``loss`` is the probability that a message is lost, whatever its delay; ``key`` names the law in
-        errors.
-        """
+        """Build the sampler of this law, for steps of ``dt`` seconds; ``key`` names the law in errors."""
 
 
 def sampler_of(written: Any, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> Sampler:

@@ -98,12 +98,7 @@ class DelayLine:
         sent: Tensor | None,
         context: MessageContext | None = None,
     ) -> tuple[Memory, Delivery]:
-        """Send one message per sender, and deliver the messages that arrive in this step.
-
-        ``values`` [M, ...] each; ``sent`` [M] bool: which are really sent, all if not given; ``context``:
-        needed only if the sampler sees it. Returns the memory after the step, and what the receivers then
-        hold.
-        """
+        """Send ``values`` [M, ...] of the senders ``sent`` [M] (None: all), and deliver what arrives now."""
         clock, generated_at = memory["clock"] + 1, memory["generated_at"]
         n_slots, n_senders = self.sampler.lost, len(generated_at)
         n_places = n_slots * n_senders

@@ -269,11 +269,9 @@ def observation_transforms(scenario: ScenarioConfig) -> list[Transform]:
 
 
 def history_since_message(scenario: ScenarioConfig) -> bool:
-    """Whether a UAV's action history holds only actions newer than its message that the server holds.
+    """Whether an action history holds only actions newer than the message that the server holds.
 
-    With delayed actions, slow clocks or a delayed broadcast a UAV cannot tell which actions are newer, and
-    with ``observation.own`` or ``links=matrix`` it knows its own latest message anyway: then it holds all of
-    them.
+    Not where a UAV cannot tell which are newer (slow clocks, delayed actions), or knows its own message.
     """
     delay, clock = scenario.delay, scenario.clock
     slow = clock.steps("server") > 1 or clock.steps("agents") > 1 or scenario.links.kind != "server"

@@ -18,12 +18,10 @@ ByAgent = dict[str, Any]
 
 
 class UavParallelEnv(ParallelEnv[str, Array, Any]):
-    """The UAVs of a scenario, with its delays, as a PettingZoo ``ParallelEnv``.
+    """The UAVs of a scenario, with its delays, as a PettingZoo ``ParallelEnv``, from ``uav_0`` on.
 
-    Agents are ``uav_0``, ``uav_1`` and so on; all of their episodes end together. Observations are float32
-    [F], rewards those that the server perceives; infos, and the arguments, are those of ``UavGymEnv``.
-    ``state()`` is what a central critic may know: the observations that the server makes of the messages it
-    holds.
+    All episodes end together. Observations are float32 [F]; infos and arguments are those of ``UavGymEnv``.
+    ``state()``: what the server observes of the messages that it holds, for a central critic.
     """
 
     def __init__(

@@ -21,8 +21,7 @@ class Learner(Protocol):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Update the networks from consecutive steps [B, T]; returns numbers to log, by name.
 
-        The batch has what the environment outputs, the extras that the learner's settings name in ``reads``,
-        and what the actor has written.
+        The batch has the environment's entries, the extras in ``reads``, and what the actor has written.
         """
         ...
 

@@ -94,10 +94,7 @@ class Mappo:
         return batch
 
     def optimize(self, batch: TensorDictBase) -> dict[str, float]:
-        """Make ``epochs`` passes over a batch [B, T] with advantages, in minibatches of steps or of worlds.
-
-        It returns the means of ``LOSSES``, ``NUMBERS`` and the norm of the gradient, ``gradient_norm``.
-        """
+        """Make ``epochs`` passes over a batch [B, T]; means of ``LOSSES``, ``NUMBERS``, ``gradient_norm``."""
         terms = []
         for entries in self._minibatches(batch):
             losses, numbers = self.losses(entries, self.entropy_coeff.value)

@@ -65,10 +65,7 @@ def initialized(config: ModelConfig, network: Network, gain: float) -> Network:
 
 
 class LegalCategorical(Distribution):
-    """Categorical distribution over the legal actions ``mask`` [*, A] bool (all if None), of logits [*, A].
-
-    TorchRL's ``MaskedCategorical`` is the same, but takes four times as long.
-    """
+    """Categorical distribution of logits [*, A] over legal actions; TorchRL's takes four times as long."""
 
     def __init__(self, logits: Tensor, mask: Tensor | None = None) -> None:
         legal = logits if mask is None else logits.masked_fill(~mask, -1e8)
@@ -161,10 +158,7 @@ def _actor_network(env: EnvBase, config: ModelConfig, n_out: int, *out_keys: Nes
 
 
 class SkipConnection(nn.Module):
-    """Logits that are a network's outputs plus, times a learnt weight, the logs of probabilities.
-
-    These are in the ``columns`` of the observation. The last layer begins with zeros.
-    """
+    """A network's outputs, zero at first, plus the logs of the observation's ``columns`` times a weight."""
 
     def __init__(self, network: nn.Module, columns: slice) -> None:
         super().__init__()

@@ -172,10 +172,7 @@ class BackupdateStorage(TimeStorage):
         self.overwrite(rows, {key: value[-len(rows) :] for key, value in recomputed.items()})
 
     def recomputed(self, steps: TensorDictBase, n_right: int = 0) -> dict[NestedKey, Tensor]:
-        """The corrected entries of consecutive steps [T, B], as the receiver knows after the last step.
-
-        The first ``n_right`` steps are stored as they should be: what is recomputed for these may be wrong.
-        """
+        """The corrected entries of steps [T, B]; the first ``n_right`` stored ones are right."""
         begins = steps[self._count].squeeze(-1) == 0
         entries, added = self._recompute_latest(steps)
         after = self._correct(entries, steps)

@@ -47,10 +47,7 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
 
 
 def beliefs_in_hindsight(server: Server, steps: TensorDictBase) -> Tensor:
-    """The server's belief after each step, from all messages up to it that have arrived by now, [T, B, K].
-
-    The belief after the first of the stored steps [T, B] must be final, unless its episode begins with it.
-    """
+    """The belief after each stored step, from what has arrived by now, [T, B, K]; the first is final."""
     assert server.grid is not None
     grid, messages = server.grid, server.messages(steps[next_key(keys.MESSAGE)])
     delay = steps[next_key(keys.DELAY)].squeeze(-1)

@@ -1,7 +1,4 @@
-"""Features of messages: those of the paper's Table 2, and those of where the source is believed to be.
-
-``observe`` is pure and batched, and reads nothing but the messages that it is given.
-"""
+"""Features of messages: those of the paper's Table 2, and those of where the source is believed to be."""
 
 import math
 from collections.abc import Callable, Mapping

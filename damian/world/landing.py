@@ -58,11 +58,7 @@ class Candidates:
             self._rank_all()
 
     def rank(self, flat: Tensor, region: Tensor, action: Tensor) -> tuple[Ranking, Tensor]:
-        """Rank the landing points to which actions [B, N] or, in [0, 1], [B, N, 2] may lead.
-
-        From the flat ids of the landing points [B, N] in regions [B]. Returns candidates as M lists, and the
-        row of each UAV among them, [B, N].
-        """
+        """Rank the points to which actions from points ``flat`` may lead; and the row of each UAV, [B, N]."""
         if self.config.kind == "discrete":
             return self.ranking, flat * self.config.n_actions + action
         action = action.double().clamp(0, 1)

@@ -37,11 +37,7 @@ class InitialConditions(NamedTuple):
 
 
 class Simulation:
-    """The constants of the worlds, and the functions that reset and step their state.
-
-    A UAV reports its latest ``trail`` landing points. Regions, start points and walks are drawn here, on the
-    CPU.
-    """
+    """The worlds' constants, regions and walks, drawn on the CPU, and functions of their state."""
 
     def __init__(self, config: WorldConfig, dt: float, trail: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
