@@ -28,11 +28,6 @@ def n_stops(walk):
     return walk.arrive.isfinite().sum(1)
 
 
-def leg_lengths(walk):
-    """Lengths of all legs between real stops [m]."""
-    return walk.stop.diff(dim=1).norm(dim=-1)[walk.arrive[:, 1:].isfinite()]
-
-
 def twin_duration(length, speed, acceleration):
     """Duration of a leg: two ramps and a constant speed between them, or two ramps that meet."""
     if length == 0:

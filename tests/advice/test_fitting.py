@@ -5,7 +5,6 @@ import json
 import pytest
 
 from damian.advice.fitting import fit, read_log, summary, trace_rows
-from damian.common.errors import InputError
 from damian.delays.laws import Trace
 from damian.recipes.command import main
 
@@ -57,12 +56,6 @@ def test_a_law_reads_the_trace(log, tmp_path, capsys):
     assert sampler.loses
 
 
-def test_what_is_no_log_is_refused(log):
-    for name, text in (("x.jsonl", "{}\n"), ("x.csv", "ID,lat,lon\nA,1,2\nB,1,2")):
-        with pytest.raises(InputError):
-            read_log(log(text, name))
-
-
 def test_a_journal_is_a_log(log):
     head = {"journal": "damian-advice", "version": 2, "fleet": "x", "uavs": ["A"], "about": {}}
     reports = [
@@ -80,8 +73,3 @@ def test_a_uav_that_is_silent_in_flight_loses_nothing(log):
     fitted = fit(read_log(log("\n".join(["ID,time,receive time,lat,lon,FLA", *lines]))))
     assert fitted.losses == "by their period of 1 s"
     assert fitted.n_lost == 0
-
-
-def test_a_long_pause_counts_as_no_loss(log):
-    lines = [f"A,{i},{i + 0.1},53.1,-4.5,{i}" for i in (*range(10), *range(5000, 5010))]
-    assert fit(read_log(log("\n".join(["ID,time,receive time,lat,lon,sequence", *lines])))).n_lost == 0

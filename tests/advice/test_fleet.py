@@ -136,19 +136,6 @@ def test_after_a_long_silence_it_does_not_matter_when_somebody_asked(task, monke
     assert fleets[0].step == fleets[1].step == 3 * SILENT + 9
 
 
-def test_after_a_long_silence_the_history_holds_no_action_that_had_been_reflected(monkeypatch):
-    """As in a fleet that takes every step."""
-    observed = []
-    for silent in (SILENT, 1000):
-        monkeypatch.setattr("damian.advice.fleet.SILENT_STEPS", silent)
-        fleet = begun(**TASKS["history"])
-        advise(fleet, START + 3, ["a"])
-        told(fleet, "a", START + 8, fleet.decision(0).goal)
-        fleet.advance(START + 3 * SILENT)
-        observed.append(fleet.observe([0])[keys.OBSERVATION])
-    assert torch.equal(*observed)
-
-
 def test_a_landing_point_that_somebody_was_sent_to_is_not_given_away():
     """The UAV does not report any more; after a while it is believed where it was last."""
     fleet = begun(1, actions=ActionConfig(distances=[0.0, 60.0], headings=[0.0, 90.0, 180.0, 270.0]))

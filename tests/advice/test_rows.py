@@ -1,12 +1,10 @@
 """Rows of tables: what is understood, what is refused, and that no cell of an answer is a formula."""
 
-import csv
-import io
 import json
 
 import pytest
 
-from damian.advice.rows import Advice, Report, as_csv, read_csv, read_json
+from damian.advice.rows import Report, read_csv, read_json
 from damian.common.errors import InputError
 
 ROW = {"ID": "B", "time": 1.75e9, "lat": 52.8, "lon": -4.1, "source_spotted": 0, "battery": 80.0}
@@ -67,9 +65,3 @@ def test_a_wrong_row_is_refused_with_its_place_column_and_value(case):
 def test_what_is_no_row_is_refused(text):
     with pytest.raises(InputError):
         read_json(text)
-
-
-def test_what_is_not_known_is_na_in_a_table():
-    told = {"heading": None, "distance": 0.0, "duration": 0.0, "arrival": 5.0, "step": 1, "age": -0.5}
-    (row,) = csv.DictReader(io.StringIO(as_csv([Advice(ID="A", state="hold", lat=-52.8, lon=-4.1, **told)])))
-    assert (row["ID"], float(row["lat"]), row["heading"]) == ("A", -52.8, "NA")

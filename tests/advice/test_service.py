@@ -101,17 +101,6 @@ def test_reports_go_in_and_landing_points_come_out(client, fleet, session, clock
     assert status["uavs"][0] == status["uavs"][0] | {"ID": "A", "age": 1.0, "late": 0, "duplicates": 1}
 
 
-def test_a_wrong_row_is_refused_with_its_place_and_nothing_is_taken(client, fleet, session):
-    for changed, message in (
-        ({"ID": "Z"}, "row 2: ID: 'Z' is no UAV"),
-        ({"lat": 91}, "row 2: lat: 91: Input"),
-    ):
-        answer = client.post(f"{fleet}/reports", json=[row("A", 0, session), row("B", 40, session) | changed])
-        assert answer.status_code == 422
-        assert answer.json()["error"].startswith(message)
-    assert not session.fleets["north"].logs[0].reports, "all rows are taken, or none"
-
-
 def test_who_has_the_wrong_token_learns_nothing(client, fleet, session):
     answers = [
         client.get(path, headers=headers)
@@ -133,12 +122,6 @@ def test_a_fleet_is_created_once_and_can_be_ended(client, fleet, session):
     assert client.put(fleet, json={"uavs": ["X"]}).status_code == 201
 
 
-@pytest.mark.parametrize("uavs", [None, [], ["A", "A"], [""], ["=A"], [["A"]]])
-def test_wrong_uavs_are_refused(client, uavs):
-    answer = client.put("/fleets/north", json={"uavs": uavs})
-    assert (answer.status_code, "uavs" in answer.json()["error"]) == (422, True)
-
-
 def test_a_huge_body_is_refused(client, fleet):
     answer = client.post(f"{fleet}/reports", content=b"[" + b" " * MAX_BODY * 10)
     assert answer.status_code == 413
@@ -155,12 +138,6 @@ def test_after_any_nonsense_the_service_goes_on(client, fleet, session, content)
     assert not any(log.reports for log in session.fleets["north"].logs)
     assert client.post(f"{fleet}/reports", json=rows(session)).status_code == 200
     assert client.get(f"{fleet}/advice").status_code == 200
-
-
-def test_a_wrong_question_for_advice_is_refused(client, fleet, session):
-    client.post(f"{fleet}/reports", json=rows(session))
-    for query in ("?uav=Z", "?format=xml", "?uavs=A", "?uav="):
-        assert client.get(f"{fleet}/advice{query}").status_code == 422
 
 
 @pytest.mark.sample(2)

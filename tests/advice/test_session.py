@@ -2,7 +2,6 @@
 
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -123,12 +122,6 @@ def test_a_journal_of_something_else_is_refused(node, tmp_path, text, message):
     assert str(error.value).startswith(f"{tmp_path / 'x.jsonl'}: {message}")
 
 
-def test_a_journal_that_was_never_begun_is_removed(tmp_path):
-    (tmp_path / "x.jsonl").write_text('{"journal": "dam')
-    assert not AdviceSession(lambda uavs: pytest.fail("no fleet is needed"), tmp_path).fleets
-    assert not (tmp_path / "x.jsonl").exists()
-
-
 # Two services.
 
 
@@ -152,14 +145,6 @@ def test_a_journal_of_other_settings_is_refused_with_both_values(make_session):
     now = ["port=8000", "host=0.0.0.0", "journal=x", "device=cuda", "agents=7"]
     session = make_session(overrides=["+region=llanbedr", *now, *WORDS[1:]])
     assert [*session.fleets] == ["north"], "these may differ"
-
-
-def test_a_journal_of_other_landing_points_is_refused(make_session):
-    """The words are the same, but a file that they name has changed."""
-    begun(make_session()).close()
-    region = replace(LLANBEDR, lattice_step=60.0)
-    with pytest.raises(InputError, match=r"north\.jsonl: it is of other landing points"):
-        make_session(Node(for_uavs(scenario_of(region=region), 2)))
 
 
 # A journal that cannot be written.

@@ -4,11 +4,9 @@ import importlib.util
 from dataclasses import replace
 
 import bench
-import bench_timing
 import bench_training
 import pytest
-from bench import BARE, RIVAL, WHOLE, arms, delays, rivals, scenarios
-from bench_timing import Measured, in_turn
+from bench import BARE, WHOLE, arms, delays, rivals, scenarios
 from bench_training import ARMS, HEADER, RIVALS, WIDTHS, arm_config, training
 
 from damian.envs.pipeline import has_message_delay
@@ -31,16 +29,6 @@ def presets():
     return scenarios()
 
 
-def test_chunks_take_turns_and_have_their_own_median_and_spread(monkeypatch):
-    ends = iter([0, 2, 2, 3, 3, 9, 9, 10, 10, 13, 13, 14])  # seconds: chunks of 2, 1, 6, 1, 3 and 1
-    monkeypatch.setattr(bench_timing.time, "perf_counter", lambda: next(ends))
-    order = []
-    chunks = {"slow": lambda: order.append("slow"), "fast": lambda: order.append("fast")}
-    times = in_turn(chunks, steps=1000, repeats=3)
-    assert order == ["slow", "fast"] * 3
-    assert times == {"slow": Measured(3, 2, 6), "fast": Measured(1, 1, 1)}
-
-
 @pytest.mark.slow
 def test_every_environment_of_the_delay_table_is_measured(presets):
     text = bench.cost_of_delays({"everything": presets["everything"]}, TINY)
@@ -56,12 +44,6 @@ def test_the_comparison_has_a_row_for_each_arm_and_a_figure(presets, tmp_path, m
     names = [*rivals(1), *arms(presets, 1, (BARE, WHOLE), ("eager",))]
     assert [line.split(" | ")[0] for line in text.strip().splitlines()[4:]] == [f"| {name}" for name in names]
     assert (tmp_path / "runs" / "bench.png").exists()
-
-
-def test_speed_is_given_relative_to_vmas():
-    times = {RIVAL: Measured(30, 29, 31), "ours": Measured(2, 1, 3)}
-    assert bench.ratio(times, times["ours"].median) == "15.0"
-    assert bench.ratio({"ours": Measured(2, 1, 3)}, 2) == "-"
 
 
 # The training part.

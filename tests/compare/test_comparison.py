@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from damian.compare.comparison import (
     ALL_MESSAGES,
@@ -14,7 +13,6 @@ from damian.compare.comparison import (
     Arm,
     Comparison,
 )
-from damian.compare.figures import ARM_COLOURS, plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import interquartile_mean
 
@@ -186,65 +184,3 @@ def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     script = [(line.policy, line.regime) for line in comparison.lines if line.arm == "script"]
     assert script == [("its own messages", "R0"), (ALL_MESSAGES, "R3")]
     assert comparison.compared("t", "late")["aware"]["recovery"].value == pytest.approx((22 / 3 - 4) / 6)
-
-
-def drawn(monkeypatch, draw) -> Figure:
-    """The figure that a function draws instead of saving it."""
-    figures = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kwargs: figures.append(figure))
-    draw()
-    return figures[-1]
-
-
-def test_a_figure_shows_every_arm_with_results_in_a_look_of_its_own_and_no_other_one(monkeypatch, tmp_path):
-    names = [f"arm {i}" for i in range(2 * len(ARM_COLOURS) - 2)]
-    arms = {"best": Arm(delayed=False), "blind": Arm(naive=True)} | {name: Arm() for name in names}
-    arms |= {"unfinished": Arm(), "script": Arm(oracle=True)}
-    scores = {"best": [9.0, 11, 10], "blind": [1.0, 5, 3]} | {name: [6.0, 9, 7] for name in names}
-    comparison = Comparison(rows_of("t", "late", scores), arms)
-    panels = {"all": [*names, "unfinished", "left out"], "none": ["left out"]}
-    path = tmp_path / "figure.png"
-    norms = drawn(monkeypatch, lambda: plot_norms(comparison, path))
-    delays = drawn(monkeypatch, lambda: plot_delays(comparison, panels, path))
-    assert len(delays.axes) == 2
-    for axis, expected in ((norms.axes[0], ["blind", *names]), (delays.axes[0], names)):
-        assert axis.get_legend_handles_labels()[1] == expected
-        lines = [bars[0] for bars in axis.containers]
-        assert len({(line.get_color(), line.get_marker()) for line in lines}) == len(expected)
-
-
-@pytest.mark.parametrize(("first", "drawn_over"), [(3, [3.0, 4.0]), (5, [])])
-def test_a_learning_curve_is_drawn_where_all_of_its_runs_have_been(first, drawn_over, monkeypatch, tmp_path):
-    runs = [
-        [
-            {
-                "episodes": float(n),
-                "perceived_return": n / 9,
-                "perceived_success_rate": 0.5,
-                "perceived_steps": 9.0,
-            }
-            for n in episodes
-        ]
-        for episodes in (range(5), range(first, 9))
-    ]
-    comparison = Comparison(rows_of("t", "late", SCORES), ARMS)
-    path = tmp_path / "curves.png"
-    figure = drawn(monkeypatch, lambda: plot_curves(comparison, {("t", "none", "best"): runs}, {}, path))
-    line = next(line for line in figure.axes[0].lines if line.get_label() == "best")
-    place = np.asarray(line.get_xdata())
-    assert [*place[~np.isnan(place)][[0, -1]]] == drawn_over if drawn_over else np.isnan(place).all()
-
-
-@pytest.mark.parametrize(("last", "label"), [(500.0, "environment steps"), (400.0, "episodes")])
-def test_curves_are_over_steps_if_all_runs_made_as_many_and_else_over_episodes(
-    last, label, monkeypatch, tmp_path
-):
-    measures = {"perceived_return": 1.0, "perceived_success_rate": 0.5, "perceived_steps": 9.0}
-    fast, slow = (
-        [{"frames": end * n / 4, "episodes": many * n, **measures} for n in range(5)]
-        for end, many in ((500.0, 90), (last, 9))
-    )
-    one, curves = Comparison(rows_of("t", "late", SCORES), ARMS), {("t", "none", "best"): [fast, slow]}
-    figure = drawn(monkeypatch, lambda: plot_curves(one, curves, {}, tmp_path / "curves.png"))
-    assert {axis.get_xlabel() for axis in figure.axes} == {label}
-    assert max(figure.axes[0].lines[0].get_xdata()) == (500 if label != "episodes" else 36)

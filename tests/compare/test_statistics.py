@@ -22,11 +22,6 @@ def means(scores):
     return scores.mean(-1)
 
 
-def test_recovery_is_0_for_naive_and_1_for_undelayed():
-    aware = np.array([4.0, 10.0, 7.0, 1.0, 13.0])
-    np.testing.assert_array_equal(recovery(aware, 4.0, 10.0, 0.0), [0, 1, 0.5, -0.5, 1.5])
-
-
 @pytest.mark.parametrize(
     ("naive", "defined"), [(8.0, True), (9.0, True), (9.01, False), (10.0, False), (11.0, False)]
 )

@@ -61,9 +61,6 @@ def test_an_update_keeps_the_lag_with_the_hold_probability(probability):
     require_share(kept[1::2], probability + (1 - probability) / 1000)
 
 
-# Runs of losses.
-
-
 # Contexts.
 
 

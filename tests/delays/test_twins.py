@@ -1,6 +1,5 @@
 """Late messages, actions and rewards beside senders in plain Python, whose episodes end at random steps."""
 
-import copy
 import math
 from typing import Any
 
@@ -9,7 +8,7 @@ import torch
 from context_law import LONGEST, Crowd, twin_delay
 from delay_twin import Counting, Purse, Receiver
 from delayed_envs import choices as uav_choices
-from helpers import all_same, everything, play
+from helpers import everything, play
 from transform_cases import (
     ACTION,
     N_AGENTS,
@@ -201,44 +200,3 @@ def test_a_held_law_loses_the_same_messages_and_delays_the_others_equally():
     one, other = (torch.stack([td["agents", "delay"] for td in outputs[1::2]]) for outputs in (free, held))
     assert other.equal(torch.where(one == -1, -1, LONGEST))
     assert (one == -1).any()
-
-
-def one_of_each(name: str) -> list[Any]:
-    law, reward = LAWS[name], Crowd("seen", column=4, loses=False) if name == "context" else LAWS[name]
-    return [
-        ActionDelay(law, ACTION, loss=0.1, **options(name)),
-        ObservationDelay(law, [OBSERVATION], loss=0.1, **options(name)),
-        RewardDelay(reward, REWARD, **options(name)),
-    ]
-
-
-@pytest.mark.parametrize("name", ["all", "context"])
-def test_a_world_alone_has_the_same_delays_as_in_a_batch(name):
-    batch = play(delayed(*one_of_each(name)), choices(n_steps=20))
-    for w, world in enumerate(WORLDS):
-        alone = play(delayed(*one_of_each(name), worlds=[world]), choices([world], 20))
-        assert all_same([td[w : w + 1] for td in batch], alone)
-
-
-@pytest.mark.parametrize("name", [name for name in LAWS if name != "context"])
-def test_a_copy_and_a_loaded_state_go_on_with_the_same_delays(name):
-    env = delayed(*one_of_each(name))
-    play(env, choices(n_steps=9))
-    copied, loaded = copy.deepcopy(env), delayed(*one_of_each(name))
-    play(loaded, choices(n_steps=4))
-    loaded.base_env.__dict__.update(copy.deepcopy(env.base_env).__dict__)
-    loaded.transform.load_state_dict(copy.deepcopy(env.transform.state_dict()))
-    runs = []
-    for each in (env, copied, loaded):
-        steps = [each.step(each.rand_action().set(ACTION, action))["next"] for action in choices(n_steps=9)]
-        runs.append(steps)
-    assert all_same(*runs[:2])
-    assert all_same(*runs[1:])
-
-
-def test_a_lag_of_0_is_the_identity():
-    lag = Lag(Uniform(0, 3, probability=0.0), 3, hold_probability=0.5, shared=True, stagger=True)
-    transforms = [ActionDelay(lag, ACTION), ObservationDelay(lag, [OBSERVATION]), RewardDelay(lag, REWARD)]
-    plain = play(Counting(WORLDS, N_AGENTS), choices())
-    found = play(delayed(*transforms), choices())
-    assert all_same([td.exclude(("agents", "age")) for td in found], plain)

@@ -9,18 +9,14 @@ import torch
 from helpers import (
     EAST,
     HERE,
-    KEEPS_GOING,
     MOTIONS,
-    act,
     both_motions,
     clock,
     flight,
     fresh,
     go,
     one_uav,
-    random_actions,
     sent_messages,
-    square,
     walking,
 )
 
@@ -28,34 +24,10 @@ from damian.server.rewards import RewardConfig
 from damian.server.termination import EpisodeConfig
 from damian.world.battery import BatteryConfig, charge_gain, flight_drain
 from damian.world.motion import MotionConfig
-from damian.world.signal_source import SourceConfig
 
 FAR = [[390.0, 10.0]]
 
 # Ends of episodes.
-
-
-@pytest.mark.parametrize(("share", "needed"), [(0.3, 1), (0.5, 2), (1.0, 3)])
-def test_success_needs_a_share_of_the_uavs_to_spot_the_source_at_once(share, needed):
-    episode = EpisodeConfig(max_steps=None, success_share=share)
-    env = fresh(square(source=SourceConfig(level_db=143.0), episode=episode), num_worlds=256)
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(5):
-        output = act(env, random_actions(env, generator))
-        enough = sent_messages(output).spotted.sum(-1, keepdim=True) >= needed
-        assert enough.any()
-        assert not enough.all()
-        assert output["success"].equal(enough)
-        assert output["terminated"].equal(enough)
-        assert not output["truncated"].any()
-
-
-def test_the_time_limit_truncates_and_does_not_terminate():
-    env = fresh(one_uav(episode=EpisodeConfig(max_steps=3)))
-    ends = [go(env, HERE) for _ in range(3)]
-    assert [td["truncated"].item() for td in ends] == [False, False, True]
-    assert [td["done"].item() for td in ends] == [False, False, True]
-    assert not any(td["terminated"].item() or td["success"].item() for td in ends)
 
 
 @both_motions
@@ -95,33 +67,6 @@ def test_after_its_walk_the_source_is_silent_and_the_episode_terminates_if_so_co
         output = go(env, HERE)
         assert output["terminated"].item() == terminates
         assert not sent_messages(output).spotted.item()
-
-
-@pytest.mark.parametrize("emission", ["constant", "per_stop"])
-def test_a_source_that_begins_its_walk_anew_is_heard_for_the_whole_episode(emission):
-    source = walking(level_db=170.0, emission=emission, emission_probability=0.4, n_hotspots=2, max_stops=3)
-    env = fresh(one_uav(source=source, clock=clock("1m"), episode=KEEPS_GOING), num_worlds=64)
-    heard, rounds = [], 60.0 * 150 / env.simulation.walk.depart[:, -1]
-    assert rounds.min() > 2
-    for _ in range(150):
-        output = go(env, HERE)
-        heard.append(sent_messages(output).spotted)
-        assert not output["done"].any()
-    share = torch.stack(heard).float()
-    assert share[50:].mean().item() == pytest.approx(1.0 if emission == "constant" else 0.4, abs=0.03)
-    assert (emission == "constant") == share.all()
-
-
-@pytest.mark.parametrize(("over_steps", "bonus"), [(False, 3.0), (True, 1.5)])
-def test_success_gives_the_bonus_and_a_timeout_the_penalty(over_steps, bonus):
-    source = SourceConfig(level_db=130.0, position=[160.0, 100.0])
-    episode = EpisodeConfig(max_steps=3, success_share=1.0)
-    task = RewardConfig(spotted=0.0, bonus=3.0, bonus_over_steps=over_steps, penalty=0.5)
-    env = fresh(one_uav(source=source, episode=episode, reward=task))
-    assert go(env, HERE)["agents", "reward"].item() == 0.0
-    assert go(env, EAST)["agents", "reward"].item() == bonus
-    env.reset()
-    assert go(env, HERE, HERE, HERE)["agents", "reward"].item() == -0.5
 
 
 # Batteries.

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase, RewardSum, StepCounter
 from damian.delays.config import DelayConfig, LinkConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.scenario import ScenarioConfig
-from damian.keys import AGENTS, EPISODE_REWARD, GLOBAL_OBSERVATION, REWARD
+from damian.keys import AGENTS, EPISODE_REWARD, REWARD
 from damian.transforms.reward import EpisodeTotals
 
 STEPS = 20
@@ -80,17 +80,3 @@ def test_with_delays(delays):
 def test_with_links_between_uavs():
     delay = DelayConfig(obs=2, loss=0.1)
     check_equal_to_torchrls_way(everything(delay=delay, links=LinkConfig(kind="matrix", delay=1)))
-
-
-@pytest.mark.parametrize("delay", [DelayConfig(), DelayConfig(obs=2, loss=0.1)])
-def test_remembered_coverage_is_that_of_the_messages(delay):
-    env = delayed(everything("polynomial", delay=delay))
-    assert env.server.remembers_coverage
-    for step in steps_of(env, choices(env, STEPS))[::2]:
-        held = step["next", AGENTS].get("received", step["next", AGENTS, "message"])
-        elapsed = torch.zeros(env.batch_size, dtype=torch.long)
-        features = env.server.features(env.server.messages(held), elapsed)
-        column = env.server.observation.critic.index("coverage")
-        n_distances = env.uav_env.n_agents - 1  # one feature has a column for each other UAV
-        column += (n_distances - 1) * ("agent_distances" in env.server.observation.critic[:column])
-        assert torch.equal(step["next", GLOBAL_OBSERVATION][..., column], features["coverage"])

@@ -1,20 +1,15 @@
 """``UavEnv`` as a TorchRL environment: specs, batches against single worlds, seeds, compilation."""
 
-import copy
-
 import pytest
 import torch
 from helpers import (
     KINDS,
     MOTIONS,
     REGIONS,
-    act,
     all_same,
     both_kinds,
     both_motions,
-    check_equal,
     everything,
-    fresh,
     play,
     random_actions,
     same,
@@ -92,42 +87,6 @@ def random_action_entry(env, generator):
 # Worlds and seeds.
 
 
-@pytest.mark.sample(2)
-@both_kinds
-@both_motions
-def test_worlds_stepped_together_equal_worlds_stepped_alone(motion, kind):
-    n_worlds = 3
-    together = UavEnv(everything(motion, kind), num_worlds=n_worlds, seed=5)
-    alone = UavEnv(everything(motion, kind), num_worlds=1, seed=5)
-    generator = torch.Generator().manual_seed(1)
-    actions = [random_actions(together, generator) for _ in range(30)]
-    seeds = torch.tensor([11, 12, 13])
-    together.seed_worlds(seeds)
-    expected = play(together, actions)
-    assert torch.stack([td["done"] for td in expected]).sum() >= 2 * n_worlds
-    for b in range(n_worlds):
-        alone.seed_worlds(seeds[b : b + 1])
-        outputs = play(alone, [a[b : b + 1] for a in actions])
-        assert all_same(outputs, [td[b : b + 1] for td in expected])
-
-
-@both_motions
-def test_a_partial_reset_changes_only_its_worlds(motion):
-    env = fresh(everything(motion), num_worlds=6)
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(3):
-        after = act(env, random_actions(env, generator))
-    before = copy.deepcopy(env.state)
-    mask = torch.tensor([True, False, False, True, False, False])
-    output = env.reset(after.exclude("reward").set("_reset", mask[:, None]))
-    check_equal(before, env.state, ~mask)
-    assert env.state.steps.tolist() == [0, 3, 3, 0, 3, 3]
-    assert env.state.episode.tolist() == [2, 1, 1, 2, 1, 1]
-    keys = [("agents", "observation"), ("agents", "message"), "state"]
-    assert same(output.select(*keys)[~mask], after.select(*keys)[~mask])
-    assert not same(output.select(*keys)[mask], after.select(*keys)[mask])
-
-
 def test_set_seed_repeats_a_rollout_and_worlds_and_episodes_differ():
     env = UavEnv(everything(), num_worlds=8)
     generator = torch.Generator().manual_seed(0)
@@ -143,6 +102,3 @@ def test_set_seed_repeats_a_rollout_and_worlds_and_episodes_differ():
     starts = {tuple(world) for world in first[0]["state"].tolist()}
     assert len(starts) > 3
     assert len({int(env.reset()[0]["state"].sum() * 100) for _ in range(20)}) > 3
-
-
-# Compilation.

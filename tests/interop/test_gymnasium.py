@@ -104,12 +104,6 @@ def test_stable_baselines_trains_and_its_policy_flies():
     assert env.action_space.contains(action.item())
 
 
-def test_masks_are_those_that_maskable_learners_ask_for():
-    env = gymnasium.make("damian/Energy-v0").unwrapped
-    _, info = env.reset(seed=0)
-    assert np.array_equal(env.action_masks(), info["action_mask"].astype(bool))
-
-
 def test_what_a_user_can_get_wrong_is_said_in_one_line():
     with pytest.raises(InputError, match=r"agents: 2 is not 1.*UavParallelEnv"):
         gymnasium.make("damian/Spotting-v0", overrides=["agents=2"])

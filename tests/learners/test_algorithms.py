@@ -68,6 +68,3 @@ def test_every_learner_trains_with_every_kind_of_action_and_awareness_and_is_eva
     assert float(last["frames"]) == 96
     with (tmp_path / "result.csv").open(newline="") as file:
         assert all(math.isfinite(float(row["perceived_return"])) for row in csv.DictReader(file))
-
-
-# The parts of a learner.

@@ -136,6 +136,3 @@ def test_rewards_are_divided_by_the_root_mean_square_of_discounted_returns_over_
         assert (batch == before).all()
     expected = torch.tensor(slow_returns(batches, 0.8)).square().mean().sqrt()
     assert scale.value.item() == pytest.approx(expected.item(), rel=1e-4)
-
-
-# Checkpoints.

@@ -15,11 +15,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from damian.common.errors import InputError
 from damian.recipes.train import run as main
 from damian.runs.checkpoint import read_checkpoint
 from damian.runs.metrics_log import MetricsLog
-from damian.runs.run_lock import locked
 
 TINY = ["worlds=4", "learner.steps=8", "eval_episodes=2", "model.hidden=[8]", "checkpoint_every=3"]
 TINY += ["region.lattice_step=60", "episode.max_steps=12", "frames=256", "logger=csv"]
@@ -141,15 +139,6 @@ def check_equal(whole: Path, other: Path) -> None:
     assert differ == []
     assert files(other) == files(whole)
     assert {str(path) for path in FINISHED} <= files(whole)
-
-
-def is_locked(folder: Path) -> bool:
-    """Has another run locked the folder?"""
-    try:
-        with locked(folder):
-            return False
-    except InputError:
-        return True
 
 
 def files(folder: Path) -> set[str]:

@@ -1,15 +1,8 @@
 """The program that advises real UAVs, run by its command line: tables, folders and HTTP, and its refusals."""
 
 import csv
-import http.client
 import json
-import random
-import subprocess
 import sys
-import threading
-import time
-import urllib.error
-import urllib.request
 from pathlib import Path
 
 import pytest
@@ -142,76 +135,3 @@ def test_tables_in_a_folder_are_answered_and_wrong_ones_put_aside(inbox, tmp_pat
     session.close()
     again = session_of(tmp_path / "journals").fleet("main")
     assert [list(told) for told in again.told] == [list(told) for told in session.fleet("main").told]
-
-
-class Program:
-    """``damian advise port=0`` as a process of its own."""
-
-    def __init__(self, folder: Path, *words: str) -> None:
-        code = "from damian.recipes.command import main; main()"
-        given = [*SCRIPT, "port=0", f"token={TOKEN}", f"journal={folder / 'journals'}", *words]
-        given += [f"hydra.run.dir={folder}/run{time.time_ns()}"]
-        self.process = subprocess.Popen(
-            [sys.executable, "-W", "ignore", "-c", code, "advise", *given],
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=folder,
-        )
-        assert self.process.stdout is not None
-        self.url = next(line for line in self.process.stdout if line.startswith("listening")).split()[-1]
-
-    def __call__(self, method: str, path: str, body=None, token: str = TOKEN):
-        """Answer to a request; raises an ``OSError`` if there is none."""
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(
-            self.url + path, data, {"Authorization": f"Bearer {token}"}, method=method
-        )
-        try:
-            with urllib.request.urlopen(request, timeout=20) as answer:
-                return answer.status, json.loads(answer.read() or "null")
-        except urllib.error.HTTPError as error:
-            return error.code, json.loads(error.read())
-
-
-@pytest.mark.slow
-def test_nothing_that_was_acknowledged_is_lost_when_the_program_is_killed(tmp_path):
-    generator, acknowledged = random.Random(3), {"A": [], "B": []}
-    points = session_of(tmp_path / "other").make(["A"]).ground.place
-    for round_ in range(2):
-        program = Program(tmp_path)
-        assert program("GET", "/fleets/north", token="wrong-wrong-wrong")[0] == 401
-        assert program("PUT", "/fleets/north", {"uavs": ["A", "B"]})[0] == (200 if round_ else 201)
-
-        def send(uav: str, program=program) -> None:
-            while True:
-                lat, lon = points(generator.randrange(90))
-                row = {"ID": uav, "time": time.time() - generator.random(), "lat": lat, "lon": lon}
-                try:
-                    if program("POST", "/fleets/north/reports", row)[0] == 200:
-                        acknowledged[uav].append(row["time"])
-                    program("GET", f"/fleets/north/advice?uav={uav}")
-                except (OSError, http.client.HTTPException):
-                    return
-
-        threads = [threading.Thread(target=send, args=(uav,)) for uav in "AB"]
-        for thread in threads:
-            thread.start()
-        time.sleep(2.0)
-        program.process.kill()
-        program.process.communicate(timeout=30)
-        for thread in threads:
-            thread.join()
-        journal = (tmp_path / "journals" / "north.jsonl").read_text().splitlines()
-        reports = [each for line in journal if '"reports"' in line for each in json.loads(line)["reports"]]
-        for uav, times in acknowledged.items():
-            there = [each["time"] for each in reports if each["id"] == uav]
-            assert {*times} <= {*there}
-            assert len(there) <= len(times) + 1, "at most the one that was not answered is there too"
-            acknowledged[uav] = there
-    assert all(len(times) > 20 for times in acknowledged.values())
-
-
-def test_without_the_server_library_the_remedy_is_named(run, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "uvicorn", None)
-    message = "port: 0 needs uvicorn, which is not installed: pip install 'damian[advise]'"
-    check_refused(lambda: run(*SCRIPT, "port=0"), message, capsys)

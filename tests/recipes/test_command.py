@@ -11,8 +11,6 @@ import damian
 from damian.recipes import cli
 from damian.recipes.command import PROGRAMS, main
 from damian.recipes.known import CONF, groups, known_settings
-from damian.settings import LEARNERS
-from damian.settings.programs import SEARCHES
 
 
 def refusal(capsys, *words: str) -> str:
@@ -105,13 +103,6 @@ def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, tmp_
     assert cli.settings("scenario=mine", own_folder=str(tmp_path / "my own")).agents == 2
 
 
-@pytest.mark.parametrize("program", ["train", "tune", "fly", "advise"])
-def test_every_program_takes_every_learner(program):
-    for name, settings in LEARNERS.items():
-        assert type(cli.settings(f"learner={name}", program=program).learner) is settings
-    assert set(SEARCHES) == set(LEARNERS)
-
-
 def test_a_training_has_few_settings_and_each_is_documented():
     found = cli.composed("train", [])
 
@@ -154,8 +145,3 @@ def test_help_explains_a_program_a_section_and_a_setting(capsys):
     assert "    paper: " in printed
     main(["train", "--cfg", "job", "agents=4"])
     assert "agents: 4" in capsys.readouterr().out
-
-
-def test_a_law_replaces_the_law_of_a_group():
-    config = cli.settings("delay=paper", "delay.obs={law: uniform, low: 1, high: 2}")
-    assert dict(config.delay.obs) == {"law": "uniform", "low": 1, "high": 2}

@@ -18,7 +18,6 @@ from damian.recipes.known import CONF
 from damian.runs.run_lock import locked
 from damian.settings.programs import CompareConfig, Experiment
 
-STORED = Path(__file__).parents[2] / "docs" / "results"
 SMALL = [
     "frames=16",
     "worlds=2",
@@ -53,13 +52,6 @@ def compare(tmp_path, monkeypatch):
 def table(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def store_results(folder: Path, rows: list[dict]) -> None:
-    """Store results of a comparison, without learning curves."""
-    for name, lines in ("results.csv", [[*rows[0]], *(row.values() for row in rows)]), ("curves.csv", []):
-        with (folder / name).open("w", newline="") as file:
-            csv.writer(file).writerows(lines)
 
 
 def measured(folder: Path) -> list[dict[str, str]]:
@@ -140,26 +132,6 @@ def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp
     check_refused(lambda: compare(*words, *late), problem, capsys)
     (kept / "results.csv").write_text("seed\nx\n")
     check_refused(lambda: compare(*words[:1], *stored), "it does not hold the results", capsys)
-
-
-@pytest.mark.slow
-def test_a_report_counts_every_stored_seed_unless_a_number_of_seeds_is_given(compare, tmp_path):
-    n_seeds = 12
-    words, results = ["report_only=true", "hydra.run.dir=kept"], table(STORED / "delays/results.csv")
-    first = [row for row in results if row["seed"] == "8" and row["delay"] in ("none", "paper")]
-    rows = [{**row, "seed": 8 + n} for n in range(n_seeds) for row in first]
-    rows += [{**row, "seed": 7} for row in first]  # the experiment counts from seed 8
-    (tmp_path / "kept").mkdir()
-    store_results(tmp_path / "kept", rows)
-    for more, counted in ([], n_seeds), (["seeds=1"], 1):
-        compare("experiment=delays", *words, *more)
-        assert {line["seeds"] for line in table(tmp_path / "kept/table.csv")} == {str(counted)}
-        text = (tmp_path / "kept/table.md").read_text()
-        assert f"\n- {counted} seeds (8 to {7 + counted})" in "\n" + text
-        assert text.startswith("- **developing**") == (counted < 10)
-    store_results(tmp_path / "kept", [row for row in rows if row["arm"] != "own" or row["seed"] == 8])
-    compare("experiment=delays", *words)
-    assert (tmp_path / "kept/table.md").read_text().startswith("- **developing**")  # own has too few
 
 
 def test_a_policy_is_flown_once_it_is_finished_and_again_once_it_is_newer(compare, capsys):

@@ -10,11 +10,8 @@ import pytest
 from helpers import check_refused
 from omegaconf import OmegaConf
 
-from damian.common.errors import InputError
 from damian.compare.comparison import OF_ARM
 from damian.recipes import evaluate, train
-from damian.recipes.cli import settings as composed_config
-from damian.recipes.shared.runs import check_policy_fits
 
 TRAINED = [
     "frames=64",
@@ -87,17 +84,6 @@ def test_new_overrides_replace_those_of_the_run_and_the_others_apply(fly):
     assert shorter == 1
 
 
-def test_several_delays_are_evaluated_in_one_sweep(fly, tmp_path):
-    fly("-m", "delay.obs=0,2", "hydra.sweep.dir=sweep")
-    tables = {
-        OmegaConf.load(path.parent / "config.yaml").delay.obs: results(path.parent)
-        for path in (tmp_path / "sweep").glob("*/result.csv")
-    }
-    assert tables.keys() == {0, 2}
-    shares = {delay: (row["random"]["late"], row["random"]["lost"]) for delay, row in tables.items()}
-    assert shares == {0: (0.0, 0.0), 2: (1.0, 0.0)}
-
-
 def test_a_policy_keeps_its_action_history_under_another_delay_and_the_changes_are_printed(fly, capsys):
     first = fly("delay.history=2", "delay.obs=1", of=None, folder="first", program=train)
     capsys.readouterr()
@@ -115,30 +101,6 @@ def test_a_policy_keeps_its_action_history_under_another_delay_and_the_changes_a
 )
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path, overrides, message):
     check_refused(lambda: fly(*overrides), message, capsys)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("agents=5", "agents: the policy was trained with 3, so it cannot fly with 5"),
-        ("observation.belief=[belief_moments]", r"observation.belief: the policy was trained with \[\]"),
-    ],
-)
-def test_what_a_policy_needs_to_fly_is_named(word, message):
-    words = ["scenario=coverage", "reward.spotted=1"]
-    trained, other = composed_config(*words), composed_config(*words, word)
-    with pytest.raises(InputError, match=message):
-        check_policy_fits(other, trained)
-    check_policy_fits(trained, trained)
-
-
-@pytest.mark.parametrize(
-    ("policy", "message"),
-    [(None, "checkpoint: it is missing"), ("nowhere", "checkpoint: nowhere holds no config.yaml")],
-)
-def test_without_a_policy_nothing_is_evaluated(fly, capsys, tmp_path, policy, message):
-    check_refused(lambda: fly(of=policy), message, capsys)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 from helpers import check_refused
-from stopped_runs import TINY, ended, files, forked, is_locked, killed_after
+from stopped_runs import TINY, ended, files, forked, killed_after
 
 from damian.learners.mappo import Mappo
 from damian.recipes import evaluate, train
 from damian.runs.checkpoint import read_checkpoint
-from damian.runs.interrupt import Interrupt
 from damian.runs.metrics_log import MetricsLog, read_metrics
 from damian.runs.run_lock import locked
 
@@ -46,15 +45,6 @@ def test_a_folder_in_use_is_refused_and_stays_as_it_is(run, capsys, copied):
     with locked(copied):
         check_refused(lambda: run("resume=run"), "resume: run is in use by another run", capsys)
     assert contents(copied) == before
-
-
-def test_a_lock_ends_with_its_process(tmp_path):
-    child = os.fork()
-    if not child:
-        with locked(tmp_path):
-            os.kill(os.getpid(), signal.SIGKILL)
-    assert ended(child) == -signal.SIGKILL
-    assert not is_locked(tmp_path)
 
 
 # Full disks and folders that cannot be written.
@@ -121,25 +111,6 @@ def test_a_damaged_folder_is_refused_in_one_line(run, capsys, copied, damage, me
 
 
 # Signals.
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_asks_and_the_second_one_stops_at_once(number):
-    def handler(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = {each: signal.signal(each, handler) for each in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with Interrupt() as interrupt:
-            assert interrupt.asked is None
-            os.kill(os.getpid(), number)
-            assert interrupt.asked == number
-            with pytest.raises(KeyboardInterrupt):
-                os.kill(os.getpid(), number)
-        assert signal.getsignal(number) == handler
-    finally:
-        for each, old in before.items():
-            signal.signal(each, old)
 
 
 def test_sigterm_stops_a_run_after_its_update(run, capsys, monkeypatch):

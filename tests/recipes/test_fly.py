@@ -183,10 +183,3 @@ def test_a_page_has_the_episodes_in_the_order_of_their_files(replay, capsys):
     assert capsys.readouterr().out.startswith("page: page/replay.html (0.")
     assert text.index('"title":"delay=undelayed.json"') < text.index('"title":"delay=late.json"')
     assert len(text) < len(page([flight()])) + 10_000
-
-
-def test_a_damaged_episode_is_refused_in_one_line_and_leaves_no_page(replay, tmp_path, capsys):
-    held = json.loads((tmp_path / "late.json").read_text())
-    (tmp_path / "late.json").write_text(json.dumps({**held, "time": "soon"}))
-    check_refused(lambda: replay("replay=[late.json]"), "late.json: ", capsys)
-    assert not (tmp_path / "page").exists()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import check_refused
 from PIL import Image
 
 from damian.advice.journal import About, Head, Journal, Received
@@ -59,21 +58,3 @@ def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(show):
     features = json.loads((folder / "episode_0.geojson").read_text())["features"]
     kinds = [each["properties"]["kind"] for each in features]
     assert (kinds.count("track"), kinds.count("source track")) == (2, 0)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["policy=script"], "policy: script means nothing with journal or replay"),
-        (["span=[90,99]"], "span: no step lies between 90 and 99 s: the journal covers 0 to 5 s"),
-        (["journal=nothing.jsonl"], "nothing.jsonl: it cannot be read: No such file or directory"),
-    ],
-)
-def test_what_cannot_be_shown_is_refused_in_one_line(show, capsys, overrides, message):
-    check_refused(lambda: show(*overrides), message, capsys)
-
-
-def test_a_later_span_begins_later(show):
-    episode = Episode.load(show("span=[2,4]") / "episode_0.json")
-    assert episode.about["began"] == "2023-11-14T22:13:23.000Z"
-    assert episode.time[0] == 0

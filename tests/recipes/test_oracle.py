@@ -8,30 +8,13 @@ import pytest
 import torch
 
 from damian import keys
-from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.recipes import oracle
-from damian.recipes.cli import settings as composed_config
 from damian.server.features import ObservationConfig
 from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("delay.obs=0", "delay.obs: no message is late or lost"),
-        ("links=matrix", "links: matrix is not supported"),
-        ("checkpoint=trained", "checkpoint: the script flies here"),
-    ],
-)
-def test_rows_that_could_not_differ_or_not_be_computed_are_refused(word, message):
-    with pytest.raises(InputError, match=message):
-        oracle.check(composed_config("delay.obs=2", word))
-
-
-# The script.
 
 WORDS = ["scenario=delaybench/tracking", "observation.belief_cell=60", "eval_episodes=300"]
 WORDS += ["episode.max_steps=25", "delay.obs=6", "hydra.run.dir=script"]

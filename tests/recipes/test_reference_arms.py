@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from delay_twin import drawn
 from helpers import (
     KEEPS_GOING,
     MOTIONS,
@@ -22,7 +21,6 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian.delays.config import DelayConfig
-from damian.delays.laws import Held, law_of
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
@@ -71,20 +69,6 @@ def test_held_messages_arrive_as_with_a_constant_delay(law, motion):
     obs, longest = LAWS[law]
     held = rollout_of(everything(motion, delay=DelayConfig(obs=obs, hold="max", history=2)))
     assert all_same(held, rollout_of(everything(motion, delay=DelayConfig(obs=longest, history=2))))
-
-
-@pytest.mark.parametrize("law", ["uniform", "burst", "trace"])
-def test_held_messages_are_lost_as_often_as_before(law, tmp_path):
-    (tmp_path / "delays.csv").write_text("delay\n0\n5\nlost\n2\n")
-    trace = {"law": "trace", "path": str(tmp_path / "delays.csv")}
-    law_config, longest = {"uniform": (PAPER, 7), "burst": (BURST, 4), "trace": (trace, 5)}[law]
-    free, held = (each.sampler(loss=0.2) for each in (law_of(law_config), Held(law_of(law_config))))
-    before, after = (drawn(sampler, torch.arange(500), 20) for sampler in (free, held))
-    assert (held.longest, held.lost) == (longest, free.lost)
-    assert after.equal(torch.where(before == free.lost, held.lost, longest))
-    assert 0.1 < (after == held.lost).float().mean() < 0.5
-    assert held.loses
-    assert held.constant_delay is None
 
 
 # The privileged observation.

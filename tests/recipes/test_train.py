@@ -9,8 +9,6 @@ import pytest
 import torch
 from helpers import check_refused
 from omegaconf import OmegaConf
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from torch import Tensor
 
 from damian.envs.pipeline import make_env
@@ -109,18 +107,6 @@ def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run, tra
     assert all(torch.allclose(kept[name], before[name], atol=1e-6) for name in kept)
     assert [row["frames"] for row in metrics(still)] == [128.0, 256.0]  # frames count from 0 again
     assert OmegaConf.load(still / "config.yaml").model.hidden == [16]
-
-
-def test_tensorboard_shows_settings(run):
-    folder = run(*TINY, "delay=paper", "aware=backupdate")
-    events = EventAccumulator(str(folder)).Reload()
-    plugin = events.summary_metadata["_hparams_/session_start_info"].plugin_data
-    settings = HParamsPluginData.FromString(plugin.content).session_start_info.hparams
-    assert settings["seed"].number_value == 0
-    assert settings["delay.obs"].string_value.startswith("{'law': 'uniform'")
-    plugin = events.summary_metadata["_hparams_/experiment"].plugin_data
-    named = {each.name.tag for each in HParamsPluginData.FromString(plugin.content).experiment.metric_infos}
-    assert named == {*events.Tags()["scalars"]}
 
 
 def test_every_policy_is_evaluated_in_the_same_episodes(run):

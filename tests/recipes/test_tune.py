@@ -7,7 +7,6 @@ from pathlib import Path
 import optuna
 import pytest
 from extensions import TINY
-from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 from stopped_runs import killed_after
 
@@ -122,19 +121,3 @@ def test_settings_that_are_refused_and_trainings_that_fail_are_told_and_the_sear
 def test_a_space_that_cannot_be_searched_is_refused(search, message):
     with pytest.raises(InputError, match=message):
         read_space(search)
-
-
-def test_ranges_and_choices_are_those_of_optuna():
-    space = read_space(
-        {
-            "learner": {"lr": {"low": 1e-4, "high": 1e-2, "log": True}, "gamma": {"low": 0, "high": 0.5}},
-            "model": {"hidden": {"choices": [[8], [8, 8]]}},
-            "delay": {"history": {"low": 1, "high": 9, "step": 2}},
-        }
-    )
-    assert space == {
-        "learner.lr": FloatDistribution(1e-4, 1e-2, log=True),
-        "learner.gamma": FloatDistribution(0, 0.5),
-        "model.hidden": CategoricalDistribution(["[8]", "[8,8]"]),
-        "delay.history": IntDistribution(1, 9, step=2),
-    }

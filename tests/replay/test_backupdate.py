@@ -6,7 +6,6 @@ import pytest
 import torch
 from helpers import everything, random_actions, square
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 
@@ -16,81 +15,12 @@ from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.hindsight import MessageLog, ended_before, latest_arrived
 from damian.replay.recompute import server_recompute
 from damian.server.termination import EpisodeConfig
 
 LONGEST = 5
 RANDOM_DELAY = {"law": "uniform", "low": 0, "high": LONGEST}
 WORLDS, UAVS = 3, 2
-
-
-# The pure functions, against a loop.
-
-
-def random_log(
-    n_steps: int, loss: float, order: str, generator: torch.Generator
-) -> tuple[MessageLog, Tensor]:
-    """A log of random messages, which contain the step of their generation, and where episodes begin."""
-
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
-
-    begins = rand(n_steps, WORLDS, 1).expand(-1, -1, UAVS) < 0.15
-    begins[0] = True
-    delay = (rand(n_steps, WORLDS, UAVS) * (LONGEST + 1)).long()
-    delay[rand(*delay.shape) < loss] = -1
-    sent = torch.arange(n_steps).view(-1, 1, 1).expand(delay.shape)
-    held = torch.zeros_like(sent)
-    for b in range(WORLDS):
-        for i in range(UAVS):
-            for t in range(n_steps):
-                start = max(s for s in range(t + 1) if begins[s, b, i])
-                arrived = [g for g in range(start, t + 1) if 0 <= delay[g, b, i] <= t - g]
-                last_arrival = max((g + delay[g, b, i] for g in arrived), default=None)
-                latest = [g for g in arrived if g + delay[g, b, i] == last_arrival]
-                held[t, b, i] = max((arrived if order == "generation" else latest), default=start - 1)
-    return MessageLog(sent.unsqueeze(-1).float(), delay, held.unsqueeze(-1).float(), sent - held), begins
-
-
-@pytest.mark.parametrize("order", ["generation", "arrival"])
-@pytest.mark.parametrize("loss", [0.0, 0.5])
-def test_latest_arrived_equals_a_loop_over_messages(loss, order):
-    generator = torch.Generator().manual_seed(1)
-    for _ in range(20):
-        log, begins = random_log(16, loss, order, generator)
-        now = int(torch.randint(16, (), generator=generator))
-        latest = latest_arrived(log, now)[0][..., 0]
-        for b in range(WORLDS):
-            for i in range(UAVS):
-                for t in range(now + 1):
-                    start = max(s for s in range(t + 1) if begins[s, b, i])
-                    arrived = [g for g in range(start, t + 1) if 0 <= log.delay[g, b, i] <= now - g]
-                    assert latest[t, b, i] == max(arrived, default=start - 1)
-
-
-def test_no_message_that_arrives_after_the_time_of_learning_is_used():
-    log, _ = random_log(16, 0.2, "generation", torch.Generator().manual_seed(2))
-    now = 9
-    arrival = torch.arange(16).view(-1, 1, 1) + log.delay
-    later = (arrival > now) | (torch.arange(16).view(-1, 1, 1) > now)
-    spoilt = log._replace(sent=torch.where(later.unsqueeze(-1), torch.nan, log.sent))
-    assert later[: now + 1].any()
-    for found, expected in zip(latest_arrived(spoilt, now), latest_arrived(log, now), strict=True):
-        assert found[: now + 1].equal(expected[: now + 1])
-
-
-def test_an_episode_has_ended_after_its_first_end():
-    def column(*flags: int) -> Tensor:
-        return torch.tensor(flags, dtype=torch.bool).unsqueeze(-1)
-
-    ended, begins = column(0, 1, 0, 1, 0, 0, 1), column(1, 0, 0, 0, 1, 0, 0)
-    assert ended_before(ended, begins, torch.zeros(1).bool()).equal(column(0, 0, 1, 1, 0, 0, 0))
-    begins[0] = False
-    assert ended_before(ended, begins, torch.ones(1).bool()).equal(column(1, 1, 1, 1, 0, 0, 0))
-
-
-# The storage, on rollouts.
 
 
 def rollout(scenario: ScenarioConfig, n_steps: int, n_worlds: int = 4) -> TensorDictBase:
@@ -198,16 +128,6 @@ def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happe
             assert ends[b, steps].tolist() == true_ends[b, : len(steps)].tolist()
     assert (~corrected["valid"]).any()
     assert corrected["next", "done"][corrected["reset_after"]].all()
-
-
-def test_batches_and_delays_that_are_too_long_are_refused():
-    scenario = everything("instant", episode=PERSISTENT)
-    delayed = rollout(replace(scenario, delay=DelayConfig(obs=RANDOM_DELAY)), 20)
-    with pytest.raises(ValueError, match="max_size: 116 is too little for batches of 20 steps"):
-        buffer(scenario, 29).extend(delayed)
-    too_late = rollout(replace(scenario, delay=DelayConfig(obs=LONGEST + 1)), 20)
-    with pytest.raises(ValueError, match="longest: a message takes 6 steps, more than 5"):
-        buffer(scenario, 64).extend(too_late)
 
 
 @pytest.mark.parametrize("as_files", [False, True])

@@ -47,14 +47,6 @@ def test_decisions_are_those_that_a_loop_finds(n_decisions, seed):
     assert len(found) == len(expected) > 20
 
 
-def test_if_uavs_are_always_ready_every_step_but_the_last_ones_begins_a_decision():
-    ready = torch.ones(T, B, N, dtype=torch.bool)
-    never = torch.zeros(T, B, dtype=torch.bool)
-    found = find_decisions(ready, ready, never, never, 3)
-    assert (found.end - found.begin == 2).all()
-    assert len(found.begin) == (T - 2) * B * N
-
-
 def random_steps(seed: int) -> TensorDict:
     """Random steps, as a ring buffer holds them whose oldest step lies at index 4."""
     torch.manual_seed(seed)

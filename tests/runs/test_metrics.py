@@ -20,8 +20,8 @@ from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.runs.metrics import EpisodeLog, Evaluation, evaluation
-from damian.runs.metrics_log import MetricsLog, read_metrics
-from damian.runs.run_folder import results_table, save_results
+from damian.runs.metrics_log import MetricsLog
+from damian.runs.run_folder import save_results
 from damian.runs.run_record import check_version
 from damian.server.features import ObservationConfig
 from damian.server.rewards import RewardConfig
@@ -218,18 +218,6 @@ def test_the_episode_log_is_an_exponential_mean_over_episodes_in_the_order_of_th
 ROW = Evaluation(4, 0.25, 50.0, 1.5, 0.75, 30.0, 2.5, 0.125, 0.5, 0.1)
 
 
-def test_a_table_shows_success_only_if_possible_and_what_the_server_perceived_only_with_delays():
-    def shown(**settings: bool) -> dict[str, str]:
-        head, _, line = results_table({"random": ROW}, **settings).splitlines()
-        return dict(zip(head.strip("| ").split(" | "), line.strip("| ").split(" | "), strict=True))
-
-    plain = {"policy": "random", "return": "1.50"}
-    assert shown(can_succeed=False) == plain
-    assert shown(can_succeed=True) == plain | {"success rate": "0.25", "steps": "50.00"}
-    late = {"perceived return": "2.50", "age": "0.12", "late": "0.50", "lost": "0.10"}
-    assert shown(can_succeed=False, late=True) == plain | late
-
-
 def test_results_are_written_with_every_measure(tmp_path):
     table = save_results({"one": ROW, "other": ROW}, tmp_path, can_succeed=False, late=False)
     assert (tmp_path / "result.md").read_text() == table + "\n"
@@ -250,13 +238,6 @@ def test_a_resumed_log_drops_later_rows_and_takes_new_numbers(tmp_path):
     log.add(30, {"loss": 6.0})
     lines = ["frames,loss,old,new", "10.0,2.0,3.0,nan", "20.0,5.0,nan,4.0", "30.0,6.0,nan,nan"]
     assert (tmp_path / "metrics.csv").read_text().splitlines() == lines
-
-
-@pytest.mark.parametrize("text", ["a\n1\n", "frames,a\n1,many\n"])
-def test_a_broken_metrics_file_is_refused_in_one_line(tmp_path, text):
-    (tmp_path / "metrics.csv").write_text(text)
-    with pytest.raises(InputError, match=r"metrics\.csv: it (is no table of numbers|has no column frames)"):
-        read_metrics(tmp_path)
 
 
 def test_tensorboard_shows_numbers_and_settings_up_to_where_a_run_resumed(tmp_path):

@@ -7,14 +7,11 @@ import torch
 from belief_twin import chance_at
 from helpers import everything, square, walking
 
-from damian.common.errors import InputError
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig, make_simulation
-from damian.envs.uav_env import UavEnv
 from damian.server.belief import predict
 from damian.server.features import RINGS, SECTORS, ObservationConfig, feature
 from damian.server.server import Server
-from damian.world.landing import ActionConfig
 
 ALL = ["belief_gain", "belief_moments", "belief_map"]
 
@@ -138,11 +135,3 @@ def test_a_feature_of_ones_own_may_read_the_belief():
     torch.testing.assert_close(
         td["agents", "observation"][..., -1], td["belief"].amax(-1, keepdim=True).expand(2, 3)
     )
-
-
-def test_beliefs_that_nothing_computes_are_refused():
-    observation = ObservationConfig(belief=["belief_gain"])
-    with pytest.raises(InputError, match=r"observation.belief: .* needs discrete actions"):
-        square(observation=observation, actions=ActionConfig(kind="continuous"))
-    with pytest.raises(InputError, match=r"observation.belief: .* damian.make_env"):
-        UavEnv(square(observation=observation), 2)

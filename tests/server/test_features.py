@@ -1,16 +1,12 @@
 """Features equal those of plain loops over UAVs, on random messages, and lie within [0, 1]."""
 
-import math
-
-import pytest
 import torch
 import twin
 from helpers import SCALE, TIME_SCALE, messages_of, random_worlds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from damian.common.errors import InputError
-from damian.server.features import GLOBAL, LOCAL, ObservationConfig, feature, observe
+from damian.server.features import GLOBAL, LOCAL, ObservationConfig, observe
 
 NAMES = [name for name in (*LOCAL, *GLOBAL) if name != "coverage"]
 seeds = st.integers(0, 2**32 - 1)
@@ -37,31 +33,6 @@ def test_every_feature_equals_that_of_a_plain_loop_and_lies_within_0_and_1(
     seed, n_agents, heard, spots, newest
 ):
     check_features(random_worlds(seed, n_agents, heard, spots), newest)
-
-
-def one_world(*places, **changed):
-    """One world with UAVs at these places; the first has detected the source, the last has these changes."""
-    uavs = [twin.Uav(place) for place in places]
-    uavs[0].heard_at, uavs[0].heard_from = 5.0, places[0]
-    for name, value in changed.items():
-        setattr(uavs[-1], name, value)
-    return messages_of([(10.0, uavs)])
-
-
-@pytest.mark.parametrize(
-    ("place", "bearing"),
-    [((0.0, -50.0), 0.0), ((-50.0, 0.0), 0.25), ((0.0, 50.0), 0.5), ((50.0, 0.0), 0.75)],
-)
-def test_bearings_are_measured_clockwise_from_north(place, bearing):
-    features = observe(*one_world((0.0, 0.0), place), ["source_bearing"])["source_bearing"]
-    assert features[0, 1].item() == pytest.approx(bearing, abs=1e-6)
-
-
-def test_drift_is_one_half_for_a_uav_that_flies_at_the_source_and_less_if_the_source_is_to_its_left():
-    north = observe(*one_world((0.0, 0.0), (0.0, -50.0), track=0.0), ["source_drift"])["source_drift"]
-    assert north[0, 1].item() == pytest.approx(0.5)
-    east = one_world((0.0, 0.0), (0.0, -50.0), track=math.pi / 2)
-    assert observe(*east, ["source_drift"])["source_drift"][0, 1].item() == pytest.approx(0.25)
 
 
 def test_bearing_and_drift_have_no_rounding_errors_at_the_estimated_position_of_the_source():
@@ -91,10 +62,3 @@ def test_the_actor_observes_the_age_of_the_uavs_message_and_the_critic_does_not(
     assert config.actor == ["spotted", "age"]
     assert config.critic == ["source_time", "spotted"]
     assert ObservationConfig(["spotted"], ["source_time"], age=True).actor == [*config.critic, "age"]
-
-
-def test_an_impossible_setting_is_refused_in_one_line():
-    with pytest.raises(InputError, match="scope of a feature: locale is not one of local, global"):
-        feature("locale")
-    with pytest.raises(InputError, match=r"observation.local_features: it leaves the actor blind"):
-        ObservationConfig([], ctde=True)

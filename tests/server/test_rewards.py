@@ -8,8 +8,8 @@ from helpers import messages_of, random_worlds
 from hypothesis import given
 from hypothesis import strategies as st
 
-from damian.server.rewards import INDIVIDUAL, SYSTEM, Counters, RewardConfig, final_reward, reward
-from damian.server.termination import EpisodeConfig, Status, status
+from damian.server.rewards import INDIVIDUAL, SYSTEM, Counters, RewardConfig, reward
+from damian.server.termination import EpisodeConfig, status
 
 NAMES = (*INDIVIDUAL, *SYSTEM)
 
@@ -111,16 +111,3 @@ def test_empty_batteries_or_the_end_of_the_sources_walk_terminate_without_succes
     assert status_of([False, False], empty=True, **ends) == (False, True, False)
     assert status_of([False], over=True, max_steps=5, end_with_source=True) == (False, True, False)
     assert status_of([False], over=True, max_steps=None) == (False, False, False)
-
-
-def bonus_or_penalty(success, terminated, truncated, **task):
-    """The final reward of an episode of four steps."""
-    flags = Status(*(torch.tensor([flag]) for flag in (success, terminated, truncated)))
-    return final_reward(flags, Counters(torch.tensor([4]), torch.zeros(1, 1)), RewardConfig(**task)).item()
-
-
-def test_only_success_receives_the_bonus_which_may_be_divided_by_the_steps():
-    assert bonus_or_penalty(True, True, False, bonus=2.0) == 2.0
-    assert bonus_or_penalty(True, True, False, bonus=2.0, bonus_over_steps=True) == 0.5
-    assert bonus_or_penalty(True, True, False, penalty=3.0) == 0.0
-    assert bonus_or_penalty(False, False, False, bonus=2.0, penalty=3.0) == 0.0

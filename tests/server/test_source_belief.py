@@ -10,7 +10,6 @@ from belief_twin import belief, chance_at, detection_table
 from helpers import everything, square, walking
 from torch import Tensor
 
-from damian.common.errors import InputError
 from damian.envs.scenario import make_simulation
 from damian.server.belief import (
     SourceGrid,
@@ -137,23 +136,6 @@ def test_where_shapes_may_not_depend_on_data_the_beliefs_are_the_same(grid, monk
         torch.testing.assert_close(one.beliefs, other.beliefs, rtol=1e-5, atol=1e-7)
 
 
-def test_a_message_changes_nothing_before_it_arrives():
-    grid = grids["one region"]
-    flights = [Flight(grid, 1, own=False), Flight(grid, 1, own=False)]
-    loud, quiet = (
-        torch.tensor([[1, grid.no_report, grid.no_report]]) - torch.tensor([[i, 0, 0]]) for i in (0, 1)
-    )
-    everyone, nothing = torch.ones(1, dtype=torch.bool), torch.full((1, 3), grid.no_report)
-    for age in range(LONGEST + 1):
-        for flight, row in zip(flights, (loud, quiet), strict=True):
-            sent = row if age == 0 else nothing
-            delay = torch.full((1, 3), 3)
-            slot, *beliefs = _advance(*_parts(grid, flight.window), sent, delay, flight.region, everyone)
-            flight.beliefs = together(beliefs)
-            flight.window = flight.window._replace(slot=slot)
-        assert torch.equal(flights[0].beliefs, flights[1].beliefs) == (age < 3)
-
-
 def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Tensor]:
     """Beliefs, and whether the source is in the cell, where all happens as the grid assumes."""
     torch.manual_seed(0)
@@ -211,9 +193,3 @@ def test_the_chance_of_a_detection_equals_the_slow_twins(grid):
         for p in (0, 3, n_points - 1):
             expected = chance_at(grid, r, beliefs[r], r * n_points + p)
             assert chance[r, p].item() == pytest.approx(expected, rel=1e-4)
-
-
-def test_a_grid_that_does_not_fit_is_refused():
-    airspace = make_simulation(square(), 0).airspace
-    with pytest.raises(InputError, match=r"observation.belief_cell: 0.05 m"):
-        build_source_grid(airspace, SourceConfig(), 50.0, 1.0, cell=0.05)

@@ -36,13 +36,6 @@ def test_a_ring_stands_where_the_server_believes_a_uav_only_if_it_is_mistaken_in
     assert [text.get_text() for text in film.map.texts] == ["4 s"]
 
 
-def test_the_belief_is_darker_in_more_probable_cells_of_the_region():
-    cells = np.array([[-50.0, 0.0], [0.0, 0.0], [50.0, 0.0]])
-    film = Film(flight(0, cells=cells, belief=np.array([[0.1, 0.6, 0.3]])))
-    brightness = [colour_at(film, 0, *cell).sum() for cell in cells]
-    assert brightness[1] < brightness[2] < brightness[0] < colour_at(film, 0, 0.0, 150.0).sum()
-
-
 @pytest.mark.parametrize(
     ("changes", "title"), [({}, "age of"), ({"battery": np.ones((4, 2)) * [[9], [8], [7], [6]]}, "battery")]
 )

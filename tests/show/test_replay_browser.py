@@ -210,21 +210,6 @@ def test_the_slider_the_keys_and_a_click_in_a_chart_go_to_an_instant(opened):
             check_numbers(page, episode, step)
 
 
-@pytest.mark.parametrize("layer", ["truth", "believed", "messages", "covered", "belief"])
-def test_each_layer_can_be_seen_and_taken_away(opened, layer):
-    with opened(late_flight()) as page:
-        page.press(*["ARROW_RIGHT"] * 11)
-        button = page.one(f"[data-layer={layer}]")
-        pictures, states = [], []
-        for _ in range(3):
-            pictures.append(page.map())
-            states.append(button.get_attribute("aria-pressed"))
-            button.click()
-            page.settle()
-        assert pictures[0] == pictures[2] != pictures[1]
-        assert states[0] == states[2] != states[1]
-
-
 def coloured(picture, uav, tolerance=40):
     """Rows and columns of the pixels that have about the colour of a UAV."""
     colour = np.array([int(COLOURS[uav][i : i + 2], 16) for i in (1, 3, 5)])

@@ -78,6 +78,3 @@ def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, arm
         assert late["next", *keys.GLOBAL_OBSERVATION].equal(undelayed)
         assert not late["next", *keys.OBSERVATION][..., :17].equal(undelayed)
         assert late["next", *keys.BACKUPDATED].any()
-
-
-# The command line.

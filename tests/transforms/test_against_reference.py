@@ -38,9 +38,6 @@ def law(request, tmp_path):
     return LAWS[request.param](tmp_path)
 
 
-# Comparisons with the reference implementations in plain Python.
-
-
 @pytest.mark.sample(3)
 @pytest.mark.parametrize("order", ["generation", "arrival"])
 @pytest.mark.parametrize(("loss", "sent_key"), [(0.0, None), (0.25, "message_sent")])
@@ -117,18 +114,6 @@ def test_every_agent_receives_the_rewards_of_the_reference_and_none_is_lost(law)
             assert received[t][w][n][0] == purse.step(t, reward, table[t][row], ended)
             in_transit += reward - received[t][w][n][0]
             assert not ended or in_transit == 0
-
-
-@pytest.mark.parametrize("law", [3, 40])
-def test_worlds_that_go_on_after_an_end_are_not_paid_twice(law):
-    env, undelayed = delayed(RewardDelay(law, REWARD)), delayed(RewardDelay(0, REWARD))
-    in_transit, steps = torch.zeros(len(WORLDS), N_AGENTS, 1), [each.reset() for each in (env, undelayed)]
-    for action in choices():
-        pairs = zip((env, undelayed), steps, strict=True)
-        steps = [each.step(td.set(ACTION, action))["next"] for each, td in pairs]
-        received, earned = (td[REWARD] for td in steps)
-        in_transit = in_transit + earned - received
-        assert not in_transit[steps[0]["done"].squeeze(-1)].any()
 
 
 def test_a_reset_during_an_episode_discards_its_rewards_in_transit():
@@ -217,18 +202,6 @@ def test_with_an_age_key_the_history_contains_only_actions_that_the_observation_
             expected = [action if since - at < reflected_after else default for at, action in latest]
             assert found[2 * t + 1, w, n].equal(torch.tensor(expected) / 6)
             recorded = [] if done[t][w][0] else recorded
-
-
-def test_a_history_of_action_codes_is_appended_to_the_observation():
-    codes = torch.arange(14.0).view(7, 2)
-    coded = delayed(ActionHistory(2, ACTION, codes=codes, append_to=OBSERVATION), ends=0.0)
-    outputs, undelayed = play(coded, choices()), play(Counting(WORLDS, N_AGENTS, ends=0.0), choices())
-    for t in range(2, STEPS):
-        observation = outputs[2 * t - 1][OBSERVATION]
-        assert observation[..., :7].equal(undelayed[2 * t - 1][OBSERVATION])
-        assert observation[..., 7:].equal(
-            torch.cat([codes[choices()[t - 2]], codes[choices()[t - 1]]], -1).double()
-        )
 
 
 @pytest.mark.parametrize("clocks", [[3], [2, 3], [1]])

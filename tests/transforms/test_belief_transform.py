@@ -6,14 +6,13 @@ import pytest
 import torch
 from belief_twin import belief
 from delayed_envs import PAPER
-from helpers import SQUARE, square, walking
+from helpers import square, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, StepCounter, TransformedEnv
 
 from damian import keys
-from damian.baselines.greedy import greedy_policy
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -22,9 +21,7 @@ from damian.replay.backupdate import BackupdateStorage
 from damian.replay.recompute import server_recompute
 from damian.server.belief import report_rows
 from damian.server.features import ObservationConfig
-from damian.server.termination import EpisodeConfig
 from damian.world.motion import MotionConfig
-from damian.world.regions.config import RegionConfig
 
 LONGEST = 7
 
@@ -118,22 +115,3 @@ def test_back_updated_beliefs_know_what_has_arrived_since(batch):
                 if end < last:
                     check(world[keys.BELIEF][end + 1], wanted)
     assert corrected > 3
-
-
-def test_of_the_times_when_it_says_so_often_a_flown_source_is_there_about_so_often():
-    source = walking(level_db=130.0, local_speed=8.0, local_acceleration=4.0, min_wait=0.0, max_wait=3.0)
-    observation = ObservationConfig(belief=["belief_moments"], belief_cell=20.0)
-    region = RegionConfig(kind="vertices", vertices=SQUARE, lattice_step=25.0, initial_conditions=256)
-    episode = EpisodeConfig(max_steps=40)
-    scenario = square(
-        source=source, observation=observation, region=region, episode=episode, delay=DelayConfig(obs=PAPER)
-    )
-    env = make_env(scenario, 256, extras=["message", "state"])
-    data = env.rollout(40, greedy_policy(env))["next"]
-    cell = torch.cdist(data[keys.STATE][..., -2:], env.server.grid.centres).argmin(-1)
-    said = data[keys.BELIEF]
-    was = torch.nn.functional.one_hot(cell, said.shape[-1]).float()
-    for low, high in ((0.02, 0.1), (0.1, 0.2), (0.2, 0.3), (0.3, 0.4), (0.4, 0.6)):
-        here = (said >= low) & (said < high)
-        assert here.sum() > 300
-        assert was[here].mean().item() == pytest.approx(said[here].mean().item(), abs=0.1), (low, high)

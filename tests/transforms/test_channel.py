@@ -74,17 +74,6 @@ def test_the_outputs_match_specs_that_can_be_indexed(options):
         assert specs["agents"][0, 1].shape == ()
 
 
-def test_several_entries_are_sent_together():
-    keys = [OBSERVATION, ("agents", "ready")]
-    env, alone = (
-        TransformedEnv(Counting(WORLDS, N), channel(delay=2, in_keys=sent)) for sent in (keys, None)
-    )
-    for both, one in zip(outputs_of(env), outputs_of(alone), strict=True):
-        assert both["agents", "received_observation"].equal(one[RECEIVED])
-        assert both["agents", "received_ready"].dtype == torch.bool
-    check_env_specs(env, break_when_any_done="both")
-
-
 def test_a_chosen_message_is_an_action_that_the_environment_never_gets():
     env = TransformedEnv(pettingzoo(), Channel(1, action_key=("agent", "message"), message_size=4))
     assert isinstance(env.full_action_spec["agent", "message"], Bounded)
@@ -151,6 +140,3 @@ def test_a_limited_medium_is_shared_fairly():
     counts = (fresh & others).flatten(0, 1)[:, [1, 2, 0], [0, 1, 2]].sum(0)
     expected, n = 20 * 200 / N, 20 * 200
     assert all(abs(count - expected) < 5 * math.sqrt(n * 2 / 9) for count in counts.tolist())
-
-
-# Errors.

@@ -103,37 +103,6 @@ def test_every_link_may_have_a_law_and_a_loss_of_its_own(tmp_path):
 
 
 @dataclass(frozen=True)
-class Crowd(Law):
-    """The delay depends on sender, receiver, the number of senders, and the time."""
-
-    def sampler(self, dt: float = 1.0, loss: float = 0.0, key: str = "delay") -> ContextSampler:
-        return ContextSampler(self.delays, 9, loss)
-
-    def delays(self, context: MessageContext) -> Tensor:
-        early = (context.time < 2.5 * context.dt).long()
-        return context.sender + 2 * context.receiver.clamp(min=0) + context.n_sending - 1 - early
-
-
-@pytest.mark.parametrize("dt", [1.0, 0.5])
-def test_a_law_sees_the_context_of_a_link(dt):
-    env = counting(Channel(Crowd(), sent_key="message_sent", dt=dt))
-
-    def make(b: int, _: Tensor) -> World:
-        def delay(clock: int, link: tuple, n_sending: int) -> int | None:
-            early = clock - world.began < 2.5
-            steps = link[1] + 2 * link[0] + n_sending - 1 - early
-            return None if steps < 0 else min(steps, 9)
-
-        world = World(N, delay)
-        return world
-
-    def wants(outputs: Any, _: Any, b: int) -> set:
-        return {(i, j) for i, j in ALL if outputs["agents", "message_sent"][b, j]}
-
-    check_against_twin(env, make, wants)
-
-
-@dataclass(frozen=True)
 class Slow(Law):
     """A step per 0.3 m between sender and receiver; messages over more than 1.5 m are lost."""
 

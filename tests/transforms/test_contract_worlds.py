@@ -10,13 +10,10 @@ from every_transform import (
     LATE,
     TRANSFORMS,
     drawing,
-    every_transform,
-    played,
 )
 from helpers import all_same, same
 from streams import check_independent
 from torchrl.envs import Compose, EnvBase, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.utils import step_mdp
 
 from damian.delays.laws import Burst, Law, Uniform
 from damian.delays.samplers import ContextSampler, Sampler
@@ -156,56 +153,3 @@ def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(make):
             rest = skipping.step(td.clone().set("action", actions[t]).set("_step", torch.zeros(2).bool()))
             assert rest["next", "observation"].equal(td["observation"])
         other = other.clone().update(after.select(*other.keys(True, True), strict=False))
-
-
-# Flags at any level.
-
-
-def test_a_root_reward_is_paid_whole_though_only_its_agents_are_done():
-    kind = KINDS["flags in the group"]
-    env = TransformedEnv(kind.make(), RewardDelay(3, "team_reward"))
-    paid = torch.stack([td["team_reward"] for td in played(env, kind, 30)[::2]])
-    assert paid[:, 0, 0].tolist() == [0.0, 0.0, 3.0] * 10
-    assert paid[:, 1, 0].tolist() == [0.0, 0.0, 0.0, 1.0, 4.0] * 6
-
-
-def test_a_reset_of_the_agents_of_one_world_resets_the_root_entries_of_that_world_only():
-    kind = KINDS["flags in the group, root entries"]
-    env = TransformedEnv(kind.make(), ObservationDelay(2, "state"))
-    td = env.reset()
-    for _ in range(2):
-        td = env.step(env.rand_action(td))["next"].exclude("team_reward")
-    assert td["age"].flatten().tolist() == [2.0, 2.0]
-    mask = torch.tensor([True, False]).view(2, 1, 1).expand(2, 2, 1)
-    env.reset(td.clone().set(("agents", "_reset"), mask))
-    assert env.transform.memory["reset_at"].tolist() == [2, 0]
-    td = env.step(env.rand_action(td))["next"]
-    assert td["age"].flatten().tolist() == [1.0, 2.0]
-    assert td["state"].flatten().tolist() == [0.0, 1.0]
-
-
-# A batch chosen at reset.
-
-
-@every_transform
-def test_a_batch_chosen_at_reset_does_what_its_worlds_do_alone(make):
-    kind = KINDS["batch chosen at reset"]
-    env, alone = (TransformedEnv(kind.make(), make(kind, LATE)) for _ in range(2))
-    torch.manual_seed(0)
-    first, actions = env.base_env.gen_params(batch_size=[3]), torch.rand(6, 3, 1) * 4 - 2
-    seeds, outputs = torch.tensor([4, 5, 6]), []
-    first.update(env.base_env.reset(first.clone()).select("th", "thdot"))
-    env.transform.seed_worlds(seeds)
-    begun = env.reset(first.clone())
-    td = begun.clone()
-    for action in actions:
-        td = step_mdp(env.step(td.clone().set("action", action)), exclude_reward=False)
-        outputs.append(td)
-    for world in range(3):
-        alone.transform.seed_worlds(seeds[world : world + 1])
-        td = alone.reset(first[world : world + 1].clone())
-        td.update(begun[world : world + 1].select("th", "thdot"))
-        for action, expected in zip(actions, outputs, strict=True):
-            chosen = td.clone().set("action", action[world : world + 1])
-            td = step_mdp(alone.step(chosen), exclude_reward=False)
-            assert same(td, expected[world : world + 1])

@@ -61,33 +61,3 @@ def test_the_history_holds_what_has_arrived_of_the_latest_steps(group, own):
         for receiver in range(AGENTS):
             expected = torch.stack(twin(data, world, receiver, group, own))
             assert data[world]["next", "agents", "history"][:, receiver].equal(expected)
-
-
-def test_without_delay_the_newest_row_is_the_message():
-    data = flown(0, 0.0)
-    history = data["next", "agents", "history"]
-    assert history[..., 0, :-3].equal(data["next", "agents", "message"])
-    assert (history[..., 0, -3:] == torch.tensor([1.0, 0.0, 1.0])).all()
-
-
-def test_a_message_changes_nothing_before_it_arrives():
-    when = 2.0  # seconds since the episode began; packed messages begin with their time
-
-    def changed(message: torch.Tensor) -> torch.Tensor:
-        return message + (message[..., :1] == when) * torch.tensor([0.0] + [7.0] * (message.shape[-1] - 1))
-
-    data, other = flown(group=True), flown(group=True, encode=changed)
-    same = (data["next", "agents", "history"] == other["next", "agents", "history"]).all(-1)
-    sent = data["next", "agents", "message"][..., 0] == when  # [B, T, N]
-    assert sent.any()
-    for world, step, sender in sent.nonzero().tolist():
-        delay = int(data["next", "agents", "delay"][world, step, sender])
-        for later in range(K):
-            if step + later >= 20 or data["next", "done"][world, step : step + later].any():
-                break
-            for receiver in range(AGENTS):
-                row = (sender - receiver) % AGENTS * K + later
-                arrived = 0 <= delay <= later
-                assert bool(same[world, step + later, receiver, row]) == (not arrived)
-    assert not same.all()
-    assert same.sum() > 0.8 * same.numel()

@@ -2,12 +2,11 @@
 
 import pytest
 import torch
-from contract import ACTION, OBSERVATION, REWARD
+from contract import ACTION, OBSERVATION
 from delay_twin import Counting
-from plain_env import GROUP, Plain
+from plain_env import Plain
 from tensordict import TensorDict
-from torchrl.data import Categorical
-from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs import Compose, GymEnv, StepCounter, Transform, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.delays.laws import Burst
@@ -21,7 +20,6 @@ from damian.transforms import (
     SampleAndHold,
     delay_trajectories,
 )
-from damian.transforms.hold import SkipUntilReady
 
 MISSING = {
     "observatoin": lambda: ObservationDelay(3, ["observation", "observatoin"]),
@@ -53,14 +51,6 @@ def test_an_entry_that_there_is_already_is_not_replaced(transforms):
         TransformedEnv(Plain(), Compose(*transforms())).rollout(3)
 
 
-def test_a_delay_around_workers_does_not_replace_the_age_of_the_delay_within():
-    def make() -> TransformedEnv:
-        return TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(1))
-
-    with pytest.raises(InputError, match="ObservationDelay: age is already"):
-        TransformedEnv(SerialEnv(2, make), ObservationDelay(2)).reset()
-
-
 MISTAKES = {
     "in_keys: .* is empty, and so is in_keys_inv": lambda: SampleAndHold(2, [], []),
     "dt: -1 s is not above 0 s": lambda: SampleAndHold("3s", dt=-1),
@@ -83,18 +73,6 @@ def test_a_wrong_argument_is_one_line(line):
         MISTAKES[line]()
 
 
-def test_links_of_another_number_of_agents_are_refused():
-    with pytest.raises(InputError, match=r"Channel: the links are given for 2 agents, but .* is of 3"):
-        TransformedEnv(Counting([3, 5], 3), Channel([[0, 1], [1, 0]])).reset()
-
-
-@pytest.mark.parametrize("make", [ActionDelay, ActionHistory])
-def test_a_default_that_is_no_legal_action_is_refused(make):
-    env = TransformedEnv(Plain(Categorical(5, GROUP)), make(2, ACTION, default=7))
-    with pytest.raises(InputError, match=r"default: 7 is not a legal default action, .* between 0 and 4"):
-        env.reset()
-
-
 CHANGES = {
     "ActionDelay changes which actions": lambda: ActionDelay(3, ACTION),
     "SampleAndHold changes which actions": lambda: SampleAndHold(3, [], ACTION),
@@ -114,11 +92,6 @@ def test_outside_an_environment_the_error_says_what_to_do(use):
         use(ObservationDelay(2))(TensorDict({"observation": torch.zeros(3, 1)}, [3]))
 
 
-def test_a_skipping_clock_is_refused_outside_a_delayed_environment():
-    with pytest.raises(RuntimeError, match="SkipUntilReady works only in a DelayedEnv"):
-        TransformedEnv(Plain(), SkipUntilReady(reward_keys=[REWARD])).rollout(2)
-
-
 def test_the_state_of_another_delay_is_refused():
     def begun(delay: int) -> Transform:
         env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(delay))
@@ -128,9 +101,3 @@ def test_the_state_of_another_delay_is_refused():
     one, other = begun(2), begun(5)
     with pytest.raises(RuntimeError, match="size mismatch"):
         other.load_state_dict(one.state_dict())
-
-
-def test_a_step_before_the_first_reset_is_refused():
-    env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(2))
-    with pytest.raises(RuntimeError, match="after a reset"):
-        env.step(env.rand_action(env.base_env.reset()))

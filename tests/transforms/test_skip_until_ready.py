@@ -11,7 +11,6 @@ from helpers import everything, same, square
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from damian.common.errors import InputError
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
@@ -179,8 +178,3 @@ def test_a_reward_is_discounted_once_for_each_earlier_step_of_the_merged_step():
         total += (k < td["duration"]).unsqueeze(-1) * 0.5**k * other[REWARD]
     assert td[REWARD].equal(total)
     assert (total != other[REWARD]).any()
-
-
-def test_skipping_is_refused_where_all_messages_are_needed():
-    with pytest.raises(InputError, match=r"clock\.skip: True skips steps, but back-updating"):
-        make_env(skips(square()), 1, extras=["message"])

@@ -99,13 +99,6 @@ def test_stored_steps_are_delayed_as_in_the_environment(kind, chain):
 # Where episodes begin.
 
 
-def test_rows_that_were_cut_and_joined_begin_anew():
-    one, other = counted(12, ends=0.0), counted(9, ends=0.1)
-    late = Compose(ObservationDelay(3, [OBSERVATION]), RewardDelay(2, REWARD))
-    found = delay_trajectories(torch.cat([one, other], 1), late)
-    assert same(found, torch.cat([delay_trajectories(part, late) for part in (one, other)], 1))
-
-
 def test_the_number_of_the_trajectory_tells_where_an_episode_begins():
     data = counted(8, ends=0.0)
     again = torch.arange(8).expand(len(WORLDS), 8) == torch.tensor([2, 3, 4, 9]).unsqueeze(-1)

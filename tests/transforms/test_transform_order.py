@@ -1,13 +1,11 @@
 """Orders of transforms in which one would undo or miss the work of another are refused."""
 
 import pytest
-from contract import LATE, OBSERVATION, REWARD, Drift, unserved
-from plain_env import Plain
+from contract import LATE, Drift
 from torchrl.envs import (
     Compose,
     ConditionalSkip,
     NoopResetEnv,
-    SerialEnv,
     StepCounter,
     TerminateTransform,
     Transform,
@@ -75,24 +73,3 @@ def test_a_wrong_order_of_transforms_is_refused(pair, nested):
 def test_a_right_order_of_transforms_works(pair):
     env = TransformedEnv(Drift(), Compose(*(make() for make in pair)))
     assert env.rollout(6, break_when_any_done=False).shape == (3, 6)
-
-
-@pytest.mark.parametrize("other", [lambda: RewardDelay(2, REWARD), lambda: SampleAndHold(2, [OBSERVATION])])
-def test_a_server_node_must_come_before_transforms_of_its_outputs(other):
-    uplink = ObservationDelay(LATE, ("agents", "message"), ("agents", "received"))
-    wrong = Compose(uplink, other(), ServerNode(unserved().server))
-    with pytest.raises(InputError, match=r"order of transforms: .* must come after ServerNode"):
-        TransformedEnv(unserved(), wrong).reset()
-
-
-def test_an_end_around_the_workers_loses_the_rewards_of_a_delay_within_them():
-    """What docs/transforms.md says, and the remedy that it names."""
-
-    def paid(inner: list[Transform], outer: list[Transform]) -> list[float]:
-        workers = SerialEnv(2, lambda: TransformedEnv(Plain(), Compose(*[each.clone() for each in inner])))
-        env = TransformedEnv(workers, Compose(*outer))
-        steps = env.rollout(8, break_when_any_done=False)  # two episodes of 4 steps, which earn 1, 2, 3 and 4
-        return steps["next", "agents", "reward"][0, 0, :, 0, 0].tolist()
-
-    assert paid([RewardDelay(2, REWARD)], [StepCounter(4)]) == [0, 0, 1, 2] * 2
-    assert paid([StepCounter(4), RewardDelay(2, REWARD)], []) == [0, 0, 1, 2 + 3 + 4] * 2

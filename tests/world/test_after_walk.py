@@ -1,17 +1,14 @@
 """What a dynamic source does after its walk: it begins it anew, for any number of rounds."""
 
-import math
 from fractions import Fraction
 
 import pytest
 import torch
-from helpers import fresh, one_uav
 from hypothesis import given
 from hypothesis import strategies as st
 from walks import dynamic_walks, n_stops, twin_position
 
-from damian.settings import ClockConfig
-from damian.world.signal_source import SourceConfig, Walk, locate
+from damian.world.signal_source import Walk, locate
 
 LOOP = {"after_walk": "loop"}
 
@@ -41,16 +38,3 @@ def returning(walk):
     n = int(n_stops(walk)[0])
     arrive = torch.cat([walk.arrive[:, :n], walk.depart[:, n : n + 1]], 1)
     return Walk(*(field[:, : n + 1] for field in walk))._replace(arrive=arrive)
-
-
-def test_a_simulation_is_as_exact_after_many_steps_as_at_first():
-    source = SourceConfig(motion="dynamic", n_hotspots=2, min_wait=0.0, max_wait=1.0)
-    env = fresh(one_uav(source=source, clock=ClockConfig("0.1s")))
-    walk, moved = env.simulation.walk, 0
-    for steps in (0, 77, 123_456_789, 987_654_321):
-        place, *_ = env.simulation.source_now(env.state._replace(steps=torch.tensor([steps])))
-        phase = float(Fraction(steps) / 10 % Fraction(walk.depart[0, -1].item()))
-        expected, _ = twin_position(returning(walk), 0, phase)
-        assert place[0].tolist() == pytest.approx(expected, abs=2e-2)
-        moved += math.dist(expected, walk.stop[0, 0].tolist()) > 1
-    assert moved > 1

@@ -1,7 +1,5 @@
 """Positions, legal actions and readiness of UAVs, and the times at which they send messages."""
 
-import copy
-
 import pytest
 import shapely
 import torch
@@ -12,11 +10,9 @@ from helpers import (
     act,
     both_kinds,
     both_motions,
-    check_equal,
     everything,
     fresh,
     random_actions,
-    same,
     sent_messages,
     square,
     usecase,
@@ -91,28 +87,6 @@ def test_uavs_start_on_different_points_or_on_one_or_on_the_given_ones():
     given = sent_messages(env.reset()).position + env.simulation.airspace.offset[0]
     expected = [pytest.approx([62.85586449, -119.2183645], abs=1e-4)] * 3
     assert given[0].tolist() == expected
-
-
-# Decisions, flights and messages.
-
-
-def test_the_action_of_a_uav_that_is_not_ready_changes_nothing():
-    env = fresh(everything("polynomial"), num_worlds=32)
-    generator = torch.Generator().manual_seed(0)
-    waited = 0
-    for _ in range(25):
-        before = copy.deepcopy(env.state)
-        ready = env.simulation.ready(before)
-        action = random_actions(env, generator)
-        after = act(env, action)
-        state = copy.deepcopy(env.state)
-        env.state = before
-        other = torch.where(ready, action, random_actions(env, generator))
-        assert same(act(env, other), after)
-        check_equal(env.state, state)
-        waited += int((~ready & (other != action)).sum())
-        assert state.motions.le(before.motions + ready).all()
-    assert waited > 100
 
 
 # Action masks.

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from damian.world.regions.geodesy import (
@@ -44,59 +44,6 @@ def test_local_metres_within_50_km_survive_the_round_trip_over_degrees(lat, lon,
 
 
 # --- the centroid of an area --------------------------------------------------------------------
-
-
-def on_sphere(lon, lat):
-    """Unit vectors of places, [..., 3]."""
-    lon, lat = np.radians(lon), np.radians(lat)
-    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], -1)
-
-
-def centroid_by_integration(rings, depth=5):
-    """Mean of the unit vectors over the area, by fans of triangles cut into small flat ones: its direction.
-
-    Each ring is a fan about its first corner; triangles that turn clockwise count negative.
-    """
-    total = np.zeros(3)
-    for ring in rings:
-        corners = on_sphere(*ring[:-1].T)
-        fan = np.stack([np.repeat(corners[:1], len(corners) - 2, 0), corners[1:-1], corners[2:]], 1)
-        for _ in range(depth):
-            a, b, c = fan.swapaxes(0, 1)
-            ab, bc, ca = (
-                (x + y) / np.linalg.norm(x + y, axis=-1)[:, None] for x, y in [(a, b), (b, c), (c, a)]
-            )
-            fan = np.concatenate(
-                [np.stack(t, 1) for t in [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]]
-            )
-        normal, middle = np.cross(fan[:, 1] - fan[:, 0], fan[:, 2] - fan[:, 0]) / 2, fan.sum(1)
-        middle /= np.linalg.norm(middle, axis=1)[:, None]
-        total += (np.sum(normal * middle, 1)[:, None] * middle).sum(0)
-    return total / np.linalg.norm(total)
-
-
-def star_rings(rng, size_deg, lat, lon, hole):
-    """A ragged ring about a place, counter-clockwise, and if wanted a hole in it, clockwise; degrees."""
-    angle = np.sort(rng.uniform(0, 2 * np.pi, 9))
-    shell = np.stack([np.cos(angle) / np.cos(np.radians(lat)), np.sin(angle)], -1)
-    shell = [lon, lat] + size_deg * rng.uniform(0.3, 1, 9)[:, None] * shell
-    hole_ring = [lon, lat] + 0.2 * (shell[::-1] - [lon, lat]) + [0.02 * size_deg, 0]
-    return [np.vstack([ring, ring[:1]]) for ring in ([shell, hole_ring] if hole else [shell])]
-
-
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    size_km=st.sampled_from([0.03, 1.0, 100.0, 500.0]),
-    lat=st.floats(-70, 70),
-    lon=st.floats(-180, 180),
-    hole=st.booleans(),
-)
-@settings(max_examples=40)
-def test_the_centroid_of_an_area_is_that_of_a_numerical_integration(seed, size_km, lat, lon, hole):
-    rings = star_rings(np.random.default_rng(seed), size_km / 111, lat, lon, hole)
-    place = on_sphere(*area_centroid(rings)[::-1])
-    error_m = EARTH_RADIUS_M * np.linalg.norm(place - centroid_by_integration(rings))
-    assert error_m < max(1e-4 * size_km * 1000 / 100, 0.2)
 
 
 def test_the_centroid_of_an_area_across_the_antimeridian_or_around_the_pole_is_inside():

@@ -72,18 +72,6 @@ def test_the_lattice_agrees_with_a_slow_loop_on_concave_holed_and_multipart_poly
     np.testing.assert_allclose(points, _slow_lattice(polygon, step, degrees), atol=1e-6)
 
 
-@settings(max_examples=settings.default.max_examples // 4)
-@given(st.integers(0, 2**32 - 1), st.floats(10, 60), st.floats(5, 90))
-def test_landing_points_are_strictly_inside_distinct_and_ordered_by_direction(seed, step, degrees):
-    polygon = random_polygon(np.random.default_rng(seed), 30_000, 60_000)
-    points = landing_lattice(polygon, step, degrees)
-    assert all(polygon.contains(Point(p)) for p in points)
-    assert len(np.unique(points, axis=0)) == len(points)
-    centre = np.array(polygon.centroid.coords[0])
-    angles = np.arctan2(*(points - centre).T[::-1])
-    assert (np.diff(angles) > -1e-9).all()
-
-
 @pytest.mark.parametrize(
     ("step", "degrees", "n", "message"),
     [

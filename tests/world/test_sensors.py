@@ -1,15 +1,11 @@
 """Readings of one's own sensors equal those of a plain loop, and change nothing else in a message."""
 
-import pickle
-
-import pytest
 import torch
-from helpers import act, both_motions, everything, random_actions, same
+from helpers import both_motions, everything, random_actions
 from hypothesis import given
 from hypothesis import strategies as st
 from sensor_cases import GLOBAL, LOCAL, SENSORS, readings_of
 
-from damian.common.errors import InputError
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import UavEnv
 from damian.server.features import ObservationConfig
@@ -61,22 +57,3 @@ def test_unpacked_messages_equal_the_packed_ones(seed, window, n_readings, shape
     for name, field in messages._asdict().items():
         assert getattr(again, name).equal(field), name
     assert rows[..., rows.shape[-1] - n_readings :].equal(messages.readings)
-
-
-def test_a_pickled_environment_with_sensors_continues_in_the_same_way():
-    env, generator = UavEnv(sensing(), num_worlds=3), torch.Generator().manual_seed(0)
-    env.reset()
-    copy = pickle.loads(pickle.dumps(env))
-    for _ in range(3):
-        action = random_actions(env, generator)
-        assert same(act(env, action), act(copy, action))
-
-
-# Mistakes.
-
-
-def test_a_mistake_in_the_list_of_sensors_is_one_line():
-    with pytest.raises(InputError, match=r"^sensors\[0\].strenght: 1 is no parameter of sensor_cases:gust"):
-        UavEnv(everything(sensors=[{"sensor": "sensor_cases:gust", "strenght": 1}]))
-    with pytest.raises(InputError, match=r"^sensors\[2\].name: gap is the name of another sensor"):
-        UavEnv(everything(sensors=[*SENSORS, "sensor_cases:gap"]))
