@@ -10,7 +10,6 @@ import yaml
 
 import damian
 import damian.transforms
-from damian.recipes.cli import settings
 from damian.recipes.command import PROGRAMS, SETTINGS
 from damian.recipes.known import check_words
 
@@ -47,16 +46,6 @@ def test_every_command_that_a_file_names_exists(file):
         own = [word for word in words if re.match(r"[\w.]+=", word) and not re.search("FOLDER|NAME", word)]
         if name in SETTINGS and not any(word.startswith(("--help", "--config-dir")) for word in words):
             check_words(SETTINGS[name], own)
-
-
-def test_every_comparison_that_a_file_names_has_its_tasks_delays_and_arms():
-    found = [words for file in FILES for name, words in commands(file) if name == "compare"]
-    found = [
-        words for words in found if any(word.split("=")[0] in ("tasks", "delays", "arms") for word in words)
-    ]
-    assert len(found) > 2
-    for words in found:
-        settings(*[word for word in words if "hydra" not in word], program="compare")
 
 
 @pytest.mark.parametrize("file", DOCUMENTS, ids=lambda file: file.name)

@@ -127,12 +127,6 @@ def write_journal(path: Path) -> None:
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
-def test_the_documents_show_commands():
-    assert len(COMMANDS["README.md"]) >= 10
-    assert len(COMMANDS["settings.md"]) >= 20
-    assert {"advise.md", "episodes.md", "runs.md"} <= {*COMMANDS}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_commands_of_a_document_run(name, trained, tmp_path):
@@ -146,22 +140,3 @@ def test_the_commands_of_a_document_run(name, trained, tmp_path):
         if any("journals/" in word for word in words):
             write_journal(folder / "journals" / "north.jsonl")
         call(words, folder)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["episodes.md", "runs.md"])
-def test_the_python_of_a_document_runs(name, trained, tmp_path, monkeypatch):
-    folder = tmp_path / "folder"
-    shutil.copytree(trained, folder)
-    for each in ("undelayed", "late"):
-        shutil.copytree(folder / each, folder / "runs" / each)
-    monkeypatch.chdir(folder)
-    found: dict = {}
-    for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs" / name).read_text(), re.DOTALL):
-        exec(block, found)
-    if name == "episodes.md":
-        assert found["picture"].ndim == 3
-        assert all(Path(made).stat().st_size > 10_000 for made in ("flight.gif", "both.html"))
-    else:
-        weights = found["weights"]("runs/FOLDER")
-        assert all(weight.isfinite().all() for weight in weights.values())

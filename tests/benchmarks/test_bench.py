@@ -1,16 +1,12 @@
 """The tables of examples/benchmarks, with few worlds and steps."""
 
 import importlib.util
-from dataclasses import replace
 
 import bench
 import bench_training
 import pytest
 from bench import BARE, WHOLE, arms, delays, rivals, scenarios
-from bench_training import ARMS, HEADER, RIVALS, WIDTHS, arm_config, training
-
-from damian.envs.pipeline import has_message_delay
-from damian.recipes.shared.settings import backupdates
+from bench_training import ARMS, HEADER, RIVALS, WIDTHS, training
 
 TINY = bench.Sizes(
     worlds=4,
@@ -47,19 +43,6 @@ def test_the_comparison_has_a_row_for_each_arm_and_a_figure(presets, tmp_path, m
 
 
 # The training part.
-
-
-def test_arms_differ_in_delay_awareness_compiling_and_critic_only():
-    configs = [arm_config(words, [64, 64], worlds=8, steps=16) for words in ARMS]
-    assert [has_message_delay(config) for config in configs] == [False] * 3 + [True] * 2
-    assert [backupdates(config) for config in configs] == [False] * 3 + [True] * 2
-    assert [config.compile for config in configs] == [False, True, True, False, True]
-    assert [config.model.shared_value for config in configs] == [False, False, True, False, True]
-    for config in configs:
-        assert (config.agents, config.worlds, config.update_steps) == (3, 8, 16)
-        assert config.model.hidden == [64, 64]
-        model = replace(config.model, shared_value=False)
-        assert (config.learner, model) == (configs[0].learner, configs[0].model)
 
 
 @pytest.mark.slow

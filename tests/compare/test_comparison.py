@@ -160,18 +160,6 @@ def test_an_untrained_network_stands_beside_the_trained_one_and_as_an_arm_of_its
     assert prior["recovery"].value == pytest.approx((2.5 - 4) / 6)
 
 
-def test_the_interval_of_a_share_lies_between_0_and_1_and_that_of_a_length_is_not_negative():
-    scores = {arm: [1.0, 0.99, 0.9] for arm in THREE} | {"aware": [0.0, 0.02, 0.01]}
-    comparison = Comparison(rows_of("t", "late", scores), ARMS, "success_rate")
-    best, aware = (comparison.mean("t", *place) for place in (("none", "best"), ("late", "aware")))
-    assert (best.high, aware.low) == (1, 0)
-    for line in comparison.lines:
-        for name in ("success_rate", "perceived_success_rate", "late", "lost", "backupdated"):
-            assert 0 <= line.measures[name].low <= line.measures[name].high <= 1, name
-        assert min(line.measures[name].low for name in ("steps", "perceived_steps", "age")) >= 0
-    assert comparison.lines[0].measures["return"].high > 1
-
-
 def test_an_arm_is_compared_with_the_script_that_knows_all_messages_on_time():
     arms = ARMS | {"script": Arm(oracle=True)}
     rows = rows_of("t", "late", THREE)

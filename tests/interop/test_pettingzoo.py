@@ -70,13 +70,6 @@ def test_torchrl_reads_the_environment_and_our_transforms_delay_it_further():
     assert delayed.rollout(4)["next", "uav", "age"].max() == 2
 
 
-def test_a_picture_is_drawn():
-    env = made("delay.obs=1", render_mode="rgb_array", view="3d")
-    env.reset(seed=0)
-    assert env.render().shape == (700, 720, 3)
-    assert made().render() is None
-
-
 def test_what_a_user_can_get_wrong_is_said_in_one_line():
     env = made()
     env.reset()

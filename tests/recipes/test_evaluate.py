@@ -1,7 +1,6 @@
 """The evaluation recipe, run by its command line: a trained policy with other UAVs, regions and delays."""
 
 import csv
-import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -102,14 +101,3 @@ def test_a_policy_keeps_its_action_history_under_another_delay_and_the_changes_a
 def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(fly, capsys, tmp_path, overrides, message):
     check_refused(lambda: fly(*overrides), message, capsys)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_damaged_checkpoint_is_refused(fly, trained, capsys, tmp_path):
-    damaged = shutil.copytree(trained, tmp_path / "damaged")
-    (damaged / "checkpoint.pt").write_text("{")
-    check_refused(lambda: fly(of=damaged), "checkpoint.pt: it is damaged", capsys)
-    (damaged / "checkpoint.pt").unlink()
-    check_refused(lambda: fly(of=damaged), "checkpoint.pt: there is no such file", capsys)
-    (damaged / "config.yaml").unlink()
-    check_refused(lambda: fly(of=damaged), "damaged holds no config.yaml, so there is no run", capsys)
-    assert list(tmp_path.iterdir()) == [damaged]

@@ -11,9 +11,9 @@ from helpers import check_refused
 from stopped_runs import TINY, ended, files, forked, killed_after
 
 from damian.learners.mappo import Mappo
-from damian.recipes import evaluate, train
+from damian.recipes import train
 from damian.runs.checkpoint import read_checkpoint
-from damian.runs.metrics_log import MetricsLog, read_metrics
+from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_lock import locked
 
 
@@ -127,18 +127,3 @@ def test_sigterm_stops_a_run_after_its_update(run, capsys, monkeypatch):
     assert stopped.value.code == 143
     assert capsys.readouterr().err.splitlines()[-1] == "interrupted; continue with resume=run"
     assert read_checkpoint(Path("run/checkpoint.pt"), "test")["training"]["progress"]["updates"] == 2
-
-
-# The best policy.
-
-
-@pytest.mark.slow
-def test_the_best_policy_of_a_run_can_be_flown(run, monkeypatch):
-    folder = run(*TINY, "frames=640")
-    best = read_checkpoint(folder / "best.pt", "test")
-    assert best["training"]["progress"]["best"] == max(
-        row["perceived_return"] for row in read_metrics(folder)[2::3]
-    )
-    monkeypatch.setattr("sys.argv", ["evaluate.py", "checkpoint=run/best.pt", "hydra.run.dir=flown"])
-    evaluate.run()
-    assert Path("flown/result.csv").exists()

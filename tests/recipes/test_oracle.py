@@ -15,7 +15,6 @@ from damian.server.features import ObservationConfig
 from damian.world.regions.config import RegionConfig
 from damian.world.signal_source import SourceConfig
 
-
 WORDS = ["scenario=delaybench/tracking", "observation.belief_cell=60", "eval_episodes=300"]
 WORDS += ["episode.max_steps=25", "delay.obs=6", "hydra.run.dir=script"]
 

@@ -58,25 +58,6 @@ def test_gain_is_the_chance_of_detecting_the_source_where_an_action_leads(flown)
             assert features["belief_gain"][world, uav, action].item() == pytest.approx(expected, rel=1e-3)
 
 
-def test_where_another_uav_stands_the_gain_is_that_of_the_second_nearest_landing_point(flown):
-    simulation, server, messages, features, belief = flown
-    candidates, n_actions = simulation.candidates, simulation.config.actions.n_actions
-    region, standing = int(server.region_of(messages)[0]), int(messages.trail[0, 0, 0])
-    base = region * simulation.airspace.max_points
-    pairs = candidates.ranking.point[standing * n_actions : (standing + 1) * n_actions, :2].tolist()
-    action = next(a for a, (nearest, second) in enumerate(pairs) if standing - base not in (nearest, second))
-    nearest, second = pairs[action]
-    trail = messages.trail.clone()
-    trail[0, 1, 0] = base + nearest
-    steps = torch.zeros(len(belief), dtype=torch.long)
-    gain = server.features(messages._replace(trail=trail), steps, ["belief_gain"], belief=belief)[
-        "belief_gain"
-    ]
-    expected = chance_at(server.grid, region, belief[0], base + second)
-    assert gain[0, 0, action].item() == pytest.approx(expected, rel=1e-3)
-    assert features["belief_gain"][0, 0, action].item() != pytest.approx(expected, rel=1e-3)
-
-
 def test_moments_are_mean_spread_and_entropy(flown):
     simulation, server, messages, features, belief = flown
     for world, uav in ((0, 0), (5, 2)):

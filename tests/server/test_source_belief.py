@@ -117,25 +117,6 @@ def test_beliefs_equal_the_slow_twins_for_any_delays_losses_resets_and_pauses(gr
             flight.check()
 
 
-@every_grid
-def test_where_shapes_may_not_depend_on_data_the_beliefs_are_the_same(grid, monkeypatch):
-    one, other = Flight(grid, 4, own=True), Flight(grid, 4, own=True)
-    for i in range(8):
-        stepped, mask = one.draw(4, 4) > 0, one.draw(3, 4) == 0
-        other.draw(4, 4), other.draw(3, 4)
-        one.step(stepped)
-        with monkeypatch.context() as patch:
-            patch.setattr("damian.common.devices.data_dependent", lambda device: False)
-            other.step(stepped)
-        torch.testing.assert_close(one.beliefs, other.beliefs, rtol=1e-5, atol=1e-7)
-        if i % 3 == 2:
-            one.begin(mask)
-            with monkeypatch.context() as patch:
-                patch.setattr("damian.common.devices.data_dependent", lambda device: False)
-                other.begin(mask)
-        torch.testing.assert_close(one.beliefs, other.beliefs, rtol=1e-5, atol=1e-7)
-
-
 def simulated(grid: SourceGrid, n_worlds: int, n_steps: int) -> tuple[Tensor, Tensor]:
     """Beliefs, and whether the source is in the cell, where all happens as the grid assumes."""
     torch.manual_seed(0)

@@ -10,32 +10,6 @@ from damian.common.plotting import COLOURS
 from damian.show.film import Film, save_film
 
 
-def colour_at(film: Film, step: int, east: float, north: float) -> np.ndarray:
-    """The colour of a place on the map, in [0, 1]."""
-    picture = film.frame(step)
-    column, row = film.map.transData.transform((east, north))
-    return picture[round(len(picture) - 1 - row), round(column)] / 255
-
-
-def test_a_uav_has_its_colour_where_it_truly_is_and_turns_with_its_heading():
-    film = Film(flight(track=np.array([[0.0, 0.0], [0.0, np.pi / 2], [0.0, np.pi], [0.0, 0.0]])))
-    for uav, east in enumerate((-100.0, 100.0)):
-        np.testing.assert_allclose(colour_at(film, 0, east, 102.0), to_rgb(COLOURS[uav]), atol=0.02)
-    to_north, to_east = (np.abs(colour_at(film, t, 105.0, 100.0) - to_rgb(COLOURS[1])).sum() for t in (0, 1))
-    assert to_east < 0.8 * to_north
-
-
-def test_a_ring_stands_where_the_server_believes_a_uav_only_if_it_is_mistaken_in_time():
-    believed = np.tile([[-100.0, 100.0], [-100.0, -150.0]], (2, 1, 1))
-    film = Film(flight(1, believed=believed, age=np.array([[0.0, 0.0], [0.0, 4.0]])))
-    radius = 12 / 2 / 72 * film.figure.dpi
-    scale = film.map.transData.transform([(0, 0), (1, 0)])
-    east = -100.0 + radius / (scale[1, 0] - scale[0, 0])
-    assert np.abs(colour_at(film, 0, east, -150.0) - colour_at(film, 0, 150.0, -150.0)).max() < 0.02
-    np.testing.assert_allclose(colour_at(film, 1, east, -150.0), to_rgb(COLOURS[1]), atol=0.1)
-    assert [text.get_text() for text in film.map.texts] == ["4 s"]
-
-
 @pytest.mark.parametrize(
     ("changes", "title"), [({}, "age of"), ({"battery": np.ones((4, 2)) * [[9], [8], [7], [6]]}, "battery")]
 )

@@ -13,7 +13,6 @@ import pytest
 from episodes import flight
 from PIL import Image
 
-from damian.common.plotting import COLOURS
 from damian.show.replay_page import save_page
 
 pytestmark = pytest.mark.browser
@@ -208,30 +207,3 @@ def test_the_slider_the_keys_and_a_click_in_a_chart_go_to_an_instant(opened):
             step = round(page.time() / 2)
             assert 8 <= step <= 12
             check_numbers(page, episode, step)
-
-
-def coloured(picture, uav, tolerance=40):
-    """Rows and columns of the pixels that have about the colour of a UAV."""
-    colour = np.array([int(COLOURS[uav][i : i + 2], 16) for i in (1, 3, 5)])
-    return np.nonzero(np.abs(picture.astype(int) - colour).max(-1) < tolerance)
-
-
-def test_the_space_shows_uavs_above_the_ground_and_turns(opened):
-    place = np.tile([[-80.0, 0.0, 0.0], [80.0, 0.0, 0.0]], (LAST + 1, 1, 1))
-    place[LAST, 0, 2] = 60.0
-    calm = {"position": place, "believed": place[..., :2], "age": np.zeros((LAST + 1, 2))}
-    with opened(late_flight(0, **calm, spotted=np.zeros((LAST + 1, 2), bool))) as page:
-        page.one("[data-view='3d']").click()
-        page.press("2", "3", "5")
-        low = page.picture(".view")
-        assert len(np.unique(low.reshape(-1, 3), axis=0)) > 50
-        assert len(coloured(low, 0)[0]) > 30
-        assert len(coloured(low, 1)[0]) > 30
-        page.press("END")
-        high = page.picture(".view")
-        assert coloured(high, 0)[0].min() < coloured(low, 0)[0].min() - 30
-        assert abs(coloured(high, 1)[0].min() - coloured(low, 1)[0].min()) < 3
-        drag = page.actions().move_to_element(page.one(".view"))
-        drag.click_and_hold().move_by_offset(120, 0).release().perform()
-        page.settle()
-        assert (page.picture(".view") != high).any(-1).mean() > 0.05

@@ -5,11 +5,10 @@ import re
 from html.parser import HTMLParser
 
 import numpy as np
-import pytest
 from episodes import flight
 
 from damian.common.plotting import COLOURS
-from damian.show.replay_page import page, save_page, titles
+from damian.show.replay_page import page, save_page
 
 EVIL = "scenario=</script><script>alert('&\"\ud800')</script><!--"
 
@@ -78,18 +77,3 @@ def test_names_of_any_text_stay_text():
     held = json.loads(parts.text("script", id="replay"))
     assert held["episodes"][0]["title"] == EVIL
     assert "alert" in parts.text("title")
-
-
-@pytest.mark.parametrize(
-    ("words", "shared", "names"),
-    [
-        ([["a=1", "delay=none"], ["a=1", "delay=burst"]], "a=1", ["delay=none", "delay=burst"]),
-        ([["a=1"], ["a=1", "+delay.obs=8"]], "a=1", ["without delay.obs=8", "delay.obs=8"]),
-        ([["a=1"], ["a=1"]], "a=1", ["episode 1", "episode 2"]),
-        ([["formats=[html]", "hydra.run.dir=x", "keep=all"], ["b=2"]], "", ["without b=2", "b=2"]),
-    ],
-)
-def test_episodes_are_named_by_the_settings_that_tell_them_apart(words, shared, names):
-    everywhere, own = titles(flown_with(*words))
-    assert everywhere.removesuffix("policy=greedy seed=2 world=0").strip() == shared
-    assert own == names

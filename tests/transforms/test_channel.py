@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 import torch
 from delay_twin import Counting
-from helpers import same
 from tensordict import TensorDictBase
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase, TransformedEnv
@@ -91,45 +90,6 @@ def test_a_chosen_message_is_an_action_that_the_environment_never_gets():
 
 
 # Properties.
-
-
-@pytest.mark.sample(2)
-@pytest.mark.parametrize("name", ["all", "limit", "matrix", "laws"])
-def test_nothing_changes_before_a_falsified_message_arrives(name):
-    def outputs(**tampered: Any) -> list[TensorDictBase]:
-        return outputs_of(
-            TransformedEnv(Counting(WORLDS, N, ends=0.02, **tampered), channel(**CHANNELS[name]))
-        )
-
-    is_source = torch.zeros(len(WORLDS), N, N, dtype=torch.bool)
-    is_source[1, :, 2] = True
-    truth, heard = outputs(), 0
-    for step in range(3, 11):
-        for one, other in zip(truth, outputs(tampered=(1, 2, step)), strict=True):
-            falsified = other[RECEIVED][..., 2] < 0
-            generated = one[OBSERVATION][..., 2].unsqueeze(-1) - one[WRITTEN[1]]
-            assert falsified.equal(is_source & (generated == step) & one[WRITTEN[2]])
-            assert one[RECEIVED][~falsified].equal(other[RECEIVED][~falsified])
-            assert same(one.select(*WRITTEN[1:]), other.select(*WRITTEN[1:]))
-            heard += falsified[1, :2, 2].sum()
-    assert heard
-
-
-@pytest.mark.parametrize("name", ["all", "limit", "matrix", "laws"])
-def test_a_world_does_the_same_alone_as_among_others(name):
-    def written(worlds: list[int]) -> torch.Tensor:
-        transform = channel(**CHANNELS[name])
-        transform.seed_worlds(torch.tensor(worlds))
-        env = TransformedEnv(Counting(worlds, N), transform)
-        td, seen = env.reset(), []
-        for t in range(20):
-            action = torch.tensor([[t % 7] * N] * len(worlds))
-            stepped, td = env.step_and_maybe_reset(td.set(("agents", "action"), action))
-            seen += [stepped["next"].clone(), td.clone()]
-        return torch.stack([outputs.select(*WRITTEN) for outputs in seen], 1)
-
-    together = written(WORLDS)
-    assert all(same(together[b], written([name])[0]) for b, name in enumerate(WORLDS))
 
 
 def test_a_limited_medium_is_shared_fairly():
