@@ -8,7 +8,7 @@ import torch
 from helpers import square
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, PendulumEnv
+from torchrl.envs import EnvBase, GymEnv
 
 from damian.envs.uav_env import UavEnv
 
@@ -20,10 +20,6 @@ class Kind(NamedTuple):
     observation: Any = ("agents", "observation")
     action: Any = ("agents", "action")
     reward: Any = ("agents", "reward")
-    begin: Callable[[EnvBase], TensorDictBase | None] = lambda env: None
-    """The argument of ``reset``."""
-    stateless: bool = False
-    """Whether the environment reads its state from the TensorDict, so that no entry may be overwritten."""
 
 
 class Teams(EnvBase):
@@ -104,8 +100,5 @@ KINDS = {
     "PettingZoo, state": Kind(petting_zoo, "state", ("agent", "action"), ("agent", "reward")),
     "flags in the group": Kind(Teams),
     "flags in the group, root entries": Kind(Teams, "state", ("agents", "action"), "team_reward"),
-    "batch chosen at reset": Kind(
-        PendulumEnv, "th", "action", "reward", lambda env: env.gen_params(batch_size=[3]), stateless=True
-    ),
     "UAVs": Kind(lambda: UavEnv(square(), num_worlds=2, extras=["message"])),
 }

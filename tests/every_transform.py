@@ -27,10 +27,7 @@ GROUPS = {name: kind for name, kind in KINDS.items() if isinstance(kind.observat
 
 
 def observation_delay(kind: Kind, law: Any, **options: Any) -> StatefulTransform:
-    """An observation delay; where the environment reads its state from the observation, under another key."""
-    out_keys = ["seen"] if kind.stateless else None
-    flags = {"fresh_key": "fresh", "delay_key": "delay"}
-    return ObservationDelay(law, kind.observation, out_keys, **flags, **options)
+    return ObservationDelay(law, kind.observation, fresh_key="fresh", delay_key="delay", **options)
 
 
 TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
@@ -41,11 +38,7 @@ TRANSFORMS: dict[str, Callable[..., StatefulTransform]] = {
     ),
     "CumulativeReward": lambda kind, law, **options: CumulativeReward(3, 0.5, kind.reward, **options),
     "ActionHistory": lambda kind, law, **options: ActionHistory(3, kind.action, **options),
-    "SampleAndHold": lambda kind, law, **options: (
-        SampleAndHold(2, (), kind.action, **options)
-        if kind.stateless
-        else SampleAndHold(2, kind.observation, **options)
-    ),
+    "SampleAndHold": lambda kind, law, **options: SampleAndHold(2, kind.observation, **options),
 }
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
@@ -73,7 +66,7 @@ def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> 
     if seed is not None:
         torch.manual_seed(seed)
         env.set_seed(seed)
-    td, outputs = env.reset(kind.begin(env)), []
+    td, outputs = env.reset(), []
     for _ in range(n_steps):
         after, td = env.step_and_maybe_reset(env.rand_action(td))
         outputs += [after["next"].clone(), td.clone()]

@@ -176,8 +176,6 @@ def test_a_late_detection_is_known_to_newer_messages_that_say_nothing_of_it():
     [
         ({"uav": "d"}, "ID: 'd' is no UAV of this fleet: a, b, c"),
         ({"time": START + 60}, "time: 1700000060 s is 60.0 s after it came in"),
-        ({"lat": 0.0}, "lat, lon: 0, -4.1"),
-        ({"lat": None, "lon": None, "x": 0.0, "y": 0.0}, "places in LlanbedrTest are lat, lon"),
         ({"readings": (1.0,)}, "readings: 1 numbers are not 0, as in the training"),
     ],
 )

@@ -51,7 +51,7 @@ def fleet_of(uavs: list[str], scenario: ScenarioConfig = SCENARIO) -> Fleet:
     return Fleet(Node(scenario, 3, reward_terms=True), uavs, policy=lambda _: pytest.fail("it was asked"))
 
 
-@pytest.fixture(scope="module", params=SCENARIOS)
+@pytest.fixture(scope="module", params=[pytest.param("instant", marks=pytest.mark.slow), "flights"])
 def scenario(request) -> ScenarioConfig:
     return SCENARIOS[request.param]
 

@@ -48,7 +48,9 @@ def served(scenario, policy_of, n_worlds: int, horizon: int):
         return evaluate(env, Client(env, ground, http, lambda time: now.__setitem__(0, time), START), horizon)
 
 
-@pytest.mark.parametrize(("task", "policy_of"), [("belief", network), ("flights", recurrent)])
+@pytest.mark.parametrize(
+    ("task", "policy_of"), [("belief", network), pytest.param("flights", recurrent, marks=pytest.mark.slow)]
+)
 def test_flights_by_the_service_are_those_of_the_simulation(task, policy_of):
     scenario = scenario_of(**TASKS[task], reward=REWARD)
     horizon = 40 if task == "flights" else 15

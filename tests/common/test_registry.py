@@ -39,11 +39,8 @@ def test_your_own_component_is_found_by_its_path_in_the_current_folder(tmp_path,
 REFUSED = {
     "key: rude is not one of plain, nor a path such as": lambda: greetings().get("rude", "key"),
     "key: nowhere:x: No module named 'nowhere'; nowhere must": lambda: greetings().get("nowhere:x", "key"),
-    "key: math:formal: the module math has no formal": lambda: greetings().get("math:formal", "key"),
     "key: math:pi is no function": lambda: greetings().get("math:pi", "key"),
-    "key: plain is not {greeting: package": lambda: greetings().read("plain", "key", "greeting"),
     "key.too: 1 is no parameter of plain": lambda: check_parameters(polite, {"too": 1}, "plain", "key"),
-    "key: plain needs a value for to": lambda: check_parameters(polite, {"loud": True}, "plain", "key"),
 }
 
 

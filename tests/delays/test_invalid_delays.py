@@ -11,21 +11,11 @@ from damian.delays.config import DelayConfig, LinkConfig, check_laws
 from damian.delays.laws import LONGEST, Burst, Held, Lag, Uniform
 from damian.transforms import ActionDelay, ObservationDelay, RewardDelay
 
-STEPS_OR_TIME = "is neither whole steps such as 3 nor a time such as 3s"
-
 INVALID_LAWS = [
-    (-1, f": -1 {STEPS_OR_TIME}"),
-    ("3.5", f": 3.5 {STEPS_OR_TIME}"),
     ("3h", f": 3h is more than {LONGEST} steps"),
-    ("uniform", ": uniform is no delay; that law is written {law: uniform}"),
     ({"law": "gauss"}, ".law: gauss is not one of constant, uniform, geometric, burst, trace"),
-    ({"law": "uniform", "lo": 3}, ".lo: 3 is no setting of the law uniform, which has low, high, pro"),
     ({"law": "uniform", "low": 4, "high": 2}, ".low: 4 and high=2 are not two steps or two times"),
-    ({"law": "uniform", "high": 2, "probability": 1.5}, ".probability: 1.5 is not between 0 and 1"),
     ({"law": "burst", "bad": {"law": "burst"}}, ".bad: {'law': 'burst'} is not a memoryless law"),
-    ({"law": "trace"}, ".path: it is missing: the file with the delays"),
-    ({"law": "lag", "update_period": 0}, ".update_period: 0 is not above 0"),
-    ({"law": "lag", "update_period": "episode", "stagger": True}, ".update_period: episode draws one lag"),
     ({"law": "distance", "speed": math.nan}, ".speed: nan m/s is not above 0 m/s"),
 ]
 
@@ -43,10 +33,6 @@ def test_an_invalid_law_raises_one_line_that_names_its_key(setting, error):
     [
         ({"delay": 3}, "links.delay: 3 means nothing with links=server"),
         ({"kind": "matrix", "delay": [[0, 1], [1, 0]]}, "links.delay: [[0, 1], [1, 0]] is not 3 lists"),
-        (
-            {"kind": "matrix", "loss": [[0, 0, 0], [0, 0, 2], [0, 0, 0]]},
-            "links.loss: 2 is not between 0 and 1",
-        ),
     ],
     ids=str,
 )

@@ -40,8 +40,6 @@ def periods(clock: SystemClock, *spotted: torch.Tensor) -> list[int]:
     [
         ({"simulation": "1s", "agents": "1.5s"}, "clock.agents: 1.5s is not a multiple"),
         ({"agents": "2s", "server": "3s"}, "clock.server: 3s is not a multiple of clock.agents=2s"),
-        ({"longest": "2s"}, "clock.longest: 2s means nothing without clock.trigger"),
-        ({"skip_discount": 0.9}, "clock.skip_discount: 0.9 means nothing without clock.skip=true"),
     ],
 )
 def test_impossible_periods_are_refused(clock, message):

@@ -10,31 +10,22 @@ from damian.common.errors import InputError
 from damian.delays.config import LinkConfig
 from damian.envs.pipeline import make_env
 from damian.server.features import ObservationConfig
-from damian.server.termination import EpisodeConfig
 from damian.settings import ClockConfig
 from damian.world.motion import MotionConfig
 
 OWN = ObservationConfig(own=True)
 BELIEF = ObservationConfig(belief=["belief_gain"])
 REFUSED: dict[str, Callable[[], Any]] = {
-    "delay: 3 is not a DelayConfig": lambda: square(delay=3),
     "observation.own: True does not go with clock.server": lambda: square(
         observation=OWN, clock=ClockConfig(server="2s")
     ),
     "observation.belief: ['belief_gain'] does not go with links=matrix": lambda: square(
         observation=BELIEF, links=LinkConfig("matrix")
     ),
-    "observation.global_features: ['agent_distances'] is empty for a single UAV": lambda: square(
-        agents=1, observation=ObservationConfig([], ["agent_distances"])
-    ),
-    "episode.discharged_share: 0.5 needs battery.enabled=true": lambda: square(
-        episode=EpisodeConfig(discharged_share=0.5)
-    ),
     "clock.skip: True skips steps": lambda: make_env(
         square(clock=ClockConfig(skip=True)), extras=["message"]
     ),
     "extras: mesage is not one of message, state": lambda: make_env(square(), extras=["mesage"]),
-    "seed: -3 is not at least 0": lambda: make_env(square(), seed=-3),
     "motion.max_level: 2 m leaves room for 2 flight levels": lambda: make_env(
         square(motion=MotionConfig("polynomial", min_level=1, max_level=2, level_separation=1))
     ),

@@ -53,24 +53,11 @@ from dataclasses import dataclass
 from learner import Reinforce, ReinforceConfig
 
 @dataclass
-class NoActorConfig(ReinforceConfig):
-    def make(self, env, setup, buffer):
-        learner = super().make(env, setup, buffer)
-        learner.components = lambda: {"optimizer": learner.optimizer}
-        return learner
-
-@dataclass
 class RaisingConfig(ReinforceConfig):
     def make(self, env, setup, buffer):
         learner = super().make(env, setup, buffer)
         learner.learn = lambda batch: {"loss": batch["nothing"]}
         return learner
-
-class Bare(ReinforceConfig):
-    extra: float = 1.0
-
-    def make(self, env, setup, buffer):
-        pass
 
 class Raising:
     def __init__(self, folder):
@@ -144,11 +131,7 @@ def test_worker_processes_of_a_comparison_find_the_extensions(run, folder):
     ("overrides", "message"),
     [
         (["learner=learnr:X"], "learner: learnr:X: No module named 'learnr'; learnr must be installed"),
-        (["learner=learner:Reinforce"], "learner: learner:Reinforce is no dataclass derived from"),
-        (["learner=learner:ReinforceConfig", "learner.entropi=1"], "learner.entropi: no such key; did you"),
         (["learner=reader:ReaderConfig"], "learner: reader:ReaderConfig reads hindsight, which needs aware="),
-        (["learner=faulty:NoActorConfig"], "faulty:NoActorConfig: components: ['optimizer'] has no actor"),
-        (["learner=faulty:Bare"], "learner: faulty:Bare is no dataclass: write @dataclass above the class"),
         (["logger.custom=[law:Satellite]"], "law:Satellite is no function (folder) -> logger, nor a class"),
     ],
 )

@@ -73,14 +73,9 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
 
 REFUSALS = [
     (["policy=script"], "reports: nothing is not the only one of reports=FILE"),
-    (["reports=table.csv", "port=0"], "reports: reports and port is not the only one of"),
     (["reports=nothing.csv"], "nothing.csv: no such file"),
-    (["folder=nothing", "uavs=[A]"], "folder: nothing is not there"),
     (["reports=table.csv", "uavs=[A,B,C,D]"], "table.csv: no advice yet: no report of D has come in"),
     (["reports=table.csv", "uavs=[A,B]"], "table.csv: line 4: ID: 'C' is no UAV of this fleet: A, B"),
-    (["reports=table.csv", "links=updown"], "links: updown is not server"),
-    (["port=0", "host=999.1.1.1"], "port: 999.1.1.1:0 cannot be used"),
-    (["reports=table.csv", "journal=kept"], "journal: kept is for a service or a folder"),
 ]
 
 

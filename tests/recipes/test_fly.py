@@ -51,9 +51,9 @@ def printed_line(capsys) -> str:
 
 
 def test_a_run_folder_holds_configuration_episode_film_and_figure(run, capsys):
-    folder = run(*BADLY, "agents=2", "episode.max_steps=4", "formats=[gif,png,html,geojson]", "views=[2d,3d]")
+    folder = run(*BADLY, "agents=2", "episode.max_steps=4", "formats=[gif,png,html,geojson]")
     files = {"config.yaml", "run.json", "episode_0.json", "episode_0.geojson"}
-    files |= {"episode_0.gif", "episode_0_3d.gif", "episode_0.png", "episode_0.html"}
+    files |= {"episode_0.gif", "episode_0.png", "episode_0.html"}
     assert {path.name for path in folder.iterdir()} == files
     assert "4 steps" in printed_line(capsys)
     picture = imread(folder / "episode_0.png")

@@ -44,7 +44,7 @@ def write_journal(path: Path) -> None:
 
 
 def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(show):
-    folder = show("formats=[gif,png,html,geojson]", "clock.simulation=0.5s")
+    folder = show("formats=[gif,geojson]", "clock.simulation=0.5s")
     episode = Episode.load(folder / "episode_0.json")
     assert (episode.n_agents, episode.names, episode.source) == (2, ["A", "B"], None)
     assert np.diff(episode.time) == pytest.approx(0.5), "a setting that is given replaces that of the advice"

@@ -78,10 +78,7 @@ def test_a_file_holds_the_episode_to_five_digits_and_says_what_its_columns_mean(
     [
         ({"version": 3}, "it is damian-episode of version 3"),
         ({"age": [[0.0, 0.0]]}, "age has 1 instants, and time has 4"),
-        ({"battery": [[1.0], [1.0, 2.0]] * 2}, "inhomogeneous"),
-        ({"reward_terms": {"near": {}}}, "float"),
         ({"time": [0.0, 1.0, 1.0, 2.0]}, "time does not increase"),
-        ({"region": {"type": "Polygon"}}, "ParseException"),
     ],
 )
 def test_a_file_that_holds_no_episode_is_refused_in_one_line(tmp_path, changes, problem):

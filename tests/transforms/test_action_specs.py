@@ -7,11 +7,9 @@ from torchrl.data import (
     Binary,
     Bounded,
     Categorical,
-    MultiCategorical,
     MultiOneHot,
     OneHot,
     TensorSpec,
-    Unbounded,
 )
 from torchrl.envs import TransformedEnv
 from transform_cases import ACTION
@@ -19,7 +17,6 @@ from transform_cases import ACTION
 from damian.transforms import ActionDelay, ActionHistory
 
 HISTORY = ("agents", "action_history")
-NARROW_AND_WIDE = torch.tensor([1.0, 10.0]).view(2, 1).expand(*GROUP, 2)
 
 
 def numbered(first: int) -> torch.Tensor:
@@ -28,11 +25,6 @@ def numbered(first: int) -> torch.Tensor:
 
 
 RANGES: dict[str, tuple[TensorSpec, torch.Tensor, torch.Tensor]] = {
-    "numbers of agents": (
-        Bounded(-NARROW_AND_WIDE, NARROW_AND_WIDE, (*GROUP, 2)),
-        -NARROW_AND_WIDE,
-        NARROW_AND_WIDE,
-    ),
     "different numbers": (
         Bounded(-numbered(3).double(), numbered(5).double(), (*GROUP, 2), dtype=torch.float64),
         -numbered(3),
@@ -42,11 +34,6 @@ RANGES: dict[str, tuple[TensorSpec, torch.Tensor, torch.Tensor]] = {
         Bounded(-numbered(2), numbered(4), (*GROUP, 2), dtype=torch.int32),
         -numbered(2),
         numbered(4),
-    ),
-    "choices of agents": (
-        MultiCategorical(numbered(2), (*GROUP, 2)),
-        torch.zeros(*GROUP, 2),
-        numbered(1),
     ),
     "one possible value": (
         Bounded(torch.full((*GROUP, 2), 2.0), torch.tensor([2.0, 4.0]).expand(*GROUP, 2), (*GROUP, 2)),
@@ -73,25 +60,11 @@ def test_every_number_of_every_agent_is_scaled_by_its_own_bounds(spec, low, high
 # Defaults.
 
 LEGAL = {
-    "number": (Categorical(5, GROUP), 4, torch.full(GROUP, 4)),
     "a number for each agent": (Categorical(5, GROUP), [3, 4], torch.tensor([3, 4]).expand(GROUP)),
     "none": (Bounded(2, 7, GROUP, dtype=torch.int64), None, torch.full(GROUP, 2)),
-    "none, below 0": (Bounded(-7.0, -2.0, GROUP), None, torch.full(GROUP, -2.0)),
-    "at the bound": (
-        Bounded(0.3, 0.7, GROUP, dtype=torch.float64),
-        0.7,
-        torch.full(GROUP, 0.7, dtype=torch.float64),
-    ),
     "index": (OneHot(3, (*GROUP, 3)), 2, torch.tensor([0, 0, 1]).expand(*GROUP, 3)),
     "indices": (MultiOneHot([2, 3], (*GROUP, 5)), [1, 2], torch.tensor([0, 1, 0, 0, 1]).expand(*GROUP, 5)),
-    "none, one-hot": (
-        MultiOneHot([2, 3], (*GROUP, 5)),
-        None,
-        torch.tensor([1, 0, 1, 0, 0]).expand(*GROUP, 5),
-    ),
     "flags": (Binary(3, (*GROUP, 3)), [0, 1, 1], torch.tensor([0, 1, 1]).expand(*GROUP, 3)),
-    "truth": (Binary(3, (*GROUP, 3), dtype=torch.bool), True, torch.ones(*GROUP, 3, dtype=torch.bool)),
-    "unbounded": (Unbounded((*GROUP, 1)), -1e9, torch.full((*GROUP, 1), -1e9)),
 }
 
 

@@ -36,7 +36,7 @@ IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
     "CumulativeReward": lambda kind: CumulativeReward(1, 0.5, kind.reward),
     "ActionHistory": lambda kind: ActionHistory(3, kind.action),
     "SampleAndHold": lambda kind: (
-        SampleAndHold(1, () if kind.stateless else kind.observation, kind.action)
+        SampleAndHold(1, kind.observation, kind.action)
         if kind.observation != "state"
         else SampleAndHold(1, kind.observation)
     ),
@@ -49,10 +49,7 @@ IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
 @every_case
 def test_the_outputs_match_the_specs_and_every_spec_can_do_without_the_batch(kind, make):
     env = TransformedEnv(kind.make(), make(kind, LATE))
-    if kind.stateless:
-        assert set(played(env, kind)[-1].keys(True, True)) >= set(env.full_observation_spec.keys(True, True))
-    else:
-        check_env_specs(env, break_when_any_done="both")
+    check_env_specs(env, break_when_any_done="both")
     dims = len(env.batch_size)
     for name in (name for name in dir(type(env)) if name.endswith("_spec_unbatched") and name[0] != "_"):
         spec, whole = getattr(env, name), getattr(env, name.removesuffix("_unbatched"))
@@ -96,7 +93,7 @@ def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(k
 def test_what_is_written_shares_no_memory_with_the_buffers(kind, make):
     env = TransformedEnv(kind.make(), make(kind, LATE))
     env.set_seed(0)
-    td = env.reset(kind.begin(env))
+    td = env.reset()
     for _ in range(5):
         owned = [*env.transform.memory.values()]
         td = env.rand_action(td)

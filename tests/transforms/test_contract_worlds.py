@@ -34,8 +34,7 @@ def test_the_seed_of_a_plain_environment_reaches_its_transforms(kind, make):
     for number, seed in enumerate((3, 4, 3)):
         torch.manual_seed(number)  # the state of torch's generator does not matter
         env.set_seed(seed)
-        begin = kind.begin(env)
-        outputs.append([env.reset(begin)])
+        outputs.append([env.reset()])
         streams.append(env.transform.memory["streams"].clone())
         torch.manual_seed(0)
         for _ in range(3):
@@ -43,7 +42,7 @@ def test_the_seed_of_a_plain_environment_reaches_its_transforms(kind, make):
             outputs[-1] += [after["next"], td]
     assert streams[0].equal(streams[2])
     assert not set(streams[0].tolist()) & set(streams[1].tolist())
-    if not kind.stateless and kind.make is not vmas:  # VMAS itself goes on with its earlier random state
+    if kind.make is not vmas:  # VMAS itself goes on with its earlier random state
         assert all_same(outputs[0], outputs[2])
 
 

@@ -6,15 +6,13 @@ from contract import ACTION, OBSERVATION
 from delay_twin import Counting
 from plain_env import Plain
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs import Compose, GymEnv, Transform, TransformedEnv
 
 from damian.common.errors import InputError
 from damian.delays.laws import Burst
 from damian.transforms import (
     ActionDelay,
-    ActionHistory,
     Channel,
-    CumulativeReward,
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
@@ -23,9 +21,6 @@ from damian.transforms import (
 
 MISSING = {
     "observatoin": lambda: ObservationDelay(3, ["observation", "observatoin"]),
-    "sent": lambda: ObservationDelay(3, sent_key="sent"),
-    "age": lambda: ActionHistory(2, append_to="observation", age_key="age"),
-    "rewrad": lambda: RewardDelay(2, "rewrad"),
     "act": lambda: SampleAndHold(2, ["observation"], ["act"]),
 }
 
@@ -39,9 +34,7 @@ def test_a_key_that_the_environment_does_not_have_is_named(key):
 
 IN_USE = {
     "two ages": lambda: [ObservationDelay(1, OBSERVATION), ObservationDelay(3, OBSERVATION)],
-    "two histories": lambda: [ActionHistory(2, ACTION), ActionHistory(3, ACTION)],
     "an entry of the environment": lambda: [ObservationDelay(2, OBSERVATION, age_key="reward")],
-    "a channel": lambda: [Channel(1, OBSERVATION, "reward")],
 }
 
 
@@ -53,17 +46,9 @@ def test_an_entry_that_there_is_already_is_not_replaced(transforms):
 
 MISTAKES = {
     "in_keys: .* is empty, and so is in_keys_inv": lambda: SampleAndHold(2, [], []),
-    "dt: -1 s is not above 0 s": lambda: SampleAndHold("3s", dt=-1),
-    "order: newest is not one of": lambda: ObservationDelay(1, order="newest"),
     "delay: .* loses messages, but no reward": lambda: RewardDelay(Burst(bad_loss=0.5)),
-    "steps: 0 is not at least 1": lambda: CumulativeReward(0),
     "delay 2 x 2, hears 3 x 3: these are of": lambda: Channel([[0, 1], [1, 0]], hears=[[True] * 3] * 3),
-    "loss: 1.5 is not between 0 and 1": lambda: Channel(1, loss=[[0, 1.5], [0, 0]]),
     "comm_range: 5 needs a position_key": lambda: Channel(1, comm_range=5),
-    "action_key: .* does not go with in_keys": lambda: Channel(
-        1, OBSERVATION, action_key=("agents", "words"), message_size=1
-    ),
-    "in_keys: observation is not in a group": lambda: Channel(1, "observation"),
 }
 
 
@@ -76,7 +61,6 @@ def test_a_wrong_argument_is_one_line(line):
 CHANGES = {
     "ActionDelay changes which actions": lambda: ActionDelay(3, ACTION),
     "SampleAndHold changes which actions": lambda: SampleAndHold(3, [], ACTION),
-    "it ends episodes where the stored steps go on": lambda: StepCounter(3),
 }
 
 

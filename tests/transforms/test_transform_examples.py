@@ -23,6 +23,7 @@ def test_a_late_pendulum_observes_what_is_some_steps_old(capsys):
     assert f"{steps['age'].mean():.1f} steps" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_agents_of_vmas_have_ages_of_their_own():
     pytest.importorskip("vmas")
     age = run("late_vmas")["age"]
@@ -40,6 +41,7 @@ def test_agents_of_vmas_hear_what_others_chose_to_say():
     assert not agents["received_mask"][:, :, 0, 1].all()
 
 
+@pytest.mark.slow
 def test_a_replay_buffer_contains_late_steps():
     example = run("late_replay_buffer")
     stored = example["buffer"][:]
@@ -48,6 +50,7 @@ def test_a_replay_buffer_contains_late_steps():
     assert stored["age"][0] == stored["age"][1:][stored["next", "done"][:-1]].max() == 0
 
 
+@pytest.mark.slow
 def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew(capsys):
     example = run("late_critic")
     learnt, actor, loss = (example[name] for name in ("learnt", "actor", "loss"))

@@ -5,9 +5,7 @@ from contract import LATE, Drift
 from torchrl.envs import (
     Compose,
     ConditionalSkip,
-    NoopResetEnv,
     StepCounter,
-    TerminateTransform,
     Transform,
     TransformedEnv,
 )
@@ -19,7 +17,6 @@ from damian.transforms import (
     CumulativeReward,
     ObservationDelay,
     RewardDelay,
-    SampleAndHold,
 )
 from damian.transforms.server_node import ServerNode
 
@@ -34,26 +31,14 @@ def appending() -> Transform:
 
 WRONG = {
     "a history before an action delay": (lambda: ActionHistory(2), lambda: ActionDelay(LATE)),
-    "a history before a clock": (
-        lambda: ActionHistory(2),
-        lambda: SampleAndHold(2, [], ["action"]),
-    ),
     "an observation delay after a history that appends": (appending, delay),
-    "a clock after a history that appends": (appending, lambda: SampleAndHold(2)),
     "a time limit after a reward delay": (lambda: RewardDelay(2), lambda: StepCounter(max_steps=5)),
-    "an end after a reward delay": (
-        lambda: RewardDelay(2),
-        lambda: TerminateTransform(lambda _: True),
-    ),
     "skipped steps before a delay": (lambda: ConditionalSkip(lambda td: td["done"]), delay),
-    "idle steps after a delay": (delay, lambda: NoopResetEnv(2)),
 }
 RIGHT = {
     "a history after an action delay": (lambda: ActionDelay(LATE), lambda: ActionHistory(2)),
     "a history that appends after a delay": (delay, appending),
-    "a clock after a history with its own entry": (lambda: ActionHistory(2), lambda: SampleAndHold(2)),
     "sums of delayed rewards": (lambda: RewardDelay(LATE), lambda: CumulativeReward(3)),
-    "two delays of one observation": (delay, lambda: ObservationDelay(1, age_key=None)),
 }
 
 
