@@ -16,7 +16,7 @@ from hypothesis import settings
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # for learning, and for the programs that tests start
 
-settings.register_profile("same", derandomize=True, deadline=None, max_examples=100)
+settings.register_profile("same", derandomize=True, deadline=None, max_examples=50)
 settings.register_profile("deep", deadline=None, max_examples=3000, print_blob=True)
 settings.load_profile("same")
 

@@ -58,13 +58,6 @@ class RaisingConfig(ReinforceConfig):
         learner = super().make(env, setup, buffer)
         learner.learn = lambda batch: {"loss": batch["nothing"]}
         return learner
-
-class Raising:
-    def __init__(self, folder):
-        pass
-
-    def log_scalar(self, name, value, step):
-        raise OSError("disk full")
 """
 
 
@@ -142,19 +135,10 @@ def test_a_mistake_is_one_clear_line(run, folder, capsys, overrides, message):
     assert not (folder / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("learner=faulty:RaisingConfig", "faulty:RaisingConfig: KeyError: "),
-        ("logger.custom=[faulty:Raising]", "logger Raising: OSError: disk full (faulty.py, line "),
-    ],
-)
-def test_an_error_in_the_first_update_is_one_line_after_the_progress_bar(
-    run, folder, capsys, override, message
-):
+def test_an_error_in_the_first_update_is_one_line_after_the_progress_bar(run, folder, capsys):
     (folder / "faulty.py").write_text(BROKEN)
     with pytest.raises(SystemExit) as stopped:
-        run(*TINY, override)
+        run(*TINY, "learner=faulty:RaisingConfig")
     assert stopped.value.code == 2
     *_, last = capsys.readouterr().err.strip().splitlines()
-    assert last.startswith(f"error: {message}")
+    assert last.startswith("error: faulty:RaisingConfig: KeyError: ")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from stable_baselines3 import PPO
 
 import damian.interop
 from damian import compose_scenario, keys
@@ -91,17 +90,6 @@ def test_a_picture_shows_what_a_film_of_the_episode_shows():
     assert not np.array_equal(first, env.render())
     env.reset(seed=0)
     assert np.array_equal(first, env.render())
-
-
-def test_stable_baselines_trains_and_its_policy_flies():
-    env = gymnasium.make("damian/Spotting-v0", overrides=["delay.obs=1"])
-    model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, device="cpu", seed=0)
-    before = [each.clone() for each in model.policy.parameters()]
-    model.learn(64)
-    assert any(not torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
-    observation, _ = env.reset(seed=0)
-    action, _ = model.predict(observation, deterministic=True)
-    assert env.action_space.contains(action.item())
 
 
 def test_what_a_user_can_get_wrong_is_said_in_one_line():

@@ -83,6 +83,7 @@ def test_new_overrides_replace_those_of_the_run_and_the_others_apply(fly):
     assert shorter == 1
 
 
+@pytest.mark.slow
 def test_a_policy_keeps_its_action_history_under_another_delay_and_the_changes_are_printed(fly, capsys):
     first = fly("delay.history=2", "delay.obs=1", of=None, folder="first", program=train)
     capsys.readouterr()

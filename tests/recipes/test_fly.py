@@ -64,6 +64,7 @@ def test_a_run_folder_holds_configuration_episode_film_and_figure(run, capsys):
         assert film.size == (720, 700)
 
 
+@pytest.mark.slow
 def test_the_policy_of_a_checkpoint_flies_with_the_settings_of_its_training(run, monkeypatch, capsys):
     words = ["agents=2", "frames=32", "worlds=2", "learner.steps=8", "model.hidden=[4]", "eval_episodes=2"]
     words += ["actions.distances=[0,30,60]", "episode.max_steps=6", "delay.obs=2", "hydra.run.dir=trained"]
@@ -138,6 +139,7 @@ def test_wrong_input_is_refused_in_one_line_and_leaves_no_folder(run, capsys, tm
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_real_region_with_a_hole_goes_from_file_to_film(run, tmp_path):
     square = np.array([[0.0, 0.0], [0.006, 0.0], [0.006, 0.004], [0.0, 0.004], [0.0, 0.0]])
     rings = [square + np.array([139.7, 35.6]), square / 4 + np.array([139.702, 35.601])]

@@ -43,6 +43,7 @@ def write_journal(path: Path) -> None:
     journal.close()
 
 
+@pytest.mark.slow
 def test_everything_is_made_of_a_journal_and_nothing_shows_a_source(show):
     folder = show("formats=[gif,geojson]", "clock.simulation=0.5s")
     episode = Episode.load(folder / "episode_0.json")

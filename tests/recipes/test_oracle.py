@@ -29,6 +29,7 @@ def returns(tmp_path, monkeypatch):
         return {row["policy"]: float(row["return"]) for row in csv.DictReader(file)}
 
 
+@pytest.mark.slow
 def test_who_knows_more_on_time_wins_more(returns):
     rows = ["what has arrived", "its own messages", "all messages", "the source's place"]
     assert [*returns] == rows

@@ -19,7 +19,7 @@ from walks import (
     twin_position,
 )
 
-from damian.world.signal_source import SourceConfig, footprint_radius, leg_profile, locate
+from damian.world.signal_source import leg_profile, locate
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "motion_energy_coverage.json").read_text())
 
@@ -39,13 +39,6 @@ POLYGONS = {
     "turned sliver": TURNED_SLIVER,
     "two parts": TWO_PARTS,
 }
-
-
-def test_the_footprint_radius_follows_from_power_and_intensity():
-    config = SourceConfig(level_db=123.0, microphone_db=71.5)
-    power = 4 * math.pi * 1e-12 * 10 ** (123.0 / 10)
-    faintest = 1e-12 * 10 ** (71.5 / 10)
-    assert footprint_radius(config) == pytest.approx(math.sqrt(power / (4 * math.pi * faintest)))
 
 
 @example(length=1e-18, speed=1.0, acceleration=0.05)
@@ -102,22 +95,6 @@ def test_every_stop_is_inside_the_polygon_and_near_its_hotspot(name):
             assert 3 <= end - begin - 1 <= 7
             assert all(math.dist(stops[begin], stops[k]) <= 40.001 for k in range(begin, end))
     assert hotspots == 20 * 10
-
-
-def test_waits_and_legs_alternate_without_gaps():
-    walk = in_double(dynamic_walks(n=20))
-    for w, n in enumerate(n_stops(walk).tolist()):
-        arrive, depart = walk.arrive[w, :n].tolist(), walk.depart[w, :n].tolist()
-        assert arrive[0] == 0.0
-        for k in range(n):
-            assert 60 - 1e-2 <= depart[k] - arrive[k] <= 360 + 1e-2
-        for k in range(n - 1):
-            leg = twin_duration(
-                math.dist(walk.stop[w, k].tolist(), walk.stop[w, k + 1].tolist()),
-                walk.speed[w, k].item(),
-                walk.acceleration[w, k].item(),
-            )
-            assert arrive[k + 1] - depart[k] == pytest.approx(leg, abs=1e-2)
 
 
 @given(

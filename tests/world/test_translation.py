@@ -4,17 +4,13 @@ import functools
 
 import numpy as np
 import pytest
-import shapely
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from damian.common.tensors import tree_map
 from damian.settings.world import WorldConfig
 from damian.world.battery import BatteryConfig
 from damian.world.landing import ActionConfig
 from damian.world.regions.config import RegionConfig
-from damian.world.regions.region import Region, centred
 from damian.world.signal_source import SourceConfig
 from damian.world.simulation import Simulation
 
@@ -70,9 +66,6 @@ def leaves(state):
     return [*state[:-1], *state.sent]
 
 
-OFFSET = st.floats(-1e7, 1e7)
-
-
 def check_moved(vertices, offset, kind):
     """Assert that moving the region and all places changes no bit of a rollout."""
     before = unmoved(tuple(map(tuple, vertices)), kind)
@@ -91,12 +84,3 @@ def check_moved(vertices, offset, kind):
 )
 def test_moving_the_region_and_all_places_changes_no_bit_of_a_rollout(vertices, offset, kind):
     check_moved(vertices, offset, kind)
-
-
-@given(seed=st.integers(0, 2**32 - 1), east=OFFSET, north=OFFSET)
-def test_a_centred_region_does_not_depend_on_where_it_was(seed, east, north):
-    corners = np.random.default_rng(seed).uniform(-300, 300, (7, 2)).round(3)
-    here = centred(Region(shapely.MultiPoint(corners).convex_hull, "here"))
-    there = centred(Region(shapely.MultiPoint(np.add(corners, [east, north])).convex_hull, "there"))
-    corners, moved = ({*map(tuple, shapely.get_coordinates(r.polygon))} for r in (here, there))
-    assert corners == moved
