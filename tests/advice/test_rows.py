@@ -1,4 +1,4 @@
-"""Rows of tables: what is understood, what is refused, and that no cell of an answer is a formula."""
+"""Rows of tables: what is understood, and what is refused."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables and figures of them."""
+"""Comparisons of arms: pairs of seeds, J_norm, recovery, and the tables of them."""
 
 import numpy as np
 import pytest

@@ -148,11 +148,12 @@ def test_a_step_and_a_reset_touch_no_tensor_of_another_device(scenario, no_data)
         step_and_reset(env, worlds, moved[:-1], moved[-1], mask)
 
 
-@pytest.mark.parametrize("name", ["mixed", "everything", "matrix", "continuous"])
+@pytest.mark.parametrize("name", ["mixed", "everything", "matrix", "continuous", "belief"])
 def test_both_ways_give_the_same_rollout(name, monkeypatch):
     outputs = []
     for dependent in (True, False):
         monkeypatch.setattr(devices, "data_dependent", lambda device, dependent=dependent: dependent)
         env = delayed(SCENARIOS[name])
         outputs.append(play(env, choices(env, 12)))
-    assert all_same(*outputs)
+    rounding = 1e-5 if name == "belief" else 0.0  # sums over cells in another order
+    assert all_same(*outputs, rounding)

@@ -1,4 +1,4 @@
-"""Ends of episodes and their rewards (paper, section 4.1), batteries, and the source."""
+"""Ends of episodes (paper, section 4.1), batteries, and the end of the source."""
 
 import copy
 import itertools

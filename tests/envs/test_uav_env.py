@@ -1,4 +1,4 @@
-"""``UavEnv`` as a TorchRL environment: specs, batches against single worlds, seeds, compilation."""
+"""``UavEnv`` as a TorchRL environment: specs, skipped steps and seeds."""
 
 import pytest
 import torch

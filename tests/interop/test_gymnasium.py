@@ -1,4 +1,4 @@
-"""One UAV for users of Gymnasium: their own checker, a learner of theirs, and what the worlds really did."""
+"""One UAV for users of Gymnasium: their own checker, and what the worlds really did."""
 
 from itertools import product
 

@@ -1,4 +1,4 @@
-"""The record of a run: what a resumed run keeps of its first part, and damaged records."""
+"""The record of a run: what a resumed run keeps of its first part, and its command."""
 
 import shlex
 import sys

@@ -1,4 +1,4 @@
-"""Back-updating with late messages, against a loop and against the same rollout without delays."""
+"""Back-updating with late messages, against the same rollout without delays."""
 
 from dataclasses import replace
 

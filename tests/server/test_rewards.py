@@ -1,4 +1,4 @@
-"""Reward terms and ends of episodes equal those of plain loops; ends and bonuses are also checked by hand."""
+"""Reward terms and ends of episodes equal those of plain loops."""
 
 import numpy as np
 import pytest

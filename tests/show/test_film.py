@@ -1,4 +1,4 @@
-"""Films of episodes: the pixels of a frame mean what they should."""
+"""Films of episodes: their frames, and their views."""
 
 import numpy as np
 import pytest

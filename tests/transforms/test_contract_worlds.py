@@ -1,4 +1,4 @@
-"""Seeds, worlds that skip steps, flags at any level, and batches chosen at reset."""
+"""Seeds that reach every transform, and worlds that skip steps."""
 
 from dataclasses import dataclass
 from typing import Any

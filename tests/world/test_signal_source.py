@@ -1,4 +1,4 @@
-"""The signal source: footprint radius, walks in many polygons, and positions by integrated speed profiles."""
+"""The signal source: walks in many polygons, and positions by integrated speed profiles."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Causality, independence of the worlds, added delays, and every kind of action."""
+"""Delays of actions and of observations add up."""
 
 import pytest
 import torch
@@ -7,16 +7,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from transform_cases import ACTION, N_AGENTS, OBSERVATION, REWARD, WORLDS, delayed
 
-from damian.transforms import (
-    ActionDelay,
-    ObservationDelay,
-)
-
-# Delays of actions and of observations together.
+from damian.transforms import ActionDelay, ObservationDelay
 
 
-@pytest.mark.parametrize("i", range(4))
-@pytest.mark.parametrize("j", range(4))
+@pytest.mark.parametrize(("i", "j"), [(0, 0), (0, 3), (3, 0), (1, 2), (3, 3)])
 def test_delays_of_observations_and_actions_add_up(i, j):
     """Delays i and j have the same effect as an observation delay i + j (Katsikopoulos, Engelbrecht 2003).
 
