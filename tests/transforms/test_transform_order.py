@@ -18,7 +18,6 @@ from damian.transforms import (
     ObservationDelay,
     RewardDelay,
 )
-from damian.transforms.server_node import ServerNode
 
 
 def delay() -> Transform:
