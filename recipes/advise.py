@@ -1,16 +1,7 @@
 """Advise real UAVs: from what they report, where each should land next, by a trained policy or the script.
 
-    damian advise checkpoint=runs/first reports=table.csv            (one table, one answer)
-    damian advise checkpoint=runs/first folder=inbox "uavs=[A,B,C]"  (every table that comes into a folder)
-    damian advise checkpoint=runs/first port=8000 journal=journals   (several fleets over HTTP)
-    damian advise region=llanbedr policy=script reports=table.csv    (the script)
-    damian advise fit=journals/north.jsonl                           (how late the links were, for trainings)
-
-Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
-docs/advise.md explains the columns of the reports, the answers, and what is guaranteed. The run folder gets
-config.yaml, the answers to a table as advice.csv and advice.json, and the journals unless journal= names
-another folder. The program knows the region and its landing points, and nothing else of the world: it avoids
-no obstacles, and somebody else is responsible for safety.
+damian advise checkpoint=runs/first reports=table.csv            (one table, one answer; docs/advise.md)
+damian advise checkpoint=runs/first port=8000 journal=journals   (several fleets over HTTP)
 """
 
 import copy
@@ -72,11 +63,7 @@ def make_session(config: AdviseConfig, folder: Path | None) -> AdviceSession:
 
 
 def answer_table(config: AdviseConfig, folder: Path) -> None:
-    """Answer one table of reports: print the advice, and write it into the run folder.
-
-    Raises:
-        InputError: the table is wrong, or does not have every UAV.
-    """
+    """Answer one table of reports: print the advice, and write it into the run folder."""
     path, now = Path(str(config.reports)), time.time()
     session = make_session(config, None)
     with named(path):
@@ -129,11 +116,7 @@ def advise(config: AdviseConfig, folder: Path) -> None:
 
 
 def serve(config: AdviseConfig, session: AdviceSession) -> None:
-    """Answer over HTTP until the program is stopped.
-
-    Raises:
-        InputError: the server library is not installed, or the address cannot be used.
-    """
+    """Answer over HTTP until the program is stopped."""
     try:
         uvicorn, service = import_module("uvicorn"), import_module("damian.advice.service")
     except ImportError as error:

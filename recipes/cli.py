@@ -203,11 +203,7 @@ def _unknown(node: Any, config: Any, path: str = "") -> Iterator[str]:
 
 
 def settings(*overrides: str, program: str = "train", own_folder: str | None = None) -> Any:
-    """The checked settings of a program with these overrides, for Python programs too.
-
-    Raises:
-        InputError: an override is misspelt, or its value is impossible.
-    """
+    """The checked settings of a program with these overrides, for Python programs too."""
     check_words(program, overrides, own_folder)
     return checked(composed(program, overrides, own_folder), program)
 
@@ -266,10 +262,7 @@ def one_line_errors() -> Iterator[None]:
 def run(work: Work, program: str = "train", again: bool = False) -> None:
     """Run a program with the words of the command line; with ``-m`` once for each combination of values.
 
-    Args:
-        work: takes checked settings and the run folder to fill.
-        program: one of ``SCHEMAS``.
-        again: the same command in the same folder goes on with what is there, as a comparison does.
+    With ``again`` the same command in the same folder goes on with what is there, as a comparison does.
     """
     with one_line_errors():
         given = parsed(sys.argv[1:])

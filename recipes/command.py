@@ -1,7 +1,4 @@
-"""The command ``damian``: runs one of the programs of this folder.
-
-    damian train agents=3 delay.obs=3
-    damian --help
+"""The command ``damian``: runs one of the programs of this folder, as in ``damian train agents=3``.
 
 Help and wrong words are answered before TorchRL, which takes seconds to import, is loaded.
 """
@@ -31,11 +28,7 @@ SETTINGS = {name: name for name in PROGRAMS} | {"evaluate": "train", "oracle": "
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the program that the first word names with the other words.
-
-    Args:
-        words: the command line without ``damian``; ``sys.argv`` if not given.
-    """
+    """Run the program that the first word names with the other words."""
     # Threads that wait for each other soon sleep: where other programs run, a training whose threads keep
     # spinning takes several times as long. OpenMP reads this when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")

@@ -1,19 +1,7 @@
 """Train and evaluate several arms with several seeds over tasks and delays, and compare their results.
 
-    damian compare experiment=usecase2 seeds=10 processes=2
-    damian compare experiment=delaybench "tasks=[tracking]" "arms=[undelayed,own_naive,own]"
-    damian compare experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
-    damian compare experiment=usecase2 seeds=10 processes=40 launcher=slurm "slurm={slurm_partition: cpu}"
-    damian compare experiment=usecase2 report_only=true
-    damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench
-
-An experiment is a file of conf/experiment that lists tasks, delays and arms. An arm is one way to train or to
-fly: naive, with an action history, with back-updating, and so on. Each run has its own folder,
-runs/EXPERIMENT/TASK/DELAY/ARM/seed_N, with its output in log.txt. After Ctrl-C, the same command continues;
-finished runs are not repeated. runs/EXPERIMENT gets results.csv (every run), curves.csv (their learning
-curves), and what follows from these: table.md and table.csv (means with 95 % intervals, J_norm, recovery),
-figure.png and curves.png. With report_only=true these are made again, from the runs or, in a folder without
-any, from results.csv and curves.csv.
+damian compare experiment=usecase2 seeds=2 "overrides=['frames=1000','eval_episodes=8']"
+damian compare experiment=delaybench report_only=true hydra.run.dir=docs/results/delaybench
 """
 
 import sys
@@ -93,14 +81,7 @@ def _check_policies(runs: Sequence[Run]) -> None:
 
 
 def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list[str]) -> Iterator[Run]:
-    """The runs of one task, delay and arm, which the folder names.
-
-    Args:
-        config: settings of the comparison.
-        folder: folder of the arm.
-        trained_in: the task, or that in which the policies were trained that fly in a held-out one.
-        overrides: of the task and the delay.
-    """
+    """The runs of one task, delay and arm, which the folder names."""
     task, delay, name = folder.parts[-3:]
     arm, arms = config.experiment.arms[name], config.experiment.arms
     flies_alone = arm.oracle or arm.untrained
@@ -211,11 +192,7 @@ def _seeds_of_runs(config: CompareConfig, folder: Path) -> int | None:
 
 
 def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list[str], list[Run]]:
-    """Carry out the runs, unless only a report is asked for.
-
-    Returns:
-        the results of the finished runs; the names of those that are not finished; and those that failed.
-    """
+    """Carry out the runs, unless only a report is asked for."""
     runs, failed = plan(config, folder), []
     for run in runs:
         check_stored(run)

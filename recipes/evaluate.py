@@ -1,12 +1,7 @@
 """Evaluate a trained policy: as it was trained, or with more UAVs, other delays or another region.
 
-    damian train hydra.run.dir=runs/first
-    damian evaluate checkpoint=runs/first agents=10 delay=paper
-    damian evaluate -m checkpoint=runs/first delay.obs=0,2,4,8
-
-The overrides of the training run apply too, unless the command line gives others. The features of the actor's
-observation must stay the same. The run folder gets config.yaml, result.csv and result.md: success, steps and
-return of the trained policy beside the untrained one, the script and random actions.
+damian evaluate checkpoint=runs/first agents=10 delay=paper
+damian evaluate -m checkpoint=runs/first delay.obs=0,2,4,8
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -72,12 +67,6 @@ def report(
     config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module | None = None
 ) -> Evaluation:
     """Evaluate an actor beside an untrained one, the script and random actions; write and print the results.
-
-    Args:
-        config: settings of the evaluation.
-        folder: the run folder.
-        env: its environment, a world for each episode.
-        actor: the trained actor; None: only the others fly.
 
     Returns:
         The evaluation of the random policy in the same episodes.

@@ -1,18 +1,7 @@
 """Fly episodes and keep each as file, film, figure or page: what is true, and what the server believes.
 
-    damian fly checkpoint=runs/first
-    damian fly scenario=delaybench/tracking delay=paper aware=belief policy=script
-    damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
-    damian fly journal=journals/north.jsonl "formats=[html,geojson]"
-    damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"
-
-Every override of damian train may be given, except resume; those of the run that checkpoint names apply too.
-The run folder gets config.yaml, and for each episode that is kept episode_N.json (docs/episodes.md explains
-it), the film episode_N.gif (and episode_N_3d.gif), and episode_N.png: a map, the positions over time, and the
-age of information; with keep=extremes they are called best, median and worst. "formats=[html]" makes
-episode_N.html, which plays the episode. With a journal of damian advise nothing is flown: the episode is the
-flight that it tells. Nor is it with ``replay``, which makes one page, replay.html, that plays stored episodes
-side by side: the same seed flown with and without a delay shows what the delay does.
+damian fly checkpoint=runs/first eval_episodes=200 keep=extremes "formats=[mp4]" "views=[2d,3d]"
+damian fly "replay=[runs/undelayed/episode_0.json,runs/late/episode_0.json]"
 """
 
 from dataclasses import fields

@@ -194,11 +194,7 @@ def default_options(program: str) -> dict[str, str]:
 
 
 def groups(own_folder: str | None = None) -> dict[str, list[str]]:
-    """Options of every group, by the group's name; a file _NAME.yaml is no option, but what options share.
-
-    Args:
-        own_folder: a folder with configuration files of the user's own, whose options come first.
-    """
+    """Options of every group, by the group's name; a file _NAME.yaml is no option, but what options share."""
     options: dict[str, list[str]] = {}
     for root in map(Path, filter(None, [own_folder, CONF])):
         for file in sorted(root.rglob("[!_]*.yaml")):
@@ -209,13 +205,7 @@ def groups(own_folder: str | None = None) -> dict[str, list[str]]:
 
 
 def no_such_key(key: str, program: str = "train", section: Sequence[str] = ()) -> str:
-    """The message for an unknown key, with the nearest known one.
-
-    Args:
-        key: the dotted key.
-        program: one of ``SCHEMAS``.
-        section: keys beside it, where they are known; a learner of the user's own has its own keys.
-    """
+    """The message for an unknown key, with the nearest known one."""
     if key in SYNONYMS:
         return f"{key}: no such key; did you mean {SYNONYMS[key]}?"
     known, group = known_settings(program), key.partition(".")[0]
@@ -233,14 +223,7 @@ def no_such_key(key: str, program: str = "train", section: Sequence[str] = ()) -
 
 
 def help_text(name: str, program: str, keys: Sequence[str] = (), own_folder: str | None = None) -> str:
-    """What ``--help`` prints: a page on a program, or the meaning of settings and groups.
-
-    Args:
-        name: of the program.
-        program: whose settings it has, one of ``SCHEMAS``.
-        keys: groups, and dotted keys of settings or sections, to explain.
-        own_folder: a folder with configuration files of the user's own.
-    """
+    """What ``--help`` prints: a page on a program, or the meaning of settings and groups."""
     if keys:
         found = [[*_options(program, key, own_folder), *_meaning(program, key)] for key in keys]
         return "\n".join("\n".join(f or [no_such_key(k, program)]) for k, f in zip(keys, found, strict=True))

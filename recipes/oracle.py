@@ -1,13 +1,7 @@
-"""Fly the script with ever more known on time: which late messages cost how much.
+"""Fly the script with ever more known on time: which late messages cost how much (docs/protocol.md).
 
-    damian oracle scenario=delaybench/tracking delay=paper
-    damian oracle -m scenario=delaybench/tracking delay.obs=2,4,8,16
-
-The script (``damian.baselines.greedy.Searcher``) lets each UAV go where it most probably detects the source
-next, as the belief says: by the messages that have arrived at the server, by each UAV's own messages at once
-too (both R0), by all messages at once, and by the source's true place (both R3, docs/protocol.md). With all
-messages on time it is a strong reference, and no proven limit: a policy that plans further ahead may win
-more. The run folder gets config.yaml, result.csv and result.md, with one row for what is known.
+With all messages on time the script is a strong reference, and no proven limit: a policy that plans further
+ahead may win more.
 """
 
 from dataclasses import replace
@@ -80,11 +74,7 @@ def _script(config: TrainConfig, scenario: ScenarioConfig, true_place: bool) -> 
 
 
 def true_belief(env: DelayedEnv) -> TensorDictModule:
-    """A module that replaces the server's belief by certainty about the source's cell.
-
-    Args:
-        env: its scenario observes a belief, and ``state`` is among its extras.
-    """
+    """A module that replaces the server's belief by certainty about the source's cell."""
     server = env.server
     grid = cast(SourceGrid, server.grid)
 

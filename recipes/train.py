@@ -1,16 +1,7 @@
-"""Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one.
+"""Train UAVs with MAPPO or SAC, then evaluate the policy beside a random and a scripted one (docs/runs.md).
 
-    damian train agents=3 scenario=spotting motion=polynomial seed=1
-    damian train scenario=paper/usecase2 delay=paper aware=both
-    damian train learner=sac scenario=tracking actions=continuous
-    damian train -m seed=0,1,2 agents=3,5
-    damian train hydra.run.dir=runs/first
-    damian train resume=runs/first frames=600000
-
-``--help`` lists the groups of settings, ``--help KEY`` explains a setting or a section. The run folder,
-runs/DATE_TIME unless hydra.run.dir names another one, gets config.yaml, run.json (versions, machine, wall
-time), metrics.csv (a row for each update), TensorBoard events, checkpoint.pt, best.pt, learning_curve.png,
-and the evaluation as result.csv and result.md (docs/runs.md).
+damian train scenario=paper/usecase2 delay=paper aware=both hydra.run.dir=runs/first
+damian train resume=runs/first frames=600000
 """
 
 import sys

@@ -1,18 +1,7 @@
-"""Search for better settings of a learner with Optuna.
+"""Search for better settings of a learner with Optuna; the same command continues a search.
 
-    damian tune scenario=delaybench/tracking delay=paper aware=belief trials=30 processes=2
-    damian tune learner=sac trials=100 frames=100000 hydra.run.dir=runs/tune_sac
-    damian tune aware=both "search.learner.gamma.choices=[0.9,0.99]" "+search.delay.history={low: 1, high: 8}"
-
-Every override of damian train may be given, except resume. Each trial is a training with other settings, in
-RUN/trial_N; its value is what the evaluation after it measures (score and policy). A trial whose return is
-below the median of the earlier trials, at the same number of frames, is pruned. After Ctrl-C or a kill the
-same command continues, from the checkpoints of the trials that were being trained. The run folder,
-runs/tune unless hydra.run.dir names another one, gets trials.csv, table.md, and search.db, Optuna's storage,
-of which its dashboard draws figures (optuna-dashboard sqlite:///RUN/search.db).
-
-All trials have the same seed and are compared in the same episodes: what was searched for must be shown with
-other seeds (damian compare).
+damian tune scenario=delaybench/tracking delay=paper aware=belief trials=30 processes=2
+damian tune aware=both "search.learner.gamma.choices=[0.9,0.99]" "+search.delay.history={low: 1, high: 8}"
 """
 
 import functools
@@ -68,16 +57,7 @@ OWN = {each.name for each in fields(TuneConfig)} - {each.name for each in fields
 
 
 def read_space(search: Mapping[str, Any], path: str = "") -> dict[str, BaseDistribution]:
-    """The values of each setting that a search varies, by its dotted key.
-
-    Args:
-        search: nested as the settings are; each as ``{low: 1, high: 8}``, with ``log: true`` or ``step``, or
-            as ``{choices: [...]}``.
-        path: what stands before the keys, within.
-
-    Raises:
-        InputError: a setting does not exist, or its values are not written so.
-    """
+    """The values of each setting that a search varies, by its dotted key."""
     space = {}
     for name, written in search.items():
         key = f"{path}{name}"
@@ -106,16 +86,7 @@ def _distribution(choices: Any = None, **values: Any) -> BaseDistribution:
 
 
 class Search:
-    """A search for settings, whose trials are trainings.
-
-    Args:
-        config: all settings.
-        overrides: of ``damian train``, for every trial.
-        folder: the run folder.
-
-    Raises:
-        InputError: the settings cannot be varied so, or the folder holds a search with other settings.
-    """
+    """A search for settings, whose trials are trainings."""
 
     def __init__(self, config: TuneConfig, overrides: list[str], folder: Path) -> None:
         self.config, self.overrides, self.folder = config, overrides, folder
@@ -188,15 +159,7 @@ class Search:
 def train_watched(
     config: TrainConfig, folder: Path, storage: str, number: int, pruner: optuna.pruners.BasePruner
 ) -> None:
-    """Train for a trial, and stop when it is pruned.
-
-    Args:
-        config: settings of the training.
-        folder: its run folder.
-        storage: address of Optuna's storage.
-        number: of the trial.
-        pruner: decides whether to stop.
-    """
+    """Train for a trial, and stop when it is pruned."""
     opened = optuna.storages.RDBStorage(storage)
     study = optuna.load_study(study_name=NAME, storage=opened, pruner=pruner)
     trial = opened.get_trial_id_from_study_id_trial_number(opened.get_study_id_from_name(NAME), number)
@@ -230,11 +193,7 @@ def search(config: TuneConfig, overrides: list[str], folder: Path) -> None:
 
 
 def report(found: Search) -> None:
-    """Write the table, and print how to train with the best settings.
-
-    Raises:
-        RunError: no trial has been finished.
-    """
+    """Write the table, and print how to train with the best settings."""
     trials = found.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL))
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     if not complete:

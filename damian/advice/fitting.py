@@ -53,11 +53,7 @@ class Fit(NamedTuple):
 
 
 def read_log(path: Path) -> list[Report]:
-    """The reports of a journal, or of a table with a column ``receive time``; each says when it came in.
-
-    Raises:
-        InputError: the file is something else, or there are fewer than two reports.
-    """
+    """The reports of a journal, or of a table with a column ``receive time``; each says when it came in."""
     if path.suffix == SUFFIX or path.name.endswith(".ended"):
         read_head(path)
         lines = [line for _, line in read_lines(path)]
@@ -82,9 +78,6 @@ def fit(reports: Iterable[Report]) -> Fit:
     Where reports of a UAV are numbered (``sequence``), a missing number is a lost message. Where they are
     not, but most come in whole periods, a gap of several periods has lost messages in it, unless the UAV was
     in the air, where it is silent. Else no loss can be seen.
-
-    Args:
-        reports: which say when they came in.
     """
     found: list[Message] = []
     kinds: set[str] = set()

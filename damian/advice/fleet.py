@@ -1,9 +1,7 @@
 """A fleet of real UAVs: reports come in, advice goes out.
 
-Time is divided into the steps of the training: step k lasts from ``start + k dt`` to ``start + (k + 1) dt``,
-where the start is the instant at which the oldest first report was generated. A message belongs to the step
-in which it was generated, and counts from the step in which it came in; its age is the number of steps since
-the former.
+Step k lasts from ``start + k dt`` on; the oldest first report was generated at the start. A message belongs
+to the step in which it was generated, and counts from the step in which it came in.
 """
 
 import math
@@ -138,12 +136,7 @@ class Fleet:
         return math.floor((time - (self.start or 0.0)) / self.node.dt + _ROUNDING)
 
     def check(self, report: Report, now: float | None = None) -> None:
-        """Check a report before it is added, at the time ``now`` [s], or None for one that is recorded.
-
-        Raises:
-            InputError: the UAV is of another fleet, its clock is wrong, the report is from another region, or
-                it came in so late that steps cannot be counted.
-        """
+        """Check a report before it is added, at the time ``now`` [s], or None for one that is recorded."""
         if report.id not in self.number:
             raise InputError(f"ID: {show(report.id)} is no UAV of this fleet: {listed(self.uavs)}")
         came = report.received if now is None else now
@@ -313,16 +306,8 @@ class Fleet:
     def choose(self, now: float, asking: Sequence[str] | None = None) -> Choice | None:
         """Let UAVs choose that have not yet in this step; nothing changes until they are told (``tell``).
 
-        Args:
-            now: the time [s].
-            asking: IDs of those that are ready; if not given, all that are not known to be in flight.
-
         Returns:
             What they have chosen; None if there are none.
-
-        Raises:
-            InputError: a UAV is of another fleet, or the fleet began too long ago.
-            Waiting: not every UAV has reported yet.
         """
         numbers = self.numbers_of(asking)
         self.advance(now)

@@ -72,14 +72,7 @@ Line = Received | Advised
 
 
 class Journal:
-    """A journal that can be appended to.
-
-    Args:
-        path: its file; an unfinished line at its end, which a killed process leaves, is removed.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
+    """A journal to append to; an unfinished last line, which a killed process leaves, is removed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -90,11 +83,7 @@ class Journal:
             os.ftruncate(self._file, self._end)
 
     def append(self, line: Head | Line) -> None:
-        """Write a line.
-
-        Raises:
-            RunError: it cannot be written, such as on a full disk; nothing of it is kept.
-        """
+        """Write a line, or nothing of it if that fails."""
         text = line.model_dump_json(by_alias=True, exclude_none=True).encode() + b"\n"
         with writing(self.path):
             os.ftruncate(self._file, self._end)  # what is left of a line that could not be written
@@ -108,21 +97,13 @@ class Journal:
 
 
 def read_head(path: Path) -> Head:
-    """The first line of a journal.
-
-    Raises:
-        InputError: it is no journal of this version.
-    """
+    """The first line of a journal."""
     with named(path):
         return validated(Head, parsed_json(_texts(path)[0]), "line 1")
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, Line]]:
-    """The lines after the first one, with their numbers; an unfinished one at the end is left out.
-
-    Raises:
-        InputError: the file cannot be read, or a line is damaged.
-    """
+    """The lines after the first one, with their numbers; an unfinished one at the end is left out."""
     with named(path):
         texts = _texts(path)
     for number, text in enumerate(texts[1:], 2):

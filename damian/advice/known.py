@@ -30,12 +30,7 @@ DIGITS = {DEGREES: 8, METRES: 3}
 
 
 class Ground:
-    """Landing points of a region, as reports and answers name places.
-
-    Args:
-        airspace: the first of its regions is flown over.
-        reach: longest distance of a reported place from the nearest landing point [m].
-    """
+    """Landing points of a region, as answers and reports, up to ``reach`` [m] beside them, name places."""
 
     def __init__(self, airspace: Airspace, reach: float) -> None:
         self.region, self.reach = airspace.regions[0], reach
@@ -119,13 +114,7 @@ class FilledReport:
 
 
 class UavLog:
-    """The reports of one UAV.
-
-    Args:
-        ground: landing points.
-        window: number of its latest landing points in a message.
-        n_readings: number of readings in a message.
-    """
+    """The reports of one UAV."""
 
     def __init__(self, ground: Ground, window: int, n_readings: int) -> None:
         self.ground, self.window, self.n_readings = ground, window, n_readings
@@ -138,11 +127,7 @@ class UavLog:
         return self.reports[-1] if self.reports else None
 
     def check(self, report: Report) -> None:
-        """Check what a report says of places and readings.
-
-        Raises:
-            InputError: a place is far from any landing point, or there is another number of readings.
-        """
+        """Check what a report says of places and readings."""
         if report.columns != self.ground.columns:
             own = ", ".join(self.ground.columns)
             raise InputError(f"places in {self.ground.region.name} are {own}: give those of {report.id} so")

@@ -1,8 +1,7 @@
 """The server node of a fleet whose messages are reported from outside, instead of sent by a simulation.
 
-It has the transforms that follow the delay in ``damian.envs.pipeline``, and takes steps as an environment
-does. So a policy observes the same, bit for bit, as in the simulation, if the same messages arrive at the
-same steps.
+It takes steps as an environment does. So a policy observes the same, bit for bit, as in the simulation, if
+the same messages arrive at the same steps.
 """
 
 from dataclasses import replace
@@ -58,13 +57,7 @@ class Reported(NamedTuple):
 
 
 class ReportedEnv(UavEnv):
-    """A single world of which nothing but messages is known; ``Node`` takes its steps.
-
-    Args:
-        scenario: all settings; its delays are not simulated.
-        seed: of the region, if the region is random.
-        reward_terms: whether a transform writes the weighted terms of the reward.
-    """
+    """A single world of which nothing but messages is known; ``Node`` takes its steps."""
 
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         extras = {"message", "reward_terms"} if reward_terms else {"message"}
@@ -98,14 +91,6 @@ class Node:
     """The server node of a fleet: what it remembers, and what it tells the UAVs in each step.
 
     Several fleets may share a node, because their memories are arguments and results of its methods.
-
-    Args:
-        scenario: settings of the training; its number of UAVs is that of the fleet.
-        seed: of the region, if the region is random.
-        reward_terms: compute the weighted terms of the reward too.
-
-    Raises:
-        InputError: the scenario lets UAVs compute observations that the server cannot know.
     """
 
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
@@ -145,14 +130,7 @@ class Node:
     def step(
         self, memories: Memories, reported: Reported, action: Tensor, chosen: Tensor
     ) -> tuple[Memories, TensorDictBase]:
-        """The memories and the outputs of a further step; the given memories stay as they are.
-
-        Args:
-            memories: after the step before.
-            reported: what the server learns in this step.
-            action: actions of the step before, [1, N, ...].
-            chosen: which UAVs chose one in the step before, [1, N] bool.
-        """
+        """Memories and outputs after actions [1, N, ...] that the ``chosen`` UAVs took in the step before."""
         memories = _copies(memories)
         for i, transform in enumerate(self.transforms):
             if isinstance(transform, Belief | MessageHistory):
@@ -177,9 +155,6 @@ def scenario_of_service(scenario: ScenarioConfig) -> ScenarioConfig:
     """The scenario as a server node outside the simulation can serve it.
 
     A UAV's own messages are known as late as all others (``observation.own``), and no step is skipped.
-
-    Raises:
-        InputError: observations do not come from a server node.
     """
     problem = "is not server: the service is the server node, and cannot know what links bring to a UAV"
     checks.require(scenario.links.kind == "server", "links", scenario.links.kind, problem)

@@ -1,9 +1,7 @@
 """The flight that a journal tells, as an episode, from which films, pages and GeoJSON are made.
 
-The server node applies the reports and decisions of the journal again, step by step, and so knows what it
-knew then. The positions of the UAVs are those that they reported, in hindsight: late reports count for the
-time when they were generated, and between two reports a UAV is taken to move on the straight way. Nobody
-knows where the source was.
+The server node takes the steps of the journal again. Positions are those that the UAVs reported, in
+hindsight, and between two reports on the straight way. Nobody knows where the source was.
 """
 
 import math
@@ -70,9 +68,6 @@ def episode_of(
         about: where the episode comes from; the IDs of the UAVs and the time of its first instant are added.
         span: first and last time to keep, since every UAV had reported [s]; all if not given.
         progress: shows how far the journal has been read, as ``tqdm.tqdm``.
-
-    Raises:
-        InputError: the journal is damaged, not every UAV has reported, or the span has no steps or too many.
     """
     view, reports = _read(path, fleet, span or (0.0, math.inf), progress)
     steps = np.array(view.steps)
@@ -134,11 +129,7 @@ def _take(fleet: Fleet, view: ServerView, line: Line, span: tuple[float, float])
 def _advance(
     fleet: Fleet, view: ServerView, now: float, span: tuple[float, float], is_last: bool = False
 ) -> None:
-    """Take the steps up to an instant, and note those in the span; the last one is noted at the end.
-
-    Raises:
-        InputError: there are more steps in the span than an episode may have.
-    """
+    """Take the steps up to an instant, and note those in the span; the last one is noted at the end."""
     if fleet.start is None:
         return
     start, dt = fleet.start, fleet.node.dt

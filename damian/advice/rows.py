@@ -133,15 +133,7 @@ class Report(BaseModel):
         return None if first is None else (first, second)
 
     def stamp(self, now: float, file: bool = False) -> None:
-        """Set the times that the report leaves open.
-
-        Args:
-            now: when it came in [s].
-            file: it is from a file, whose ``receive time`` counts.
-
-        Raises:
-            InputError: it says when it came in, and is not from a file.
-        """
+        """Set the times that the report leaves open; only one from a ``file`` may say when it came in."""
         said = self.model_fields_set
         if "received" in said and not file:
             raise InputError("receive time: only a table has it; the service looks at its own clock")
@@ -185,30 +177,18 @@ Rows = list[tuple[str, Report]]
 
 
 def read_file(path: Path) -> Rows:
-    """Reports of a file: JSON if its name ends with ``.json``, or else CSV.
-
-    Raises:
-        InputError: it cannot be read, or a row is wrong.
-    """
+    """Reports of a file: JSON if its name ends with ``.json``, or else CSV."""
     text = read_text(path)
     return read_json(text) if path.suffix.lower() == ".json" else read_csv(text)
 
 
 def read_csv(text: str) -> Rows:
-    """Reports of a CSV table.
-
-    Raises:
-        InputError: it is no table, or a row is wrong.
-    """
+    """Reports of a CSV table."""
     return _rows([(f"line {row.line}", row.cells) for row in parse_table(text, [])])
 
 
 def read_json(text: str | bytes) -> Rows:
-    """Reports of JSON: an object, or a list of objects.
-
-    Raises:
-        InputError: it is something else, or a row is wrong.
-    """
+    """Reports of JSON: an object, or a list of objects."""
     found = parsed_json(text)
     rows = found if isinstance(found, list) else [found]
     return _rows([(f"row {n}", row) for n, row in enumerate(rows, 1)])
@@ -221,11 +201,7 @@ def _rows(found: Sequence[tuple[str, Any]]) -> Rows:
 
 
 def parsed_json(text: str | bytes) -> Any:
-    """Parse JSON, without NaN and Infinity.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Parse JSON, without NaN and Infinity."""
     try:
         return from_json(text, allow_inf_nan=False)
     except ValueError as error:
@@ -236,11 +212,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def validated(model: type[Model], value: Any, where: str = "") -> Model:
-    """A value as a model.
-
-    Raises:
-        InputError: it is none; the line has the place, the field, the value and the first problem.
-    """
+    """A value as a model."""
     try:
         return model.model_validate(value)
     except ValidationError as error:

@@ -31,13 +31,7 @@ _CSV = "text/csv"
 
 
 def make_app(session: AdviceSession, token: str, clock: Callable[[], float] = time.time) -> Starlette:
-    """The service as an ASGI application.
-
-    Args:
-        session: the fleets.
-        token: of the service.
-        clock: the current time [s].
-    """
+    """The service as an ASGI application."""
     service = Service(session, token, clock)
     routes = [
         Route("/fleets/{name}", service.put, methods=["PUT"]),

@@ -1,10 +1,7 @@
 """Several fleets with their journals: what all sources of reports (tables, folders, HTTP) have in common.
 
-Each kind of request that changes a fleet does the same three things in this order: it checks, writes the line
-of the journal, and then changes the fleet. So nothing is acknowledged that the journal does not say, and a
-request that fails changes nothing. A new kind of request, such as an acknowledgement, is another method of
-``AdviceSession`` of this form, with its line in ``journal.py``, its part of ``replay``, and its route in
-``service.py``.
+Each request checks, writes the line of the journal, and then changes the fleet: nothing is acknowledged that
+the journal does not say, and a request that fails changes nothing.
 """
 
 import json
@@ -44,11 +41,6 @@ class AdviceSession:
         folder: of the journals; those in it are restored, and no other session may use it until this one is
             closed. None: nothing is kept.
         about: which policy advises by which settings, for the journals, as ``About``.
-
-    Raises:
-        InputError: a journal is damaged, or of another policy or other settings, or another session uses the
-            folder.
-        RunError: the folder cannot be written.
     """
 
     def __init__(
@@ -75,22 +67,13 @@ class AdviceSession:
             raise
 
     def fleet(self, name: str) -> Fleet:
-        """The fleet of a name.
-
-        Raises:
-            NoFleet: there is none.
-        """
+        """The fleet of a name."""
         if name not in self.fleets:
             raise NoFleet(f"fleet: there is no fleet {show(name)}")
         return self.fleets[name]
 
     def create(self, name: str, uavs: Any) -> bool:
-        """Create a fleet of UAVs with these IDs; returns whether it is new.
-
-        Raises:
-            InputError: the name or an ID is not valid, or the fleet exists with other UAVs.
-            RunError: the journal cannot be written; there is no such fleet.
-        """
+        """Create a fleet of UAVs with these IDs; returns whether it is new."""
         head = validated(Head, {"fleet": name, "uavs": uavs, "about": self.about})
         if name in self.fleets:
             if self.fleets[name].uavs != head.uavs:
@@ -105,11 +88,7 @@ class AdviceSession:
         return True
 
     def end(self, name: str, now: float) -> None:
-        """End a fleet; its journal stays, under another name.
-
-        Raises:
-            RunError: the journal cannot be renamed; the fleet goes on.
-        """
+        """End a fleet; its journal stays, under another name."""
         self.fleet(name)
         if journal := self._journals.get(name):
             with writing(journal.path):
@@ -121,18 +100,8 @@ class AdviceSession:
     def report(self, name: str, rows: Rows, now: float, file: bool = False) -> list[str]:
         """Take reports, all or none of them; the journal has them when this returns.
 
-        Args:
-            name: of the fleet.
-            rows: the reports.
-            now: when they came in [s].
-            file: they are from a file, whose column ``receive time`` counts.
-
         Returns:
             What was found of each, as ``Fleet.report`` says it.
-
-        Raises:
-            InputError: a row is wrong; none is taken.
-            RunError: the journal cannot be written; none is taken.
         """
         fleet = self.fleet(name)
         clock = now if file else max(now, fleet.clock)
@@ -149,13 +118,7 @@ class AdviceSession:
     def advise(
         self, name: str, now: float, asking: Sequence[str] | None = None, only: bool = False
     ) -> list[Advice]:
-        """Let the UAVs that ask (all, if None) choose, and say what all, or ``only`` those, were told last.
-
-        Raises:
-            InputError: a UAV is of another fleet, or the fleet began too long ago.
-            Waiting: not every UAV has reported yet.
-            RunError: the journal cannot be written; no UAV has chosen.
-        """
+        """Let the UAVs that ask (all, if None) choose; what all, or ``only`` those, were told last."""
         fleet = self.fleet(name)
         choice = fleet.choose(now, asking)
         if choice is not None:
@@ -204,11 +167,7 @@ class AdviceSession:
 
 
 def replay(fleet: Fleet, line: Line) -> None:
-    """Do again what a line of a journal says.
-
-    Raises:
-        InputError: it cannot have happened.
-    """
+    """Do again what a line of a journal says."""
     if isinstance(line, Received):
         for report in line.reports:
             fleet.check(report)
@@ -240,9 +199,6 @@ def check_same(then: About, now: About) -> None:
     """Check that a journal is of the policy and of the settings of this service.
 
     It keeps actions and steps, which mean something else with other settings.
-
-    Raises:
-        InputError: it is of others.
     """
     was, own = ({**_settings_of(a), "policy": a.policy, "checkpoint": a.checkpoint} for a in (then, now))
     differ = [
@@ -294,11 +250,7 @@ def read_inbox(session: AdviceSession, name: str, folder: Path, now: float) -> b
 
 
 def write_answer(folder: Path, answer: list[Advice]) -> str:
-    """Write the advice of a fleet into a folder, as ``ANSWERS``; returns its table.
-
-    Raises:
-        RunError: it cannot be written.
-    """
+    """Write the advice of a fleet into a folder, as ``ANSWERS``; returns its table."""
     write_atomically(folder / "advice.json", json.dumps(as_rows(answer), indent=1))
     write_atomically(folder / "advice.csv", table := as_csv(answer))
     return table

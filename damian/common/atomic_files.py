@@ -12,11 +12,7 @@ UNFINISHED = ".part"
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:
-    """Write a whole file, or leave the file of this name as it is.
-
-    Raises:
-        RunError: the file cannot be written, such as on a full disk.
-    """
+    """Write a whole file, or leave the file of this name as it is."""
     unfinished = path.with_name(path.name + UNFINISHED)
     with writing(path):
         try:
@@ -43,11 +39,7 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn an error of the file system that is raised inside into one line that names the path.
-
-    Raises:
-        RunError: there was such an error.
-    """
+    """Turn an error of the file system that is raised inside into one line that names the path."""
     try:
         yield
     except OSError as error:

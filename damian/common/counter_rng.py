@@ -1,11 +1,8 @@
 """Random numbers as a pure function of a key and counters: no generator, no hidden state.
 
-A key is a 64-bit integer (int64, so that it may be negative), one for each random stream. A stream draws
-the same numbers in a batch as alone, on any device and under ``torch.compile``. The hash is the mixing
-function of SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014;
-multipliers: D. Stafford's variant 13) of the counter, with the key added within it a second time: each
-key gives a sequence of its own, not another section of the sequence that all keys share. It is a third of
-the operations of Philox, and good enough for simulation, not for cryptography.
+A stream, with a key of 64 bits, draws the same numbers in a batch as alone, on any device and compiled. The
+hash is the mixing function of SplitMix64 (Steele, Lea and Flood 2014; multipliers: D. Stafford's variant 13)
+of the counter, with the key added within it again, so that each key gives a sequence of its own.
 """
 
 import hashlib

@@ -31,11 +31,7 @@ class Registry(Generic[T]):
         self._components: dict[str, T] = {}
 
     def register(self, name: str) -> Callable[[Component], Component]:
-        """Decorator that adds a component under a name.
-
-        Raises:
-            ValueError: the name is taken, or looks like a path.
-        """
+        """Decorator that adds a component under a name."""
 
         def add(component: Component) -> Component:
             if name in self._components or ":" in name:
@@ -46,11 +42,7 @@ class Registry(Generic[T]):
         return add
 
     def get(self, name: Any, key: str) -> T:
-        """The component of a name or path; ``key`` is that of the setting, for errors.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The component of a name or path; ``key`` is that of the setting, for errors."""
         if isinstance(name, str) and name in self._components:
             return self._components[name]
         if not isinstance(name, str) or ":" not in name:
@@ -62,11 +54,7 @@ class Registry(Generic[T]):
         return component
 
     def read(self, written: Any, key: str, entry: str) -> tuple[str, T, dict[str, Any]]:
-        """Read ``{entry: package.module:name, parameter: value, ...}``: name or path, component, parameters.
-
-        Raises:
-            InputError: it is no such mapping, or there is no such component.
-        """
+        """Name or path, component and parameters of ``{entry: package.module:name, parameter: ..., ...}``."""
         if not isinstance(written, Mapping) or entry not in written:
             raise InputError(f"{key}: {written} is not {{{entry}: package.module:name, parameter: value}}")
         path = written[entry]
@@ -86,11 +74,7 @@ class Registry(Generic[T]):
 
 
 def name_of(parameters: dict[str, Any], default: str, key: str) -> str:
-    """Take the entry ``name``, which tells components of one function apart, out of the parameters.
-
-    Raises:
-        InputError: it is no name of letters, digits and underscores.
-    """
+    """Take the entry ``name``, which tells components of one function apart, out of the parameters."""
     name = parameters.pop("name", default)
     checks.require(str(name).isidentifier(), f"{key}.name", name, "is not a name of letters, digits and _")
     return name
@@ -106,9 +90,6 @@ def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], pat
     """Require that the given parameters are keyword-only arguments of a function, and that none is missing.
 
     ``path`` is the name or path of the component, and ``key`` that of the setting, for errors.
-
-    Raises:
-        InputError: the function has no such parameter, or one without a default is not given.
     """
     accepted = inspect.signature(function).parameters
     known = {name: each for name, each in accepted.items() if each.kind is inspect.Parameter.KEYWORD_ONLY}
@@ -120,11 +101,7 @@ def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], pat
 
 
 def _import_path(path: str, key: str) -> Any:
-    """The object at ``package.module:Name``, also from a module of the current folder.
-
-    Raises:
-        InputError: the module cannot be imported, or has no such object.
-    """
+    """The object at ``package.module:Name``, also from a module of the current folder."""
     module_name, _, name = path.partition(":")
     folder = os.getcwd()
     if folder not in sys.path:

@@ -17,11 +17,7 @@ MAX_LINE = 1000
 
 
 def read_text(file: Path) -> str:
-    """Read a whole UTF-8 file as text, with or without a byte order mark.
-
-    Raises:
-        InputError: the file is missing, unreadable, empty or not UTF-8.
-    """
+    """Read a whole UTF-8 file as text, with or without a byte order mark."""
     if not file.is_file():  # reading a pipe would wait for ever
         raise InputError("is not a file" if file.exists() else "no such file")
     try:
@@ -43,12 +39,7 @@ class Row(NamedTuple):
 
 
 def parse_table(text: str, columns: Iterable[str]) -> list[Row]:
-    """Parse a CSV table with a header, which must have these columns; empty rows are left out.
-
-    Raises:
-        InputError: a quote stays open, a column is missing or doubled, or a row has more or fewer cells than
-            the header.
-    """
+    """Parse a CSV table with a header, which must have these columns; empty rows are left out."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]

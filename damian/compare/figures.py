@@ -210,10 +210,7 @@ def _curve_panel(
 def _band(
     runs: Sequence[Sequence[Mapping[str, float]]], name: str, progress: str
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Steps or episodes (``progress``) that all seeds reached, mean over seeds, ends of its 95 % interval.
-
-    Each is [_POINTS], NaN if there is none that all have reached; ``name`` is the measure.
-    """
+    """Steps or episodes (``progress``) that all seeds reached, mean over seeds, ends of its 95 % interval."""
     points = [np.array([(r[progress], r[name]) for r in run if not np.isnan(r[name])]) for run in runs]
     points = [run for run in points if len(run)]
     first = max((run[0, 0] for run in points), default=np.inf)

@@ -1,8 +1,6 @@
-"""Statistics of runs: normalised scores, recovery, interquartile mean, and their bootstrap intervals.
+"""Statistics of runs, vectorised over leading dimensions ``*``; higher scores are better.
 
-All functions are vectorised over leading dimensions ``*``, so that a statistic takes one sample or all
-resamples at once. Higher scores are better. Source of the stratified bootstrap and of the interquartile
-mean: Agarwal et al. 2021, arXiv 2108.13264.
+Source of the stratified bootstrap and of the interquartile mean: Agarwal et al. 2021, arXiv 2108.13264.
 """
 
 import math

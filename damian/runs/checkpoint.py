@@ -23,31 +23,14 @@ _PLAIN = (bool, int, float, str, bytes, torch.Size, torch.device, torch.dtype, t
 
 
 def write_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a checkpoint, completely or not at all; an older file of this name is replaced.
-
-    Args:
-        path: of the file.
-        content: nested mappings, lists and tuples of tensors, TensorDicts, numbers, strings and None.
-
-    Raises:
-        InputError: something else is in the content.
-        RunError: the file cannot be written.
-    """
+    """Write a checkpoint, completely or not at all; an older file of this name is replaced."""
     buffer = io.BytesIO()
     torch.save(plain(content), buffer)
     write_atomically(path, buffer.getvalue())
 
 
 def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
-    """Read a checkpoint, with all tensors on the CPU.
-
-    Args:
-        path: of the file.
-        key: the setting that names the file or its folder, for errors.
-
-    Raises:
-        InputError: the file is missing, damaged, or no checkpoint.
-    """
+    """Read a checkpoint, with all tensors on the CPU."""
     try:
         # torch does not compare checksums, so that a changed bit would be a silently wrong weight.
         whole = zipfile.ZipFile(path).testzip() is None
@@ -67,11 +50,7 @@ def digest(path: Path) -> str | None:
 
 
 def plain(value: Any) -> Any:
-    """A value without TensorDicts, and without tensors that hold on to a larger one.
-
-    Raises:
-        InputError: it is something that ``read_checkpoint`` would not read.
-    """
+    """A value without TensorDicts, and without tensors that hold on to a larger one."""
     if isinstance(value, Tensor):
         tensor = value.detach().cpu()
         # torch.save would write the whole storage that a view was cut from.
@@ -102,17 +81,7 @@ def to_tensordict(stored: Mapping[str, Any]) -> TensorDict:
 
 
 def restore(components: Mapping[str, Any], stored: Mapping[str, Any], path: Path, key: str) -> None:
-    """Restore components in place with their ``load_state_dict``.
-
-    Args:
-        components: by name.
-        stored: their states by name; further ones are not used.
-        path: of the checkpoint, for errors.
-        key: the setting that names the file or its folder, for errors.
-
-    Raises:
-        InputError: a component is missing, or does not fit.
-    """
+    """Restore components in place with their ``load_state_dict``; ``key`` is the setting of the file."""
     for name, component in components.items():
         if name not in stored:
             raise InputError(f"{key}: {path}: it has no {name}, only {', '.join(map(str, stored))}")

@@ -23,15 +23,6 @@ class MetricsLog:
     """Writes named numbers to ``metrics.csv``, TensorBoard and other loggers; a resumed run appends to them.
 
     All rows of the file have the same columns: a number that a row lacks is nan.
-
-    Args:
-        folder: the run folder.
-        tensorboard: whether to write TensorBoard events.
-        to_csv: whether to write ``metrics.csv``.
-        frames: environment steps, over all worlds, at the checkpoint from which the run resumes; rows of
-            later steps are dropped.
-        loggers: further loggers, which get every number.
-        settings: all settings by dotted key; hyperparameters for TensorBoard and the other loggers.
     """
 
     def __init__(
@@ -55,11 +46,7 @@ class MetricsLog:
         self._call("log_hparams", dict(self._settings))
 
     def add(self, frames: int, numbers: Mapping[str, float]) -> None:
-        """Log numbers by name, after so many environment steps over all worlds.
-
-        Raises:
-            RunError: a file cannot be written.
-        """
+        """Log numbers by name, after so many environment steps over all worlds."""
         for name, number in numbers.items():
             self._call("log_scalar", name, number, frames)
         row = {_FIRST_COLUMN: float(frames), **numbers}
@@ -121,9 +108,6 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
     """Read the rows of a run's ``metrics.csv``; an empty list if the file does not exist.
 
     A last line without an end is not read: a killed run leaves it behind.
-
-    Raises:
-        InputError: the file cannot be read, or is no table of numbers with a column ``frames``.
     """
     path = folder / METRICS
     if not path.exists():

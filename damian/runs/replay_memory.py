@@ -24,10 +24,6 @@ class ReplayMemory:
     up to (s + 1) R, and is written when all of them are stored and late messages can change none of them any
     more. The rows after the last segment are part of the state. A checkpoint thus costs as much as the new
     rows, however large the memory is.
-
-    Args:
-        buffer: on a ``TimeStorage``, with a round-robin writer (TorchRL's default); None: there is no memory.
-        folder: of the segments.
     """
 
     def __init__(self, buffer: ReplayBuffer | None, folder: Path) -> None:

@@ -57,13 +57,6 @@ def save_results(
 ) -> str:
     """Write evaluations by policy to ``result.csv`` and, as a Markdown table, to ``result.md``.
 
-    Args:
-        rows: evaluations by name of the policy.
-        folder: the run folder.
-        can_succeed: as for ``results_table``.
-        late: as for ``results_table``.
-        note: lines under the table, before those that explain its columns.
-
     Returns:
         the table, with the lines under it.
     """

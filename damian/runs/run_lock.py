@@ -15,16 +15,7 @@ LOCK = ".lock"
 
 @contextmanager
 def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
-    """Lock a folder for what is done inside; the lock ends with the process, however that ends.
-
-    Args:
-        folder: the run folder; without one there is nothing to lock.
-        key: the setting that names the folder, for errors.
-
-    Raises:
-        InputError: another process has locked it.
-        RunError: nothing can be written there.
-    """
+    """Lock a folder for what is done inside; the lock ends with the process, however that ends."""
     if not folder.is_dir():
         yield
         return

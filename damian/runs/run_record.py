@@ -22,13 +22,7 @@ PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy"
 
 
 def write_record(folder: Path, command: str, **entries: Any) -> None:
-    """Write the record of a run that begins; that of a resumed one gets the command in its list ``resumed``.
-
-    Args:
-        folder: the run folder.
-        command: the command line, to be run again in a shell.
-        entries: what else to keep of the first part of the run.
-    """
+    """Write the record of a run that begins; that of a resumed one gets the command in its ``resumed``."""
     part = {"command": command, "started": datetime.now(UTC).isoformat(timespec="seconds")}
     if record := read_record(folder):
         record["resumed"] = [*record.get("resumed", []), part]
@@ -83,13 +77,6 @@ def check_version(folder: Path, key: str) -> None:
     """Check that this minor version of damian has written a run folder, as its record says.
 
     Files change between minor versions, and no version reads those of another one.
-
-    Args:
-        folder: the run folder.
-        key: the setting that names it, for errors.
-
-    Raises:
-        InputError: another minor version has written it.
     """
     writer = str(read_record(folder).get("damian", damian.__version__))
     if writer.split(".")[:2] != damian.__version__.split(".")[:2]:

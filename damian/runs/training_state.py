@@ -42,13 +42,6 @@ class TrainingState:
     """All that changes during a training, stored in a run folder.
 
     A training that loads the state continues as if it had never stopped, bit for bit on a CPU.
-
-    Args:
-        folder: the run folder.
-        components: of the learner, by name.
-        collector: has reset its environment.
-        clock: the system clock.
-        buffer: replay buffer on a ``TimeStorage``, if there is one.
     """
 
     def __init__(
@@ -102,13 +95,7 @@ class TrainingState:
 
 
 def load_networks(written: Path, key: str, components: Mapping[str, Any]) -> None:
-    """Restore some components of a learner in place, such as its actor.
-
-    Args:
-        written: a run folder, or a checkpoint file in it.
-        key: the setting that names it, for errors.
-        components: by name.
-    """
+    """Restore some components of a learner in place, such as its actor."""
     path = checkpoint_file(written, key)
     restore(components, _content(path, key)["components"], path, key)
 

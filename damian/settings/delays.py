@@ -79,11 +79,7 @@ class LinkConfig(Settings):
         self.refuse(both, "range", "does not go with links.hears: leave out one of them")
 
     def check(self, n_agents: int) -> None:
-        """Check what is given for each pair of UAVs.
-
-        Raises:
-            InputError: there is not one entry for each receiver and sender, or it has another type.
-        """
+        """Check what is given for each pair of UAVs."""
         self.refuse(self.hears is not None and not is_matrix(self.hears), "hears", "is not a list")
         for name in ("delay", "loss", "hears"):
             rows = getattr(self, name)

@@ -164,11 +164,7 @@ class AdviseConfig(FlownPolicyConfig):
         check_token("token", self.token)
 
     def check_source(self) -> None:
-        """Require exactly one source of reports.
-
-        Raises:
-            InputError: there is none, or more than one, or a journal is named that nothing would write.
-        """
+        """Require exactly one source of reports."""
         given = [name for name in ("reports", "folder", "port", "fit") if getattr(self, name) is not None]
         problem = "is not the only one of reports=FILE, folder=FOLDER, port=NUMBER, fit=FILE: give one"
         checks.require(len(given) == 1, "reports", " and ".join(given) or "nothing", problem)

@@ -156,11 +156,7 @@ class Episode:
 
     @classmethod
     def load(cls, path: Path) -> "Episode":
-        """Read an episode from its file.
-
-        Raises:
-            InputError: the file does not hold an episode of this version, or its columns do not fit together.
-        """
+        """Read an episode from its file."""
         try:
             found = json.loads(read_text(path))
             if (found.get("schema"), found.get("version")) != (SCHEMA, VERSION):
@@ -176,11 +172,7 @@ class Episode:
             raise InputError(f"{path}: it is no episode of version {VERSION}: {problem}") from error
 
     def checked(self) -> "Episode":
-        """The episode itself.
-
-        Raises:
-            ValueError: a column has not as many instants as there are times, or time does not increase.
-        """
+        """The episode itself, if its columns have as many instants as there are times, which increase."""
         for name in COLUMNS:
             values = getattr(self, name)
             for each in values.values() if isinstance(values, Mapping) else [values]:
@@ -208,13 +200,7 @@ OUTPUTS = (
 
 
 def record(rollout: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> list[Episode]:
-    """The first episode of each world in a rollout.
-
-    Args:
-        rollout: of an environment with the extras ``message``, ``state`` and ``reward_terms``, [B, T].
-        env: the environment without delays.
-        about: where the episodes come from.
-    """
+    """The first episode of each world in a rollout [B, T] with the extras that ``OUTPUTS`` need."""
     episodes = []
     for world in range(len(rollout)):
         steps = cast(TensorDictBase, rollout[world].cpu())

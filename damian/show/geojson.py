@@ -33,10 +33,6 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
     with ``times`` [s] of its points), ``source track`` (if it is known), ``footprint`` and ``coverage`` (what
     its footprints have covered) of a UAV, ``believed position`` (with ``age_s``), and ``belief`` (a cell,
     with the ``probability`` that the source is in it). Across the antimeridian, longitudes go beyond 180.
-
-    Args:
-        episode: flown over a real region.
-        step: number of steps to write.
     """
     origin = origin_of(episode)
     features = [
@@ -47,11 +43,7 @@ def feature_collection(episode: Episode, step: int) -> dict[str, Any]:
 
 
 def origin_of(episode: Episode) -> tuple[float, float]:
-    """Latitude and longitude of the point (0, 0) of an episode [deg].
-
-    Raises:
-        InputError: the region has no place on Earth.
-    """
+    """Latitude and longitude of the point (0, 0) of an episode [deg]."""
     if episode.origin is None:
         problem = "its region has no latitude and longitude; fly over region=llanbedr, fir or geojson"
         raise InputError(f"geojson: {problem}")

@@ -1,8 +1,6 @@
-"""Replay pages: one HTML file that plays one or more episodes, needs no network, and lies beside them.
+"""Replay pages: one HTML file that plays one or more episodes, and needs no network.
 
-The page's own files are in ``page/``: a template, a style and ES modules, and the libraries that
-``make page-libraries`` has bundled. Here they are put into one file: an import map names every module as a
-data URL, so that each stays an ordinary module.
+An import map names every module of ``page/`` as a data URL, so that each stays an ordinary module.
 """
 
 import html

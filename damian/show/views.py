@@ -30,12 +30,7 @@ _CORNERS = 48
 
 
 class MapView:
-    """The region from above.
-
-    Args:
-        axis: where to draw.
-        episode: what to draw.
-    """
+    """The region from above."""
 
     def __init__(self, axis: Axes, episode: Episode) -> None:
         self.axis, self.radius = axis, episode.radius
@@ -80,12 +75,7 @@ class MapView:
 
 
 class SpaceView:
-    """The region and the space above it, which turns slowly.
-
-    Args:
-        axis: where to draw, with projection ``3d``.
-        episode: what to draw.
-    """
+    """The region and the space above it, which turns slowly."""
 
     def __init__(self, axis: Any, episode: Episode) -> None:
         self.axis, self.radius = axis, episode.radius

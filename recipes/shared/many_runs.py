@@ -109,12 +109,7 @@ def check_stored(run: Run) -> None:
 
 
 class SlurmJobs:
-    """Carries out runs as Slurm jobs, through submitit.
-
-    Args:
-        folder: gets the files of submitit; all machines must see it.
-        parameters: of submitit's executor; ``cluster: local`` starts processes of this machine instead.
-    """
+    """Carries out runs as Slurm jobs, or with ``cluster: local`` as processes, through submitit."""
 
     def __init__(self, folder: Path, parameters: Mapping[str, Any]) -> None:
         options = {"cluster": "slurm", "cpus_per_task": 1, "name": "damian", **parameters}
@@ -140,14 +135,7 @@ class SlurmJobs:
 def perform_all(
     runs: Sequence[Run], processes: int, told: tuple[str, str], slurm: SlurmJobs | None = None
 ) -> list[Run]:
-    """Carry out the runs that are not finished; returns those that failed.
-
-    Args:
-        runs: those that train come first, and then those that fly the policies.
-        processes: number of runs at the same time.
-        told: policy and measure of the latest run that the progress bar shows.
-        slurm: carries out the runs, if they are not carried out on this machine.
-    """
+    """Carry out the runs that are not finished; returns those that failed. The bar shows ``told``."""
     todo, failed = [run for run in runs if not run.finished], []
     with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
         for trains in (True, False):
@@ -165,9 +153,7 @@ def perform_each(
 ) -> Iterator[tuple[Run, BaseException | None]]:
     """Carry out runs, taken one by one as processes become free; yields each with its error, or None.
 
-    Raises:
-        KeyboardInterrupt: after Ctrl-C or SIGTERM, when every training run has written a checkpoint.
-        RunError: a worker process was killed.
+    After Ctrl-C or SIGTERM it raises ``KeyboardInterrupt``, when every training has written a checkpoint.
     """
     before = signal.signal(signal.SIGTERM, interrupt)  # batch systems send it
     try:

@@ -43,13 +43,6 @@ def prepared(
 
     A resumed run goes on in its own folder with its own settings; only ``frames`` and ``episodes`` may
     change. The overrides of the run that ``checkpoint`` names apply too, unless others are given.
-
-    Args:
-        program: one of ``SCHEMAS``.
-        words: overrides on the command line.
-        own_folder: a folder with configuration files of the user's own.
-        folder: the run folder that the command line names.
-        again: the folder may hold what the same command has left there.
     """
     given = composed(program, words, own_folder)
     words = [word for word in words if not key_of(word).startswith("hydra")]
@@ -135,14 +128,7 @@ def run_folder(written: Path) -> Path:
 
 
 def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[str] = ()) -> TrainConfig:
-    """The settings of the run in a folder.
-
-    Args:
-        folder: the run folder.
-        key: the setting that names the folder, for errors.
-        trust: whether components of other code that the file names may be imported.
-        named: words of the command line, whose components may be imported.
-    """
+    """The settings of the run in a folder; the other arguments are those of ``require_trust``."""
     file = folder / CONFIG
     if not file.is_file():
         raise InputError(f"{key}: {folder} holds no {CONFIG}, so there is no run")
@@ -171,7 +157,8 @@ def require_trust(found: Any, key: str, trust: bool, named: Sequence[str]) -> No
     """Refuse components of other code that stored settings name, unless the caller has named or trusts them.
 
     Importing ``package.module:Name`` runs the module, and a stored file may come from anybody. So nothing is
-    made of ``found``, the stored settings, before. The other arguments are those of ``stored_config``.
+    made of ``found``, the stored settings, before. ``key`` is the setting that names them, and ``named`` are
+    the words of the command line.
     """
     typed = " ".join(named)
     foreign = [path for path in _components(found) if path not in typed]
@@ -223,12 +210,6 @@ def inherited(
 
     The policy keeps its histories of actions and messages, because it observes them, even if a file of the
     stored run's scenario or an option of ``delay`` says otherwise.
-
-    Args:
-        stored: settings of the stored run.
-        before: overrides of the stored run.
-        given: those of the new program.
-        own: keys with another default in this program.
     """
     keys = [*map(key_of, given), *own]
     history = [] if {"delay.history", "aware"} & {*keys} else [f"delay.history={stored.delay.history}"]
