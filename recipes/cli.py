@@ -209,10 +209,7 @@ def settings(*overrides: str, program: str = "train", own_folder: str | None = N
 
 
 def check(program: str, given: Namespace) -> str:
-    """Check a command line as far as that goes without torch; returns its settings as YAML.
-
-    The settings of a sweep are checked run by run, and those beside stored ones when these have been read.
-    """
+    """The settings of a command line as YAML, checked as far as that goes without torch."""
     if given.multirun or {"checkpoint", "resume"} & set(map(key_of, given.overrides)):
         return ""
     found = composed(program, given.overrides, given.config_dir)

@@ -26,7 +26,6 @@ from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.envs.pipeline import has_message_delay
 from damian.runs.interrupt import end_interrupted
-from damian.settings import TrainConfig
 from damian.settings.programs import SEEDS, CompareConfig
 
 from . import cli, oracle
@@ -44,11 +43,7 @@ POLICIES = {"sampled": TRAINED, "deterministic": TRAINED_DETERMINISTIC}
 
 
 def plan(config: CompareConfig, folder: Path) -> list[Run]:
-    """Every run with its checked configuration.
-
-    Seed comes after seed, so that a comparison that was stopped has about as many of each arm. What flies
-    the policies of other runs comes last.
-    """
+    """Every run with its checked settings: seed after seed, and last what flies others' policies."""
     tasks, delays = config.chosen("tasks"), {NOT_LATE: [], **config.chosen("delays")}
     places = {task: (task, overrides) for task, overrides in tasks.items()}
     for name, held_out in config.experiment.held_out.items():
@@ -62,15 +57,6 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
         if arm.delayed == (delay != NOT_LATE) and (arm.tasks is None or task in arm.tasks)
         for run in _seeds(config, folder / place / delay / name, task, [*task_overrides, *delay_overrides])
     ]
-    _check_policies(runs)
-    succeeds = any(run.config.episode.success_share is not None for run in runs)
-    should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
-    checks.require(succeeds or "success" not in config.score, "score", config.score, should)
-    return sorted(runs, key=lambda run: (not run.trains, run.config.seed))
-
-
-def _check_policies(runs: Sequence[Run]) -> None:
-    """Check that every policy fits where other arms, or held-out tasks, fly it."""
     by_folder = {run.folder: run.config for run in runs}
     for run in runs:
         if run.policy is not None:
@@ -78,6 +64,10 @@ def _check_policies(runs: Sequence[Run]) -> None:
                 check_policy_fits(run.config, by_folder[run.policy])
             except InputError as error:
                 raise InputError(f"{run.task}/{run.delay}/{run.arm}: {error}") from None
+    succeeds = any(run.config.episode.success_share is not None for run in runs)
+    should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
+    checks.require(succeeds or "success" not in config.score, "score", config.score, should)
+    return sorted(runs, key=lambda run: (not run.trains, run.config.seed))
 
 
 def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list[str]) -> Iterator[Run]:
@@ -112,10 +102,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         yield Run(task, delay, name, seeded, folder / seed_folder, program, trains=program is train)
 
 
-@cache  # several arms differ only in whose policy they fly; Hydra takes a fifth of a second
-def _composed(*overrides: str) -> TrainConfig:
-    """The settings of a training with these overrides."""
-    return cli.settings(*overrides)
+_composed = cache(cli.settings)  # several arms differ only in whose policy they fly; Hydra takes 0.2 s
 
 
 def includes(config: CompareConfig, row: Row) -> bool:
@@ -164,11 +151,14 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
 def compare(config: CompareConfig, folder: Path) -> None:
     """Carry out the runs of a comparison that are not finished, and report on them."""
     failed: list[Run] = []
-    if config.report_only and _stores_results(config, folder):
+    has_runs = any((folder / task).exists() for task in config.experiment.tasks)
+    if config.report_only and (folder / ROWS).exists() and not has_runs:
         results, missing = stored_results(folder, partial(includes, config)), []
     else:
-        if config.report_only and config.seeds is None:
-            config = replace(config, seeds=_seeds_of_runs(config, folder))
+        if config.report_only and config.seeds is None:  # all up to the last one with a run
+            names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))
+            last = max((int(name) for name in names if name.isdecimal()), default=-1)
+            config = replace(config, seeds=max(last - config.experiment.first_seed + 1, 0) or None)
         results, missing, failed = _results_of_runs(config, folder)
     if not results.rows:
         raise InputError(f"experiment: no run of it is finished in {folder}; leave out report_only")
@@ -177,18 +167,6 @@ def compare(config: CompareConfig, folder: Path) -> None:
     print(f"results: {cli.shown(folder)}")
     if failed:
         sys.exit(1)
-
-
-def _stores_results(config: CompareConfig, folder: Path) -> bool:
-    """Has a folder the results of a comparison, but none of its runs?"""
-    return (folder / ROWS).exists() and not any((folder / task).exists() for task in config.experiment.tasks)
-
-
-def _seeds_of_runs(config: CompareConfig, folder: Path) -> int | None:
-    """Number of seeds from the experiment's first one to the last one with a run; None if there is no run."""
-    names = (path.name.removeprefix("seed_") for path in folder.glob("*/*/*/seed_*"))
-    later = (int(name) - config.experiment.first_seed for name in names if name.isdecimal())
-    return max((n + 1 for n in later if n >= 0), default=None)
 
 
 def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list[str], list[Run]]:

@@ -66,11 +66,7 @@ def make_eval_env(config: TrainConfig) -> DelayedEnv:
 def report(
     config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module | None = None
 ) -> Evaluation:
-    """Evaluate an actor beside an untrained one, the script and random actions; write and print the results.
-
-    Returns:
-        The evaluation of the random policy in the same episodes.
-    """
+    """Evaluate an actor beside others, write and print the results; returns those of random actions."""
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
         env.set_seed(config.eval_seed)  # the same episodes for every policy
@@ -92,10 +88,7 @@ def report(
 
 
 def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:
-    """The network of the actor, with its prior, as it is before the first update of a training.
-
-    Its weights are those with which a training of the same seed begins, unless that began with a checkpoint.
-    """
+    """The actor, with its prior, as a training of the same seed begins with it."""
     with torch.random.fork_rng(devices=[]), own_code(config.learner.name):
         torch.manual_seed(config.seed)
         return config.learner.make_actor(env, config.model)

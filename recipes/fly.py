@@ -18,7 +18,6 @@ from tqdm import tqdm
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common import checks
-from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env
 from damian.envs.uav_env import EXTRAS
 from damian.learners.recurrent import add_recurrent_state
@@ -42,7 +41,11 @@ def fly(config: FlyConfig) -> list[Episode]:
         return [episode_of_journal(config)]
     env = make_env(config.eval_scenario, config.eval_episodes, config.eval_seed, config.device, EXTRAS)
     likely = config.flown == "deterministic"
-    policy = make_policy(config, env)
+    if config.learnt:
+        policy: TensorDictModuleBase = stored_actor(config, env)
+        add_recurrent_state(env, policy)
+    else:
+        policy = greedy_policy(env) if config.flown == "script" else random_policy(env)
     with set_exploration_type(ExplorationType.DETERMINISTIC if likely else ExplorationType.RANDOM):
         rollout = env.rollout(config.horizon, policy, break_when_any_done=False)
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "seed": config.seed}
@@ -81,15 +84,6 @@ def episode_of_journal(config: FlyConfig) -> Episode:
     about = {"policy": head.about.policy, "checkpoint": head.about.checkpoint}
     about |= {"overrides": list(config.overrides), "fleet": head.fleet}
     return episode_of(path, fleet, about, span, partial(tqdm, unit=" lines", delay=1))
-
-
-def make_policy(config: FlyConfig, env: DelayedEnv) -> TensorDictModuleBase:
-    """The policy that flies."""
-    if not config.learnt:
-        return greedy_policy(env) if config.flown == "script" else random_policy(env)
-    actor = stored_actor(config, env)
-    add_recurrent_state(env, actor)
-    return actor
 
 
 def kept(episodes: list[Episode], which: str) -> dict[str, Episode]:
@@ -133,7 +127,7 @@ def summary(name: str, episode: Episode) -> str:
     )
 
 
-def fly_or_show(config: FlyConfig, folder: Path) -> None:
+def fly_or_replay(config: FlyConfig, folder: Path) -> None:
     """Replay or fly episodes, or take the flight of a journal with the settings by which it was advised."""
     films = "mp4" not in config.formats or FFMpegWriter.isAvailable()
     checks.require(films, "formats", "mp4", "needs the program ffmpeg, which is not there; choose gif")
@@ -147,7 +141,7 @@ def fly_or_show(config: FlyConfig, folder: Path) -> None:
 
 def run() -> None:
     """Run the program with the words of the command line."""
-    cli.run(fly_or_show, "fly")
+    cli.run(fly_or_replay, "fly")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from damian.envs.pipeline import has_message_delay, make_env
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import save_results
 from damian.server.belief import SourceGrid
-from damian.settings import ScenarioConfig, TrainConfig
+from damian.settings import TrainConfig
 
 from . import cli
 from .shared.runs import save_config
@@ -58,19 +58,14 @@ def script_rows(config: TrainConfig) -> dict[str, Evaluation]:
         for knows in (False, True)
     )
     undelayed = replace(late, delay=replace(config.delay, obs=0, loss=0.0, hold="none"))
-    flights = (late, False), (own, False), (undelayed, False), (undelayed, True)
-    return {
-        known: _script(config, scenario, true_place)
-        for known, (scenario, true_place) in zip(KNOWN_ON_TIME, flights, strict=True)
-    }
-
-
-def _script(config: TrainConfig, scenario: ScenarioConfig, true_place: bool) -> Evaluation:
-    env = make_env(scenario, config.eval_episodes, config.eval_seed, config.device, ["message", "state"])
-    script: TensorDictModuleBase = greedy_policy(env)
-    if true_place:
-        script = TensorDictSequential([true_belief(env), script])  # type: ignore[list-item]
-    return evaluate(env, script, config.horizon)
+    flights, rows = [(late, False), (own, False), (undelayed, False), (undelayed, True)], {}
+    for known, (scenario, true_place) in zip(KNOWN_ON_TIME, flights, strict=True):
+        env = make_env(scenario, config.eval_episodes, config.eval_seed, config.device, ["message", "state"])
+        script: TensorDictModuleBase = greedy_policy(env)
+        if true_place:
+            script = TensorDictSequential([true_belief(env), script])  # type: ignore[list-item]
+        rows[known] = evaluate(env, script, config.horizon)
+    return rows
 
 
 def true_belief(env: DelayedEnv) -> TensorDictModule:

@@ -18,7 +18,6 @@ from tqdm import tqdm
 from damian import keys
 from damian.common import checks
 from damian.common.errors import RunError
-from damian.common.threads import using_threads
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay
 from damian.keys import next_key
@@ -54,7 +53,10 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
     collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
     state = TrainingState(folder, learner.components(), collector, clock, buffer)
     begin(config, state)
-    log = open_log(config, state)
+    loggers, settings = make_loggers(config.logger.custom, folder), dict(leaves(config))
+    log = MetricsLog(
+        folder, config.logger.tensorboard, config.logger.csv, state.progress.frames, loggers, settings
+    )
     with closing(log), closing(progress_bar(config, state)) as bar, Interrupt() as interrupt:
         for batch in ticks(collector, clock, env.server) if not enough(config, state) else ():
             numbers = update(config, learner, state, log, batch)
@@ -114,10 +116,7 @@ def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
 
 
 def begin(config: TrainConfig, state: TrainingState) -> None:
-    """Load what the run continues or starts from, and write the files with which a run folder begins.
-
-    A folder with a configuration has a checkpoint, whenever the run is stopped.
-    """
+    """Load what the run continues or starts from, and write the first checkpoint and then the settings."""
     if config.resume:
         state.load()
     elif config.checkpoint:
@@ -138,14 +137,19 @@ def update(
     episodes.add(batch)
     progress.frames += batch.numel()
     progress.updates += 1
+    threads = torch.get_num_threads()
     try:
-        with own_code(config.learner.name), using_threads(config.learning_threads):
+        torch.set_num_threads(config.learning_threads)
+        with own_code(config.learner.name):
             losses = {name: float(number) for name, number in learner.learn(batch).items()}
     except (ValueError, RuntimeError):  # torch's distributions refuse a nan
         check_convergence(config, state, {})
         raise
+    finally:
+        torch.set_num_threads(threads)
     means = {"episodes": float(episodes.finished), **episodes.means()}
-    numbers = {**means, **mean_terms(batch), **losses}
+    terms = cast(TensorDictBase, batch[next_key(keys.REWARD_TERMS)])
+    numbers = {**means, **{f"reward/{name}": x.mean().item() for name, x in terms.items()}, **losses}
     log.add(progress.frames, numbers)
     check_convergence(config, state, losses)
     return numbers
@@ -177,19 +181,6 @@ def show(bar: tqdm, config: TrainConfig, state: TrainingState) -> None:
 def enough(config: TrainConfig, state: TrainingState) -> bool:
     """Has the run reached ``config.frames`` or ``config.episodes``?"""
     return state.progress.frames >= config.frames or state.episodes.finished >= (config.episodes or torch.inf)
-
-
-def mean_terms(batch: TensorDictBase) -> dict[str, float]:
-    """Mean of each weighted reward term (eq. 5-8) over the steps, worlds and UAVs of a batch [B, T]."""
-    terms = cast(TensorDictBase, batch[next_key(keys.REWARD_TERMS)])
-    return {f"reward/{name}": term.mean().item() for name, term in terms.items()}
-
-
-def open_log(config: TrainConfig, state: TrainingState) -> MetricsLog:
-    """The files and loggers that get the numbers of each update."""
-    loggers, log_to = make_loggers(config.logger.custom, state.folder), config.logger
-    frames, settings = state.progress.frames, dict(leaves(config))
-    return MetricsLog(state.folder, log_to.tensorboard, log_to.csv, frames, loggers, settings)
 
 
 def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, interrupt: Interrupt) -> bool:

@@ -2,6 +2,8 @@
 
 damian tune scenario=delaybench/tracking delay=paper aware=belief trials=30 processes=2
 damian tune aware=both "search.learner.gamma.choices=[0.9,0.99]" "+search.delay.history={low: 1, high: 8}"
+
+All trials have the same seed: what they find must be shown with other seeds (damian compare).
 """
 
 import functools
@@ -18,9 +20,8 @@ from tqdm import tqdm
 
 from damian.common import checks
 from damian.common.atomic_files import write_atomically
-from damian.common.csv_table import csv_table
 from damian.common.errors import InputError, RunError
-from damian.common.markdown import markdown_table
+from damian.common.tables import csv_table, markdown_table
 from damian.runs.interrupt import end_interrupted
 from damian.settings import TrainConfig
 from damian.settings.programs import TuneConfig
@@ -178,20 +179,6 @@ def train_watched(
         print("pruned")
 
 
-def search(config: TuneConfig, overrides: list[str], folder: Path) -> None:
-    """Carry out the trials that are missing, and report on all of them."""
-    found = Search(config, overrides, folder)
-    done = found.n_finished
-    with tqdm(total=config.trials, initial=done, unit=" trials", disable=done >= config.trials) as bar:
-        for run, error in perform_each(found.runs(), config.processes):
-            value = found.tell(run, error)
-            bar.set_postfix({config.score: "-" if value is None else f"{value:.3g}"})
-            bar.update()
-            if error is not None:
-                print(f"failed: {run.folder}: {cli.reason(error)}", file=sys.stderr)
-    report(found)
-
-
 def report(found: Search) -> None:
     """Write the table, and print how to train with the best settings."""
     trials = found.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL))
@@ -221,14 +208,23 @@ def report(found: Search) -> None:
 
 
 def search_all(config: TuneConfig, folder: Path) -> None:
-    """Search for settings until there are as many trials as were asked for."""
+    """Search for settings until there are as many trials as were asked for, and report on all of them."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     check_learning(config)
     overrides = [word for word in config.overrides if key_of(word).split(".")[0] not in OWN]
+    found = Search(config, overrides, folder)
+    done = found.n_finished
     try:
-        search(config, overrides, folder)
+        with tqdm(total=config.trials, initial=done, unit=" trials", disable=done >= config.trials) as bar:
+            for run, error in perform_each(found.runs(), config.processes):
+                value = found.tell(run, error)
+                bar.set_postfix({config.score: "-" if value is None else f"{value:.3g}"})
+                bar.update()
+                if error is not None:
+                    print(f"failed: {run.folder}: {cli.reason(error)}", file=sys.stderr)
     except KeyboardInterrupt as error:
         end_interrupted(error)
+    report(found)
     print(f"results: {folder}")
 
 

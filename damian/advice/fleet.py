@@ -60,11 +60,6 @@ class Decision:
     duration: float
     """Expected duration of the flight [s]."""
 
-    @property
-    def expires(self) -> float:
-        """When the landing point is no longer booked, unless the UAV reports to be there [s]."""
-        return self.time + 2 * self.duration + GRACE
-
 
 class Choice(NamedTuple):
     """What UAVs have chosen, and have not been told yet."""
@@ -84,12 +79,8 @@ class Waiting(Exception):
 class Fleet:
     """The server node of one fleet, and the policy that it asks.
 
-    Args:
-        node: for as many UAVs; fleets may share it, because it remembers nothing of them.
-        uavs: IDs of the UAVs, in the order in which they book landing points.
-        policy: from observations to actions.
-        drawn: actions are drawn; if not, the most likely ones are taken.
-        seed: of these draws.
+    Fleets may share a node, which remembers nothing of them. UAVs book landing points in the order of their
+    IDs. With ``drawn``, actions are drawn by ``seed``; if not, the most likely ones are taken.
     """
 
     def __init__(
@@ -125,7 +116,10 @@ class Fleet:
         """Outputs of this step, and the messages ``sent`` that are held in it; None until they are needed."""
         self.sent: Messages | None = None
         self.first_step = self.last_arrival = 0
-        self.hidden = self.hidden_after = _no_hidden(policy, len(self.uavs))
+        modules = policy.modules() if isinstance(policy, torch.nn.Module) else ()
+        sizes = [each.cell.hidden_size for each in modules if isinstance(each, AgentGRU)]
+        self.hidden = self.hidden_after = torch.zeros(1, len(self.uavs), sizes[0]) if sizes else None
+        """Hidden states of a recurrent policy before and after this step, [1, N, H]."""
         self._forget_choices()
         self.previous = self.action, self.chosen
 
@@ -153,12 +147,7 @@ class Fleet:
             raise InputError(f"time: the fleet began more than {LIFE:g} s ago: end it, and begin a new one")
 
     def report(self, report: Report) -> str:
-        """Add a checked report.
-
-        Returns:
-            ``new``, ``late`` (an older one, which is kept in its place), ``duplicate`` (one that was
-            generated at the same time came in before), or ``old`` (generated before the fleet began).
-        """
+        """Add a checked report; it is ``new``, ``late``, ``duplicate``, or ``old`` (before the start)."""
         self.advance(report.received)  # what comes in late fills in no earlier step
         uav = self.number[report.id]
         log = self.logs[uav]
@@ -230,7 +219,8 @@ class Fleet:
             return
         last = self.step_of(now)
         while self.step < last:
-            if self.before is not None and self._is_idle():
+            quiet = self.step >= self.last_arrival + SILENT_STEPS
+            if self.before is not None and quiet and not self.chosen.any() and not self.previous[1].any():
                 following = min([last, *(due for due, _, _ in self.pending)])
                 self.before = self.node.skip(self.before, following - self.step)
             else:
@@ -242,11 +232,6 @@ class Fleet:
             self.hidden, self.step, self.outputs, self.arrived = self.hidden_after, following, None, []
             self._forget_choices()
             self._collect()
-
-    def _is_idle(self) -> bool:
-        """Whether the step changes nothing: there was no report for long, and nobody has chosen."""
-        quiet = self.step >= self.last_arrival + SILENT_STEPS
-        return quiet and not self.chosen.any() and not self.previous[1].any()
 
     def _observe(self) -> TensorDictBase:
         """The outputs of the step, from what has arrived by now."""
@@ -299,16 +284,13 @@ class Fleet:
             return held.target
         if held.step <= decision.step:
             return decision.goal
-        return held.target if asks or self.clock > decision.expires else decision.goal
+        expired = self.clock > decision.time + 2 * decision.duration + GRACE
+        return held.target if asks or expired else decision.goal
 
     # Advice.
 
     def choose(self, now: float, asking: Sequence[str] | None = None) -> Choice | None:
-        """Let UAVs choose that have not yet in this step; nothing changes until they are told (``tell``).
-
-        Returns:
-            What they have chosen; None if there are none.
-        """
+        """What UAVs choose that have not yet in this step; nothing changes until they are told (``tell``)."""
         numbers = self.numbers_of(asking)
         self.advance(now)
         if self.start is None:
@@ -416,10 +398,3 @@ class Fleet:
     def _age(self, filled: FilledReport | None) -> float | None:
         """Age of a report [s]."""
         return None if filled is None else round(max(self.clock - filled.report.time, 0.0), 3)
-
-
-def _no_hidden(policy: Any, n_uavs: int) -> Tensor | None:
-    """Hidden states of a recurrent policy at the beginning, [1, N, H]; None if it is not recurrent."""
-    modules = policy.modules() if isinstance(policy, torch.nn.Module) else ()
-    sizes = [each.cell.hidden_size for each in modules if isinstance(each, AgentGRU)]
-    return torch.zeros(1, n_uavs, sizes[0]) if sizes else None

@@ -182,33 +182,27 @@ class UavLog:
         filled.battery = battery if report.battery is None else report.battery
         filled.readings = readings if report.readings is None else report.readings
         filled.spotted = report.source_spotted and not report.flies
-        self._fill_detection(filled, before)
+        place = report.place("source_")
+        if filled.spotted:
+            filled.detected, filled.detected_at = filled.step, filled.point
+        elif report.source_time is None:
+            if before is not None:
+                filled.detected, filled.detected_at = before.detected, before.detected_at
+        elif place is not None:
+            filled.detected_at = near(place)
+        else:
+            held = before and before.detected_at
+            filled.detected_at = filled.point if held is None else held
         filled.motions = 0 if before is None or before.spotted else before.motions
         filled.motions += before is not None
         if report.motions is not None:
             filled.motions = report.motions
-        filled.trail = self._trail(filled, before)
-
-    def _fill_detection(self, filled: FilledReport, before: FilledReport | None) -> None:
-        place = filled.report.place("source_")
-        if filled.spotted:
-            filled.detected, filled.detected_at = filled.step, filled.point
-        elif filled.report.source_time is None:
-            if before is not None:
-                filled.detected, filled.detected_at = before.detected, before.detected_at
-        elif place is not None:
-            filled.detected_at = self.ground.landing_point(place)
-        else:
-            held = before and before.detected_at
-            filled.detected_at = filled.point if held is None else held
-
-    def _trail(self, filled: FilledReport, before: FilledReport | None) -> tuple[int, ...]:
         trail = list(before.trail) if before else []
-        if filled.report.previous is not None:
-            trail = [filled.point, *map(self.ground.landing_point, filled.report.previous)]
+        if report.previous is not None:
+            trail = [filled.point, *map(near, report.previous)]
         elif trail[:1] != [filled.point]:
             trail = [filled.point, *trail]
-        return tuple([*trail, *[trail[-1]] * self.window][: self.window])
+        filled.trail = tuple([*trail, *[trail[-1]] * self.window][: self.window])
 
 
 def messages_of(reports: Sequence[FilledReport], server: Server, points: Tensor, dt: float) -> Messages:

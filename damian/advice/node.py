@@ -88,10 +88,7 @@ class ReportedEnv(UavEnv):
 
 
 class Node:
-    """The server node of a fleet: what it remembers, and what it tells the UAVs in each step.
-
-    Several fleets may share a node, because their memories are arguments and results of its methods.
-    """
+    """The server node of a fleet; several may share it, because memories are arguments and results."""
 
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         scenario = scenario_of_service(scenario)
@@ -114,10 +111,7 @@ class Node:
 
     @torch.no_grad()
     def begin(self, reported: Reported) -> tuple[Memories, TensorDictBase]:
-        """The memories and the outputs of the first step, in which the first message of every UAV is known.
-
-        The number of the step is in ``reported.state``, and need not be 0.
-        """
+        """Memories and outputs of the first step, of any number, when every UAV has sent a message."""
         outputs = self.worlds.outputs_of(reported, first=True)
         everywhere = torch.ones(1, 1, dtype=torch.bool)
         memories, outputs = begin(self.transforms, _copies(self._unused), outputs, everywhere)
@@ -152,10 +146,7 @@ def _copies(memories: Memories) -> Memories:
 
 
 def scenario_of_service(scenario: ScenarioConfig) -> ScenarioConfig:
-    """The scenario as a server node outside the simulation can serve it.
-
-    A UAV's own messages are known as late as all others (``observation.own``), and no step is skipped.
-    """
+    """The scenario that a service can serve: own messages are known as late as others, no step is skipped."""
     problem = "is not server: the service is the server node, and cannot know what links bring to a UAV"
     checks.require(scenario.links.kind == "server", "links", scenario.links.kind, problem)
     return replace(

@@ -18,7 +18,7 @@ from torch import Tensor
 from damian import keys
 from damian.advice.fitting import fit
 from damian.advice.fleet import Decision, Fleet
-from damian.advice.journal import Line, Received, read_lines
+from damian.advice.journal import Received, read_lines
 from damian.advice.rows import Place, Report, written
 from damian.advice.session import replay
 from damian.common.errors import InputError
@@ -62,18 +62,16 @@ def episode_of(
 ) -> Episode:
     """The flight of a journal as an episode; ``source`` and ``emits`` are None.
 
-    Args:
-        path: the journal.
-        fleet: a new one of its UAVs, whose node writes the terms of the reward; its policy is not asked.
-        about: where the episode comes from; the IDs of the UAVs and the time of its first instant are added.
-        span: first and last time to keep, since every UAV had reported [s]; all if not given.
-        progress: shows how far the journal has been read, as ``tqdm.tqdm``.
+    The fleet is a new one, whose node writes the terms of the reward; ``span`` is the first and last time to
+    keep, since every UAV had reported [s], and ``progress`` is like ``tqdm.tqdm``.
     """
     view, reports = _read(path, fleet, span or (0.0, math.inf), progress)
     steps = np.array(view.steps)
     truth = [_hindsight(fleet, reports[uav], steps) for uav in range(len(fleet.uavs))]
     columns = {name: np.stack([each[name] for each in truth], 1) for name in truth[0]}
-    columns["target"] = _targets(fleet, view.told, columns["position"][0, :, :2], steps)
+    columns["target"] = np.tile(columns["position"][0, :, :2], (len(steps), 1, 1))
+    for uav, decision in view.told:
+        columns["target"][steps > decision.step, uav] = fleet.ground.points[decision.goal]
     columns["sent"], columns["delay"] = _messages(fleet, view, reports, steps)
     columns |= {name: _stacked(getattr(view, name)) for name in ("believed", "age", "reward")}
     columns["sent"][0], columns["reward"][0] = False, 0.0
@@ -104,7 +102,10 @@ def _read(
     for number, line in progress(list(read_lines(path))):
         with named(f"{path}: line {number}"):
             if fleet.step <= end:
-                _take(fleet, view, line, span)
+                _advance(fleet, view, line.received if isinstance(line, Received) else line.asked, span)
+                replay(fleet, line)
+                told = () if isinstance(line, Received) else [fleet.number[uav] for uav in line.told]
+                view.told += [(uav, cast(Decision, fleet.decision(uav))) for uav in told]
             if fleet.start is not None:
                 end = fleet.first_step + span[1] / fleet.node.dt
             for report in line.reports if isinstance(line, Received) else ():
@@ -116,14 +117,6 @@ def _read(
         whole = f"the journal covers 0 to {(fleet.step - fleet.first_step) * fleet.node.dt:g} s"
         raise InputError(f"span: no step lies between {span[0]:g} and {span[1]:g} s: {whole}")
     return view, reports
-
-
-def _take(fleet: Fleet, view: ServerView, line: Line, span: tuple[float, float]) -> None:
-    """Apply the reports or decisions of a line, after the steps before it."""
-    _advance(fleet, view, line.received if isinstance(line, Received) else line.asked, span)
-    replay(fleet, line)
-    for uav in () if isinstance(line, Received) else line.told:
-        view.told.append((fleet.number[uav], cast(Decision, fleet.decision(fleet.number[uav]))))
 
 
 def _advance(
@@ -195,16 +188,6 @@ def _course(position: Floats) -> Floats:
     east, north, _ = np.diff(position, axis=0, prepend=position[:1]).T
     moved = [float(np.arctan2(*way)) if any(way) else None for way in zip(east, north, strict=True)]
     return _filled(moved, 0.0) % (2 * np.pi)
-
-
-def _targets(
-    fleet: Fleet, told: Sequence[tuple[int, Decision]], begin: Floats, steps: NDArray[np.int64]
-) -> Floats:
-    """Landing points that the UAVs were told by then, [S, N, 2]; where they began before."""
-    targets = np.tile(begin, (len(steps), 1, 1))
-    for uav, decision in told:
-        targets[steps > decision.step, uav] = fleet.ground.points[decision.goal]
-    return targets
 
 
 def _messages(

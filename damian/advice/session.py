@@ -36,11 +36,8 @@ class NoFleet(InputError):
 class AdviceSession:
     """The fleets of a service.
 
-    Args:
-        make_fleet: makes the fleet of UAVs with these IDs.
-        folder: of the journals; those in it are restored, and no other session may use it until this one is
-            closed. None: nothing is kept.
-        about: which policy advises by which settings, for the journals, as ``About``.
+    The ``folder`` of journals is locked until ``close``, and the fleets in it are restored if they are of the
+    policy and settings ``about``; with None nothing is kept.
     """
 
     def __init__(
@@ -98,11 +95,7 @@ class AdviceSession:
         del self.fleets[name]
 
     def report(self, name: str, rows: Rows, now: float, file: bool = False) -> list[str]:
-        """Take reports, all or none of them; the journal has them when this returns.
-
-        Returns:
-            What was found of each, as ``Fleet.report`` says it.
-        """
+        """Take reports, all or none, and write them to the journal; returns what ``Fleet.report`` found."""
         fleet = self.fleet(name)
         clock = now if file else max(now, fleet.clock)
         for where, report in rows:
@@ -196,11 +189,14 @@ def _taken(fleet: Fleet, reports: Sequence[Report]) -> list[str]:
 
 
 def check_same(then: About, now: About) -> None:
-    """Check that a journal is of the policy and of the settings of this service.
+    """Check that a journal is of this policy and these settings, on which its actions depend."""
 
-    It keeps actions and steps, which mean something else with other settings.
-    """
-    was, own = ({**_settings_of(a), "policy": a.policy, "checkpoint": a.checkpoint} for a in (then, now))
+    def settings(about: About) -> dict[str, str | None]:
+        parts = [word.lstrip("+").partition("=") for word in about.overrides]
+        kept = {key: value for key, _, value in parts if key.split(".")[0] not in MAY_DIFFER}
+        return {**kept, "policy": about.policy, "checkpoint": about.checkpoint}
+
+    was, own = settings(then), settings(now)
     differ = [
         f"{key}: {was.get(key, 'not given')} then, {own.get(key, 'not given')} now"
         for key in {**was, **own}
@@ -208,12 +204,6 @@ def check_same(then: About, now: About) -> None:
     ]
     if differ:
         raise InputError(f"it is of other settings: {'; '.join(differ)}: give the same")
-
-
-def _settings_of(about: About) -> dict[str, str | None]:
-    """What overrides set, by key, without what may differ; the last one of a key counts."""
-    parts = [word.lstrip("+").partition("=") for word in about.overrides]
-    return {key: value for key, _, value in parts if key.split(".")[0] not in MAY_DIFFER}
 
 
 # A folder as a source of reports: every table that is put into it is read once, and answered there.
@@ -224,14 +214,10 @@ DONE, REFUSED, REASON = ".done", ".refused", ".refused.txt"
 
 
 def read_inbox(session: AdviceSession, name: str, folder: Path, now: float) -> bool:
-    """Read the tables that have come into a folder, in the order of their names, and answer them.
+    """Read the tables that have come into a folder, in the order of their names, and answer them, if any.
 
-    A table must appear complete: write it under a name that begins with a dot, and rename it. The answer is
-    ``advice.csv`` and ``advice.json`` in the folder. A table becomes ``NAME.done``, or if it is wrong and so
-    changes nothing ``NAME.refused`` beside ``NAME.refused.txt``, in place of an earlier one of that name.
-
-    Returns:
-        Whether there was any table.
+    A table, complete when it appears, becomes ``NAME.done``, or if it is wrong and so changes nothing
+    ``NAME.refused`` beside ``NAME.refused.txt``.
     """
     tables = [each for each in sorted(folder.glob("[!.]*")) if each.suffix.lower() in (".csv", ".json")]
     tables = [each for each in tables if each.name not in ANSWERS and each.is_file()]

@@ -7,7 +7,7 @@ long before a computer refuses a number.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from typing import Any, TypeGuard
 
 from damian.common.errors import InputError
 
@@ -37,8 +37,8 @@ def require(condition: bool, key: str, value: Any, should: str) -> None:
 def in_range(key: str, value: float, low: float, high: float | None = None, unit: str = "") -> None:
     """Require a number ``low <= value <= high``; without ``high``, the largest number of the unit."""
     most = max(low, LARGEST.get(unit, HUGE)) if high is None else high
-    good = _is_number(value) and low <= value <= most
-    one_sided = high is None and not (_is_number(value) and most < value < math.inf)
+    good = is_number(value) and low <= value <= most
+    one_sided = high is None and not (is_number(value) and most < value < math.inf)
     bounds = f"at least {low:g}" if one_sided else f"between {low:g} and {most:g}"
     require(good, key, f"{value} {unit}".strip(), f"is not {bounds} {unit}".strip())
 
@@ -52,7 +52,7 @@ def whole(key: str, value: Any, low: int, high: float | None = None, unit: str =
 
 def above(key: str, value: float, low: float, unit: str = "") -> None:
     """Require a number above ``low``, by ``TINY`` at least, up to the largest number of the unit."""
-    good = _is_number(value) and low < value < math.inf
+    good = is_number(value) and low < value < math.inf
     require(good, key, f"{value} {unit}".strip(), f"is not above {low:g} {unit}".strip())
     in_range(key, value, low + TINY, max(low + TINY, LARGEST.get(unit, HUGE)), unit)
 
@@ -65,11 +65,7 @@ def seed(key: str, value: Any, low: int | None = None) -> None:
 
 
 def seconds(key: str, value: str | float, zero: bool = False) -> float:
-    """Convert a time to seconds: ``"2s"``, ``"0.5m"``, ``"1h"``, or a bare number of seconds.
-
-    Raises:
-        InputError: the value is no time, below 0 s, 0 s unless ``zero``, or longer than ``SECONDS``.
-    """
+    """Convert ``"2s"``, ``"0.5m"``, ``"1h"``, or a number to seconds, which are 0 only with ``zero``."""
     text = str(value).strip()
     number, unit = (text[:-1], text[-1]) if text[-1:] in _SECONDS else (text, "s")
     try:
@@ -83,7 +79,7 @@ def seconds(key: str, value: str | float, zero: bool = False) -> float:
 
 def place(key: str, value: Any) -> None:
     """Require a position ``[x, y]`` of two numbers [m] between ``-METRES`` and ``METRES``."""
-    good = isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value))
+    good = isinstance(value, Sequence) and len(value) == 2 and all(map(is_number, value))
     require(good and all(map(math.isfinite, value)), key, value, "is not [x, y] in metres")
     require(all(abs(v) <= METRES for v in value), key, value, f"is not within {METRES:g} m of the origin")
 
@@ -132,5 +128,6 @@ def device(key: str, value: str) -> None:
     require(value in available, key, value, f"is not one of the devices here: {', '.join(available)}")
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
+    """Is a value a number, and neither true nor false?"""
     return isinstance(value, int | float) and not isinstance(value, bool)

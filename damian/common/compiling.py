@@ -9,13 +9,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class CompiledMethods:
-    """The methods of an object, each compiled at its first call.
+    """The methods of an object, each compiled at its first call, with the options of ``compiled``.
 
-    A copy, and what a pickle is read as, has the same options but no graphs: these belong to the object whose
-    methods they were made from, so that the copy of this object compiles its own.
-
-    Args:
-        options: keyword arguments of ``torch.compile``, as in ``compiled``.
+    A copy, and what a pickle is read as, has no graphs: these belong to the object of the methods.
     """
 
     def __init__(self, options: dict[str, Any]) -> None:
@@ -34,12 +30,7 @@ class CompiledMethods:
 
 
 def compiled(function: Function, **options: Any) -> Function:
-    """Compile a function as one graph.
-
-    Args:
-        function: a pure function of tensors that returns tensors.
-        options: keyword arguments of ``torch.compile``; they replace the defaults, which are tuned for a CPU.
-    """
+    """Compile a pure function of tensors as one graph; ``options`` replace the defaults, tuned for a CPU."""
     options = options or {"options": _INDUCTOR}
     # Recompiles are isolated, so that a function never runs a graph compiled for another's settings.
     return torch.compile(  # type: ignore[call-overload]

@@ -17,11 +17,9 @@ _FIRST, _SECOND = -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15
 
 
 def bits64(key: Tensor, *counters: Tensor) -> Tensor:
-    """Draw 64 random bits as int64, one for each element of the broadcast shape of key and counters.
+    """Draw 64 random bits, int64, one for each element of the broadcast shape of key and counters.
 
-    Args:
-        key: random stream, int64.
-        counters: whole numbers, int64, that tell the draws of a stream apart; their order matters.
+    Counters are int64 and tell the draws of a stream apart; their order matters.
     """
     for counter in counters:
         product = _product(key, counter)

@@ -9,9 +9,7 @@ from torch import Tensor
 def data_dependent(device: torch.device) -> bool:
     """Whether shapes and branches may depend on data, so that only the rows that need it are worked on.
 
-    On a CPU this saves work. Any other device would have to finish all of its work first, to tell the CPU how
-    many rows there are: there, all rows are worked on, and a mask chooses. So does a compiled graph, except
-    for its custom operators.
+    Any device but a CPU would first have to finish all work to tell how many: there a mask chooses.
     """
     return device.type == "cpu"
 

@@ -8,10 +8,7 @@ from pathlib import Path
 
 
 class InputError(ValueError):
-    """Wrong input; ``str(error)`` is one line with the key or place, the value, its unit and the remedy.
-
-    A recipe prints that line and exits with code 2; any other error keeps its traceback.
-    """
+    """Wrong input, in one line with key, value, unit and remedy; a recipe prints it and exits with code 2."""
 
 
 RUN_ERROR = 3
@@ -19,19 +16,12 @@ RUN_ERROR = 3
 
 
 class RunError(RuntimeError):
-    """A run that cannot go on: a full disk, or numbers that are not finite; ``str(error)`` is one line.
-
-    A recipe prints that line and exits with code ``RUN_ERROR``.
-    """
+    """A run that cannot go on, in one line; a recipe prints it and exits with code ``RUN_ERROR``."""
 
 
 @contextmanager
 def naming_errors(name: str) -> Iterator[None]:
-    """Turn an error that the first call of a component of the user's own raises into an ``InputError``.
-
-    Its line has the name (such as ``delay.obs: law rush:BusyHour``), the error, and the
-    file and line of the component. An ``InputError`` or a ``RunError`` stays as it is.
-    """
+    """Turn what a component of the user's own raises into an ``InputError`` with its name, file and line."""
     try:
         yield
     except (InputError, RunError):

@@ -87,10 +87,7 @@ def require_parentheses(first: Any, written: str) -> None:
 
 
 def check_parameters(function: Callable[..., Any], given: Mapping[str, Any], path: str, key: str) -> None:
-    """Require that the given parameters are keyword-only arguments of a function, and that none is missing.
-
-    ``path`` is the name or path of the component, and ``key`` that of the setting, for errors.
-    """
+    """Require that ``given`` are the keyword-only arguments of a function; ``path`` names it in errors."""
     accepted = inspect.signature(function).parameters
     known = {name: each for name, each in accepted.items() if each.kind is inspect.Parameter.KEYWORD_ONLY}
     for name, value in given.items():

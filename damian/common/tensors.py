@@ -20,14 +20,7 @@ def expand_mask(mask: Tensor, like: Tensor) -> Tensor:
 
 
 def next_true(flags: Tensor) -> Tensor:
-    """Index of the next true flag at or after each place, T if there is none.
-
-    Args:
-        flags: in order of time, [T, ...] bool.
-
-    Returns:
-        as ``flags``, int64.
-    """
+    """Index of the next true flag at or after each place, T if there is none; flags [T, ...] by time."""
     n_flags = len(flags)
     index = expand_mask(torch.arange(n_flags, device=flags.device), flags)
     return torch.where(flags, index, n_flags).flip(0).cummin(0).values.flip(0)

@@ -215,10 +215,7 @@ class Comparison:
         return _mean(scores, self.score) if scores else UNKNOWN
 
     def scores(self, task: str, delay: str) -> dict[str, dict[int, float]]:
-        """Scores by arm and seed, with the sign that makes higher ones better.
-
-        First come the undelayed arm and the random policy, both without delay.
-        """
+        """Scores by arm and seed, higher ones better; first come undelayed and random, without delay."""
         sign = -1 if self.score in LESS_IS_BETTER else 1
         sources = {self.undelayed: (NOT_LATE, self.undelayed, self.policy)}
         sources[RANDOM] = (NOT_LATE, self.undelayed, RANDOM)
@@ -250,10 +247,7 @@ class Comparison:
         return Compared(seeds, {**found, "of_oracle": _ratio(scores[arm], oracle)})
 
     def pairs(self, task: str, delay: str) -> dict[tuple[str, str], Estimate]:
-        """Probability that a run of one delayed arm beats one of another, with its score interval, by names.
-
-        Seeds are those that both have finished; there is no entry for arms that share none.
-        """
+        """Probability that a run of one delayed arm beats one of another, over their common seeds."""
         scores = dict(list(self.scores(task, delay).items())[2:])
         found = {}
         for one, other in permutations(scores, 2):

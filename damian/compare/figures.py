@@ -55,13 +55,7 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
 
     One task has a row of panels for each delay, with return, success rate and steps; of several tasks, each
     has a row with its returns under each delay. A curve is the mean over seeds, with its 95 % band. Dashed
-    lines: the random policy and, where known, the best possible value; dotted lines: arms that train nothing.
-
-    Args:
-        comparison: comparison to draw.
-        curves: measures of the runs in training.
-        best: best possible values, by measure.
-        path: image file.
+    lines: the random policy and the ``best`` possible values; dotted lines: arms that train nothing.
     """
     grid = [row for row in _panels(comparison, curves) if row]
     if not grid:
@@ -86,10 +80,7 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
 
 
 def plot_norms(comparison: Comparison, path: Path) -> None:
-    """Draw J_norm of each arm under each delay, with its 95 % interval, in a panel for each task.
-
-    A task in which no J_norm is known has no panel; if it is known in none, there is no figure.
-    """
+    """Draw J_norm of each arm under each delay, with 95 % intervals, in a panel for each task with any."""
     norms = {task: found for task in comparison.tasks() if (found := _known_norms(comparison, task))}
     if not norms:
         path.unlink(missing_ok=True)  # an older one would show other runs
@@ -121,16 +112,10 @@ def plot_norms(comparison: Comparison, path: Path) -> None:
 
 
 def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], path: Path) -> None:
-    """Draw the score of arms over the delays of the first task, with 95 % intervals.
+    """Draw the score of the arms of each panel over the delays of the first task, with 95 % intervals.
 
-    Below it, in a column with a naive arm, stands the recovery of the others; in a column without one their
-    share of the score of the script that knows all messages on time. Dashed lines: the undelayed arm and the
-    random policy, without delay; dotted: that script.
-
-    Args:
-        comparison: comparison to draw.
-        panels: arms of each column, by its title.
-        path: image file.
+    Below stands the recovery, or without a naive arm the share of the script's score that knows all messages
+    on time (dotted). Dashed lines: the undelayed arm and the random policy, without delay.
     """
     task = comparison.tasks()[0]
     delays = comparison.delays(task)

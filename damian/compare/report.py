@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from damian.common.markdown import markdown_table
+from damian.common.tables import markdown_table
 from damian.compare.comparison import (
     COMPARED,
     HELD_OUT_MARK,

@@ -34,18 +34,8 @@ def recovery(
 ) -> Floats:
     """Share of the delay's cost that a method wins back, ``(aware - naive) / (undelayed - naive)``.
 
-    All scores are means over seeds, and broadcast against each other.
-
-    Args:
-        aware: score of the method that takes the delay into account.
-        naive: score of the best arm that does not.
-        undelayed: score of the arm without delay.
-        random: score of the random policy without delay.
-        least: smallest ``(undelayed - naive) / (undelayed - random)`` for which there is a recovery.
-
-    Returns:
-        the recovery; nan where undelayed - naive is not positive or smaller than ``least`` allows, or where
-        undelayed does not beat random.
+    All scores are means over seeds, and broadcast against each other. It is nan where undelayed - naive is
+    not positive or less than ``least`` of undelayed - random, or where undelayed does not beat random.
     """
     gap = np.asarray(undelayed - naive, dtype=float)
     enough = (gap > 0) & (undelayed > random) & (gap >= least * (undelayed - random))
@@ -67,15 +57,9 @@ def interquartile_mean(values: Floats) -> Floats:
 
 
 def resampled(scores: Floats, draws: int, seed: int = 0) -> Floats:
-    """Draw seeds with replacement, in each stratum separately; all arms of a stratum get the same draws.
+    """Draw seeds with replacement for each stratum, a task with all its arms, which get the same draws.
 
-    Args:
-        scores: scores by seed, [strata, *, seeds]; a stratum is a task with all its arms.
-        draws: number of resamples.
-        seed: seed of the random draws.
-
-    Returns:
-        the resampled scores, [draws, strata, *, seeds].
+    Scores are [strata, *, seeds], and the result is [draws, strata, *, seeds].
     """
     strata, n_seeds = scores.shape[0], scores.shape[-1]
     drawn = np.random.default_rng(seed).integers(n_seeds, size=(draws, strata, n_seeds))
@@ -96,13 +80,9 @@ def interval(values: Floats) -> tuple[Floats, Floats]:
 
 
 def probability_of_improvement(scores: Floats, others: Floats) -> Floats:
-    """Probability that a run of one method beats a run of another, drawn with any two seeds, [*].
+    """Probability that a run of one method beats a run of another, [*], from scores by seed, [*, seeds] each.
 
     It is the share of all pairs of runs in which the first has the higher score; equal scores count half.
-
-    Args:
-        scores: scores of the first method by seed, [*, seeds].
-        others: scores of the second method by seed, [*, seeds].
     """
     difference = scores[..., :, None] - others[..., None, :]
     return ((np.sign(difference) + 1) / 2).mean((-2, -1))
@@ -144,7 +124,7 @@ def bootstrap(
         scores: scores by seed, [strata, ..., seeds].
         draws: number of resamples.
         seed: seed of the random draws.
-        bounds: smallest and largest value that the statistic can have, such as 0 and 1 for a mean of shares.
+        bounds: smallest and largest value that the statistic can have.
     """
     value = np.asarray(statistic(scores), dtype=float)
     strata, n_seeds = scores.shape[0], scores.shape[-1]

@@ -52,11 +52,7 @@ def make_loggers(written: Sequence[Any], folder: Path) -> list[Logger]:
 
 
 def check_loggers(written: Sequence[Any]) -> None:
-    """Check settings of loggers, each ``package.module:Name`` or ``{logger: package.module:Name, ...}``.
-
-    Raises:
-        InputError: a logger does not exist, or has no such parameter.
-    """
+    """Check loggers, each ``package.module:Name`` or ``{logger: package.module:Name, ...}``."""
     for each in written:
         _read(each)
 
@@ -71,10 +67,7 @@ def _read(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
 def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Logger:
     """A run of Weights & Biases, named as the run folder; a resumed training continues it.
 
-    Args:
-        folder: the run folder, which gets ``wandb/``.
-        project: the run's project.
-        offline: keep everything in the folder, for ``wandb sync``; so does the variable WANDB_MODE=offline.
+    With ``offline``, or WANDB_MODE=offline, the folder keeps everything for ``wandb sync``.
     """
     try:
         library = import_module("wandb")

@@ -55,13 +55,9 @@ EVALUATED = tuple(field.name.rstrip("_") for field in fields(Evaluation))
 
 @torch.no_grad()
 def evaluate(env: DelayedEnv, policy: nn.Module, horizon: int, sample: bool = True) -> Evaluation:
-    """Fly one episode in every world, for at most ``horizon`` steps.
+    """Fly one episode of at most ``horizon`` steps in every world of an environment with ``message``.
 
-    Args:
-        env: environment of B worlds, with ``message`` among its extras.
-        policy: chooses the actions.
-        horizon: number of steps after which an episode that has not ended is cut.
-        sample: draw actions from the policy's distribution, instead of the most likely ones.
+    With ``sample``, actions are drawn from the policy's distribution, else the most likely ones are taken.
     """
     add_recurrent_state(env, policy)
     mode = ExplorationType.RANDOM if sample else ExplorationType.DETERMINISTIC
@@ -140,11 +136,9 @@ def _mean(numbers: Tensor) -> float:
 
 
 class EpisodeLog:
-    """Exponential means over the episodes that ended in the training batches.
+    """Means over the episodes of the training; each new one multiplies the earlier ones by ``factor``.
 
-    Args:
-        factor: by which each new episode multiplies the weight of all earlier ones; 0.991 in the paper's
-            Figures 5 and 6.
+    It is 0.991 in the paper's Figures 5 and 6.
     """
 
     NAMES = ("perceived_return", "perceived_success_rate", "perceived_steps")

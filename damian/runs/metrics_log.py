@@ -22,7 +22,7 @@ _FIRST_COLUMN = "frames"
 class MetricsLog:
     """Writes named numbers to ``metrics.csv``, TensorBoard and other loggers; a resumed run appends to them.
 
-    All rows of the file have the same columns: a number that a row lacks is nan.
+    A number that a row lacks is nan; rows after ``frames``, where a run resumes, are dropped.
     """
 
     def __init__(
@@ -105,10 +105,7 @@ class MetricsLog:
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """Read the rows of a run's ``metrics.csv``; an empty list if the file does not exist.
-
-    A last line without an end is not read: a killed run leaves it behind.
-    """
+    """The rows of a run's ``metrics.csv``, if there is one, without an unfinished last line."""
     path = folder / METRICS
     if not path.exists():
         return []

@@ -18,12 +18,10 @@ SEGMENTS = 32
 
 
 class ReplayMemory:
-    """The steps of a replay buffer, as a component of a checkpoint.
+    """The steps of a replay buffer, as a component of a checkpoint, which costs as much as the new steps.
 
-    Row k is step k of all worlds, counted from the beginning of the training. Segment s has the rows from s R
-    up to (s + 1) R, and is written when all of them are stored and late messages can change none of them any
-    more. The rows after the last segment are part of the state. A checkpoint thus costs as much as the new
-    rows, however large the memory is.
+    Row k is step k of all worlds since the beginning of the training. Segment s has the rows from s R up to
+    (s + 1) R, and is written when late messages cannot change them any more; later rows are in the state.
     """
 
     def __init__(self, buffer: ReplayBuffer | None, folder: Path) -> None:

@@ -5,8 +5,7 @@ import math
 from pathlib import Path
 
 from damian.common.atomic_files import write_atomically
-from damian.common.csv_table import csv_table
-from damian.common.markdown import markdown_table
+from damian.common.tables import csv_table, markdown_table
 from damian.runs.metrics import EVALUATED, Evaluation
 
 FIGURE = "learning_curve.png"
@@ -55,11 +54,7 @@ server [steps]; late and lost: shares of the messages."""
 def save_results(
     rows: dict[str, Evaluation], folder: Path, can_succeed: bool, late: bool, note: str = ""
 ) -> str:
-    """Write evaluations by policy to ``result.csv`` and, as a Markdown table, to ``result.md``.
-
-    Returns:
-        the table, with the lines under it.
-    """
+    """Write evaluations by policy to ``result.csv`` and, as the returned table, to ``result.md``."""
     below = "\n".join(filter(None, [note, LATE if late else ""]))
     table = results_table(rows, can_succeed, late) + (f"\n\n{below}" if below else "")
     write_atomically(folder / TABLE, table + "\n")
@@ -69,15 +64,7 @@ def save_results(
 
 
 def results_table(rows: dict[str, Evaluation], can_succeed: bool, late: bool = False) -> str:
-    """Evaluations of several policies as a Markdown table, with a line for each policy.
-
-    Args:
-        rows: evaluations by name of the policy; those of NAME``, deterministic`` get columns of the line of
-            NAME.
-        can_succeed: whether the task can succeed; if so, success rate and steps are shown.
-        late: whether messages are delayed; if so, the return that the server perceived, the age of
-            information and the shares of late and lost messages are shown too.
-    """
+    """Evaluations of policies as a Markdown table; NAME``, deterministic`` gives columns of NAME's line."""
     columns = {"success rate": "success_rate", "steps": "steps"} if can_succeed else {}
     columns |= {"return": "return"}
     has_both = any(name.endswith(DETERMINISTIC) for name in rows)

@@ -33,8 +33,3 @@ def locked(folder: Path, key: str = "hydra.run.dir") -> Iterator[None]:
         with suppress(OSError):  # Windows cannot delete an open file
             (folder / LOCK).unlink()
         lock.release()
-
-
-def is_empty(folder: Path) -> bool:
-    """Is there no folder, or one with nothing in it but the file of its lock?"""
-    return not folder.is_dir() or all(path.name == LOCK for path in folder.iterdir())

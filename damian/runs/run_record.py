@@ -74,10 +74,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def check_version(folder: Path, key: str) -> None:
-    """Check that this minor version of damian has written a run folder, as its record says.
-
-    Files change between minor versions, and no version reads those of another one.
-    """
+    """Check that this minor version of damian wrote a run folder; no version reads files of another one."""
     writer = str(read_record(folder).get("damian", damian.__version__))
     if writer.split(".")[:2] != damian.__version__.split(".")[:2]:
         here = f"this is damian {damian.__version__}"

@@ -39,10 +39,7 @@ class Progress:
 
 
 class TrainingState:
-    """All that changes during a training, stored in a run folder.
-
-    A training that loads the state continues as if it had never stopped, bit for bit on a CPU.
-    """
+    """All that changes in a training, stored in a run folder: resumed, it goes on bit for bit on a CPU."""
 
     def __init__(
         self,

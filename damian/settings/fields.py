@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import UnionType
-from typing import Any, ClassVar, TypeGuard, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Union, get_args, get_origin, get_type_hints
 
 from damian.common import checks
 
@@ -40,13 +40,7 @@ class Rule:
 
 
 def setting(default: Any, meaning: str = "", **rule: Any) -> Any:
-    """A field of a dataclass of settings.
-
-    Args:
-        default: a list, mapping or dataclass is copied for every instance.
-        meaning: as of ``Rule``, for ``--help`` and the documentation.
-        rule: the other fields of ``Rule``.
-    """
+    """A field of settings: its default, copied for every instance, and the fields of its ``Rule``."""
     unit = re.search(r"\[([^\[\]]+)\]\.$", meaning)
     metadata = {"rule": Rule(meaning, **{"unit": unit[1] if unit else "", **rule})}
     if isinstance(default, type):
@@ -90,20 +84,13 @@ class Settings:
         return f"{self.section}.{name}".lstrip(".")
 
     def refuse(self, wrong: Any, name: str, problem: str) -> None:
-        """Refuse a setting, or one of a section such as ``observation.own``, in a case that is wrong.
-
-        Raises:
-            InputError: it is; the line has the key, the value and the problem.
-        """
+        """Refuse a setting, or one of a section such as ``observation.own``, in a case that is wrong."""
         if wrong:
             value = functools.reduce(getattr, name.split("."), self)
             checks.require(False, self.key(name), "it" if value in (None, "", [], {}) else value, problem)
 
     def refuse_unread(self) -> None:
-        """Refuse settings that only other kinds of this section read, if they were changed.
-
-        A kind of the user's own, ``package.module:Name``, may read any of them.
-        """
+        """Refuse changed settings that only other kinds of the section read; your own kind reads any."""
         for each in dataclasses.fields(self):
             kinds = rules(type(self))[each.name].kinds
             read = not kinds or self.variant in kinds or ":" in self.variant
@@ -160,9 +147,9 @@ def _converted(key: str, value: Any, hint: Any) -> Any:
     if kind is Any or (value is None and type(None) in get_args(hint)):
         return value
     origin, inner = get_origin(kind) or kind, get_args(kind)
-    if origin is float and is_number(value):
+    if origin is float and checks.is_number(value):
         return value
-    if origin is str and is_number(value):
+    if origin is str and checks.is_number(value):
         return str(value)  # a time such as 2
     good = isinstance(value, origin) and not (isinstance(value, bool) and origin is not bool)
     checks.require(good, key, value, f"is not {_KINDS.get(origin, f'a {origin.__name__}')}")
@@ -179,7 +166,7 @@ def _check_value(key: str, value: Any, rule: Rule, kind: Any) -> None:
         return
     if rule.choices and not (rule.paths and ":" in str(value)):
         checks.one_of(key, value, rule.choices)
-    if kind not in (int, float) or not is_number(value):
+    if kind not in (int, float) or not checks.is_number(value):
         return
     if rule.above is not None:
         checks.above(key, value, rule.above, rule.unit)
@@ -197,17 +184,8 @@ def plain(value: Any) -> Any:
     return [plain(each) for each in value] if type(value) in (list, tuple) else value
 
 
-def is_number(value: Any) -> TypeGuard[float]:
-    """Is a value a number, and neither true nor false?"""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def check_place(key: str, place: Any) -> None:
-    """Require a place: ``[x, y]`` in metres, or ``{lat: ..., lon: ...}`` in degrees.
-
-    Raises:
-        InputError: it is something else, or out of range.
-    """
+    """Require a place: ``[x, y]`` in metres, or ``{lat: ..., lon: ...}`` in degrees."""
     if not isinstance(place, Mapping):
         checks.place(key, place)
         return

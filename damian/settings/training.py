@@ -1,10 +1,10 @@
 """All settings of ``damian train``."""
 
+import os
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.common.threads import available_cores
 from damian.settings.fields import Settings, constant, setting
 from damian.settings.learners import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
 from damian.settings.scenario import ScenarioConfig
@@ -77,8 +77,11 @@ class TrainConfig(ScenarioConfig):
 
     @property
     def learning_threads(self) -> int:
-        """Number of threads with which the networks learn."""
-        return self.threads or available_cores()
+        """Threads of the learning; if not given, the cores of this process, or as many as OMP_NUM_THREADS."""
+        affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+        limit = os.environ.get("OMP_NUM_THREADS", "")
+        return self.threads or min(cores, int(limit) if limit.isdigit() and int(limit) else cores)
 
     @property
     def update_steps(self) -> int:

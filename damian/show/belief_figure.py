@@ -20,11 +20,7 @@ _DASHES = ("-", "--", ":", "-.")
 
 
 def plot_beliefs(flight: Episode, path: Path) -> None:
-    """Draw a map, the errors of the believed positions, the ages of information and the messages.
-
-    The map shows all paths up to the instant at which the server was most mistaken, which the other axes
-    mark.
-    """
+    """Draw a map at the instant when the server was most mistaken; errors, ages and messages over time."""
     error = np.linalg.norm(flight.true - flight.believed, axis=-1)
     worst = int(np.flatnonzero(error.sum(-1) == error.sum(-1).max())[-1])
     frame = frame_of(flight, worst, trail=None)
@@ -32,7 +28,13 @@ def plot_beliefs(flight: Episode, path: Path) -> None:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 6.6 + rows), layout="constrained")
         axes = figure.subplots(4, 1, height_ratios=[3.6, 1.0, 1.0, rows])
-        draw_map(axes[0], flight, worst)
+        MapView(axes[0], flight).draw(frame)
+        source = [] if flight.source is None else [flight.source]
+        paths = np.concatenate([flight.true.reshape(-1, 2), flight.believed.reshape(-1, 2), *source])
+        region = np.reshape(flight.region.bounds, (2, 2))
+        if np.ptp(region, axis=0).max() > _LARGE * (np.ptp(paths, axis=0).max() + 2 * flight.radius):
+            low, high = paths.min(0) - flight.radius, paths.max(0) + flight.radius
+            axes[0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         reason = ", when the server is most mistaken" if error.any() else ""
         axes[0].set_title(f"paths, and the UAVs at {frame.time:g} s{reason}", fontsize="medium")
         marks = [*legend_marks(flight), *_lines(axes[1], flight, error)]
@@ -46,20 +48,6 @@ def plot_beliefs(flight: Episode, path: Path) -> None:
             axis.axvline(frame.time, color=INK, linewidth=0.8, linestyle=":")
             axis.set_xlim(axes[3].get_xlim())
         figure.savefig(path, dpi=200)
-
-
-def draw_map(axis: Axes, flight: Episode, step: int) -> None:
-    """Draw the paths up to an instant, and what is true and believed there.
-
-    The whole region is shown, unless the paths are small in it.
-    """
-    MapView(axis, flight).draw(frame_of(flight, step, trail=None))
-    source = [] if flight.source is None else [flight.source]
-    paths = np.concatenate([flight.true.reshape(-1, 2), flight.believed.reshape(-1, 2), *source])
-    region = np.reshape(flight.region.bounds, (2, 2))
-    if np.ptp(region, axis=0).max() > _LARGE * (np.ptp(paths, axis=0).max() + 2 * flight.radius):
-        low, high = paths.min(0) - flight.radius, paths.max(0) + flight.radius
-        axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
 
 
 def _lines(axis: Axes, flight: Episode, values: Floats) -> list[Any]:

@@ -41,10 +41,7 @@ Integers = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of N UAVs over T steps, at T + 1 instants: that of the reset, and the end of each step.
-
-    The annotation of a column says what it means, with its unit and shape; files repeat it.
-    """
+    """One episode of N UAVs over T steps, at T + 1 instants: the reset, and the end of each step."""
 
     about: Mapping[str, Any]
     """Where it comes from: version, policy, seed, and what else the program knows."""
@@ -166,21 +163,16 @@ class Episode:
             fixed["region"] = shapely.from_geojson(json.dumps(found["region"]))
             fixed["origin"] = found["origin"] and tuple(found["origin"])
             fixed["landing_points"] = np.asarray(found["landing_points"], float)
-            return cls(**fixed, **columns).checked()
+            for name, values in columns.items():
+                for each in values.values() if isinstance(values, Mapping) else [values]:
+                    if each is not None and name != "cells" and len(each) != len(columns["time"]):
+                        raise ValueError(f"{name} has not as many instants as time")
+            if (np.diff(columns["time"]) <= 0).any():
+                raise ValueError("time does not increase")
+            return cls(**fixed, **columns)
         except (AttributeError, LookupError, TypeError, ValueError, RecursionError, ShapelyError) as error:
             problem = f"no {error}" if isinstance(error, KeyError) else one_line(str(error))
             raise InputError(f"{path}: it is no episode of version {VERSION}: {problem}") from error
-
-    def checked(self) -> "Episode":
-        """The episode itself, if its columns have as many instants as there are times, which increase."""
-        for name in COLUMNS:
-            values = getattr(self, name)
-            for each in values.values() if isinstance(values, Mapping) else [values]:
-                if each is not None and name != "cells" and len(each) != len(self.time):
-                    raise ValueError(f"{name} has {len(each)} instants, and time has {len(self.time)}")
-        if (np.diff(self.time) <= 0).any():
-            raise ValueError("time does not increase")
-        return self
 
 
 COLUMNS = {f.name: f.type.__metadata__[0] for f in fields(Episode) if hasattr(f.type, "__metadata__")}  # type: ignore[union-attr]
@@ -224,13 +216,7 @@ def at_instant(outputs: TensorDictBase) -> TensorDictBase:
 
 
 def episode_of(instants: TensorDictBase, env: UavEnv, about: Mapping[str, Any]) -> Episode:
-    """The episode of one world from ``at_instant`` of the reset and of each step, [T + 1].
-
-    Args:
-        instants: stacked.
-        env: the environment without delays.
-        about: where the episode comes from.
-    """
+    """The episode of one world from ``at_instant`` of the reset and of each step, stacked, [T + 1]."""
     message, state = cast(Tensor, instants[keys.MESSAGE]), cast(Tensor, instants[keys.STATE])
     sent = cast(Tensor, instants[keys.MESSAGE_SENT]).clone()
     sent[0] = False  # the server holds the first message from the reset on

@@ -46,12 +46,7 @@ def save_film(episode: Episode, path: Path, view: str = "2d") -> None:
 
 
 class Film:
-    """Draws the instants of an episode, one at a time, into the same figure.
-
-    Args:
-        episode: the episode to draw.
-        view: ``2d``: from above; ``3d``: with the space above it.
-    """
+    """Draws the instants of an episode into one figure; ``2d``: from above, ``3d``: in space."""
 
     def __init__(self, episode: Episode, view: str = "2d") -> None:
         self.episode = episode
@@ -125,12 +120,9 @@ class Film:
 
 
 class LiveFilm:
-    """Draws an episode while it is flown; drawing takes about 0.3 s an instant.
+    """Draws an episode while it is flown, in about 0.3 s an instant.
 
-    Args:
-        env: the environment without delays, of one world, with the extras ``message``, ``state`` and
-            ``reward_terms``.
-        view: ``2d`` or ``3d``.
+    The environment, of one world, has the extras ``message``, ``state`` and ``reward_terms``.
     """
 
     def __init__(self, env: UavEnv, view: str = "2d") -> None:

@@ -46,13 +46,7 @@ class Frame:
 
 
 def frame_of(episode: Episode, step: int, trail: int | None = TRAIL) -> Frame:
-    """An episode at an instant.
-
-    Args:
-        episode: the episode.
-        step: number of steps before the instant.
-        trail: number of steps that the paths reach back; None: to the beginning.
-    """
+    """An episode after ``step`` steps; paths reach ``trail`` steps back, or with None to the beginning."""
     begin = 0 if trail is None else max(step - trail, 0)
     uavs = [
         Uav(

@@ -36,11 +36,17 @@ def page(episodes: Sequence[Episode]) -> str:
     shared, names = titles(episodes)
     shown = [{"title": name, **episode.document()} for name, episode in zip(names, episodes, strict=True)]
     replay = {"colours": COLOURS, "likely": LIKELY, "shared": shared, "episodes": shown}
+    modules = {  # as data URLs, by the names by which they import each other
+        "libraries" if file.name == _LIBRARIES else f"page/{file.stem}": (
+            f"data:text/javascript;charset=utf-8,{quote(_text(file.name), safe=_PLAIN)}"
+        )
+        for file in sorted(_PAGE.glob("*.js"))
+    }
     return Template(_text("index.html")).substitute(
         title=_title([shared, *names]),
         licences=_text("LICENSES.txt"),
         style="\n".join(map(_text, ("uplot.css", "style.css"))),
-        modules=_in_script({"imports": _modules()}),
+        modules=_in_script({"imports": modules}),
         replay=_in_script(replay),
     )
 
@@ -64,16 +70,6 @@ def _settings(episode: Episode) -> list[str]:
     words = [str(word).lstrip("+") for word in about.get("overrides") or []]
     flown = [word for word in words if re.split(r"[.=]", word)[0] not in _NOT_FLOWN]
     return flown + [f"{key}={about[key]}" for key in _TOLD if about.get(key) is not None]
-
-
-def _modules() -> dict[str, str]:
-    """The page's modules as data URLs, by the names by which they import each other."""
-    files = sorted(_PAGE.glob("*.js"))
-    names = {file: "libraries" if file.name == _LIBRARIES else f"page/{file.stem}" for file in files}
-    return {
-        name: f"data:text/javascript;charset=utf-8,{quote(_text(file.name), safe=_PLAIN)}"
-        for file, name in names.items()
-    }
 
 
 def _text(name: str) -> str:

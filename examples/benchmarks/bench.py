@@ -24,7 +24,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
 from tqdm import tqdm
 
-from damian.common.markdown import markdown_table
+from damian.common.tables import markdown_table
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import make_env

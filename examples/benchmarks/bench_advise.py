@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from damian.common.markdown import markdown_table
+from damian.common.tables import markdown_table
 
 TOKEN = "a-token-for-the-bench"
 N_UAVS = 10

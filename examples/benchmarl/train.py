@@ -25,7 +25,7 @@ from vmas_delay import DelayedVmasTask
 
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
-from damian.common.markdown import markdown_table
+from damian.common.tables import markdown_table
 
 ALGORITHMS = {"mappo": MappoConfig, "masac": MasacConfig, "qmix": QmixConfig}
 AWARE = ("aware=history", "observation.own=true")

@@ -36,7 +36,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from damian import keys
-from damian.common.markdown import markdown_table
+from damian.common.tables import markdown_table
 from damian.keys import next_key
 from damian.learners.base import LearningSetup
 from damian.learners.networks import ModelConfig

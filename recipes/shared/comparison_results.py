@@ -9,11 +9,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+
+import numpy as np
 
 from damian.common.atomic_files import write_atomically
-from damian.common.csv_table import csv_table
 from damian.common.errors import InputError
+from damian.common.tables import csv_table
 from damian.compare.comparison import OF_ARM, Arm, Row, regime
 from damian.compare.figures import LABELS
 from damian.runs.metrics_log import read_metrics
@@ -26,7 +27,7 @@ ROWS, CURVES = "results.csv", "curves.csv"
 WORDS = ("task", "delay", "arm", "regime", "policy")
 """Columns that are not numbers."""
 POINTS = 50
-"""Largest number of points of a stored learning curve."""
+"""Largest number of points of a stored learning curve, evenly spaced over its updates."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,20 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
         succeeds = run.config.episode.success_share is not None
         label = {"task": run.task, "delay": run.delay, "arm": run.arm, "seed": run.config.seed}
         metrics = read_metrics(run.folder) if run.trains else []
-        points += [label | _point(row, succeeds) for row in _thinned(metrics)]
+        unknown = {} if succeeds else {"perceived_success_rate": math.nan}
+        spread = np.linspace(0, len(metrics) - 1, min(len(metrics), POINTS)).round().astype(int)
+        for row in [metrics[index] for index in spread]:
+            numbers = {name: float(f"{row[name]:.5g}") for name in ("frames", "episodes", *LABELS)}
+            points.append(label | numbers | unknown)
+        shares = [row["backupdated"] for row in metrics if "backupdated" in row]
         of_run = {
             "regime": regime(arms, run.arm),
             "frames": metrics[-1]["frames"] if metrics else 0,
             "seconds": read_record(run.folder).get("wall_time_s", math.nan),
         }
         for row in run.results():
-            learnt = {"backupdated": _share_backupdated(metrics) if row["policy"] in OF_ARM[:2] else math.nan}
+            learns = shares and row["policy"] in OF_ARM[:2]
+            learnt = {"backupdated": fmean(shares) if learns else math.nan}
             without = {} if succeeds else {name: math.nan for name in row if name.endswith("success_rate")}
             rows.append(label | of_run | learnt | row | without)
     return Results(rows, points)
@@ -87,30 +94,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 def _read(path: Path) -> list[Row]:
     try:
         with path.open(newline="") as file:
-            return [{name: _value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
+            kinds = dict.fromkeys(WORDS, str) | {"seed": int}
+            return [{k: kinds.get(k, float)(x) for k, x in row.items()} for row in csv.DictReader(file)]
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: it does not hold the results of a comparison ({reason(error)})") from error
-
-
-def _value(name: str, text: str) -> Any:
-    if name in WORDS:
-        return text
-    return int(text) if name == "seed" else float(text)
-
-
-def _point(row: Mapping[str, float], succeeds: bool) -> dict[str, float]:
-    numbers = {name: float(f"{row[name]:.5g}") for name in ("frames", "episodes", *LABELS)}
-    return numbers if succeeds else numbers | {"perceived_success_rate": math.nan}
-
-
-def _thinned(rows: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
-    """At most ``POINTS`` rows, evenly spaced, with the first and the last one."""
-    if len(rows) <= POINTS:
-        return list(rows)
-    return [rows[round(index * (len(rows) - 1) / (POINTS - 1))] for index in range(POINTS)]
-
-
-def _share_backupdated(rows: Sequence[Mapping[str, float]]) -> float:
-    """Share of the messages in training that late ones have replaced; nan without back-updating."""
-    shares = [row["backupdated"] for row in rows if "backupdated" in row]
-    return fmean(shares) if shares else math.nan

@@ -13,24 +13,14 @@ from ..cli import settings
 
 
 def compose_scenario(*overrides: str) -> ScenarioConfig:
-    """The scenario that ``damian train`` with these overrides flies in.
-
-    Args:
-        overrides: as on the command line, such as ``scenario=tracking``, ``delay=paper`` or ``agents=5``.
-
-    Raises:
-        InputError: an override is misspelt, or its value is impossible.
-    """
+    """The scenario of ``damian train`` with overrides such as ``scenario=tracking``, ``agents=5``."""
     return settings(*overrides)
 
 
 def gymnasium_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavGymEnv:
     """One UAV in a task, for ``gymnasium.make("damian/Spotting-v0", overrides=["delay.obs=3"])``.
 
-    Args:
-        task: a scenario in conf/scenario.
-        overrides: as on the command line.
-        options: ``seed``, ``render_mode`` and ``view`` of ``UavGymEnv``.
+    ``options`` are ``seed``, ``render_mode`` and ``view`` of ``UavGymEnv``.
     """
     return UavGymEnv(compose_scenario(f"scenario={task}", "agents=1", *overrides), **options)
 
@@ -38,9 +28,6 @@ def gymnasium_env(task: str, overrides: Sequence[str] = (), **options: Any) -> U
 def gymnasium_vector_env(task: str, overrides: Sequence[str] = (), **options: Any) -> UavVectorEnv:
     """Many worlds of a task with one UAV, for ``gymnasium.make_vec("damian/Spotting-v0", num_envs=1024)``.
 
-    Args:
-        task: a scenario in conf/scenario.
-        overrides: as on the command line.
-        options: ``num_envs`` and ``seed`` of ``UavVectorEnv``.
+    ``options`` are ``num_envs`` and ``seed`` of ``UavVectorEnv``.
     """
     return UavVectorEnv(compose_scenario(f"scenario={task}", "agents=1", *overrides), **options)

@@ -39,11 +39,7 @@ POLICY = "policy_sha256"
 def prepared(
     program: str, words: Sequence[str], own_folder: str | None, folder: Path, again: bool = False
 ) -> tuple[Any, Path]:
-    """The checked settings of a run, and its folder.
-
-    A resumed run goes on in its own folder with its own settings; only ``frames`` and ``episodes`` may
-    change. The overrides of the run that ``checkpoint`` names apply too, unless others are given.
-    """
+    """The checked settings of a run, and its folder; a resumed run has those that it had."""
     given = composed(program, words, own_folder)
     words = [word for word in words if not key_of(word).startswith("hydra")]
     if program == "compare":
@@ -68,11 +64,14 @@ def with_policy_of(
 ) -> tuple[Any, list[str]]:
     """The settings and overrides of a run that flies, or begins with, the policy of a stored run."""
     folder, trust = run_folder(Path(given.checkpoint)), bool(given.trust)
-    stored, before = stored_config(folder, "checkpoint", trust, words), stored_overrides(folder)
+    stored, run_words = stored_config(folder, "checkpoint", trust, words), read_record(folder).get(OVERRIDES)
+    before = [w for w in map(str, run_words or []) if key_of(w) not in ("trust", "checkpoint", "resume")]
     # Hydra imports a learner, and reads files that may name one, while it composes.
     named = [word.partition("=")[2].strip("'\"") for word in before]
     require_trust(named, "checkpoint", trust, words)
-    overrides = inherited(stored, before, words, own_defaults(SCHEMAS[program]))
+    defaults = {each.name: each.default for each in fields(TrainConfig)}
+    others = [f.name for f in fields(SCHEMAS[program]) if f.default != defaults.get(f.name, f.default)]
+    overrides = inherited(stored, before, words, others)
     check_words(program, overrides, own_folder)
     found = composed(program, overrides, own_folder)
     require_trust(found, "checkpoint", trust, words)
@@ -147,12 +146,6 @@ def stored_config(folder: Path, key: str, trust: bool = False, named: Sequence[s
         raise InputError(f"{key}: {file}: {reason(error)}") from None
 
 
-def stored_overrides(folder: Path) -> list[str]:
-    """The words of the command line with which a run was started, without those that concern its start."""
-    words = map(str, read_record(folder).get(OVERRIDES) or [])
-    return [word for word in words if key_of(word) not in ("trust", "checkpoint", "resume")]
-
-
 def require_trust(found: Any, key: str, trust: bool, named: Sequence[str]) -> None:
     """Refuse components of other code that stored settings name, unless the caller has named or trusts them.
 
@@ -206,11 +199,7 @@ def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfi
 def inherited(
     stored: TrainConfig, before: Sequence[str], given: Sequence[str], own: Collection[str] = ()
 ) -> list[str]:
-    """The given overrides, preceded by those of a stored run that they do not replace.
-
-    The policy keeps its histories of actions and messages, because it observes them, even if a file of the
-    stored run's scenario or an option of ``delay`` says otherwise.
-    """
+    """The given overrides after those of a stored run, which keeps the histories that its policy observes."""
     keys = [*map(key_of, given), *own]
     history = [] if {"delay.history", "aware"} & {*keys} else [f"delay.history={stored.delay.history}"]
     messages = stored.delay.messages
@@ -221,12 +210,6 @@ def inherited(
 def without(overrides: Sequence[str], replaced: Collection[str]) -> list[str]:
     """The overrides but those that set one of these keys and groups, or a key below them."""
     return [w for w in overrides if not any(f"{key_of(w)}.".startswith(f"{key}.") for key in replaced)]
-
-
-def own_defaults(kind: type) -> set[str]:
-    """Keys of the training to which the settings of another program give another default."""
-    defaults = {each.name: each.default for each in fields(TrainConfig)}
-    return {each.name for each in fields(kind) if each.default != defaults.get(each.name, each.default)}
 
 
 def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
