@@ -34,12 +34,10 @@ def described(error: BaseException) -> str:
     """An error on one line: its type, its message, and the deepest line of the user's own code."""
     text = " ".join(str(error).split())
     # Frames that belong neither to this package, nor to an installed one, nor to Python.
-    others = ("site-packages", "dist-packages", "<frozen", str(_PACKAGE), sysconfig.get_path("stdlib"))
+    package, library = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib")
+    others = ("site-packages", "dist-packages", "<frozen", package, library)
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not any(other in frame.filename for other in others)]
     known = not own or isinstance(error, SyntaxError)  # its message has the place
     place = "" if known else f" ({Path(own[-1].filename).name}, line {own[-1].lineno})"
     return f"{type(error).__name__}{': ' if text else ''}{text}{place}"
-
-
-_PACKAGE = Path(__file__).parents[1]

@@ -345,15 +345,12 @@ class Line:
     measures: dict[str, Estimate]
     compared: Compared = field(default_factory=Compared)
 
-    def estimates(self) -> dict[str, Estimate]:
-        """All numbers by the names of their columns, ``MEASURED`` and then ``COMPARED``."""
-        return {**self.measures, **{column.name: self.compared[column.name] for column in COMPARED}}
-
     def cells(self) -> dict[str, Any]:
         """Columns of ``table.csv`` by name; unknown numbers are empty."""
         cells: dict[str, Any] = {k: getattr(self, k) for k in ("task", "delay", "arm", "regime", "policy")}
         cells |= {"seeds": len(self.seeds), "compared_seeds": len(self.compared.seeds)}
-        for name, estimate in self.estimates().items():
+        found = {**self.measures, **{column.name: self.compared[column.name] for column in COMPARED}}
+        for name, estimate in found.items():
             parts = UNKNOWN if np.isnan(estimate.value) else estimate
             for suffix, value in zip(("", "_low", "_high"), parts, strict=True):
                 cells[name + suffix] = "" if np.isnan(value) else value

@@ -61,7 +61,8 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
     if not grid:
         path.unlink(missing_ok=True)  # an older one would show other runs
         return
-    width, progress = max(map(len, grid)), _progress(curves)
+    width, ends = max(map(len, grid)), {run[-1].get("frames") for runs in curves.values() for run in runs}
+    progress = "frames" if len(ends) == 1 and None not in ends else "episodes"
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(3.2 * width + 1.2, 2.6 * len(grid)), layout="constrained")
         axes = figure.subplots(len(grid), width, squeeze=False)
@@ -166,12 +167,6 @@ def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str,
     rows = [row for runs in curves.values() for run in runs for row in run]
     measures = [name for name in LABELS if any(not np.isnan(row[name]) for row in rows)]
     return [[(task, delay, name) for name in measures] for task in tasks for delay in delays[task]]
-
-
-def _progress(curves: Curves) -> str:
-    """What learning curves are drawn over, a key of ``PROGRESS``: steps, if all runs have made as many."""
-    ends = {run[-1].get("frames") for runs in curves.values() for run in runs}
-    return "frames" if len(ends) == 1 and None not in ends else "episodes"
 
 
 def _curve_panel(

@@ -11,9 +11,6 @@ from damian.server.rewards import own_terms
 from damian.settings import DelayConfig, LearningSetup, PredictiveMappoConfig, TrainConfig
 from damian.world.sensors import sensors_of
 
-MAX_BATCH = 100_000_000
-"""Most environment steps, over all worlds, that are collected before an update; they lie in memory."""
-
 
 def late(config: TrainConfig) -> list[str]:
     """Settings by which messages, actions or rewards are late."""
@@ -76,10 +73,7 @@ def check_components(config: TrainConfig) -> None:
 def check_learning(config: TrainConfig) -> None:
     """Check that the settings allow training; an evaluation has fewer requirements."""
     check_components(config)
-    setup = learning_setup(config)
-    batch, problem = setup.worlds * setup.longest_period, "environment steps between two updates"
-    checks.in_range("worlds", batch, 1, MAX_BATCH, problem)
-    config.learner.check(setup)
+    config.learner.check(learning_setup(config))
     problem = "does not go with model.rnn: hidden states change at every step, not only at decisions"
     checks.require(not (config.model.recurrent and config.clock.skip), "clock.skip", True, problem)
     _check_backupdate(config)
