@@ -161,12 +161,12 @@ def require_trust(found: Any, key: str, trust: bool, named: Sequence[str]) -> No
         )
 
 
-def _components(node: Any, name: str = "") -> Iterator[str]:
+def _components(node: Any) -> Iterator[str]:
     """Every text ``package.module:Name`` in settings, but for DAMIAN's own."""
     if isinstance(node, DictConfig | Mapping):
         for key in node:
             if key not in ("hydra", "where", "device"):  # where=PROPERTY:VALUE, device=cuda:0
-                yield from _components(node[key], str(key))
+                yield from _components(node[key])
     elif isinstance(node, str):
         module, colon, last = node.partition(":")
         path = all(part.isidentifier() for part in (*module.split("."), last))
@@ -174,7 +174,7 @@ def _components(node: Any, name: str = "") -> Iterator[str]:
             yield node
     elif isinstance(node, Sequence):
         for each in node:
-            yield from _components(each, name)
+            yield from _components(each)
 
 
 def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfig:
