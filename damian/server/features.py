@@ -59,6 +59,8 @@ class ServerContext(NamedTuple):
     """Largest number of landing points in a region, L."""
     goals: Tensor | None = None
     """For ``belief_gain``: landing points to which discrete actions lead, as ``Candidates.goals``."""
+    places_inside: Tensor | None = None
+    """For ``coverage_map``: whether the places about each landing point lie in its region, [R*L, 24]."""
     grid: SourceGrid | None = None
     """Cells in which the source may be; None if no feature reads the belief."""
     belief: Tensor | None = None
@@ -272,6 +274,13 @@ def _pairwise(v: FeatureCache) -> Tensor:
     return distance / v.scale.unsqueeze(-1)
 
 
+def others_of(v: FeatureCache) -> Tensor:
+    """Indices of the other UAVs of each wanted one, in order, [N, N-1], or [N, 1, N-1] if ``own_only``."""
+    uav = torch.arange(v.messages.time.shape[-1], device=v.messages.time.device)
+    wanted = uav.unsqueeze(-1) if v.own_only else uav
+    return uav[:-1] + (uav[:-1] >= wanted.unsqueeze(-1))
+
+
 @FEATURES.register("source_distance")
 @feature("global")
 def _source_distance(v: FeatureCache) -> Tensor:
@@ -304,10 +313,7 @@ def _source_time(v: FeatureCache) -> Tensor:
 @feature("global", width=None)
 def _agent_distances(v: FeatureCache) -> Tensor:
     pairwise = v(_pairwise)
-    uav = torch.arange(pairwise.shape[-1], device=pairwise.device)
-    wanted = uav.unsqueeze(-1) if v.own_only else uav
-    others = uav[:-1] + (uav[:-1] >= wanted.unsqueeze(-1))  # all but the UAV itself, in index order
-    return pairwise.gather(-1, others.expand(*pairwise.shape[:-1], -1)).clamp(max=1)
+    return pairwise.gather(-1, others_of(v).expand(*pairwise.shape[:-1], -1)).clamp(max=1)
 
 
 @FEATURES.register("coverage")

@@ -22,6 +22,7 @@ from damian.server.features import (
     stack,
 )
 from damian.server.rewards import Counters, features_read, final_reward, reward
+from damian.server.surroundings import places_inside
 from damian.server.termination import Status, status
 from damian.settings.scenario import ScenarioConfig
 from damian.world.coverage import FootprintTables, KnownCoverage, build_tables
@@ -98,6 +99,9 @@ class Server:
             "n_points": airspace.max_points,
             "goals": simulation.candidates.goals() if gains else None,
             "grid": grid,
+            "places_inside": places_inside(airspace, simulation.radius)
+            if "coverage_map" in self._names
+            else None,
         }
         """The fields of ``ServerContext`` that never change."""
         # UAVs that fly stay at a landing point for more than a step, so that coverage changes seldom.

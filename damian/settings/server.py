@@ -22,6 +22,8 @@ GLOBAL_FEATURES = (
     "spotting_agents",
 )
 """Features of all UAVs, in the order of the paper's Table 2."""
+SURROUNDINGS = (("place", "time_left"), ("others", "coverage_map"))
+"""Local and global features of what surrounds a UAV, beyond Table 2 (``damian.server.surroundings``)."""
 BELIEF_FEATURES = ("belief_gain", "belief_moments", "belief_map")
 """Features of the belief."""
 INDIVIDUAL = ("coverage", "spotted", "battery")
@@ -46,12 +48,15 @@ class ObservationConfig(Settings):
     section: ClassVar[str] = "observation"
 
     local_features: list[str] = setting(
-        ["spotted"], "Features of the UAV itself: battery, spotted.", choices=LOCAL_FEATURES, paths=True
+        ["spotted"],
+        f"Features of the UAV itself: {', '.join(LOCAL_FEATURES + SURROUNDINGS[0])}.",
+        choices=LOCAL_FEATURES + SURROUNDINGS[0],
+        paths=True,
     )
     global_features: list[str] = setting(
         ["source_distance", "source_bearing", "source_time"],
-        f"Features from the messages of all UAVs (Table 2): {', '.join(GLOBAL_FEATURES)}.",
-        choices=GLOBAL_FEATURES,
+        f"Features from the messages of all UAVs: {', '.join(GLOBAL_FEATURES + SURROUNDINGS[1])}.",
+        choices=GLOBAL_FEATURES + SURROUNDINGS[1],
         paths=True,
     )
     ctde: bool = setting(False, "Whether the actor observes only the local features.")

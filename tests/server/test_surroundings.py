@@ -1,0 +1,91 @@
+"""Features of what surrounds a UAV equal plain loops over places and UAVs, in random regions."""
+
+import math
+
+import pytest
+import shapely
+import torch
+
+from damian import keys, make_env
+from damian.server.surroundings import OTHERS, RINGS, SECTORS
+from damian.settings import DelayConfig, ObservationConfig, RegionConfig, ScenarioConfig
+
+NAMES = ["others", "coverage_map", "place", "time_left"]
+"""Features in the order of the observation."""
+
+
+def rollout(agents, own=False, **changed):
+    """A rollout of a random policy, and its environment."""
+    observation = ObservationConfig(["place", "time_left"], ["others", "coverage_map"], own=own, window=3)
+    region = RegionConfig(kind="random", pool=2, lattice_step=60.0)
+    scenario = ScenarioConfig(agents=agents, observation=observation, region=region, **changed)
+    env = make_env(scenario, 3, seed=agents, extras=["message"])
+    return env, env.rollout(12, break_when_any_done=False)
+
+
+def twin(env, messages, region, now, i):
+    """The observation of UAV ``i`` of one world, by name, from the messages [N] that are known."""
+    simulation = env.uav_env.simulation
+    points, radius = simulation.points, simulation.radius
+    scale = simulation.airspace.scale[region].item()
+    target, place = messages.target.tolist(), messages.position.tolist()
+    ways = []
+    for j in range(len(target)):
+        if j != i:
+            to_place = [place[j][k] - target[i][k] for k in range(2)]
+            to_target = [target[j][k] - target[i][k] for k in range(2)]
+            way = [max(-1.0, min(1.0, w / (scale / 2))) for w in to_place + to_target]
+            ways.append((math.hypot(*to_target), [*way, 1.0]))
+    ways.sort()
+    landed = [(points[p].tolist(), k) for trail in messages.trail for k, p in enumerate(trail.tolist())]
+    here, n = points[messages.trail[i, 0]].tolist(), messages.trail.shape[-1]
+    new = []
+    for ring in RINGS:
+        for sector in range(SECTORS):
+            angle = 2 * math.pi * sector / SECTORS
+            at = [here[0] + ring * radius * math.sin(angle), here[1] + ring * radius * math.cos(angle)]
+            inside = simulation.airspace.regions[region].polygon.contains(shapely.Point(at))
+            value = min(math.dist(at, xy) / (2 * radius) + 0.5 * k / n for xy, k in landed)
+            new.append(min(value, 1.0) if inside else 0.0)
+    return {
+        "coverage_map": new,
+        "others": ways,
+        "place": [max(-1, min(1, v / (scale / 2))) for v in target[i]],
+        "time_left": [1 - now / env.uav_env.scenario.time_scale],
+    }
+
+
+def check_others(rows, ways):
+    """Compare the nearest other UAVs with those of the twin; equally far ones may stand in any order."""
+    for row, (distance, _) in zip(rows.tolist(), ways, strict=False):
+        assert any(row == pytest.approx(way, abs=1e-5) for other, way in ways if abs(other - distance) < 1e-2)
+    assert not rows[len(ways) :].any()
+
+
+@pytest.mark.parametrize("agents", [1, 3, 7])
+@pytest.mark.parametrize("own", [False, True])
+def test_surroundings_equal_those_of_a_plain_loop(agents, own):
+    env, steps = rollout(agents, own, delay=DelayConfig(obs=2))
+    received, sent = steps["next"][keys.RECEIVED], steps["next"][keys.MESSAGE]
+    observed = steps["next"][keys.OBSERVATION]
+    server = env.uav_env.server
+    for world in range(len(steps)):
+        for step in range(0, steps.shape[1], 3):
+            for i in range(agents):
+                rows = received[world, step].clone()
+                if own:
+                    rows[i] = sent[world, step, i]
+                messages = server.messages(rows)
+                expected = twin(env, messages, int(server.region_of(messages)), step + 1, i)
+                others, rest = observed[world, step, i].split([5 * OTHERS, 24 + 2 + 1])
+                values = torch.tensor([number for name in NAMES[1:] for number in expected[name]])
+                assert rest.allclose(values, atol=1e-5), (world, step, i)
+                check_others(others.view(OTHERS, 5), expected["others"])
+
+
+def test_ground_just_covered_is_hardly_new_and_that_outside_the_region_never_is():
+    _, steps = rollout(1)
+    covered = steps["next"][keys.OBSERVATION][..., 5 * OTHERS : 5 * OTHERS + len(RINGS) * SECTORS]
+    assert covered[..., :SECTORS].amax() == pytest.approx(RINGS[0] / 2, abs=1e-5)
+    assert covered[..., -SECTORS:].amax() == 1
+    assert covered[..., -SECTORS:].amin() == 0  # outside
