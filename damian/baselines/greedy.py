@@ -1,4 +1,4 @@
-"""A scripted policy: fly to where the source probably is, else over ground not covered recently.
+"""Scripted policies: fly to where the source probably is, or over ground not covered recently.
 
 Every UAV flies to the landing point whose footprint contains the largest total weight.
 """
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import gather_rows
+from damian.common.tensors import gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import chance_of_staying, detection_chance, report_rows
@@ -42,14 +42,19 @@ def greedy_policy(env: DelayedEnv) -> TensorDictModule:
     shown, should = f"{n_points} landing points", "are too many for the scripted policy: take a larger step"
     checks.require(n_regions * n_points**2 <= MAX_PAIRS, "region.lattice_step", shown, should)
     available = env.observation_spec.keys(True, True)
-    believes = keys.BELIEF in available and env.uav_env.scenario.seeks_source
+    scenario = env.uav_env.scenario
+    believes = keys.BELIEF in available and scenario.seeks_source
     message = keys.RECEIVED if keys.RECEIVED in available else keys.MESSAGE
-    arguments = {"message": message, "mask": keys.ACTION_MASK}
-    arguments |= {"belief": keys.BELIEF} if believes else {"age": keys.AGE}
-    if believes and keys.OWN_BELIEF in available:
-        arguments |= {"own_message": keys.MESSAGE, "own_belief": keys.OWN_BELIEF}
-    in_keys: dict[str, NestedKey] = {name: key for name, key in arguments.items() if key in available}
-    script = Searcher if believes else Greedy
+    own_messages = keys.OWN_BELIEF in available if believes else scenario.observation.own
+    script = Searcher if believes else Greedy if scenario.seeks_source else Coverer
+    arguments: dict[str, NestedKey] = {"message": message, "mask": keys.ACTION_MASK}
+    if script is Searcher:
+        arguments |= {"belief": keys.BELIEF, "own_belief": keys.OWN_BELIEF}
+    if script is Greedy:
+        arguments |= {"age": keys.AGE}
+    elif own_messages:
+        arguments |= {"own_message": keys.MESSAGE}
+    in_keys = {name: key for name, key in arguments.items() if key in available}
     return TensorDictModule(script(env.uav_env), in_keys, [keys.ACTION])
 
 
@@ -87,6 +92,12 @@ class Greedy:
 
     def choose(self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None) -> Tensor:
         """Actions to the landing points of most ``gain`` [B, N, L], for UAVs at the targets of ``held``."""
+        return self.choose_landing(held, gain, region, mask)[0]
+
+    def choose_landing(
+        self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Actions, and the landing points [B, N] to which they lead, as indices in their region."""
         ground = self.points[region]
         gain = gain.where(self.real[region].unsqueeze(1), -torch.inf)
         flown = _distances(held.target, ground)
@@ -125,21 +136,26 @@ class Greedy:
         moved = torch.where(latest.isfinite(), latest * self.speed, torch.inf)
         return (log - log.amax(-1, keepdim=True)).exp(), moved <= RECENT * self.radius
 
-    def best_action(self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None) -> Tensor:
-        """The best legal discrete action of UAVs that stand on points of these flat ids, [B, N]."""
+    def best_action(
+        self, standing: Tensor, gain: Tensor, left: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """The best legal discrete action from points of these flat ids, [B, N], and where it leads."""
         action = torch.arange(self.actions.n_actions, device=gain.device)
         row = standing.unsqueeze(-1) * len(action) + action
         point, flown = (gather_rows(table[:, 0], row) for table in self.candidates.ranking)
         gain, left = (values.gather(-1, point.long()) for values in (gain, left))
-        return _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)
+        best = _best(gain if mask is None else gain.where(mask, -torch.inf), flown, left)
+        return best, point.long().gather(-1, best.unsqueeze(-1)).squeeze(-1)
 
-    def best_move(self, held: Messages, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor) -> Tensor:
-        """Distance and heading in [0, 1] to the best landing point within reach, [B, N, 2]."""
+    def best_move(
+        self, held: Messages, gain: Tensor, flown: Tensor, left: Tensor, ground: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Distance and heading in [0, 1] to the best landing point in reach, [B, N, 2], and this point."""
         best = _best(gain.where(flown <= self.candidates.max_distance, -torch.inf), flown, left)
         east, north = (_places_at(ground, best) - held.target).unbind(-1)
         heading = torch.remainder(torch.atan2(east, north) / (2 * math.pi), 1.0)
         distance = flown.gather(-1, best.unsqueeze(-1)).squeeze(-1) / self.candidates.max_distance
-        return torch.stack([distance, heading], -1)
+        return torch.stack([distance, heading], -1), best
 
 
 def _best(gain: Tensor, flown: Tensor, left: Tensor) -> Tensor:
@@ -207,3 +223,46 @@ class Searcher(Greedy):
             -1, point, 1.0
         )
         return stands.sum(1, keepdim=True) > stands
+
+
+class Coverer(Greedy):
+    """Each UAV flies where its footprint holds most new ground; the UAVs choose one after the other.
+
+    Ground is new if it lies outside the UAV's own latest footprints, as they are after the next landing, and
+    outside those that the UAVs before it choose, as far as it knows. It looks one step ahead.
+    """
+
+    def __call__(  # type: ignore[override]
+        self, message: Tensor, own_message: Tensor | None = None, mask: Tensor | None = None
+    ) -> Tensor:
+        """Actions, [B, N] or [B, N, 2], from packed messages [B, N, M] and legal actions [B, N, A].
+
+        Where each UAV knows its own messages, ``own_message`` [B, N, M] are these.
+        """
+        held = self.unpack(message)
+        own = held if own_message is None else self.unpack(own_message)
+        region, actions = self.region_of(held), []
+        claimed = torch.zeros(self.points[region].shape[:2], device=message.device)
+        for uav in range(message.shape[1]):  # what a UAV chooses depends on those before it
+            legal = None if mask is None else mask[:, uav : uav + 1]
+            action, point = self.choose_new(own, uav, claimed, region, legal)
+            actions.append(action)
+            if own_message is not None:  # the others do not know where it is
+                _, point = self.choose_new(held, uav, claimed, region, None)
+            claimed = torch.maximum(claimed, self.footprint(point, region).squeeze(1))
+        return torch.cat(actions, 1)
+
+    def choose_new(
+        self, known: Messages, uav: int, claimed: Tensor, region: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by others."""
+        alone = tree_map(lambda field: field[:, uav : uav + 1], known)
+        latest = alone.trail[:, 0, :-1] % self.points.shape[1]  # the next landing replaces the oldest one
+        covered = torch.cat([self.footprint(latest, region), claimed.unsqueeze(1)], 1).amax(1, keepdim=True)
+        gain = (1 - covered) @ (self.near if len(self.near) == 1 else self.near[region])
+        return self.choose_landing(alone, gain, region, mask)
+
+    def footprint(self, point: Tensor, region: Tensor) -> Tensor:
+        """1 for the landing points in the footprints of others [B, P], given as indices, [B, P, L]."""
+        rows = (0 * region if len(self.near) == 1 else region).unsqueeze(-1)
+        return self.near[rows, point]

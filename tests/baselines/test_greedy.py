@@ -10,7 +10,8 @@ from helpers import everything, sent_messages, walking
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Greedy, greedy_policy
+from damian import keys
+from damian.baselines.greedy import BLUR_M, RECENT, TRUST, Coverer, Greedy, greedy_policy
 from damian.baselines.random import random_policy
 from damian.delays.config import DelayConfig
 from damian.envs.delayed_env import DelayedEnv
@@ -83,9 +84,8 @@ def test_all_uavs_fly_to_the_latest_detection_and_the_uav_that_made_it_stays(act
     assert distance[1] == 0
 
 
-@pytest.mark.parametrize("task", [SEARCH, COVER], ids=["search", "coverage"])
-def test_before_any_detection_every_uav_flies_to_fresh_ground_nearest_to_itself(task):
-    env = field(reward=task)
+def test_before_any_detection_every_uav_flies_to_fresh_ground_nearest_to_itself():
+    env = field(reward=SEARCH)
     td = env.reset()
     start, end = sent_messages(td).position[0], landing_points(env, td)
     distance = torch.cdist(end, start)
@@ -142,25 +142,70 @@ def test_the_likelihood_of_the_source_equals_a_loop_over_messages(seed):
 
 
 def test_uavs_fly_where_their_footprints_hold_most_fresh_ground_by_the_shortest_flight():
-    scenario = everything(reward=COVER, episode=EpisodeConfig(max_steps=9))
-    env = make_env(scenario, 16, extras=["message"])
-    policy, radius = Greedy(env.uav_env), env.uav_env.simulation.radius
+    env = make_env(everything(reward=SEARCH, episode=EpisodeConfig(max_steps=9)), 16, extras=["message"])
+    policy = Greedy(env.uav_env)
+    policy.seeks = False
     td = env.rollout(4, random_policy(env))["next"][:, -1]
     held, legal = sent_messages(td), td["agents", "action_mask"]
     region = held.trail[:, 0, 0] // policy.points.shape[1]
     assert len(region.unique()) == 3
-    fresh, chosen = policy.fresh(held, policy.points[region]), greedy_policy(env)(td)["agents", "action"]
-    moves = displacement(*action_table(scenario.actions).unbind(-1))
+    fresh, chosen = policy.fresh(held, policy.points[region]), policy(td["agents", "message"], mask=legal)
     for world, uav in itertools.product(range(8), range(3)):
-        points, start = policy.points[region[world]][policy.real[region[world]]], held.position[world, uav]
-        ends = points[distances(start + moves, points).argmin(-1)]
-        gain = (distances(ends, points) <= radius).float() @ fresh[world, uav, : len(points)]
-        flown = distances(start.unsqueeze(0), ends)[0]
-        most = gain[legal[world, uav]].max()
-        best = legal[world, uav] & (gain == most)
-        action = chosen[world, uav]
-        assert best[action]
-        assert flown[action] == pytest.approx(flown[best].min().item(), abs=1e-3)
+        start, action = held.position[world, uav], chosen[world, uav]
+        check_choice(env, int(region[world]), start, fresh[world, uav], legal[world, uav], action)
+
+
+@pytest.mark.parametrize("obs", [0, 3])
+def test_uavs_choose_one_after_the_other_where_their_footprints_hold_most_new_ground(obs):
+    observation = ObservationConfig(global_features=["coverage"], local_features=[], own=obs > 0, window=3)
+    scenario = everything(
+        reward=COVER, observation=observation, episode=EpisodeConfig(max_steps=9), delay=DelayConfig(obs=obs)
+    )
+    env = make_env(scenario, 8, extras=["message"])
+    policy, radius = Coverer(env.uav_env), env.uav_env.simulation.radius
+    td = env.rollout(6, random_policy(env))["next"][:, -1]
+    sent, legal = sent_messages(td), td["agents", "action_mask"]
+    held = env.uav_env.server.messages(td[keys.RECEIVED]) if obs else sent
+    chosen = greedy_policy(env)(td)["agents", "action"]
+    for world in range(8):
+        region = int(held.trail[world, 0, 0]) // policy.points.shape[1]
+        points, claimed = policy.points[region], []
+        for uav in range(3):
+            for known in (sent, held):
+                latest = [points[p] for p in known.trail[world, uav, :-1] % len(points)]
+                taken = torch.stack([*latest, *claimed])
+                new = (distances(points, taken) > radius).all(-1).float()
+                start = known.target[world, uav]
+                if known is sent:
+                    check_choice(env, region, start, new, legal[world, uav], chosen[world, uav])
+            ends, gain, flown = ends_and_gains(env, region, start, new)
+            best = gain == gain.max()  # the others expect it there, from what they know
+            if held is sent:
+                best = torch.arange(len(ends)) == chosen[world, uav]
+            claimed.append(ends[torch.where(best, flown, torch.inf).argmin()])
+
+
+def ends_and_gains(
+    env: DelayedEnv, region: int, start: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where each action leads [A, 2], the weight in the footprint there, and the way [m], [A]."""
+    simulation = env.uav_env.simulation
+    points = simulation.airspace.points[region]
+    points = points[points[:, 0].isfinite()]
+    moves = displacement(*action_table(env.uav_env.scenario.actions).unbind(-1))
+    ends = points[distances(start + moves, points).argmin(-1)]
+    gain = (distances(ends, points) <= simulation.radius).float() @ weight[: len(points)]
+    return ends, gain, distances(start.unsqueeze(0), ends)[0]
+
+
+def check_choice(
+    env: DelayedEnv, region: int, start: Tensor, weight: Tensor, legal: Tensor, action: Tensor
+) -> None:
+    """Check that a legal action leads to where the footprint holds most weight, by the shortest flight."""
+    _, gain, flown = ends_and_gains(env, region, start, weight)
+    best = legal & (gain == gain[legal].max())
+    assert best[action]
+    assert flown[action] == pytest.approx(flown[best].min().item(), abs=1e-3)
 
 
 def distances(some: Tensor, others: Tensor) -> Tensor:
