@@ -21,7 +21,7 @@ _LIBRARIES = "libraries.min.js"
 _PLAIN = " !$&'()*+,-./:;<=>?@[]^_`{|}~\\\""
 """Characters that a data URL may hold as they are."""
 _TOLD = ("policy", "checkpoint", "seed", "world", "fleet")
-"""What an episode's ``about`` tells of its flight, beside the overrides."""
+"""What ``about`` says about an episode's flight, beside the overrides."""
 _NOT_FLOWN = (*_TOLD, "hydra", "formats", "views", "keep", "eval_episodes", "journal", "span")
 """Overrides that say nothing of how an episode was flown, or that ``about`` repeats."""
 

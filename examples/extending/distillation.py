@@ -1,4 +1,4 @@
-"""A learner of one's own: a student with late observations imitates a teacher without (regime R2).
+"""Your own learner: a student with late observations imitates a teacher without (regime R2).
 
     damian train scenario=tracking hydra.run.dir=runs/teacher
     cd examples/extending

@@ -1,4 +1,4 @@
-"""Features of one's own: the heading of a UAV, and how far the fleet is from being together.
+"""Your own features: the heading of a UAV, and how far the fleet is from being together.
 
     cd examples/extending
     damian train scenario=tracking \

@@ -1,4 +1,4 @@
-"""A learner of one's own: REINFORCE with the batch's mean return as its baseline (Williams, 1992).
+"""Your own learner: REINFORCE with the batch's mean return as its baseline (Williams, 1992).
 
     cd examples/extending
     damian train learner=learner:ReinforceConfig learner.entropy=0.02 learner.steps=50

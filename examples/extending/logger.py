@@ -1,4 +1,4 @@
-"""A logger of one's own: a file with the share of the way to a return that one hopes for.
+"""Your own logger: a file with the share of the way to a return that you hope for.
 
     cd examples/extending
     damian train "logger.custom=[{logger: logger:Progress, every: 10, goal: 1.0}]"

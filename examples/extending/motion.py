@@ -1,4 +1,4 @@
-"""A motion model of one's own: flights against the wind take longer.
+"""Your own motion model: flights against the wind take longer.
 
     cd examples/extending
     damian train motion=polynomial motion.kind=motion:WindyFlight "motion.options={wind: 4}"

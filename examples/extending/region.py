@@ -1,4 +1,4 @@
-"""A region source of one's own: an L-shaped yard.
+"""Your own region source: an L-shaped yard.
 
     cd examples/extending
     damian train region=vertices region.kind=region:yard "region.options={side: 300}"

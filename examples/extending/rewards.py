@@ -1,4 +1,4 @@
-"""Reward terms of one's own: a price for a low battery, and a reward for staying together.
+"""Your own reward terms: a price for a low battery, and a reward for staying together.
 
     cd examples/extending
     damian train scenario=energy \
@@ -25,5 +25,5 @@ def low_battery(features: Features, counters: Counters, *, below: float = 0.3) -
 
 @reward_term(reads=["features:spread"], scope="system")
 def together(features: Features, counters: Counters) -> Tensor:
-    """1 minus the spread of the fleet, a feature of one's own (``features.py``)."""
+    """1 minus the spread of the fleet, your own feature (``features.py``)."""
     return 1 - features["features:spread"]

@@ -1,4 +1,4 @@
-"""A sensor of one's own: the wind at each UAV, and a feature by which the UAVs feel it.
+"""Your own sensor: the wind at each UAV, and a feature by which the UAVs feel it.
 
     cd examples/extending
     damian train "sensors=[{sensor: sensor:wind, strength: 3}]" \
