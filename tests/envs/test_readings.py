@@ -1,4 +1,4 @@
-"""Features of one's own, of any width and range, read sensors wherever features are computed."""
+"""Your own features, of any width and range, read sensors wherever features are computed."""
 
 from dataclasses import replace
 

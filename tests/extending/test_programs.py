@@ -1,4 +1,4 @@
-"""Learners, loggers and configuration files of one's own: trained with, resumed, evaluated, compared."""
+"""Your own learners, loggers and configuration files: trained with, resumed, evaluated, compared."""
 
 import csv
 import re

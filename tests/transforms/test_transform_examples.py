@@ -36,7 +36,7 @@ def test_agents_of_vmas_hear_what_others_chose_to_say():
     example = run("late_words")
     agents, heard, age = example["agents"], example["heard"], example["age"]
     assert heard.shape == (32, 50, 3, 3, 4)
-    assert heard[:, 1:, 0, 0].equal(agents["words"][:, :-1, 0])  # one's own message arrives at once
+    assert heard[:, 1:, 0, 0].equal(agents["words"][:, :-1, 0])  # an agent's own message arrives at once
     assert 1 < age[..., 0, 1:].mean() < 5
     assert not agents["received_mask"][:, :, 0, 1].all()
 

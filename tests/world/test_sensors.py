@@ -1,4 +1,4 @@
-"""Readings of one's own sensors equal those of a plain loop, and change nothing else in a message."""
+"""Readings of your own sensors equal those of a plain loop, and change nothing else in a message."""
 
 import torch
 from helpers import both_motions, everything, random_actions
@@ -13,7 +13,7 @@ from damian.world.messages import Messages
 
 
 def sensing(motion: str = "instant", **changed) -> ScenarioConfig:
-    """A scenario with everything, and with sensors and features of one's own."""
+    """A scenario with everything, and with sensors and features of your own."""
     observation = ObservationConfig(["spotted", *LOCAL], ["source_distance", *GLOBAL])
     return everything(motion, **({"sensors": SENSORS, "observation": observation} | changed))
 
