@@ -1,4 +1,4 @@
-"""Your own distributions of delays: a satellite link with at times one more hop, and a radio link to antennas.
+"""Your own distributions of delays: a satellite link with more hops at times, and a radio link to antennas.
 
     cd examples/extending
     damian train "delay.obs={law: law:Satellite, hop: 2s, extra: 0.2}" aware=both
