@@ -75,9 +75,9 @@ DURATION = "duration"
 
 # Data collection and learning.
 STEP_COUNT = "step_count"
-"""Steps of the episode so far, [B, 1] (TorchRL's ``StepCounter``)."""
+"""Steps of the episode so far, [B, 1] (``EpisodeTotals``, as TorchRL's ``StepCounter``)."""
 EPISODE_REWARD = (AGENTS, "episode_reward")
-"""Return of the episode so far, [B, N, 1] (TorchRL's ``RewardSum``)."""
+"""Return of the episode so far, [B, N, 1] (``EpisodeTotals``, as TorchRL's ``RewardSum``)."""
 ACTION_LOG_PROB = (AGENTS, "action_log_prob")
 """Log-probability of the action when it was chosen, [B, N]."""
 LOGITS, LOC, SCALE = (AGENTS, "logits"), (AGENTS, "loc"), (AGENTS, "scale")

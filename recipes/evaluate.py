@@ -26,7 +26,7 @@ from .shared.runs import save_config
 
 MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
 of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
-likely one is taken. A policy without memory often needs chance to search: fly it as it returns more."""
+likely one is taken. A policy without memory often needs chance to search: fly the one that returns more."""
 """Lines under the table of an evaluation."""
 
 

@@ -84,6 +84,7 @@ class DelayLine:
     def reset(self, memory: Memory, values: list[Tensor], mask: Tensor) -> tuple[Memory, Delivery]:
         """Where the mask [M] is true, hold ``values`` [M, ...] and discard all messages in transit."""
         clock = memory["clock"]
+        # What is in transit stays in its slots, and is no longer newer than what is held.
         memory = memory | {n: torch.where(mask, clock, memory[n]) for n in ("reset_at", "generated_at")}
         memory["channel"] = self.sampler.begin_episode(memory["channel"], mask)
         for i, new in enumerate(values):

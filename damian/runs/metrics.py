@@ -148,7 +148,7 @@ class EpisodeLog:
         self._weight, self._sums = 0.0, [0.0] * len(self.NAMES)
 
     def add(self, batch: TensorDictBase) -> None:
-        """Add the episodes that end in a batch [B, T], with ``RewardSum`` and ``StepCounter`` entries."""
+        """Add the episodes that end in a batch [B, T], with the entries of ``EpisodeTotals``."""
         steps = cast(TensorDictBase, batch["next"]).transpose(0, 1)  # in order of time, as the mean needs
         done = steps[keys.DONE].squeeze(-1)
         measured = (keys.EPISODE_REWARD, keys.SUCCESS, keys.STEP_COUNT)
