@@ -156,7 +156,7 @@ def composed(program: str, overrides: Sequence[str], own_folder: str | None = No
         with initialize_config_dir(str(CONF), version_base=None):
             found = compose(program, words, return_hydra_config=True)
         return _tuned(found, {key_of(word) for word in overrides})
-    except ERRORS as error:
+    except (*ERRORS, ValueError) as error:  # such as a group that is set to a number
         raise InputError(reason(error, program)) from error
     finally:
         GlobalHydra.instance().hydra = running
@@ -271,6 +271,9 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
         if again:
             raise InputError("-m: not with programs that carry out many runs anyway")
 
+        own_folder = [f"--config-dir={given.config_dir}"] if given.config_dir else []
+        sys.argv[1:] = ["-m", *own_folder, *given.overrides]  # Hydra wants options first
+
         @hydra.main(version_base=None, config_path=str(CONF), config_name=program)
         def job(_: DictConfig) -> None:
             output, own = HydraConfig.get().runtime.output_dir, list(HydraConfig.get().overrides.task)
@@ -286,8 +289,11 @@ def _start(
     """Run a program once; a run that is refused before it writes anything leaves no folder."""
     runs = import_module(".shared.runs", __package__)  # it imports torch
     config, folder = runs.prepared(program, words, own_folder, shown(folder), again)
-    folder.mkdir(parents=True, exist_ok=True)
     key = "resume" if getattr(config, "resume", None) else "hydra.run.dir"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{key}: {folder} cannot be a run folder: {error.strerror}") from None
     only_reads = getattr(config, "report_only", False)  # a comparison may be reported on while it runs
     try:
         with nullcontext() if only_reads else locked(folder, key):

@@ -57,6 +57,7 @@ SYNONYMS = {
     "gamma": "learner.gamma",
     "belief": "aware=belief",
     "history": "delay.history",
+    "latency": "delay.obs",
     "num_envs": "worlds",
     "n_envs": "worlds",
     "total_frames": "frames",
@@ -114,14 +115,15 @@ def check_words(program: str, words: Sequence[str], own_folder: str | None = Non
     known, options = known_settings(program), groups(own_folder)
     for word in words:
         key, equals, value = word.partition("=")
-        first = value.partition(",")[0]
+        parts = value.split(",")  # of a sweep
         if not equals and not word.startswith("~"):
             raise InputError(f"{show(word)}: this word is not of the form KEY=VALUE")
         if key in options:
-            if key == "delay" and first[:1].isdigit():
+            if key == "delay" and value[:1].isdigit():
                 raise InputError(f"delay: {value} is no option of this group; write delay.obs={value}")
-            if first.replace("/", "").isidentifier() and first not in (*options[key], "null"):
-                raise InputError(f"{key}: {first} is not one of {', '.join(options[key])}")
+            names = [part for part in parts if part.replace("/", "").isidentifier()]
+            if wrong := [name for name in names if name not in (*options[key], "null")]:
+                raise InputError(f"{key}: {wrong[0]} is not one of {', '.join(options[key])}")
         elif not (_is_known(key, known) or own_folder or key.startswith(("hydra", "+", "~"))):
             raise InputError(no_such_key(key, program))
 

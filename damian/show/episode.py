@@ -22,7 +22,7 @@ import damian
 from damian import keys
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
-from damian.common.text_files import one_line, read_text
+from damian.common.text_files import named, one_line, read_text
 from damian.envs.uav_env import UavEnv
 
 SCHEMA, VERSION = "damian-episode", 2
@@ -154,8 +154,10 @@ class Episode:
     @classmethod
     def load(cls, path: Path) -> "Episode":
         """Read an episode from its file."""
+        with named(path):
+            text = read_text(path)
         try:
-            found = json.loads(read_text(path))
+            found = json.loads(text)
             if (found.get("schema"), found.get("version")) != (SCHEMA, VERSION):
                 raise ValueError(f"it is {found.get('schema')} of version {found.get('version')}")
             columns = {name: _column(name, found[name]) for name in COLUMNS}

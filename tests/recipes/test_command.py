@@ -44,7 +44,10 @@ def test_settings_help_and_wrong_words_need_no_torch(code):
     [
         (["trian"], "trian: no such program; the programs are train, evaluate"),
         (["train", "agnts=3"], "agnts: no such key; did you mean agents?"),
+        (["train", "num_envs=8"], "num_envs: no such key; did you mean worlds?"),
         (["train", "delay=3"], "delay: 3 is no option of this group; write delay.obs=3"),
+        (["train", "-m", "delay=none,papr"], "delay: papr is not one of"),
+        (["train", "delay=-1"], "Config group override must be a string"),
         (["train", "seed=0,1"], "Ambiguous value for argument 'seed=0,1' 1. To use it as a list"),
         (["train", "agents=two"], "agents: Value 'two' of type 'str' could not be converted to Integer"),
         (["train", "agents=0"], "agents: 0 is not between 1 and 1000"),
