@@ -271,8 +271,10 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
         if again:
             raise InputError("-m: not with programs that carry out many runs anyway")
 
-        own_folder = [f"--config-dir={given.config_dir}"] if given.config_dir else []
-        sys.argv[1:] = ["-m", *own_folder, *given.overrides]  # Hydra wants options first
+        first = [f"--config-dir={given.config_dir}"] if given.config_dir else []
+        if any(key_of(word) == "checkpoint" and "," in word for word in given.overrides):
+            first.append("hydra.job.config.override_dirname.exclude_keys=[]")  # else runs share a folder
+        sys.argv[1:] = ["-m", *first, *given.overrides]  # Hydra wants options first
 
         @hydra.main(version_base=None, config_path=str(CONF), config_name=program)
         def job(_: DictConfig) -> None:
