@@ -6,7 +6,6 @@ Nothing here imports torch, so that help and a misspelt word are answered at onc
 
 import os
 import shlex
-import signal
 import sys
 import traceback
 from argparse import Namespace
@@ -31,7 +30,7 @@ from yaml import YAMLError
 
 from damian.common.errors import RUN_ERROR, InputError, RunError
 from damian.common.text_files import one_line
-from damian.runs.interrupt import exit_code
+from damian.runs.interrupt import end_interrupted, number_of
 from damian.runs.run_lock import locked
 from damian.settings import LEARNERS, TrainConfig
 from damian.settings.fields import rules
@@ -248,9 +247,8 @@ def one_line_errors() -> Iterator[None]:
             line += " (DAMIAN_TRACEBACK=1 shows the traceback)"
         print(f"error: {line}", file=sys.stderr)
         sys.exit(RUN_ERROR if isinstance(error, RunError | OSError) else 2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(exit_code(signal.SIGINT))
+    except KeyboardInterrupt as error:
+        end_interrupted(number_of(error))
 
 
 # ------------------------------------------------------------------------------------------ running
@@ -265,8 +263,7 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
         given = parsed(sys.argv[1:])
         check_words(program, given.overrides, given.config_dir)
         if not given.multirun:
-            found = composed(program, given.overrides, given.config_dir)
-            _start(work, program, given.overrides, given.config_dir, Path(found.hydra.run.dir), again)
+            _start(work, program, given.overrides, given.config_dir, again=again)
             return
         if again:
             raise InputError("-m: not with programs that carry out many runs anyway")
@@ -286,12 +283,20 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
 
 
 def _start(
-    work: Work, program: str, words: list[str], own_folder: str | None, folder: Path, again: bool = False
+    work: Work,
+    program: str,
+    words: list[str],
+    own_folder: str | None,
+    job_folder: Path | None = None,
+    again: bool = False,
 ) -> None:
-    """Run a program once; a run that is refused before it writes anything leaves no folder."""
+    """Run a program once, for a sweep in ``job_folder``; a run that is refused leaves no folder."""
     runs = import_module(".shared.runs", __package__)  # it imports torch
-    config, folder = runs.prepared(program, words, own_folder, shown(folder), again)
+    given = composed(program, words, own_folder)
+    asked = shown(job_folder or Path(given.hydra.run.dir))
+    config, folder = runs.prepared(program, given, words, own_folder, asked, again)
     key = "resume" if getattr(config, "resume", None) else "hydra.run.dir"
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -305,7 +310,8 @@ def _start(
                 runs.perform(config, folder, work)
     finally:
         with suppress(OSError):  # it is not empty
-            os.removedirs(folder)
+            for each in made:
+                each.rmdir()
 
 
 def shown(folder: Path) -> Path:

@@ -25,7 +25,7 @@ from damian.compare.figures import plot_curves, plot_delays, plot_norms
 from damian.compare.report import markdown
 from damian.compare.statistics import FEWEST
 from damian.envs.pipeline import has_message_delay
-from damian.runs.interrupt import end_interrupted
+from damian.runs.interrupt import end_interrupted, number_of
 from damian.settings.programs import SEEDS, CompareConfig
 
 from . import cli, oracle
@@ -179,7 +179,7 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
             slurm = SlurmJobs(folder / "slurm", config.slurm or {}) if config.launcher == "slurm" else None
             failed = perform_all(runs, config.processes, (POLICIES[config.policy], config.score), slurm)
     except KeyboardInterrupt as error:
-        end_interrupted(error)
+        end_interrupted(number_of(error), "run the same command again to continue")
     for run in failed:
         print(f"failed: {run.name}; see {run.folder / LOG}", file=sys.stderr)
     done = [run for run in runs if run.finished]

@@ -4,7 +4,6 @@ damian train scenario=paper/usecase2 delay=paper aware=both hydra.run.dir=runs/f
 damian train resume=runs/first frames=600000
 """
 
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -26,7 +25,7 @@ from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage, corrections_of
 from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
-from damian.runs.interrupt import Interrupt
+from damian.runs.interrupt import Interrupt, end_interrupted
 from damian.runs.loggers import make_loggers
 from damian.runs.metrics_log import MetricsLog
 from damian.runs.run_folder import CHECKPOINT, FIGURE, plot_learning_curve
@@ -37,7 +36,7 @@ from damian.settings.fields import leaves
 from . import cli
 from .evaluate import make_eval_env, own_code, report
 from .shared.collectors import learning_env, make_collector, ticks
-from .shared.runs import interrupted, run_folder, save_config, stored_config
+from .shared.runs import run_folder, save_config, stored_config
 from .shared.settings import backupdates, check_learning, learning_setup, longest_wait
 
 Watch = Callable[[int, dict[str, float]], None]
@@ -66,7 +65,7 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
             if save_or_stop(config, state, log, interrupt):
                 break
     if interrupt.asked:
-        sys.exit(interrupted(folder, interrupt.asked))
+        end_interrupted(interrupt.asked, f"continue with resume={folder}")
     random = report(config, folder, make_eval_env(config), learner.actor)
     module, _, name = config.learner.name.partition(":")
     title = f"{config.agents} UAVs, {name or module.upper()}"

@@ -22,7 +22,7 @@ from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, RunError
 from damian.common.tables import csv_table, markdown_table
-from damian.runs.interrupt import end_interrupted
+from damian.runs.interrupt import end_interrupted, number_of
 from damian.settings import TrainConfig
 from damian.settings.programs import TuneConfig
 
@@ -223,7 +223,7 @@ def search_all(config: TuneConfig, folder: Path) -> None:
                 if error is not None:
                     print(f"failed: {run.folder}: {cli.reason(error)}", file=sys.stderr)
     except KeyboardInterrupt as error:
-        end_interrupted(error)
+        end_interrupted(number_of(error), "run the same command again to continue")
     report(found)
     print(f"results: {folder}")
 

@@ -32,17 +32,17 @@ class Interrupt:
         self._before = {}
 
 
-def exit_code(number: int) -> int:
-    """The exit code of a process that a signal has ended, as shells count it: 130 or 143."""
-    return 128 + number
-
-
 def interrupt(number: int, _: FrameType | None) -> NoReturn:
     """Handle a signal as Ctrl-C; the error holds the signal's number."""
     raise KeyboardInterrupt(number)
 
 
-def end_interrupted(error: KeyboardInterrupt) -> NoReturn:
-    """End a program that the same command continues."""
-    print("interrupted; run the same command again to continue", file=sys.stderr)
-    sys.exit(exit_code(error.args[0] if error.args else signal.SIGINT))
+def number_of(error: KeyboardInterrupt) -> int:
+    """The number of the signal that interrupted the program."""
+    return error.args[0] if error.args else signal.SIGINT
+
+
+def end_interrupted(number: int, remedy: str = "") -> NoReturn:
+    """End a program that a signal has stopped, with the exit code of shells: 130 or 143."""
+    print(f"interrupted; {remedy}" if remedy else "interrupted", file=sys.stderr)
+    sys.exit(128 + number)

@@ -1,8 +1,6 @@
 """Runs in their folders: starting and resuming them, and taking settings and policy of a stored one."""
 
 import random
-import signal
-import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -16,7 +14,6 @@ from damian.common.atomic_files import remove_unfinished, write_atomically
 from damian.common.errors import InputError
 from damian.common.text_files import show
 from damian.runs.checkpoint import digest
-from damian.runs.interrupt import exit_code
 from damian.runs.run_folder import CONFIG
 from damian.runs.run_record import check_version, read_record, timed, write_record
 from damian.runs.training_state import checkpoint_file
@@ -37,10 +34,14 @@ POLICY = "policy_sha256"
 
 
 def prepared(
-    program: str, words: Sequence[str], own_folder: str | None, folder: Path, again: bool = False
+    program: str,
+    given: DictConfig,
+    words: Sequence[str],
+    own_folder: str | None,
+    folder: Path,
+    again: bool = False,
 ) -> tuple[Any, Path]:
-    """The checked settings of a run, and its folder; a resumed run has those that it had."""
-    given = composed(program, words, own_folder)
+    """The checked settings and the folder of a run, from what is composed; a resumed run keeps its own."""
     words = [word for word in words if not key_of(word).startswith("hydra")]
     if program == "compare":
         return checked(given, program), folder
@@ -96,12 +97,6 @@ def seed_generators(seed: int) -> None:
     """Seed the global random generators of torch, NumPy and Python; your own components may use each."""
     for set_seed in (torch.manual_seed, np.random.seed, random.seed):
         set_seed(seed)
-
-
-def interrupted(folder: Path, number: int = signal.SIGINT) -> int:
-    """Say that a signal has stopped a run, and how to continue it; returns the exit code."""
-    print(f"interrupted; continue with resume={folder}", file=sys.stderr)
-    return exit_code(number)
 
 
 def save_config(config: TrainConfig, folder: Path) -> None:

@@ -79,6 +79,13 @@ def test_what_only_a_program_can_tell_is_one_line_too_and_leaves_no_folder(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_refused_run_removes_only_the_folders_that_it_has_made(capsys, tmp_path):
+    (tmp_path / "mine").mkdir()
+    words = ("delay.hold=max", f"hydra.run.dir={tmp_path}/mine/new/run")
+    assert "delay.hold: max means nothing" in refusal(capsys, "train", *words)
+    assert list((tmp_path / "mine").iterdir()) == []
+
+
 def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, tmp_path):
     file = tmp_path / "my own" / "scenario" / "mine.yaml"
     file.parent.mkdir(parents=True)
