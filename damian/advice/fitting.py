@@ -123,7 +123,7 @@ def trace_rows(fitted: Fit) -> list[str]:
 
 
 def summary(fitted: Fit) -> str:
-    """What was found, on two lines."""
+    """The fitted delays and losses as text, on two lines."""
     delays, n = fitted.delays, len(fitted.messages)
     uavs = {message.uav for message in fitted.messages}
     times = [message.time for message in fitted.messages]

@@ -6,6 +6,7 @@ is lost if the process is killed at any time. The first line says which fleet it
 
 import os
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -99,7 +100,7 @@ class Journal:
 def read_head(path: Path) -> Head:
     """The first line of a journal."""
     with named(path):
-        return validated(Head, parsed_json(_texts(path)[0]), "line 1")
+        return validated(Head, parsed_json(_texts(path, 1)[0]), "line 1")
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, Line]]:
@@ -113,9 +114,11 @@ def read_lines(path: Path) -> Iterator[tuple[int, Line]]:
         yield number, line
 
 
-def _texts(path: Path) -> list[bytes]:
+def _texts(path: Path, most: int = -1) -> list[bytes]:
+    """The whole lines of a file, or the first ``most`` ones."""
     try:
-        *lines, _ = path.read_bytes().split(b"\n")
+        with path.open("rb") as file:
+            *lines, _ = (file.read() if most < 0 else b"".join(islice(file, most))).split(b"\n")
     except OSError as error:
         raise InputError(f"it cannot be read: {error.strerror}") from None
     if not lines:

@@ -127,7 +127,7 @@ class UavLog:
         return self.reports[-1] if self.reports else None
 
     def check(self, report: Report) -> None:
-        """Check what a report says of places and readings."""
+        """Require places near landing points, and as many readings as the sensors give."""
         if report.columns != self.ground.columns:
             own = ", ".join(self.ground.columns)
             raise InputError(f"places in {self.ground.region.name} are {own}: give those of {report.id} so")

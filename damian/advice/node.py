@@ -57,7 +57,7 @@ class Reported(NamedTuple):
 
 
 class ReportedEnv(UavEnv):
-    """A single world of which nothing but messages is known; ``Node`` takes its steps."""
+    """A single world that is known only by its messages; ``Node`` takes its steps."""
 
     def __init__(self, scenario: ScenarioConfig, seed: int = 0, reward_terms: bool = False) -> None:
         extras = {"message", "reward_terms"} if reward_terms else {"message"}
@@ -70,7 +70,7 @@ class ReportedEnv(UavEnv):
         return outputs | {keys.RECEIVED: message.clone(), keys.AGE: age, keys.DELAY: age.long()}
 
     def outputs_of(self, reported: Reported, first: bool = False) -> Outputs:
-        """What a step, or the first one, outputs before any transform."""
+        """The outputs of a step, before any transform; ``first``: of the step that begins an episode."""
         state, on_time = reported.state, reported.on_time.unsqueeze(0)
         held = state.sent.pack()
         if first:
@@ -103,7 +103,7 @@ class Node:
             *observation_transforms(scenario),
         ]
         self.env = DelayedEnv(self.worlds, Compose(*transforms))  # type: ignore[arg-type]
-        """What the policy is made for; it is never stepped."""
+        """The environment for which the policy is built; nobody steps it."""
         self.env.reset()
         self.transforms = cast(list[StatefulTransform], transforms)
         self._unused = [transform.memory for transform in self.transforms]

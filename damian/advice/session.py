@@ -160,7 +160,7 @@ class AdviceSession:
 
 
 def replay(fleet: Fleet, line: Line) -> None:
-    """Do again what a line of a journal says."""
+    """Repeat in a fleet the reports or the advice that a line of its journal records."""
     if isinstance(line, Received):
         for report in line.reports:
             fleet.check(report)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from damian import keys
 from damian.common import checks
-from damian.common.tensors import gather_rows, tree_map
+from damian.common.tensors import distances, gather_rows, tree_map
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.uav_env import UavEnv
 from damian.server.belief import chance_of_staying, detection_chance, report_rows
@@ -73,7 +73,7 @@ class Greedy:
         self.seeks = scenario.seeks_source
         self.real = simulation.airspace.points[..., 0].isfinite()
         self.points = simulation.airspace.points.nan_to_num(posinf=0.0)
-        near = _distances(self.points, self.points) <= self.radius
+        near = distances(self.points, self.points) <= self.radius
         # A row is a landing point to cover, a column the one in whose footprint it lies.
         self.near = (near & self.real.unsqueeze(-1)).float()
 
@@ -87,8 +87,11 @@ class Greedy:
             time = held.time if age is None else held.time + age.squeeze(-1) * self.dt
             likely, recent = self.believe(held, ground, time.amax(-1, keepdim=True))
             weight = torch.where(recent, likely, weight * likely)
-        gain = weight @ (self.near if len(self.near) == 1 else self.near[region])
-        return self.choose(held, gain, region, mask)
+        return self.choose(held, weight @ self.footprints(region), region, mask)
+
+    def footprints(self, region: Tensor) -> Tensor:
+        """1 for landing points (rows) in the footprints of others (columns), [B or 1, L, L]."""
+        return self.near if len(self.near) == 1 else self.near[region]
 
     def choose(self, held: Messages, gain: Tensor, region: Tensor, mask: Tensor | None) -> Tensor:
         """Actions to the landing points of most ``gain`` [B, N, L], for UAVs at the targets of ``held``."""
@@ -100,9 +103,9 @@ class Greedy:
         """Actions, and the landing points [B, N] to which they lead, as indices in their region."""
         ground = self.points[region]
         gain = gain.where(self.real[region].unsqueeze(1), -torch.inf)
-        flown = _distances(held.target, ground)
+        flown = distances(held.target, ground)
         goal = (gain - _FLIGHT_COST * flown).argmax(-1)
-        left = _distances(_places_at(ground, goal), ground)
+        left = distances(_places_at(ground, goal), ground)
         if self.actions.kind == "discrete":
             # A UAV that the server has last heard of at its takeoff stands on its target when it chooses.
             standing = flown.argmin(-1) + region.unsqueeze(-1) * self.points.shape[1]
@@ -111,9 +114,9 @@ class Greedy:
 
     def fresh(self, held: Messages, ground: Tensor) -> Tensor:
         """1 for landing points [B, L, 2] nearest to the UAV and outside its latest footprints, [B, N, L]."""
-        distance = _distances(held.target, ground)
+        distance = distances(held.target, ground)
         own = distance <= distance.amin(1, keepdim=True)
-        from_trail = _distances(gather_rows(self.points.flatten(0, 1), held.trail), ground.unsqueeze(1))
+        from_trail = distances(gather_rows(self.points.flatten(0, 1), held.trail), ground.unsqueeze(1))
         return (own & (from_trail > self.radius).all(-2)).float()
 
     def believe(self, held: Messages, ground: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,11 +128,11 @@ class Greedy:
         """
         has_detection = held.detected_time >= 0
         since = torch.where(has_detection, now - held.detected_time, torch.inf).unsqueeze(-1)
-        outside = (_distances(held.detected_position, ground) - self.radius).clamp(min=0)
+        outside = (distances(held.detected_position, ground) - self.radius).clamp(min=0)
         log_detected = -(outside / (BLUR_M + self.speed * since / 2)).square() / 2
         log_detected = torch.where(has_detection.unsqueeze(-1), log_detected, 0.0).sum(1, keepdim=True)
         silent = ~held.spotted & ~held.in_flight & (held.time > now - self.dt / 2)
-        covered = (_distances(held.position, ground) <= self.radius) & silent.unsqueeze(-1)
+        covered = (distances(held.position, ground) <= self.radius) & silent.unsqueeze(-1)
         latest = since.amin(1, keepdim=True)
         confidence = TRUST * torch.where(latest < self.dt / 2, 1.0, self.emits)
         log = log_detected + torch.log1p(-confidence * covered.any(1, keepdim=True))
@@ -169,11 +172,6 @@ def _places_at(ground: Tensor, index: Tensor) -> Tensor:
     return ground.gather(1, index.unsqueeze(-1).expand(*index.shape, 2))
 
 
-def _distances(places: Tensor, others: Tensor) -> Tensor:
-    """Distances [*, P, Q] between places [*, P, 2] and others [*, Q, 2], exact also for small distances."""
-    return torch.cdist(places, others, compute_mode="donot_use_mm_for_euclid_dist")
-
-
 class Searcher(Greedy):
     """Each UAV flies where it most probably detects the source, or else searches its own ground."""
 
@@ -203,7 +201,7 @@ class Searcher(Greedy):
         each = belief.expand(*rows.shape, -1)
         stays = chance_of_staying(self.grid, each, rows.unsqueeze(-1))
         chance = chance.scatter(-1, here, stays).masked_fill(self.taken(known), 0.0)
-        near = _distances(own.target, ground) <= self.from_others(known, ground)
+        near = distances(own.target, ground) <= self.from_others(known, ground)
         probable = chance.amax(-1, keepdim=True) >= PROBABLE
         chance = torch.where(probable | near, chance, 0.0)
         worth = chance >= WORTH * chance.amax(-1, keepdim=True)
@@ -211,7 +209,7 @@ class Searcher(Greedy):
 
     def from_others(self, known: Messages, ground: Tensor) -> Tensor:
         """Distance from the nearest other UAV to each landing point [m], [B, N, L]; infinite for one UAV."""
-        distance = _distances(known.target, ground).unsqueeze(1)
+        distance = distances(known.target, ground).unsqueeze(1)
         n = distance.shape[2]
         itself = torch.eye(n, dtype=torch.bool, device=distance.device).unsqueeze(-1)
         return distance.masked_fill(itself, torch.inf).amin(2)
@@ -242,27 +240,28 @@ class Coverer(Greedy):
         held = self.unpack(message)
         own = held if own_message is None else self.unpack(own_message)
         region, actions = self.region_of(held), []
-        claimed = torch.zeros(self.points[region].shape[:2], device=message.device)
+        near = self.footprints(region)
+        claimed = torch.zeros(len(region), near.shape[-1], device=message.device)
         for uav in range(message.shape[1]):  # what a UAV chooses depends on those before it
             legal = None if mask is None else mask[:, uav : uav + 1]
-            action, point = self.choose_new(own, uav, claimed, region, legal)
+            action, point = self.choose_new(own, uav, claimed, near, legal)
             actions.append(action)
             if own_message is not None:  # the others do not know where it is
-                _, point = self.choose_new(held, uav, claimed, region, None)
-            claimed = torch.maximum(claimed, self.footprint(point, region).squeeze(1))
+                _, point = self.choose_new(held, uav, claimed, near, None)
+            claimed = torch.maximum(claimed, _footprints_of(point, near).squeeze(1))
         return torch.cat(actions, 1)
 
     def choose_new(
-        self, known: Messages, uav: int, claimed: Tensor, region: Tensor, mask: Tensor | None
+        self, known: Messages, uav: int, claimed: Tensor, near: Tensor, mask: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Action and landing point of one UAV, [B, 1], where ground is not ``claimed`` [B, L] by others."""
         alone = tree_map(lambda field: field[:, uav : uav + 1], known)
         latest = alone.trail[:, 0, :-1] % self.points.shape[1]  # the next landing replaces the oldest one
-        covered = torch.cat([self.footprint(latest, region), claimed.unsqueeze(1)], 1).amax(1, keepdim=True)
-        gain = (1 - covered) @ (self.near if len(self.near) == 1 else self.near[region])
-        return self.choose_landing(alone, gain, region, mask)
+        covered = torch.cat([_footprints_of(latest, near), claimed.unsqueeze(1)], 1).amax(1, keepdim=True)
+        return self.choose_landing(alone, (1 - covered) @ near, self.region_of(known), mask)
 
-    def footprint(self, point: Tensor, region: Tensor) -> Tensor:
-        """1 for the landing points in the footprints of others [B, P], given as indices, [B, P, L]."""
-        rows = (0 * region if len(self.near) == 1 else region).unsqueeze(-1)
-        return self.near[rows, point]
+
+def _footprints_of(point: Tensor, near: Tensor) -> Tensor:
+    """1 for the landing points in the footprints of those of these indices [B, P], [B, P, L]."""
+    rows = near.expand(len(point), -1, -1)
+    return rows.gather(1, point.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))

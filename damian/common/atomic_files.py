@@ -12,7 +12,7 @@ UNFINISHED = ".part"
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:
-    """Write a whole file, or leave the file of this name as it is."""
+    """Replace a file as a whole; if that fails, the file of this name stays as it was."""
     unfinished = path.with_name(path.name + UNFINISHED)
     with writing(path):
         try:

@@ -21,7 +21,7 @@ class RunError(RuntimeError):
 
 @contextmanager
 def naming_errors(name: str) -> Iterator[None]:
-    """Turn what a component of the user's own raises into an ``InputError`` with its name, file and line."""
+    """Turn an exception of the user's component into an ``InputError`` with its name, file and line."""
     try:
         yield
     except (InputError, RunError):

@@ -42,7 +42,7 @@ class Registry(Generic[T]):
         return add
 
     def get(self, name: Any, key: str) -> T:
-        """The component of a name or path; ``key`` is that of the setting, for errors."""
+        """The component with this name or path; errors name the setting ``key``."""
         if isinstance(name, str) and name in self._components:
             return self._components[name]
         if not isinstance(name, str) or ":" not in name:

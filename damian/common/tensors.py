@@ -19,6 +19,11 @@ def expand_mask(mask: Tensor, like: Tensor) -> Tensor:
     return mask.view((*mask.shape, *[1] * (like.dim() - mask.dim())))
 
 
+def distances(places: Tensor, others: Tensor) -> Tensor:
+    """Distances [*, P, Q] between places [*, P, 2] and others [*, Q, 2], exact also for small distances."""
+    return torch.cdist(places, others, compute_mode="donot_use_mm_for_euclid_dist")  # no matrix product
+
+
 def next_true(flags: Tensor) -> Tensor:
     """Index of the next true flag at or after each place, T if there is none; flags [T, ...] by time."""
     n_flags = len(flags)

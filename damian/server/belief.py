@@ -310,8 +310,8 @@ class Window(NamedTuple):
 
     A message that comes in late changes what is known of its step; from there the filter runs again. No
     message is later than the longest delay, so that older beliefs are final. The first receiver is the
-    server. The others, if any, are the N UAVs, each of which knows its own messages at once: the filter runs
-    for a UAV only from where it knows more than the server.
+    server. The others, if any, are the N UAVs. Each UAV knows its own messages at once, so that the filter
+    runs for it only from where it knows more than the server.
     """
 
     belief: Tensor

@@ -11,7 +11,7 @@ from torch import Tensor
 from damian.common import checks, devices
 from damian.common.errors import InputError
 from damian.common.registry import Registry, require_parentheses
-from damian.common.tensors import gather_rows
+from damian.common.tensors import distances, gather_rows
 from damian.server.belief import (
     SourceGrid,
     chance_of_staying,
@@ -269,9 +269,7 @@ def _bearing(v: FeatureCache) -> Tensor:
 def _pairwise(v: FeatureCache) -> Tensor:
     """Distances from the wanted UAVs to all, over the largest vertex distance of the region, [*, N, N]."""
     position = v.messages.position
-    # Not by a matrix product, which loses digits where UAVs are close to each other.
-    distance = torch.cdist(v.wanted(position), position, compute_mode="donot_use_mm_for_euclid_dist")
-    return distance / v.scale.unsqueeze(-1)
+    return distances(v.wanted(position), position) / v.scale.unsqueeze(-1)
 
 
 def others_of(v: FeatureCache) -> Tensor:

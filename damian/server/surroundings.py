@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from damian.common.tensors import gather_rows
+from damian.common.tensors import distances, gather_rows
 from damian.server.features import FEATURES, FeatureCache, feature, others_of
 from damian.world.airspace import Airspace
 
@@ -26,9 +26,9 @@ _OLDEST = 0.5
 """How new ground in the oldest footprint of the window nearly is, in [0, 1]; in the newest one it is 0."""
 
 
-def ring_places(radius: float) -> Tensor:
+def ring_places(radius: float, device: torch.device | None = None) -> Tensor:
     """Offsets of the places of ``coverage_map`` from a UAV [m], [24, 2]; the inner ring first."""
-    angle = torch.arange(SECTORS) * (2 * math.pi / SECTORS)
+    angle = torch.arange(SECTORS, device=device) * (2 * math.pi / SECTORS)
     ring = torch.stack([angle.sin(), angle.cos()], -1)
     return torch.cat([ring * distance * radius for distance in RINGS])
 
@@ -88,13 +88,10 @@ def _coverage_map(v: FeatureCache) -> Tensor:
     context, trail = v.context, v.messages.trail
     assert context.places_inside is not None
     standing = v.wanted(trail[..., 0])
-    places = gather_rows(context.points, standing).unsqueeze(-2) + ring_places(context.radius).to(
-        standing.device
-    )
+    offsets = ring_places(context.radius, standing.device)
+    places = gather_rows(context.points, standing).unsqueeze(-2) + offsets
     landed = gather_rows(context.points, trail)  # [*, N, n, 2]
-    distance = torch.cdist(
-        places.flatten(-3, -2), landed.flatten(-3, -2), compute_mode="donot_use_mm_for_euclid_dist"
-    ) / (2 * context.radius)
+    distance = distances(places.flatten(-3, -2), landed.flatten(-3, -2)) / (2 * context.radius)
     age = torch.arange(trail.shape[-1], device=trail.device) / trail.shape[-1]
     new = distance.view(*places.shape[:-1], *trail.shape[-2:]) + _OLDEST * age
     return new.flatten(-2).amin(-1).clamp(max=1) * gather_rows(context.places_inside, standing)

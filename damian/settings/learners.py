@@ -1,4 +1,4 @@
-"""Settings of the networks and of the learners, each of which names the class that learns with them."""
+"""Settings of the networks and of the learners. A learner's settings name the class that learns with them."""
 
 from dataclasses import dataclass
 from importlib import import_module
