@@ -27,7 +27,7 @@ OF_RUNS = f"overrides={json.dumps([word for word in TINY if word != 'logger=csv'
 FLIGHTS = ["eval_episodes=3"]
 SHORTER = {
     "train": TINY,
-    "tune": ["trials=2", "processes=1", OF_RUNS],
+    "tune": ["trials=2", "processes=1", *TINY],
     "evaluate": FLIGHTS,
     "fly": [*FLIGHTS, "episode.max_steps=12"],
     "oracle": FLIGHTS,
@@ -64,7 +64,7 @@ def shortened(words: list[str]) -> list[str]:
         words = [word.replace(",mp4", "") for word in words]
     if any(word.startswith("resume=") for word in words):
         return [re.sub(r"^frames=.*", "frames=128", word) for word in words]
-    if any(word.startswith("journal=journals/") for word in words):
+    if any(word.startswith(("journal=", "replay=")) for word in words):  # nothing is flown
         return words
     shorter = SHORTER.get(words[0], [])
     if any(word.startswith("checkpoint=") for word in words):  # the region is that of the training

@@ -71,7 +71,7 @@ def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
     child = os.fork()
     if child:
         return child
-    code = 1
+    code = 130  # if a signal comes before the program has begun
     try:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
@@ -83,6 +83,7 @@ def forked(words: list[str], prepare: Callable[[], None] = lambda: None) -> int:
         tqdm.set_lock(threading.RLock())  # its own one is shared, and a killed child would keep it
         sys.argv = ["train.py", *words]
         prepare()
+        code = 1
         main()
         code = 0
     except SystemExit as stopped:
