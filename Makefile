@@ -10,7 +10,7 @@ PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 .PHONY: train test test-order test-deep test-slow test-browser bench bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
-	$(VENV)/bin/damian train aware=belief frames=100000 $(ARGS)
+	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=4 aware=backupdate observation.own=true frames=400000 $(ARGS)
 
 test: $(VENV)/test
 	$(PY) -m pytest -n 2 $(ARGS)

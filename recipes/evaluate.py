@@ -13,11 +13,10 @@ from torchrl.modules import ProbabilisticActor
 from damian.baselines.greedy import greedy_policy
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError, naming_errors
-from damian.compare.comparison import RANDOM, SCRIPT, TRAINED, UNTRAINED
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
 from damian.runs.metrics import Evaluation, evaluate
-from damian.runs.run_folder import DETERMINISTIC, save_results
+from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED, save_results
 from damian.runs.training_state import load_networks
 from damian.settings import TrainConfig
 
@@ -26,7 +25,7 @@ from .shared.runs import save_config
 
 MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
 of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
-likely one is taken. A policy without memory often needs chance to search: fly the one that returns more."""
+likely one is taken. A policy without memory often needs chance to search."""
 """Lines under the table of an evaluation."""
 
 
@@ -65,8 +64,8 @@ def make_eval_env(config: TrainConfig) -> DelayedEnv:
 
 def report(
     config: TrainConfig, folder: Path, env: DelayedEnv, actor: torch.nn.Module | None = None
-) -> Evaluation:
-    """Evaluate an actor beside others, write and print the results; returns those of random actions."""
+) -> dict[str, Evaluation]:
+    """Evaluate an actor beside others, write, print and return the results, by policy."""
 
     def fly(policy: torch.nn.Module, sample: bool = True) -> Evaluation:
         env.set_seed(config.eval_seed)  # the same episodes for every policy
@@ -84,7 +83,7 @@ def report(
     succeeds = config.episode.success_share is not None
     table = save_results(rows, folder, succeeds, has_message_delay(config), MEANING)
     print(f"\nmeans of {config.eval_episodes} episodes:\n\n{table}\n")
-    return random
+    return rows
 
 
 def untrained_actor(config: TrainConfig, env: DelayedEnv) -> torch.nn.Module:

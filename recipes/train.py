@@ -4,6 +4,7 @@ damian train scenario=paper/usecase2 delay=paper aware=both hydra.run.dir=runs/f
 damian train resume=runs/first frames=600000
 """
 
+import shlex
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -27,8 +28,9 @@ from damian.replay.recompute import server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.runs.interrupt import Interrupt, end_interrupted
 from damian.runs.loggers import make_loggers
+from damian.runs.metrics import Evaluation
 from damian.runs.metrics_log import MetricsLog
-from damian.runs.run_folder import CHECKPOINT, FIGURE, plot_learning_curve
+from damian.runs.run_folder import CHECKPOINT, DETERMINISTIC, FIGURE, TRAINED, plot_learning_curve
 from damian.runs.training_state import TrainingState, load_networks
 from damian.settings import TrainConfig
 from damian.settings.fields import leaves
@@ -66,11 +68,20 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
                 break
     if interrupt.asked:
         end_interrupted(interrupt.asked, f"continue with resume={folder}")
-    random = report(config, folder, make_eval_env(config), learner.actor)
+    evaluations = report(config, folder, make_eval_env(config), learner.actor)
     module, _, name = config.learner.name.partition(":")
     title = f"{config.agents} UAVs, {name or module.upper()}"
-    plot_learning_curve(log.rows, random, folder / FIGURE, title)
+    plot_learning_curve(log.rows, evaluations, folder / FIGURE, title)
     print(f"learning curve: {folder / FIGURE}")
+    print(f"fly the best policy: {best_flight(evaluations, folder)}")
+
+
+def best_flight(evaluations: dict[str, Evaluation], folder: Path) -> str:
+    """The command that flies the trained policy, drawing its actions or not, whichever is better."""
+    policies = {"sampled": TRAINED, "deterministic": TRAINED + DETERMINISTIC}
+    scores = {name: evaluations[policy] for name, policy in policies.items()}
+    best = max(scores, key=lambda name: (scores[name].success_rate, scores[name].return_))
+    return f"damian fly checkpoint={shlex.quote(str(folder))} policy={best}"
 
 
 def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | None) -> Learner:
@@ -188,8 +199,7 @@ def save_or_stop(config: TrainConfig, state: TrainingState, log: MetricsLog, int
     due = finished or state.progress.updates % config.checkpoint_every == 0
     if due or asked:
         log.sync()
-        # Before the first episodes of all worlds can have ended, only the short ones have.
-        if due and state.progress.frames >= config.worlds * (config.episode.max_steps or 1):
+        if due:
             state.save_best()
         state.save()
     return finished or asked

@@ -18,10 +18,9 @@ from damian.compare.statistics import (
     probability_of_improvement,
     recovery,
 )
-from damian.runs.run_folder import DETERMINISTIC
+from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED
 from damian.settings.programs import LESS_IS_BETTER, Arm
 
-TRAINED, UNTRAINED, SCRIPT, RANDOM = "trained", "untrained", "script", "random"
 TRAINED_DETERMINISTIC, UNTRAINED_DETERMINISTIC = TRAINED + DETERMINISTIC, UNTRAINED + DETERMINISTIC
 SCRIPTED = (RANDOM, SCRIPT)
 """Policies that fly the same episodes beside each arm, and learn nothing."""

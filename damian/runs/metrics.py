@@ -136,37 +136,40 @@ def _mean(numbers: Tensor) -> float:
 
 
 class EpisodeLog:
-    """Means over the episodes of the training; each new one multiplies the earlier ones by ``factor``.
+    """Means over the latest episodes of the training, as many of each world, at least ``EPISODES`` in all.
 
-    It is 0.991 in the paper's Figures 5 and 6.
+    Every world counts the same, and nothing is known before one has ended in each: the first episodes to end
+    are the shortest, and their means would be too good.
     """
 
     NAMES = ("perceived_return", "perceived_success_rate", "perceived_steps")
+    EPISODES = 100
 
-    def __init__(self, factor: float = 0.991) -> None:
-        self.factor, self.finished = factor, 0
-        self._weight, self._sums = 0.0, [0.0] * len(self.NAMES)
+    def __init__(self, worlds: int) -> None:
+        self.finished = 0
+        self._latest = torch.full((worlds, math.ceil(self.EPISODES / worlds), len(self.NAMES)), torch.nan)
 
     def add(self, batch: TensorDictBase) -> None:
         """Add the episodes that end in a batch [B, T], with the entries of ``EpisodeTotals``."""
-        steps = cast(TensorDictBase, batch["next"]).transpose(0, 1)  # in order of time, as the mean needs
-        done = steps[keys.DONE].squeeze(-1)
-        measured = (keys.EPISODE_REWARD, keys.SUCCESS, keys.STEP_COUNT)
-        ended = [cast(Tensor, steps[key])[done].float().flatten(1).mean(1) for key in measured]
-        for row in torch.stack(ended, -1).tolist():
-            self._weight = self.factor * self._weight + 1
-            self._sums = [self.factor * old + new for old, new in zip(self._sums, row, strict=True)]
-            self.finished += 1
+        steps, kept = cast(TensorDictBase, batch["next"]), self._latest.shape[1]
+        done = steps[keys.DONE].to("cpu")
+        totals = [steps[key].flatten(2).float().mean(2) for key in _TOTALS]
+        ended = torch.stack(totals, -1).to("cpu").masked_fill(~done, torch.nan)  # [B, T, 3]
+        known = torch.cat([self._latest, ended], 1)
+        when = torch.arange(known.shape[1]).where(~known[..., 0].isnan(), -1)
+        latest = when.topk(kept, 1).indices.unsqueeze(-1).expand(-1, -1, len(self.NAMES))
+        self._latest, self.finished = known.gather(1, latest), self.finished + int(done.sum())
 
     def state_dict(self) -> dict[str, Any]:
-        return {"finished": self.finished, "weight": self._weight, "sums": list(self._sums)}
+        return {"finished": self.finished, "latest": self._latest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.finished, self._weight = int(state["finished"]), float(state["weight"])
-        self._sums = [float(total) for total in state["sums"]]
+        self.finished, self._latest = int(state["finished"]), state["latest"]
 
     def means(self) -> dict[str, float]:
-        """Mean return, success rate and steps, perceived by the server; nan before an episode has ended."""
-        if not self.finished:
-            return dict.fromkeys(self.NAMES, math.nan)
-        return {name: total / self._weight for name, total in zip(self.NAMES, self._sums, strict=True)}
+        """Mean return, success rate and steps as perceived; nan before an episode has ended in each world."""
+        return dict(zip(self.NAMES, self._latest.nanmean(1).mean(0).tolist(), strict=True))
+
+
+_TOTALS = (keys.EPISODE_REWARD, keys.SUCCESS, keys.STEP_COUNT)
+"""Entries of a last step with the measures of the episode, in the order of ``EpisodeLog.NAMES``."""

@@ -2,6 +2,7 @@
 
 import io
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 from damian.common.atomic_files import write_atomically
@@ -15,25 +16,31 @@ REPLAY = "replay"
 CONFIG = "config.yaml"
 RESULTS = "result.csv"
 TABLE = "result.md"
+TRAINED, UNTRAINED, SCRIPT, RANDOM = "trained", "untrained", "script", "random"
 DETERMINISTIC = ", deterministic"
 """Ending of the name of a policy whose most likely actions are taken, not drawn from its distribution."""
 
 
-def plot_learning_curve(rows: list[dict[str, float]], random: Evaluation, path: Path, title: str) -> None:
-    """Draw return and success rate over environment steps, with the random policy as a dashed line."""
+def plot_learning_curve(
+    rows: list[dict[str, float]], evaluations: Mapping[str, Evaluation], path: Path, title: str
+) -> None:
+    """Draw return and success rate over environment steps, from the untrained policy on."""
     from matplotlib.figure import Figure  # noqa: PLC0415 (slow to import, needed once)
     from matplotlib.ticker import EngFormatter  # noqa: PLC0415
 
-    panels = [("perceived_return", "return", random.perceived_return)]
+    panels = {"perceived_return": "return"}
     if any(row["perceived_success_rate"] > 0 for row in rows):
-        panels.append(("perceived_success_rate", "success rate", random.perceived_success_rate))
+        panels["perceived_success_rate"] = "success rate"
     figure = Figure(figsize=(5 * len(panels), 3.4))
     axes = figure.subplots(1, len(panels), squeeze=False)
-    for axis, (name, label, level) in zip(axes[0], panels, strict=True):
+    for axis, (name, label) in zip(axes[0], panels.items(), strict=True):
         points = [(row["frames"], row[name]) for row in rows if not math.isnan(row[name])]
-        mark = "o" if len(points) == 1 else ""  # a line of one point would be invisible
-        axis.plot(*zip(*points, strict=True), color="tab:blue", marker=mark, label="while training")
-        axis.axhline(level, color="tab:gray", linestyle="--", label="random policy")
+        points.insert(0, (0, evaluations[UNTRAINED].row()[name]))
+        axis.plot(*zip(*points, strict=True), color="tab:blue", marker="o", markevery=[0], label="training")
+        for policy, style in {SCRIPT: "-.", RANDOM: "--"}.items():
+            if policy in evaluations:  # a region may be too large for the script
+                level = evaluations[policy].row()[name]
+                axis.axhline(level, color="tab:gray", linestyle=style, label=policy)
         axis.set_xlabel("environment steps, all worlds")
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.set_ylabel(label)

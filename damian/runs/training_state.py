@@ -50,7 +50,7 @@ class TrainingState:
         buffer: ReplayBuffer | None = None,
     ) -> None:
         self.folder, self.components = folder, components
-        self.progress, self.episodes = Progress(), EpisodeLog()
+        self.progress, self.episodes = Progress(), EpisodeLog(collector.env.batch_size[0])
         self.saved = 0
         """The update after which the checkpoint of the run was written."""
         self._replay = ReplayMemory(buffer, folder / REPLAY)

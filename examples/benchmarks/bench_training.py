@@ -114,7 +114,9 @@ def rival(config: TrainConfig, together: bool) -> Iterator[Seconds]:
     ``together``: compute one value for all agents (MAPPO) instead of one for each (IPPO).
     """
     worlds, steps, learner = config.worlds, config.update_steps, cast(MappoConfig, config.learner)
-    env = VmasEnv("navigation", num_envs=worlds, n_agents=config.agents, max_steps=100, continuous_actions=True)
+    env = VmasEnv(
+        "navigation", num_envs=worlds, n_agents=config.agents, max_steps=100, continuous_actions=True
+    )
     actor, observed = vmas_actor(env, config.agents, config.model.hidden), ("agents", "observation")
     network = vmas_network(env, config.agents, config.model.hidden, 1, together)
     critic = TensorDictModule(network, in_keys=[observed], out_keys=[("agents", "state_value")])

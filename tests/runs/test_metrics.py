@@ -2,6 +2,8 @@
 
 import csv
 import json
+import math
+from statistics import fmean
 from typing import Any
 
 import pytest
@@ -198,19 +200,23 @@ def ended_episodes(batch: TensorDictBase) -> list[dict[str, float]]:
     return ended
 
 
-def test_the_episode_log_is_an_exponential_mean_over_episodes_in_the_order_of_their_ends():
-    batch, log, factor = training_batch(), EpisodeLog(0.9), 0.9
+def test_the_episode_log_means_the_latest_episodes_of_each_world_and_begins_when_all_have_one(monkeypatch):
+    monkeypatch.setattr(EpisodeLog, "EPISODES", 3 * len(batch := training_batch()))
+    log = EpisodeLog(len(batch))
     for part in batch.split([13, 1, 26], 1):
-        state, log = log.state_dict(), EpisodeLog(factor)
+        state, log = log.state_dict(), EpisodeLog(len(batch))
         log.load_state_dict(state)
         log.add(part)
-    episodes = ended_episodes(batch)
-    assert log.finished == len(episodes) > 50
+    latest = [ended_episodes(world.unsqueeze(0))[-3:] for world in batch]
+    assert log.finished == len(ended_episodes(batch)) > 50
     for name, mean in log.means().items():
-        weights = [factor**k for k in range(len(episodes))]
-        weighted = [w * row[name] for w, row in zip(weights, reversed(episodes), strict=True)]
-        assert mean == pytest.approx(sum(weighted) / sum(weights), rel=1e-5)
-    assert {row["perceived_success_rate"] for row in episodes} == {0.0, 1.0}
+        assert mean == pytest.approx(fmean([fmean([row[name] for row in world]) for world in latest]))
+    assert {row["perceived_success_rate"] for world in latest for row in world} == {0.0, 1.0}
+
+    log, shortest = EpisodeLog(len(batch)), min(int(world["next", "done"].int().argmax()) for world in batch)
+    log.add(batch[:, : shortest + 1])
+    assert log.finished > 0
+    assert all(math.isnan(mean) for mean in log.means().values())
 
 
 # Tables and files.
