@@ -29,6 +29,7 @@ class Registry(Generic[T]):
     def __init__(self, kind: str, problem: Callable[[Any], str | None] = lambda _: None) -> None:
         self.kind, self._problem = kind, problem
         self._components: dict[str, T] = {}
+        self._imported: dict[str, T] = {}  # a compiled step looks a component up, but cannot import it
 
     def register(self, name: str) -> Callable[[Component], Component]:
         """Decorator that adds a component under a name."""
@@ -45,12 +46,15 @@ class Registry(Generic[T]):
         """The component with this name or path; errors name the setting ``key``."""
         if isinstance(name, str) and name in self._components:
             return self._components[name]
+        if isinstance(name, str) and name in self._imported:
+            return self._imported[name]
         if not isinstance(name, str) or ":" not in name:
             known = f"one of {', '.join(self._components)}, nor " if self._components else ""
             raise InputError(f"{key}: {name} is not {known}a path such as package.module:Name")
         component = _import_path(name, key)
         if problem := self._problem(component):
             raise InputError(f"{key}: {name} {problem}")
+        self._imported[name] = component
         return component
 
     def read(self, written: Any, key: str, entry: str) -> tuple[str, T, dict[str, Any]]:

@@ -51,6 +51,18 @@ def _place(v: FeatureCache) -> Tensor:
     return (v.messages.target / (v.scale.unsqueeze(-1) / 2)).clamp(-1, 1)
 
 
+@FEATURES.register("number")
+@feature("local", width=OTHERS + 1)
+def _number(v: FeatureCache) -> Tensor:
+    """Which UAV it is: 1 in one of five columns, in the first one for the first and the sixth, [*, N, 5].
+
+    UAVs that share a network and decide at once share out the ground only if something tells them apart.
+    """
+    known = v.messages.time
+    columns = torch.arange(known.shape[-1], device=known.device) % (OTHERS + 1)
+    return F.one_hot(columns, OTHERS + 1).float().expand(*known.shape, OTHERS + 1)
+
+
 @FEATURES.register("time_left")
 @feature("local")
 def _time_left(v: FeatureCache) -> Tensor:

@@ -92,3 +92,8 @@ def test_a_region_of_ones_own_is_flown_over(folder):
     env = UavEnv(everything(region=RegionConfig("region:yard", options={"side": 200.0}, lattice_step=40.0)))
     assert env.simulation.airspace.regions[0].name == "L-shaped yard"
     assert env.simulation.airspace.regions[0].polygon.area == pytest.approx(0.75 * 200**2)
+
+
+@pytest.mark.slow
+def test_components_of_ones_own_are_compiled(run):
+    run(*TINY, *REWARDS, *LAW, *FEATURES, *REGION, *MOTION, SENSOR, "aware=both", "compile=true")

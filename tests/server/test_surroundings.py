@@ -10,13 +10,15 @@ from damian import keys, make_env
 from damian.server.surroundings import OTHERS, RINGS, SECTORS
 from damian.settings import DelayConfig, ObservationConfig, RegionConfig, ScenarioConfig
 
-NAMES = ["others", "coverage_map", "place", "time_left"]
+NAMES = ["others", "coverage_map", "place", "time_left", "number"]
 """Features in the order of the observation."""
 
 
 def rollout(agents, own=False, **changed):
     """A rollout of a random policy, and its environment."""
-    observation = ObservationConfig(["place", "time_left"], ["others", "coverage_map"], own=own, window=3)
+    observation = ObservationConfig(
+        ["place", "time_left", "number"], ["others", "coverage_map"], own=own, window=3
+    )
     region = RegionConfig(kind="random", pool=2, lattice_step=60.0)
     scenario = ScenarioConfig(agents=agents, observation=observation, region=region, **changed)
     env = make_env(scenario, 3, seed=agents, extras=["message"])
@@ -52,6 +54,7 @@ def twin(env, messages, region, now, i):
         "others": ways,
         "place": [max(-1, min(1, v / (scale / 2))) for v in target[i]],
         "time_left": [1 - now / env.uav_env.scenario.time_scale],
+        "number": [float(i % 5 == column) for column in range(5)],
     }
 
 
@@ -77,7 +80,7 @@ def test_surroundings_equal_those_of_a_plain_loop(agents, own):
                     rows[i] = sent[world, step, i]
                 messages = server.messages(rows)
                 expected = twin(env, messages, int(server.region_of(messages)), step + 1, i)
-                others, rest = observed[world, step, i].split([5 * OTHERS, 24 + 2 + 1])
+                others, rest = observed[world, step, i].split([5 * OTHERS, 24 + 2 + 1 + 5])
                 values = torch.tensor([number for name in NAMES[1:] for number in expected[name]])
                 assert rest.allclose(values, atol=1e-5), (world, step, i)
                 check_others(others.view(OTHERS, 5), expected["others"])
