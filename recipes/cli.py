@@ -319,11 +319,6 @@ def shown(folder: Path) -> Path:
     return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
-def own_folder() -> str | None:
-    """The folder of the user's own options, ``--config-dir``, as it was typed."""
-    return parsed(sys.argv[1:]).config_dir
-
-
 def command() -> str:
     """The command line as it was typed, to be run again in a shell; without the password of a service."""
     words = [f"{SECRET}=..." if key_of(word) == SECRET else word for word in sys.argv[1:]]

@@ -78,7 +78,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     source = arm.policy_of or (name if task != trained_in and not flies_alone else None)
     overrides = ["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides]
     try:
-        unseeded = _composed(*overrides, own_folder=cli.own_folder())
+        unseeded = _composed(*overrides, own_folder=config.own_folder)
         late_by = [] if arm.delayed else late(unseeded)
         should = "delays this arm, with which others are compared: put delays under experiment.delays"
         checks.require(not late_by, ", ".join(late_by), "its value", should)

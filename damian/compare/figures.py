@@ -22,11 +22,11 @@ from damian.compare.comparison import (
     BOUNDS,
     HELD_OUT_MARK,
     NOT_LATE,
-    RANDOM,
     Comparison,
     Estimate,
 )
 from damian.compare.statistics import Floats, bootstrap
+from damian.runs.run_folder import RANDOM, SCRIPT
 
 Curves = Mapping[tuple[str, str, str], Sequence[Sequence[Mapping[str, float]]]]
 """Rows of ``metrics.csv`` of each seed, by task, delay and arm."""
@@ -54,8 +54,9 @@ def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float
     """Draw learning curves over environment steps; over episodes if not all runs made as many steps.
 
     One task has a row of panels for each delay, with return, success rate and steps; of several tasks, each
-    has a row with its returns under each delay. A curve is the mean over seeds, with its 95 % band. Dashed
-    lines: the random policy and the ``best`` possible values; dotted lines: arms that train nothing.
+    has a row with its returns under each delay. A curve is the mean over seeds, with its 95 % band.
+    Dashed lines: the random policy and the ``best`` possible values; dash-dotted: the undelayed script;
+    dotted: arms that train nothing.
     """
     grid = [row for row in _panels(comparison, curves) if row]
     if not grid:
@@ -183,8 +184,10 @@ def _curve_panel(
             axis.fill_between(place, low, high, color=style["color"], alpha=0.2, linewidth=0)
         elif values := comparison.values(*run, comparison.policy, measure):
             axis.axhline(fmean(values.values()), **style)
-    if random := comparison.values(task, NOT_LATE, comparison.undelayed, RANDOM, measure):
-        axis.axhline(fmean(random.values()), label=RANDOM, **_LEVEL)
+    for policy, label, line in ((RANDOM, RANDOM, "--"), (SCRIPT, f"{SCRIPT}, undelayed", "-.")):
+        if values := comparison.values(task, NOT_LATE, comparison.undelayed, policy, measure):
+            level: dict[str, Any] = _LEVEL | {"linestyle": line}
+            axis.axhline(fmean(values.values()), label=label, **level)
 
 
 def _band(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from damian.common import checks
-from damian.settings.fields import Settings, setting
+from damian.settings.fields import Settings, constant, setting
 from damian.settings.training import TrainConfig
 
 MISSING: Any = "???"
@@ -308,6 +308,7 @@ class CompareConfig(Settings):
     score: str = setting("return", SCORE_MEANS, choices=SCORES)
     policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
     report_only: bool = setting(False, "Run nothing; write tables and figures from stored results.")
+    own_folder: str | None = constant(None, "The folder after --config-dir; the program fills it in.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

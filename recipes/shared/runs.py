@@ -44,7 +44,9 @@ def prepared(
     """The checked settings and the folder of a run, from what is composed; a resumed run keeps its own."""
     words = [word for word in words if not key_of(word).startswith("hydra")]
     if program == "compare":
-        return checked(given, program), folder
+        config = checked(given, program)
+        config.own_folder = own_folder
+        return config, folder
     if given.resume is not None and program == "train":
         folder = shown(Path(given.resume))
         return resumed(folder, given, words), folder

@@ -96,4 +96,5 @@ def test_a_region_of_ones_own_is_flown_over(folder):
 
 @pytest.mark.slow
 def test_components_of_ones_own_are_compiled(run):
-    run(*TINY, *REWARDS, *LAW, *FEATURES, *REGION, *MOTION, SENSOR, "aware=both", "compile=true")
+    own = ["observation.local_features=[spotted,features:heading]", *FEATURES[1:]]
+    run(*TINY, *REWARDS, *LAW, *own, *REGION, *MOTION, "compile=true")
