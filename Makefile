@@ -62,6 +62,7 @@ pictures: $(VENV)/base
 	cp build/flight/episode_0.gif docs/images/flight.gif
 	$(PY) docs/figures.py
 	$(VENV)/bin/damian compare experiment=delays report_only=true hydra.run.dir=docs/results/delays > build/delays.md
+	$(VENV)/bin/damian compare experiment=crowded "tasks=[crowded]" report_only=true hydra.run.dir=docs/results/crowded > build/crowded.md
 
 # The documentation site, in build/site.
 docs: $(VENV)/docs

@@ -53,10 +53,10 @@ _LEVEL: dict[str, Any] = {"color": "0.5", "linestyle": "--", "linewidth": 0.8}
 def plot_curves(comparison: Comparison, curves: Curves, best: Mapping[str, float], path: Path) -> None:
     """Draw learning curves over environment steps; over episodes if not all runs made as many steps.
 
-    One task has a row of panels for each delay, with return, success rate and steps; of several tasks, each
-    has a row with its returns under each delay. A curve is the mean over seeds, with its 95 % band.
-    Dashed lines: the random policy and the ``best`` possible values; dash-dotted: the undelayed script;
-    dotted: arms that train nothing.
+    One task has a row of panels for each delay, with return and, where it can succeed, success rate and
+    steps; of several tasks, each has a row with its returns under each delay. A curve is the mean over seeds,
+    with its 95 % band. Dashed lines: the random policy and the ``best`` possible values; dash-dotted: the
+    undelayed script; dotted: arms that train nothing.
     """
     grid = [row for row in _panels(comparison, curves) if row]
     if not grid:
@@ -166,7 +166,8 @@ def _panels(comparison: Comparison, curves: Curves) -> list[list[tuple[str, str,
     if len(tasks) > 1:
         return [[(task, delay, "perceived_return") for delay in delays[task]] for task in tasks]
     rows = [row for runs in curves.values() for run in runs for row in run]
-    measures = [name for name in LABELS if any(not np.isnan(row[name]) for row in rows)]
+    succeeds = any(not np.isnan(row["perceived_success_rate"]) for row in rows)
+    measures = [*LABELS] if succeeds else ["perceived_return"]  # else episodes end at their limit
     return [[(task, delay, name) for name in measures] for task in tasks for delay in delays[task]]
 
 
