@@ -275,9 +275,13 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
 
         @hydra.main(version_base=None, config_path=str(CONF), config_name=program)
         def job(_: DictConfig) -> None:
-            output, own = HydraConfig.get().runtime.output_dir, list(HydraConfig.get().overrides.task)
-            with one_line_errors():
-                _start(work, program, own, given.config_dir, Path(output))
+            output, own = Path(HydraConfig.get().runtime.output_dir), list(HydraConfig.get().overrides.task)
+            try:
+                with one_line_errors():
+                    _start(work, program, own, given.config_dir, output)
+            finally:
+                with suppress(OSError):  # Hydra has made it; it is not empty unless the run was refused
+                    output.rmdir()
 
         job()
 

@@ -86,6 +86,12 @@ def test_a_refused_run_removes_only_the_folders_that_it_has_made(capsys, tmp_pat
     assert list((tmp_path / "mine").iterdir()) == []
 
 
+def test_a_refused_job_of_a_sweep_leaves_no_folder(capsys, tmp_path):
+    words = ("-m", "delay.hold=max", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
+    assert "delay.hold: max means nothing" in refusal(capsys, "train", *words)
+    assert [path.name for path in tmp_path.iterdir()] == ["multirun.yaml"]
+
+
 def test_your_own_file_is_an_option_and_a_mistake_in_it_is_one_line(capsys, tmp_path):
     file = tmp_path / "my own" / "scenario" / "mine.yaml"
     file.parent.mkdir(parents=True)

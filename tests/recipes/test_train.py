@@ -17,6 +17,7 @@ from damian.recipes import evaluate
 from damian.recipes import train as train_recipe
 from damian.recipes.cli import settings as composed_config
 from damian.recipes.shared.runs import seed_generators, stored_config
+from damian.runs.metrics import Evaluation
 from damian.runs.training_state import load_networks
 from damian.settings import SourceConfig
 
@@ -95,6 +96,20 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     assert record["command"] == resumed["command"]
     assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
     assert resumed["resumed"][0]["command"] == f"damian train resume={same} frames=100 hydra.run.dir=second"
+
+
+@pytest.mark.parametrize(
+    ("sampled", "deterministic", "best"),
+    [((0.5, 2.0), (0.5, 3.0), "deterministic"), ((0.6, 2.0), (0.5, 3.0), "sampled")],
+)
+def test_the_policy_that_succeeds_more_often_and_then_returns_more_is_the_best(sampled, deterministic, best):
+    rows = {"trained": sampled, "trained, deterministic": deterministic}
+    found = {
+        name: Evaluation(4, success, 50.0, total, 0.5, 50.0, 2.0, 0.0, 0.0, 0.0)
+        for name, (success, total) in rows.items()
+    }
+    command = train_recipe.best_flight(found, Path("runs/a run"))
+    assert command == f"damian fly checkpoint='runs/a run' policy={best}"
 
 
 def test_a_run_starts_from_the_policy_and_the_overrides_of_a_checkpoint(run, trained):
