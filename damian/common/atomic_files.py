@@ -12,7 +12,7 @@ UNFINISHED = ".part"
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:
-    """Replace a file as a whole; if that fails, the file of this name stays as it was."""
+    """Write a file atomically: if writing fails, the existing file is unchanged."""
     unfinished = path.with_name(path.name + UNFINISHED)
     with writing(path):
         try:

@@ -41,7 +41,7 @@ def prepared(
     folder: Path,
     again: bool = False,
 ) -> tuple[Any, Path]:
-    """The checked settings and the folder of a run, from what is composed; a resumed run keeps its own."""
+    """Check the composed settings of a run and choose its folder; a resumed run keeps its stored settings."""
     words = [word for word in words if not key_of(word).startswith("hydra")]
     if program == "compare":
         config = checked(given, program)
