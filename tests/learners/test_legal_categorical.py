@@ -40,16 +40,28 @@ def test_probabilities_and_entropies_and_their_gradients_are_those_of_other_libr
 
 @every_shape
 @masked_or_not
-def test_draws_are_those_of_other_libraries_and_always_legal(shape, masked):
+def test_draws_are_legal_and_as_frequent_as_probable(shape, masked):
+    torch.manual_seed(1)
     ours, other, _ = both(shape, masked)
-    for sample_shape in (torch.Size([]), torch.Size([2]), torch.Size([2, 3])):
-        torch.manual_seed(1)
-        drawn = ours.sample(sample_shape)
-        torch.manual_seed(1)
-        assert drawn.equal(other.sample(sample_shape))
-        assert (ours.log_prob(drawn) > -1e7).all()
+    n_draws = 20_000
+    drawn = ours.sample(torch.Size([2, n_draws // 2]))
+    assert drawn.shape == (2, n_draws // 2, *shape)
+    assert ours.sample().shape == shape
+    frequency = torch.nn.functional.one_hot(drawn, 7).float().mean((0, 1))
+    error = (ours.probs * (1 - ours.probs) / n_draws).sqrt()
+    assert ((frequency - ours.probs).abs() <= 5 * error).all()  # none of an illegal action, whose error is 0
     assert ours.deterministic_sample.equal(other.mode)
     illegal = ours.logits < -1e7
     assert illegal.any() == masked
     assert (ours.probs[illegal] == 0).all()
-    assert len(set(ours.sample(torch.Size([50])).flatten().tolist())) == 7
+
+
+@pytest.mark.parametrize("n_legal", [1, 2, 7])
+def test_the_ends_of_the_unit_interval_draw_legal_actions(monkeypatch, n_legal):
+    logits, mask = torch.randn(1000, 7), torch.zeros(1000, 7).bool()
+    first = torch.randint(8 - n_legal, (1000, 1))
+    mask.scatter_(-1, first + torch.arange(n_legal), True)
+    distribution = LegalCategorical(logits, mask)
+    for end, expected in ((0.0, first), (1 - 2**-24, first + n_legal - 1)):
+        monkeypatch.setattr(torch, "rand", lambda *shape, end=end, **_: torch.full(shape, end))
+        assert distribution.sample().equal(expected.squeeze(-1))
