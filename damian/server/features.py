@@ -272,11 +272,16 @@ def _pairwise(v: FeatureCache) -> Tensor:
     return distances(v.wanted(position), position) / v.scale.unsqueeze(-1)
 
 
-def others_of(v: FeatureCache) -> Tensor:
-    """Indices of the other UAVs of each wanted one, in order, [N, N-1], or [N, 1, N-1] if ``own_only``."""
-    uav = torch.arange(v.messages.time.shape[-1], device=v.messages.time.device)
-    wanted = uav.unsqueeze(-1) if v.own_only else uav
-    return uav[:-1] + (uav[:-1] >= wanted.unsqueeze(-1))
+def of_others(v: FeatureCache, pairs: Tensor) -> Tensor:
+    """Values [*, N, N, F] of pairs of UAVs without those of a UAV with itself, [*, N, N-1, F].
+
+    With ``own_only``, [*, N, 1, N, F] and [*, N, 1, N-1, F].
+    """
+    n = pairs.shape[-2]
+    flat = pairs.flatten(-4 if v.own_only else -3, -2)
+    # In rows of N + 1, all but the first of the diagonal are in the last column.
+    different = flat[..., 1:, :].unflatten(-2, (n - 1, n + 1))[..., :-1, :]
+    return different.reshape(*pairs.shape[:-2], n - 1, pairs.shape[-1])
 
 
 @FEATURES.register("source_distance")
@@ -310,8 +315,7 @@ def _source_time(v: FeatureCache) -> Tensor:
 @FEATURES.register("agent_distances")
 @feature("global", width=None)
 def _agent_distances(v: FeatureCache) -> Tensor:
-    pairwise = v(_pairwise)
-    return pairwise.gather(-1, others_of(v).expand(*pairwise.shape[:-1], -1)).clamp(max=1)
+    return of_others(v, v(_pairwise).unsqueeze(-1)).squeeze(-1).clamp(max=1)
 
 
 @FEATURES.register("coverage")

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from damian.common.tensors import distances, gather_rows
-from damian.server.features import FEATURES, FeatureCache, feature, others_of
+from damian.server.features import FEATURES, FeatureCache, feature, of_others
 from damian.world.airspace import Airspace
 
 RINGS = (0.6, 1.25, 2.5)
@@ -82,8 +82,7 @@ def _others(v: FeatureCache) -> Tensor:
     messages, own = v.messages, v.wanted(v.messages.target).unsqueeze(-2)
     ways = torch.cat([messages.position.unsqueeze(-3) - own, messages.target.unsqueeze(-3) - own], -1)
     ways = F.pad(ways / (v.context.scale / 2)[..., None, None, None], (0, 1), value=1.0)  # [*, N, N, 5]
-    index = others_of(v)
-    ways = ways.gather(-2, index.unsqueeze(-1).expand(*ways.shape[:-2], -1, 5))
+    ways = of_others(v, ways)
     nearest = ways[..., 2:4].square().sum(-1).argsort(dim=-1, stable=True)[..., :OTHERS]
     ways = ways.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, 5))
     return F.pad(ways.clamp(-1, 1), (0, 0, 0, OTHERS - nearest.shape[-1])).flatten(-2)
