@@ -51,9 +51,11 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
     env, clock = learning_env(config), SystemClock(config.clock, config.update_steps)
     buffer = replay_buffer(config, env)
     learner = make_learner(config, env, buffer)  # its actor, its critics and their losses
-    collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compile)
+    collector = make_collector(env, learner.actor, config.worlds * clock.unit, config.compiles)
     state = TrainingState(folder, learner.components(), collector, clock, buffer)
     begin(config, state)
+    if config.compiles:
+        print("compiling: the first update takes up to a minute longer, all others about half as long")
     loggers, settings = make_loggers(config.logger.custom, folder), dict(leaves(config))
     log = MetricsLog(
         folder, config.logger.tensorboard, config.logger.csv, state.progress.frames, loggers, settings

@@ -9,6 +9,9 @@ from damian.settings.fields import Settings, constant, setting
 from damian.settings.learners import LEARNERS, LearnerConfig, MappoConfig, ModelConfig
 from damian.settings.scenario import ScenarioConfig
 
+COMPILE_FROM = 1_000_000
+"""Environment steps from which on compiling saves more time than it takes, half a minute."""
+
 
 @dataclass
 class LoggerConfig(Settings):
@@ -61,8 +64,10 @@ class TrainConfig(ScenarioConfig):
     resume: str | None = setting(None, "Run folder of the run to continue.")
     device: str = setting("cpu", "Device of all tensors: cpu, cuda, cuda:1, ...")
     threads: int | None = setting(None, "Threads of the learning; all cores if not given.", low=1, high=1024)
-    compile: bool = setting(
-        False, "Compile the steps and MAPPO's loss; it pays off from about a million environment steps on."
+    compile: Any = setting(
+        "auto",
+        "Compile the steps, the actor and MAPPO's loss; auto does from a million ``frames`` on, where it pays.",
+        choices=("auto", True, False),
     )
     trust: bool = setting(False, "Import the components package.module:Name that a run folder names.")
 
@@ -82,6 +87,11 @@ class TrainConfig(ScenarioConfig):
         cores = len(affinity(0)) if affinity else os.cpu_count() or 1
         limit = os.environ.get("OMP_NUM_THREADS", "")
         return self.threads or min(cores, int(limit) if limit.isdigit() and int(limit) else cores)
+
+    @property
+    def compiles(self) -> bool:
+        """Whether to compile; ``auto`` leaves out sensors of the user's own, which Inductor may crash on."""
+        return self.frames >= COMPILE_FROM and not self.sensors if self.compile == "auto" else self.compile
 
     @property
     def update_steps(self) -> int:

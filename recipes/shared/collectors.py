@@ -28,7 +28,7 @@ def learning_env(config: TrainConfig) -> DelayedEnv:
     reads = set(config.learner.reads) - {"hindsight"}  # the storage adds it
     extras = {"reward_terms", *["message"] * messages, *["privileged"] * privileged, *reads}
     env = make_env(config.train_scenario, config.worlds, config.seed, config.device, extras)
-    if config.compile:
+    if config.compiles:
         env.compile()
     env.append_transform(EpisodeTotals())
     return env

@@ -54,7 +54,7 @@ def learning_setup(config: TrainConfig) -> LearningSetup:
         settle=config.settle,
         recompute_actor=config.recompute_actor,
         critic_key=keys.PRIVILEGED_OBSERVATION if privileged else keys.GLOBAL_OBSERVATION,
-        compile=config.compile,
+        compile=config.compiles,
         frames=config.frames,
         action_delay=action_delay(config),
     )

@@ -68,6 +68,7 @@ def test_a_full_disk_stops_a_run_in_one_line_and_keeps_its_checkpoint(copied):
         "metrics.csv",
         "run.json",
         "config.yaml",
+        "best.pt",
     }
     assert after["checkpoint.pt"] == before["checkpoint.pt"]
 

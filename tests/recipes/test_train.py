@@ -188,3 +188,17 @@ def test_the_use_cases_are_learnt_in_500_episodes_by_most_seeds(run, case):
     rows = [(folder / "result.md").read_text().splitlines()[3].split("|") for folder in runs]
     assert sorted(float(row[2]) for row in rows)[1] >= 0.97
     assert sorted(float(row[3]) for row in rows)[1] <= 1.2
+
+
+@pytest.mark.parametrize(
+    ("words", "compiles"),
+    [
+        (["frames=999999"], False),
+        (["frames=1000000"], True),
+        (["frames=1000000", "compile=false"], False),
+        (["frames=1000000", "sensors=[my_package:wind]"], False),
+        (["frames=1", "compile=true"], True),
+    ],
+)
+def test_long_trainings_are_compiled_unless_the_settings_say_otherwise(words, compiles):
+    assert composed_config(*words).compiles is compiles
