@@ -66,7 +66,7 @@ class TrainConfig(ScenarioConfig):
     threads: int | None = setting(None, "Threads of the learning; all cores if not given.", low=1, high=1024)
     compile: Any = setting(
         "auto",
-        "Compile the steps, the actor and MAPPO's loss; auto does from a million ``frames`` on, where it pays.",
+        "Compile the steps, the actor and MAPPO's loss; auto does from a million ``frames`` on.",
         choices=("auto", True, False),
     )
     trust: bool = setting(False, "Import the components package.module:Name that a run folder names.")
