@@ -12,13 +12,15 @@ import importlib.util
 from argparse import ArgumentParser
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from bench_timing import Measured, collector_times, rollout_times
+from bench_timing import Measured, collector_times, in_turn, rollout_times, rollouts, staggered
 from bench_training import HEADER, training, vmas_actor
 from matplotlib.figure import Figure
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.libs.vmas import VmasEnv
@@ -39,7 +41,7 @@ from damian.settings import ClockConfig
 from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 
-RIVAL, LIMITED = "VMAS discovery, episodes never end", "VMAS discovery, episodes of 100 steps"
+RIVAL_TASKS, RIVAL_LIMIT = ("discovery", "navigation", "simple_spread"), 100
 BARE, WHOLE = "bare", "whole chain"
 NO_BELIEF = "no belief"
 
@@ -142,15 +144,21 @@ def arms(
 
 
 def rivals(worlds: int) -> dict[str, EnvBase]:
-    """VMAS's discovery task with three agents, without and with ends; nothing if VMAS is not installed."""
+    """Tasks of VMAS with three agents, without and with ends; nothing if VMAS is not installed."""
     if not importlib.util.find_spec("vmas"):
         print("VMAS is not installed, so there are no ratios: pip install -e '.[bench]'")
         return {}
     options = {"num_envs": worlds, "n_agents": 3, "device": "cpu", "continuous_actions": True}
     return {
-        RIVAL: VmasEnv("discovery", **options),
-        LIMITED: VmasEnv("discovery", max_steps=100, **options),
+        rival(task, limit): VmasEnv(task, max_steps=limit, **options)
+        for task in RIVAL_TASKS
+        for limit in (None, RIVAL_LIMIT)
     }
+
+
+def rival(task: str, limit: int | None = None) -> str:
+    """Name of a task of VMAS in the tables."""
+    return f"VMAS {task}, " + (f"episodes of {limit} steps" if limit else "episodes never end")
 
 
 def policy_for(env: EnvBase) -> torch.nn.Module:
@@ -167,20 +175,65 @@ def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE,
     pairs = {name: (env, policy_for(env)) for name, env in envs.items()}
     collected = collector_times(pairs, sizes.batch, sizes.repeats)
     both = (rolled, collected)
-    plot_ratios({n: [float(ratio(t, t[n].median, "0")) for t in both] for n in envs}, Path("runs/bench.png"))
+    plot_ratios(
+        {name: [min(ratios(t, name), default=0) for t in both] for name in envs}, Path("runs/bench.png")
+    )
     rows = []
     for name in envs:
-        cells = [(f"{t[name].median:.2f}", t[name].spread, ratio(t, t[name].median)) for t in both]
+        cells = [(f"{t[name].median:.2f}", t[name].spread, _listed(ratios(t, name))) for t in both]
         rows.append((name, *cells[0], *cells[1], f"{rolled[name].first:.0f}" if "compiled" in name else ""))
     title = f"{sizes.worlds} worlds, 3 UAVs, episodes end at different times; {sizes.repeats} repetitions"
-    header = ("ms/step", "lowest to highest", "times VMAS")
+    header = ("ms/step", "lowest to highest", f"times VMAS {', '.join(RIVAL_TASKS)}")
     columns = (*(f"rollout: {name}" for name in header), *(f"collector: {name}" for name in header))
     return table(title, ("environment", *columns, "compile [s]"), rows)
 
 
-def ratio(times: Mapping[str, Measured], ms: float, unknown: str = "-") -> str:
-    """How many times as fast as VMAS a step of ``ms`` milliseconds is."""
-    return f"{times[RIVAL].median / ms:.1f}" if RIVAL in times else unknown
+def ratios(times: Mapping[str, Measured], name: str) -> list[float]:
+    """How many times as fast as each task of VMAS, without ends, an environment is."""
+    without_ends = [times[rival(task)] for task in RIVAL_TASKS if rival(task) in times]
+    return [measured.median / times[name].median for measured in without_ends]
+
+
+def _listed(numbers: list[float]) -> str:
+    return ", ".join(f"{number:.1f}" for number in numbers) or "-"
+
+
+def limit_of_speed(presets: Scenarios, sizes: Sizes) -> str:
+    """Time of a compiled step of the whole chain with ever less of TorchRL around it."""
+    rows = []
+    for name, scenario in presets.items():
+        env = delayed(scenario, delays()[WHOLE], sizes.worlds, "compiled")
+        following = staggered(env, groups=25)
+        chunks = {
+            "rollout": rollouts(env, following.clone(), sizes.steps).__next__,
+            "step_and_maybe_reset": partial(steps_of, env, following, sizes.steps),
+            "the graph alone": partial(graphs_of, env, following, sizes.steps),
+        }
+        for chunk in chunks.values():
+            chunk()
+        times = in_turn(chunks, sizes.steps, sizes.repeats)
+        rows += [
+            (f"{name}: {what}", f"{ms.median:.2f}", f"{ms.median / times['rollout'].median:.2f}")
+            for what, ms in times.items()
+        ]
+    title = f"The limit: {sizes.worlds} worlds, 3 UAVs, whole chain, compiled"
+    return table(title, ("what is timed", "ms/step", "times the rollout"), rows)
+
+
+def steps_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
+    """Take steps that are not kept."""
+    for _ in range(steps):
+        _, following = env.step_and_maybe_reset(env.rand_action(following))
+
+
+def graphs_of(env: DelayedEnv, following: TensorDictBase, steps: int) -> None:
+    """Call the compiled graph of a step with the same actions again and again, without any TensorDict."""
+    stateful, _ = env._split_transforms()
+    memories, entries = env._step_inputs(stateful, env.rand_action(following))
+    step, worlds = env._method("_whole_step_and_reset", *stateful, *entries), env.uav_env.worlds
+    with torch.no_grad():
+        for _ in range(steps):
+            worlds, memories, _, _ = step(worlds, memories, entries)
 
 
 def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
@@ -276,7 +329,7 @@ def table(title: str, header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> s
 
 
 def plot_ratios(ratios: Mapping[str, list[float]], path: Path) -> None:
-    """Draw a pair of bars for each environment: how many times as fast as VMAS it is."""
+    """Draw a pair of bars for each environment: how many times as fast as the fastest task of VMAS it is."""
     labels = ("in rollouts, random actions", "in a collector, with a policy")
     figure = Figure(figsize=(8, 0.45 * len(ratios) + 1), layout="constrained")
     axis = figure.subplots()
@@ -286,7 +339,7 @@ def plot_ratios(ratios: Mapping[str, list[float]], path: Path) -> None:
     axis.set_yticks(range(len(ratios)), list(ratios))
     axis.invert_yaxis()
     axis.axvline(1, color="0.4", linewidth=0.8)
-    axis.set(xlabel="times as fast as VMAS discovery")
+    axis.set(xlabel="times as fast as the fastest of the tasks of VMAS that never end")
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(loc="lower right", frameon=False)
     figure.savefig(path, dpi=150)
@@ -300,6 +353,7 @@ def measure(quick: bool) -> None:
     report = [f"# Benchmark: CPU, one thread, torch {torch.__version__}\n"]
     parts = (
         lambda: comparison(presets, sizes),
+        lambda: limit_of_speed(presets, sizes),
         lambda: cost_of_delays(presets, sizes),
         lambda: cost_of_belief(sizes),
         lambda: growth(presets, sizes, "worlds", sizes.many_worlds),

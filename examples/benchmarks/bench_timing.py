@@ -65,7 +65,7 @@ def rollout_times(
         begin = time.perf_counter()
         following = staggered(env, groups)
         first[name] = time.perf_counter() - begin
-        chunks[name] = _rollouts(env, following, steps).__next__
+        chunks[name] = rollouts(env, following, steps).__next__
         chunks[name]()  # what is left to compile
     measured = in_turn(chunks, steps, repeats)
     return {name: times._replace(first=first[name]) for name, times in measured.items()}
@@ -83,7 +83,7 @@ def staggered(env: EnvBase, groups: int) -> TensorDictBase:
     return following
 
 
-def _rollouts(env: EnvBase, following: TensorDictBase, steps: int) -> Iterator[None]:
+def rollouts(env: EnvBase, following: TensorDictBase, steps: int) -> Iterator[None]:
     """Endless rollouts, each of which goes on where the one before has ended."""
     while True:
         rollout = env.rollout(steps, auto_reset=False, tensordict=following, break_when_any_done=False)
