@@ -28,7 +28,7 @@ test-deep: $(VENV)/test
 	$(PY) -m pytest -n 2 -m "property and not slow" --hypothesis-profile=deep $(ARGS)
 
 test-slow: $(VENV)/slow
-	$(PY) -m pytest -m slow $(ARGS)
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist worksteal -m slow $(ARGS)
 
 # The replay page in Chromium, which Debian and Ubuntu bring as these packages.
 test-browser: $(VENV)/browser

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from damian.delays.samplers import ContextSampler, MessageContext
     from damian.envs.pipeline import make_env
     from damian.envs.uav_env import UavEnv
+    from damian.recipes.evaluate import load  # type: ignore[import-not-found]
+    from damian.recipes.results import results  # type: ignore[import-not-found]
     from damian.recipes.shared.environments import compose_scenario  # type: ignore[import-not-found]
     from damian.replay.backupdate import BackupdateStorage
     from damian.server.features import feature
@@ -40,6 +42,8 @@ _MODULES = {
     "damian.delays.samplers": ["ContextSampler", "MessageContext"],
     "damian.envs.pipeline": ["make_env"],
     "damian.envs.uav_env": ["UavEnv"],
+    "damian.recipes.evaluate": ["load"],
+    "damian.recipes.results": ["results"],
     "damian.recipes.shared.environments": ["compose_scenario"],
     "damian.replay.backupdate": ["BackupdateStorage"],
     "damian.server.features": ["feature"],
@@ -91,7 +95,9 @@ __all__ = [
     "compose_scenario",
     "delay_trajectories",
     "feature",
+    "load",
     "make_env",
+    "results",
     "reward_term",
     "sensor",
 ]

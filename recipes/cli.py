@@ -234,12 +234,22 @@ def reason(error: BaseException, program: str = "train") -> str:
     return one_line(f"{key}: {text}" if key else text)
 
 
+def _interruption(error: BaseException) -> KeyboardInterrupt | None:
+    """The Ctrl-C during which an error was raised: one inside of OmegaConf makes it report a wrong key."""
+    found: BaseException | None = error
+    while found is not None and not isinstance(found, KeyboardInterrupt):
+        found = found.__context__
+    return found
+
+
 @contextmanager
 def one_line_errors() -> Iterator[None]:
     """End the program with one line on stderr if input is wrong (code 2) or a run cannot go on (3)."""
     try:
         yield
     except (InputError, RunError, OSError, *ERRORS) as error:
+        if stopped := _interruption(error):
+            end_interrupted(number_of(stopped))
         line, cause = reason(error), error.__cause__
         if os.environ.get("DAMIAN_TRACEBACK"):
             traceback.print_exception(error)
@@ -273,9 +283,12 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
             first.append("hydra.job.config.override_dirname.exclude_keys=[]")  # else runs share a folder
         sys.argv[1:] = ["-m", *first, *given.overrides]  # Hydra wants options first
 
+        sweeps: set[Path] = set()
+
         @hydra.main(version_base=None, config_path=str(CONF), config_name=program)
         def job(_: DictConfig) -> None:
             output, own = Path(HydraConfig.get().runtime.output_dir), list(HydraConfig.get().overrides.task)
+            sweeps.add(Path(HydraConfig.get().sweep.dir))
             try:
                 with one_line_errors():
                     _start(work, program, own, given.config_dir, output)
@@ -284,6 +297,8 @@ def run(work: Work, program: str = "train", again: bool = False) -> None:
                     output.rmdir()
 
         job()
+        for folder in sweeps:
+            import_module(".results", __package__).show_sweep(shown(folder))  # it imports torch
 
 
 def _start(

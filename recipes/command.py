@@ -21,10 +21,11 @@ PROGRAMS = {
     "fly": "fly episodes, and keep or replay them as files, films, figures and pages",
     "advise": "advise real UAVs: from what they report, where each should land next",
     "oracle": "fly the script with ever more known on time: which delay costs how much",
+    "results": "show the results in a folder as one table: damian results FOLDER",
 }
 """What each program does, by its name; the program is the module of this name."""
-SETTINGS = {name: name for name in PROGRAMS} | {"evaluate": "train", "oracle": "train"}
-"""Whose settings each program has."""
+SETTINGS = {name: name for name in PROGRAMS if name != "results"} | {"evaluate": "train", "oracle": "train"}
+"""Whose settings each program has; the others take a folder."""
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -48,6 +49,14 @@ def main(words: Sequence[str] | None = None) -> None:
 def _run(name: str, words: Sequence[str]) -> None:
     if name not in PROGRAMS:
         raise InputError(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}")
+    sys.argv = [f"damian {name}", *words]
+    if name not in SETTINGS:  # it takes a folder
+        module = import_module(f".{name}", __package__)
+        if {"-h", "--help"} & {*words}:
+            _show(module.__doc__ or "")
+        else:
+            module.run()
+        return
     program, given = SETTINGS[name], parsed(words)
     if given.help:
         keys = [word for word in given.overrides if "=" not in word]
@@ -60,7 +69,6 @@ def _run(name: str, words: Sequence[str]) -> None:
         if given.cfg:
             _show(found)
             return
-    sys.argv = [f"damian {name}", *words]
     import_module(f".{name}", __package__).run()
 
 

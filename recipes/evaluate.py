@@ -6,8 +6,10 @@ damian evaluate -m checkpoint=runs/first delay.obs=0,2,4,8
 
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
+from tensordict.nn import InteractionType
 from torchrl.modules import ProbabilisticActor
 
 from damian.baselines.greedy import greedy_policy
@@ -15,13 +17,14 @@ from damian.baselines.random import random_policy
 from damian.common.errors import InputError, naming_errors
 from damian.envs.delayed_env import DelayedEnv
 from damian.envs.pipeline import has_message_delay, make_env
+from damian.learners.recurrent import add_recurrent_state
 from damian.runs.metrics import Evaluation, evaluate
 from damian.runs.run_folder import DETERMINISTIC, RANDOM, SCRIPT, TRAINED, UNTRAINED, save_results
 from damian.runs.training_state import load_networks
 from damian.settings import TrainConfig
 
 from . import cli
-from .shared.runs import save_config
+from .shared.runs import save_config, with_policy_of
 
 MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
 of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
@@ -55,6 +58,51 @@ def stored_actor(config: TrainConfig, env: DelayedEnv) -> ProbabilisticActor:
     actor = config.learner.make_actor(env, config.model)
     load_networks(Path(config.checkpoint), "checkpoint", {"actor": actor})
     return actor
+
+
+class Loaded(NamedTuple):
+    """A trained policy, and an environment in which it can fly."""
+
+    policy: ProbabilisticActor
+    env: DelayedEnv
+
+
+def load(
+    run: str | Path,
+    *overrides: str,
+    worlds: int = 1,
+    seed: int | None = None,
+    deterministic: bool = False,
+    trust: bool = False,
+) -> Loaded:
+    """Load the trained policy of a run folder, with an environment of its scenario or of a changed one.
+
+    Args:
+        run: run folder, or the ``best.pt`` in it.
+        *overrides: changes to the settings of the run, such as ``delay.obs=6`` or ``agents=5``.
+        worlds: number of parallel worlds of the environment, B.
+        seed: of the environment; that of ``damian evaluate`` if not given.
+        deterministic: take the most likely actions; if not, they are drawn from the policy's distribution.
+        trust: import the components ``package.module:Name`` that the run names, which runs their code.
+
+    Returns:
+        The policy and the environment, [B].
+
+    Raises:
+        InputError: there is no run, or its policy does not fit the changed settings.
+
+    Examples:
+        >>> policy, env = damian.load("runs/first", "delay.obs=6", worlds=64, deterministic=True)
+        >>> rollout = env.rollout(50, policy, break_when_any_done=False)
+    """
+    words = [f"checkpoint='{run}'", *overrides, *["trust=true"] * trust]
+    config, _ = with_policy_of(cli.composed("train", words), "train", words, None)
+    env = make_env(config.eval_scenario, worlds, config.eval_seed if seed is None else seed, config.device)
+    policy = stored_actor(config, env).eval()
+    add_recurrent_state(env, policy)
+    kind = InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM
+    setattr(policy[-1], "default_interaction_type", kind)  # noqa: B010 (a module declares no such attribute)
+    return Loaded(policy, env)
 
 
 def make_eval_env(config: TrainConfig) -> DelayedEnv:

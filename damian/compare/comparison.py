@@ -211,7 +211,7 @@ class Comparison:
     def mean(self, task: str, delay: str, arm: str) -> Estimate:
         """Mean score of an arm over its seeds."""
         scores = list(self.values(task, delay, arm, self.policy, self.score).values())
-        return _mean(scores, self.score) if scores else UNKNOWN
+        return mean_over_seeds(scores, self.score) if scores else UNKNOWN
 
     def scores(self, task: str, delay: str) -> dict[str, dict[int, float]]:
         """Scores by arm and seed, higher ones better; first come undelayed and random, without delay."""
@@ -280,7 +280,7 @@ class Comparison:
         return found
 
 
-def _mean(values: Sequence[float], measure: str) -> Estimate:
+def mean_over_seeds(values: Sequence[float], measure: str) -> Estimate:
     """Mean of the values of a measure by seed."""
     return _estimates(lambda drawn: drawn.mean(-1), np.array([values]), BOUNDS[measure])[0]
 
@@ -384,6 +384,6 @@ def _lines(comparison: Comparison) -> Iterator[Line]:
 
 def _line(comparison: Comparison, task: str, delay: str, arm: str, policy: str) -> Line:
     found = {name: comparison.values(task, delay, arm, policy, name) for name in MEASURES}
-    means = {name: _mean(list(runs.values()), name) for name, runs in found.items()}
+    means = {name: mean_over_seeds(list(runs.values()), name) for name, runs in found.items()}
     information = regime(comparison.arms, arm)
     return Line(task, delay, arm, information, policy, sorted(found["age"]), means)

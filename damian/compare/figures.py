@@ -138,6 +138,25 @@ def plot_delays(comparison: Comparison, panels: Mapping[str, Sequence[str]], pat
         figure.savefig(path, dpi=150)
 
 
+def plot_means(means: Mapping[str, Mapping[str, Estimate]], label: str, path: Path) -> None:
+    """Draw means with 95 % intervals in a row for each group of runs, and a colour for each policy."""
+    groups = list(dict.fromkeys(name for found in means.values() for name in found))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 0.4 * len(groups) + 1.4), layout="constrained")
+        axis = figure.subplots()
+        for place, (policy, found) in enumerate(means.items()):
+            shift = 0.5 * ((place + 0.5) / len(means) - 0.5)
+            rows = [groups.index(name) + shift for name in found]
+            value, low, high = np.array([*found.values()], dtype=float).reshape(-1, 3).T
+            ends = np.nan_to_num([value - low, high - value])
+            axis.errorbar(value, rows, xerr=ends, fmt="o", color=ARM_COLOURS[place], label=policy)
+        axis.set_yticks(range(len(groups)), groups)
+        axis.invert_yaxis()
+        axis.set_xlabel(label)
+        _legend(axis, [axis])
+        figure.savefig(path, dpi=150)
+
+
 def look(comparison: Comparison, arm: str) -> dict[str, Any]:
     """Colour, line and marker of an arm, by its place among all arms of the comparison."""
     again, index = divmod(list(comparison.arms).index(arm), len(ARM_COLOURS))

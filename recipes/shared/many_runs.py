@@ -84,11 +84,16 @@ class Run:
 
     def results(self) -> list[dict[str, Any]]:
         """The results of a finished run, a row for each policy."""
-        with (self.folder / RESULTS).open(newline="") as lines:
-            return [
-                {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
-                for row in csv.DictReader(lines)
-            ]
+        return result_rows(self.folder)
+
+
+def result_rows(folder: Path) -> list[dict[str, Any]]:
+    """The results in the folder of a finished run, a row for each policy."""
+    with (folder / RESULTS).open(newline="") as lines:
+        return [
+            {"policy": row.pop("policy"), **{name: float(x) for name, x in row.items()}}
+            for row in csv.DictReader(lines)
+        ]
 
 
 def check_stored(run: Run) -> None:
