@@ -21,10 +21,14 @@ PROGRAMS = {
     "fly": "fly episodes, and keep or replay them as files, films, figures and pages",
     "advise": "advise real UAVs: from what they report, where each should land next",
     "oracle": "fly the script with ever more known on time: which delay costs how much",
+    "export": "export a policy that flies without damian: damian export RUN",
     "results": "show the results in a folder as one table: damian results FOLDER",
 }
 """What each program does, by its name; the program is the module of this name."""
-SETTINGS = {name: name for name in PROGRAMS if name != "results"} | {"evaluate": "train", "oracle": "train"}
+SETTINGS = {name: name for name in PROGRAMS if name not in ("export", "results")} | {
+    "evaluate": "train",
+    "oracle": "train",
+}
 """Whose settings each program has; the others take a folder."""
 
 

@@ -86,7 +86,7 @@ def load(
         trust: import the components ``package.module:Name`` that the run names, which runs their code.
 
     Returns:
-        The policy and the environment, [B].
+        The policy, without gradients, and the environment, [B].
 
     Raises:
         InputError: there is no run, or its policy does not fit the changed settings.
@@ -98,7 +98,7 @@ def load(
     words = [f"checkpoint='{run}'", *overrides, *["trust=true"] * trust]
     config, _ = with_policy_of(cli.composed("train", words), "train", words, None)
     env = make_env(config.eval_scenario, worlds, config.eval_seed if seed is None else seed, config.device)
-    policy = stored_actor(config, env).eval()
+    policy = stored_actor(config, env).eval().requires_grad_(False)
     add_recurrent_state(env, policy)
     kind = InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM
     setattr(policy[-1], "default_interaction_type", kind)  # noqa: B010 (a module declares no such attribute)

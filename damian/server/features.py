@@ -287,12 +287,14 @@ def of_others(v: FeatureCache, pairs: Tensor) -> Tensor:
 @FEATURES.register("source_distance")
 @feature("global")
 def _source_distance(v: FeatureCache) -> Tensor:
+    """Distance to the estimated source, over the largest vertex distance; 1 if it is unknown, [*, N]."""
     return torch.where(v(_any_has_detected), v(_raw_source_distance).clamp(max=1), 1.0)
 
 
 @FEATURES.register("source_bearing")
 @feature("global")
 def _source_bearing(v: FeatureCache) -> Tensor:
+    """Bearing of the estimated source, clockwise from north, in turns; 1 if it is unknown, [*, N]."""
     return torch.where(v(_any_has_detected), torch.remainder(v(_bearing) / (2 * math.pi), 1.0), 1.0)
 
 
@@ -307,6 +309,7 @@ def _source_drift(v: FeatureCache) -> Tensor:
 @FEATURES.register("source_time")
 @feature("global")
 def _source_time(v: FeatureCache) -> Tensor:
+    """Time since any UAV detected the source, over ``observation.time_scale``; 1 if unknown, [*, N]."""
     latest = v.messages.detected_time.amax(-1, keepdim=True)
     since = (v.context.now.unsqueeze(-1) - latest) / v.context.time_scale
     return torch.where(v(_any_has_detected), since.clamp(max=1), 1.0).expand_as(v.messages.time)
@@ -315,12 +318,14 @@ def _source_time(v: FeatureCache) -> Tensor:
 @FEATURES.register("agent_distances")
 @feature("global", width=None)
 def _agent_distances(v: FeatureCache) -> Tensor:
+    """Distances to the other UAVs in their order, over the largest vertex distance, [*, N, N - 1]."""
     return of_others(v, v(_pairwise).unsqueeze(-1)).squeeze(-1).clamp(max=1)
 
 
 @FEATURES.register("coverage")
 @feature("global")
 def _coverage(v: FeatureCache) -> Tensor:
+    """Share of the UAV's latest footprints that is new and belongs to no other UAV, [*, N]."""
     assert v.context.footprints is not None
     trail, points, known = v.messages.trail, v.context.points, v.context.coverage
     if v.own_only:
@@ -333,6 +338,7 @@ def _coverage(v: FeatureCache) -> Tensor:
 @FEATURES.register("mean_distance")
 @feature("global")
 def _mean_distance(v: FeatureCache) -> Tensor:
+    """Mean distance to the other UAVs, over the largest vertex distance, [*, N]."""
     n = v.messages.time.shape[-1]
     return (v(_pairwise).sum(-1) / max(n - 1, 1)).clamp(max=1)
 
@@ -368,18 +374,21 @@ def _spotting_agents(v: FeatureCache) -> Tensor:
 @FEATURES.register("battery")
 @feature("local")
 def _battery(v: FeatureCache) -> Tensor:
+    """Level of the battery, as a share, [*, N]."""
     return observed(v.messages.battery, v.context.battery) / 100
 
 
 @FEATURES.register("spotted")
 @feature("local")
 def _spotted(v: FeatureCache) -> Tensor:
+    """Whether the UAV detects the source, 0 or 1, [*, N]."""
     return v.messages.spotted.to(v.scale.dtype)
 
 
 @FEATURES.register("age")
 @feature("actor")
 def _age(v: FeatureCache) -> Tensor:
+    """Age of the UAV's message on the server, over ten seconds, [*, N]."""
     return (v.messages.age(v.context.now) / v.context.age_scale).clamp(max=1)
 
 

@@ -1,0 +1,85 @@
+"""An exported policy chooses in a process without damian what it chooses with it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from test_evaluate import TRAINED
+
+import damian
+from damian import keys
+from damian.recipes.command import main
+
+WITHOUT_DAMIAN = """
+import sys, torch, onnxruntime, numpy
+sys.modules["damian"] = sys.modules["tensordict"] = sys.modules["torchrl"] = None  # an import of them fails
+inputs = torch.load("inputs.pt")
+torch.save(torch.export.load("policy.pt2").module()(*inputs.values()), "program.pt")
+session = onnxruntime.InferenceSession("policy.onnx")
+given = {name: value.numpy() for name, value in inputs.items()}
+torch.save([torch.as_tensor(each) for each in session.run(None, given)], "onnx.pt")
+from safetensors.torch import load_file
+torch.save(load_file("policy.safetensors"), "weights.pt")
+"""
+
+every_policy = pytest.mark.parametrize(
+    "words",
+    [
+        ["delay.history=2"],
+        ["model=gru"],
+        ["learner=sac", "actions=continuous", "learner.warm_up=8", "learner.batch_size=8"],
+        [
+            "observation.belief=[belief_gain]",
+            "model.skip=true",
+            "observation.global_features=[agent_distances]",
+        ],
+    ],
+    ids=["history", "gru", "continuous", "belief"],
+)
+
+
+@every_policy
+def test_an_exported_policy_chooses_the_same_without_damian(words, tmp_path):
+    main(["train", *TRAINED, *words, f"hydra.run.dir={tmp_path / 'run'}"])
+    main(["export", str(tmp_path / "run")])
+    folder = tmp_path / "run" / "export"
+    described = json.loads((folder / "policy.json").read_text())
+    n_uavs = 5 if described["uavs"] == "any number" else 3
+    policy, env = damian.load(tmp_path / "run", f"agents={n_uavs}", worlds=7, deterministic=True)
+    rollout = env.rollout(4, policy, break_when_any_done=False)[:, -1]
+    key_of = {"hidden": keys.HIDDEN_BEFORE}
+    inputs = {name: rollout[key_of.get(name, ("agents", name))] for name in described["inputs"]}
+    torch.save(inputs, folder / "inputs.pt")
+    subprocess.run([sys.executable, "-c", WITHOUT_DAMIAN], cwd=folder, check=True)
+    for file in ("program.pt", "onnx.pt"):
+        outputs = dict(zip(described["outputs"], torch.load(folder / file), strict=True))
+        torch.testing.assert_close(outputs["action"], rollout[keys.ACTION], rtol=1e-4, atol=1e-5)
+        for name in {*outputs} - {"action", "probability"}:
+            torch.testing.assert_close(outputs[name], rollout["agents", name], rtol=1e-4, atol=1e-5)
+        if "probability" in outputs:
+            log_prob = outputs["probability"].log().gather(-1, rollout[keys.ACTION].unsqueeze(-1)).squeeze(-1)
+            torch.testing.assert_close(log_prob, rollout[keys.ACTION_LOG_PROB], rtol=1e-4, atol=1e-5)
+    check_description(described, inputs, torch.load(folder / "weights.pt"))
+
+
+def check_description(described: dict, inputs: dict, weights: dict) -> None:
+    """Columns and actions are as many as there are, and each action leads where the table says."""
+    columns = described["inputs"]["observation"]["columns"]
+    assert sum(each["columns"] for each in columns) == inputs["observation"].shape[-1]
+    assert all(each["meaning"] for each in columns)
+    assert ("limit" in described) == any("belief" in each["feature"] for each in columns)
+    assert weights
+    if "table" in described["actions"]:
+        assert len(described["actions"]["table"]) == inputs["action_mask"].shape[-1]
+        assert described["actions"]["table"][9] == [50.0, -90.0]
+
+
+def test_what_cannot_be_exported_is_refused_in_one_line(capsys, tmp_path):
+    for words, message in (([], "give the run folder"), ([str(tmp_path)], "holds no config.yaml")):
+        with pytest.raises(SystemExit):
+            main(["export", *words])
+        assert message in capsys.readouterr().err
+    assert [*Path(tmp_path).iterdir()] == []
