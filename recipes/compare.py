@@ -76,7 +76,7 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     arm, arms = config.experiment.arms[name], config.experiment.arms
     flies_alone = arm.oracle or arm.untrained
     source = arm.policy_of or (name if task != trained_in and not flies_alone else None)
-    overrides = ["logger=csv", "threads=1", *overrides, *arm.overrides, *config.overrides]
+    overrides = ["logger=csv", *overrides, *arm.overrides, *config.overrides]
     try:
         unseeded = _composed(*overrides, own_folder=config.own_folder)
         late_by = [] if arm.delayed else late(unseeded)

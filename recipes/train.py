@@ -151,7 +151,7 @@ def update(
     progress.updates += 1
     threads = torch.get_num_threads()
     try:
-        torch.set_num_threads(config.learning_threads)
+        torch.set_num_threads(config.threads)
         with own_code(config.learner.name):
             losses = {name: float(number) for name, number in learner.learn(batch).items()}
     except (ValueError, RuntimeError):  # torch's distributions refuse a nan

@@ -127,7 +127,7 @@ class Search:
             written = {key: trial.params[key] for key in self.space}
             chosen = {k: f"{x:.6g}" if isinstance(x, float) else str(x) for k, x in written.items()}
             trial.set_user_attr(CHOSEN, chosen)
-            words = ["logger=csv", "threads=1", *self.words(chosen)]
+            words = ["logger=csv", *self.words(chosen)]
             try:
                 config = cli.settings(*words)
             except InputError as error:

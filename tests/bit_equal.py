@@ -80,7 +80,7 @@ def rollout(overrides: list[str]) -> dict[str, str]:
 def training(overrides: list[str]) -> dict[str, list[str]]:
     """The numbers of a short training and of its evaluation."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ["frames=12000", "worlds=32", "eval_episodes=20", "threads=1", "seed=5", "logger=csv"]
+        words = ["frames=12000", "worlds=32", "eval_episodes=20", "seed=5", "logger=csv"]
         command = [str(Path(sys.executable).parent / "damian"), "train", *words, *overrides]
         subprocess.run([*command, f"hydra.run.dir={folder}/run"], check=True, capture_output=True)
         found = {}

@@ -1,6 +1,5 @@
 """All settings of ``damian train``."""
 
-import os
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -63,7 +62,9 @@ class TrainConfig(ScenarioConfig):
     overrides: list[str] = constant([], "Words of the command line; the program fills them in.")
     resume: str | None = setting(None, "Run folder of the run to continue.")
     device: str = setting("cpu", "Device of all tensors: cpu, cuda, cuda:1, ...")
-    threads: int | None = setting(None, "Threads of the learning; all cores if not given.", low=1, high=1024)
+    threads: int = setting(
+        1, "Threads of the learning; more help only networks much larger than the default.", low=1, high=1024
+    )
     compile: Any = setting(
         "auto",
         "Compile the steps, the actor and MAPPO's loss; auto does from a million ``frames`` on.",
@@ -79,14 +80,6 @@ class TrainConfig(ScenarioConfig):
         if not self.seeks_source:  # aware=belief suits any task: observe no belief by which nothing is won
             self.observation = replace(self.observation, belief=[])
             self.model = replace(self.model, skip=False)
-
-    @property
-    def learning_threads(self) -> int:
-        """Threads of the learning; if not given, the cores of this process, or as many as OMP_NUM_THREADS."""
-        affinity = getattr(os, "sched_getaffinity", None)  # not on every system
-        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-        limit = os.environ.get("OMP_NUM_THREADS", "")
-        return self.threads or min(cores, int(limit) if limit.isdigit() and int(limit) else cores)
 
     @property
     def compiles(self) -> bool:

@@ -105,7 +105,7 @@ def save_config(config: TrainConfig, folder: Path) -> None:
     """Write the record of words, versions and machine into the run folder, then the settings."""
     is_gpu = config.device.startswith("cuda")
     device = torch.cuda.get_device_name(config.device) if is_gpu else config.device
-    entries = {OVERRIDES: list(config.overrides), "device": device, "threads": config.learning_threads}
+    entries = {OVERRIDES: list(config.overrides), "device": device, "threads": config.threads}
     if config.checkpoint and not config.resume:  # a resumed run no longer needs that policy
         entries[POLICY] = digest(checkpoint_file(Path(config.checkpoint), "checkpoint"))
     write_record(folder, command(), **entries)
