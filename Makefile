@@ -1,4 +1,4 @@
-# make train | test | test-order | test-deep | test-slow | test-browser | bench | bench-quick | bench-advise | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | test-browser | bench | bench-jaxmarl | bench-quick | bench-advise | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
@@ -7,7 +7,7 @@ TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
 
-.PHONY: train test test-order test-deep test-slow test-browser bench bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow test-browser bench bench-jaxmarl bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=4 aware=backupdate observation.own=true frames=400000 $(ARGS)
@@ -37,6 +37,16 @@ test-browser: $(VENV)/browser
 
 bench: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py $(ARGS)
+
+# The same beside JaxMARL, in an environment of its own: it asks for other versions than we do.
+JAXMARL := build/jaxmarl-venv
+bench-jaxmarl: $(VENV)/bench $(JAXMARL)/ready
+	$(PY) examples/benchmarks/bench.py $(ARGS)
+
+$(JAXMARL)/ready:
+	$(PYTHON) -m venv $(JAXMARL)
+	$(JAXMARL)/bin/python -m pip install --quiet --disable-pip-version-check jaxmarl
+	touch $@
 
 # The service of damian advise over loopback.
 bench-advise: $(VENV)/test

@@ -9,6 +9,7 @@ and written to runs/bench.md, with a figure in runs/bench.png.
 """
 
 import importlib.util
+import subprocess
 from argparse import ArgumentParser
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -42,6 +43,7 @@ from damian.world.battery import BatteryConfig
 from damian.world.motion import MotionConfig
 
 RIVAL_TASKS, RIVAL_LIMIT = ("discovery", "navigation", "simple_spread"), 100
+JAXMARL, JAXMARL_PYTHON = "JaxMARL simple_spread, one graph", Path("build/jaxmarl-venv/bin/python")
 BARE, WHOLE = "bare", "whole chain"
 NO_BELIEF = "no belief"
 
@@ -182,10 +184,20 @@ def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE,
     for name in envs:
         cells = [(f"{t[name].median:.2f}", t[name].spread, _listed(ratios(t, name))) for t in both]
         rows.append((name, *cells[0], *cells[1], f"{rolled[name].first:.0f}" if "compiled" in name else ""))
+    if (ms := jaxmarl_ms(sizes.worlds)) is not None:
+        rows.insert(len(rivals(1)), (JAXMARL, f"{ms:.2f}", *[""] * 6))
     title = f"{sizes.worlds} worlds, 3 UAVs, episodes end at different times; {sizes.repeats} repetitions"
     header = ("ms/step", "lowest to highest", f"times VMAS {', '.join(RIVAL_TASKS)}")
     columns = (*(f"rollout: {name}" for name in header), *(f"collector: {name}" for name in header))
     return table(title, ("environment", *columns, "compile [s]"), rows)
+
+
+def jaxmarl_ms(worlds: int) -> float | None:
+    """Time of a step of JaxMARL's task, in its own environment and process; None if it is not installed."""
+    if not JAXMARL_PYTHON.exists():
+        return None
+    words = [str(JAXMARL_PYTHON), str(Path(__file__).with_name("bench_jaxmarl.py")), str(worlds)]
+    return float(subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()[-1])
 
 
 def ratios(times: Mapping[str, Measured], name: str) -> list[float]:
