@@ -11,12 +11,12 @@ from damian import keys
 from damian.learners.sac import Sac
 
 
-def learn(delay: int, history: int, steps: int) -> nn.Module:
+def learn(delay: int, history: int, steps: int, arm: str = "history") -> nn.Module:
     """The policy that is trained with one seed."""
     torch.manual_seed(0)
     env = make_env(delay, history)
     env.set_seed(0)
-    learner = make_learner(env, "history", steps, delay, 128)
+    learner = make_learner(env, arm, steps, delay, 128)
     train(env, learner, steps, tqdm(disable=True))
     return learner.actor
 
@@ -83,5 +83,7 @@ def test_delay_lowers_the_return_and_the_action_history_restores_it():
     returns = {delay: evaluate_under(delay, 0, undelayed, 20) for delay in (0, 6)}
     assert returns[0] > -300
     assert returns[6] < returns[0] - 300
-    aware = evaluate_under(6, 6, learn(delay=6, history=6, steps=12_000), 20)
-    assert aware > returns[6] + 300
+    naive = evaluate_under(6, 0, learn(delay=6, history=0, steps=12_000), 20)
+    for arm, steps in (("history", 12_000), ("bpql", 8_000)):
+        aware = evaluate_under(6, 6, learn(delay=6, history=6, steps=steps, arm=arm), 20)
+        assert aware > naive + 300, arm
