@@ -172,7 +172,8 @@ def policy_for(env: EnvBase) -> torch.nn.Module:
 
 def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE, WHOLE)) -> str:
     """Speed beside VMAS, through rollouts and collectors; the figure is written to runs/bench.png."""
-    envs = rivals(sizes.worlds) | arms(presets, sizes.worlds, kinds, sizes.modes)
+    others = rivals(sizes.worlds)
+    envs = others | arms(presets, sizes.worlds, kinds, sizes.modes)
     rolled = rollout_times(envs, sizes.steps, sizes.repeats)
     pairs = {name: (env, policy_for(env)) for name, env in envs.items()}
     collected = collector_times(pairs, sizes.batch, sizes.repeats)
@@ -185,7 +186,7 @@ def comparison(presets: Scenarios, sizes: Sizes, kinds: tuple[str, ...] = (BARE,
         cells = [(f"{t[name].median:.2f}", t[name].spread, _listed(ratios(t, name))) for t in both]
         rows.append((name, *cells[0], *cells[1], f"{rolled[name].first:.0f}" if "compiled" in name else ""))
     if (ms := jaxmarl_ms(sizes.worlds)) is not None:
-        rows.insert(len(rivals(1)), (JAXMARL, f"{ms:.2f}", *[""] * 6))
+        rows.insert(len(others), (JAXMARL, f"{ms:.2f}", *[""] * 6))
     title = f"{sizes.worlds} worlds, 3 UAVs, episodes end at different times; {sizes.repeats} repetitions"
     header = ("ms/step", "lowest to highest", f"times VMAS {', '.join(RIVAL_TASKS)}")
     columns = (*(f"rollout: {name}" for name in header), *(f"collector: {name}" for name in header))
@@ -210,6 +211,13 @@ def _listed(numbers: list[float]) -> str:
     return ", ".join(f"{number:.1f}" for number in numbers) or "-"
 
 
+def beside_first(scenario: str, times: Mapping[str, Measured]) -> list[tuple[str, str, str]]:
+    """A row for each of the measured times: its median, and how many times that of the first one it is."""
+    medians = {what: measured.median for what, measured in times.items()}
+    first = next(iter(medians.values()))
+    return [(f"{scenario}: {what}", f"{ms:.2f}", f"{ms / first:.2f}") for what, ms in medians.items()]
+
+
 def limit_of_speed(presets: Scenarios, sizes: Sizes) -> str:
     """Time of a compiled step of the whole chain with ever less of TorchRL around it."""
     rows = []
@@ -224,10 +232,7 @@ def limit_of_speed(presets: Scenarios, sizes: Sizes) -> str:
         for chunk in chunks.values():
             chunk()
         times = in_turn(chunks, sizes.steps, sizes.repeats)
-        rows += [
-            (f"{name}: {what}", f"{ms.median:.2f}", f"{ms.median / times['rollout'].median:.2f}")
-            for what, ms in times.items()
-        ]
+        rows += beside_first(name, times)
     title = f"The limit: {sizes.worlds} worlds, 3 UAVs, whole chain, compiled"
     return table(title, ("what is timed", "ms/step", "times the rollout"), rows)
 
@@ -254,10 +259,7 @@ def cost_of_delays(presets: Scenarios, sizes: Sizes) -> str:
     for name, scenario in presets.items():
         envs = {kind: delayed(scenario, changes, sizes.worlds) for kind, changes in delays().items()}
         times = rollout_times(envs, sizes.steps, sizes.repeats)
-        rows += [
-            (f"{name}: {kind}", f"{measured.median:.2f}", f"{measured.median / times[BARE].median:.2f}")
-            for kind, measured in times.items()
-        ]
+        rows += beside_first(name, times)
     title = f"What delays cost: {sizes.worlds} worlds, 3 UAVs, eager"
     return table(title, ("environment", "ms/step", "times bare"), rows)
 

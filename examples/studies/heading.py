@@ -11,7 +11,6 @@ logarithm; the walks that are flown are not those from which moves were counted.
 """
 
 import math
-import statistics
 from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,6 +24,7 @@ from tqdm import tqdm
 from damian import keys
 from damian.baselines.greedy import greedy_policy
 from damian.common.tables import markdown_table
+from damian.compare.comparison import mean_over_seeds
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.keys import next_key
@@ -41,9 +41,6 @@ DIRECTIONS, AT_REST = 8, 0.4
 """Directions of the classes of velocity; share of the steps, the slowest ones, that count as rest."""
 WALKS, STEPS, RARE = 512, 128, 1e-6
 """Walks from which moves are counted, and their steps; weight of a move that was never counted."""
-STUDENT = {2: 12.706, 3: 4.303, 5: 2.776, 10: 2.262}
-"""Half the width of a 95 % interval, in standard errors of a mean of so many values."""
-
 GridBuilder = Callable[..., SourceGrid]
 
 
@@ -122,17 +119,11 @@ def flown(scenario: ScenarioConfig, build: GridBuilder, worlds: int, seed: int) 
     return evaluation(rollout, env.server).return_, probable.clamp(min=1e-9).log().mean().item()
 
 
-def interval(values: list[float]) -> str:
-    """Mean of values with its 95 % interval."""
-    mean, half = statistics.mean(values), STUDENT[len(values)] * statistics.stdev(values) / len(values) ** 0.5
-    return f"{mean:.2f} [{mean - half:.2f}, {mean + half:.2f}]"
-
-
 def main() -> None:
     """Fly, and print the table."""
     options = ArgumentParser(description="Compare a filter over places with one over velocities too.")
     options.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
-    options.add_argument("--seeds", nargs="+", type=int, default=range(8, 18), help="2, 3, 5 or 10 of them")
+    options.add_argument("--seeds", nargs="+", type=int, default=range(8, 18))
     options.add_argument("--worlds", type=int, default=256, help="episodes of each seed")
     args = options.parse_args()
     torch.set_num_threads(1)
@@ -148,7 +139,12 @@ def main() -> None:
         ]
         returns, logs = ([[each[i] for each in runs] for runs in found] for i in (0, 1))
         more = [100 * (b / a - 1) for a, b in zip(*returns, strict=True)]
-        rows.append((f"{task}, {late} steps late", *map(interval, (*returns, more, *logs))))
+        rows.append(
+            (
+                f"{task}, {late} steps late",
+                *(mean_over_seeds(each, "return") for each in (*returns, more, *logs)),
+            )
+        )
     header = (
         "task",
         "return: place",
