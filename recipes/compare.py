@@ -30,13 +30,13 @@ from damian.settings.programs import SEEDS, CompareConfig
 
 from . import cli, oracle
 from .evaluate import fly, fly_untrained
-from .shared.comparison_results import ROWS, Results, results_of, stored_results, write_csv
+from .shared.comparison_results import FIGURE, MARKDOWN, ROWS, Results, results_of, stored_results, write_csv
 from .shared.many_runs import LOG, Run, SlurmJobs, check_stored, perform_all
 from .shared.runs import check_policy_fits
 from .shared.settings import check_learning, late
 from .train import train
 
-TABLE, MARKDOWN, FIGURE, CURVES = "table.csv", "table.md", "figure.png", "curves.png"
+TABLE, CURVES = "table.csv", "curves.png"
 EPISODES = 100
 """A report with an arm of fewer seeds, or with fewer episodes per evaluation, is marked as developing."""
 POLICIES = {"sampled": TRAINED, "deterministic": TRAINED_DETERMINISTIC}

@@ -32,6 +32,7 @@ from damian.settings import ActionConfig, ScenarioConfig
 from damian.world.landing import action_table
 
 from .evaluate import load
+from .shared.runs import any_number_of_uavs, run_folder, stored_config
 
 EXPORT, DESCRIPTION = "export", "policy.json"
 NEED = "pip install 'damian[export]'"
@@ -79,10 +80,10 @@ def export(run: Path, trust: bool = False) -> Path:
     """Export the policy of a run folder into its subfolder ``export``; returns that folder."""
     safetensors, _ = _needed("safetensors.torch"), _needed("onnxscript")
     actor, env = load(run, worlds=2, trust=trust)
-    policy, target = ExportedPolicy(actor).eval(), (run.parent if run.is_file() else run) / EXPORT
+    policy, target = ExportedPolicy(actor).eval(), run_folder(run) / EXPORT
     examples = tuple(env.reset()[key] for key in policy.in_keys)
     sizes = {0: torch.export.Dim("worlds", min=1)}
-    if any_number_of_uavs(env.uav_env.scenario):
+    if any_number_of_uavs(stored_config(run_folder(run), "checkpoint", trust)):
         sizes[1] = torch.export.Dim("uavs", min=1)
     target.mkdir(exist_ok=True)
     with torch.no_grad(), warnings.catch_warnings():
@@ -112,13 +113,8 @@ def export(run: Path, trust: bool = False) -> Path:
 
 
 def _output(name: str) -> str:
-    """Name of an output in ONNX, in which it may not be that of an input."""
+    """Name of an output in ONNX, which does not let an output have the name of an input."""
     return f"next_{name}" if name == "hidden" else name
-
-
-def any_number_of_uavs(scenario: ScenarioConfig) -> bool:
-    """Do the observations have the same columns for any number of UAVs?"""
-    return "agent_distances" not in scenario.observation.actor
 
 
 def _needed(module: str) -> Any:
@@ -166,7 +162,7 @@ def describe(
 
 
 def columns(scenario: ScenarioConfig, n_columns: int) -> list[dict[str, Any]]:
-    """The columns of an observation, in order; each is what the server computes, already scaled."""
+    """Describe the columns of an observation, in order; the server has scaled them already."""
     widths, found = {"agent_distances": scenario.agents - 1, "belief_gain": scenario.actions.n_actions}, []
     for name in scenario.observation.actor:
         feature = feature_of(name)

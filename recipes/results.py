@@ -21,11 +21,10 @@ from damian.runs.run_folder import DETERMINISTIC, RANDOM, RESULTS, SCRIPT, TRAIN
 from damian.runs.run_record import read_record
 
 from .known import key_of
-from .shared.comparison_results import ROWS, stored_results, write_csv
+from .shared.comparison_results import FIGURE, MARKDOWN, ROWS, stored_results, write_csv
 from .shared.many_runs import result_rows
 from .shared.runs import OVERRIDES
 
-TABLE, FIGURE = "table.md", "figure.png"
 MEASURES = ("return", "success_rate", "steps", "perceived_return", "age")
 """Measures of the table of a sweep; success and steps only where some run succeeds."""
 
@@ -51,16 +50,21 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     """The results in a folder, a row for each policy of each run."""
     if is_comparison(folder):
         return [dict(row) for row in stored_results(folder, lambda row: True).rows]
-    files = sorted(folder.rglob(RESULTS))
-    if not files:
+    return sweep_rows(folder)[1]
+
+
+def sweep_rows(folder: Path) -> tuple[list[str], list[dict[str, Any]]]:
+    """The settings in which the finished runs of a sweep differ, and a row for each policy of each run."""
+    runs = [file.parent for file in sorted(folder.rglob(RESULTS))]
+    if not runs:
         raise InputError(f"{folder}: there is no {RESULTS} in it, so no run has finished there")
-    words = {file.parent: read_record(file.parent).get(OVERRIDES, []) for file in files}
-    given = {run: {key_of(word): word.partition("=")[2] for word in words[run]} for run in words}
-    keys = list(dict.fromkeys(key for settings in given.values() for key in settings))
+    words = {run: read_record(run).get(OVERRIDES, []) for run in runs}
+    given = {run: {key_of(word): word.partition("=")[2] for word in words[run]} for run in runs}
+    keys = dict.fromkeys(key for settings in given.values() for key in settings)
     swept = [key for key in keys if len({settings.get(key) for settings in given.values()}) > 1]
-    return [
+    return swept, [
         {**{key: _value(given[run].get(key)) for key in swept}, "folder": str(run.relative_to(folder)), **row}
-        for run in given
+        for run in runs
         for row in result_rows(run)
     ]
 
@@ -81,8 +85,7 @@ def _value(text: str | None) -> Any:
 
 def report(folder: Path) -> str:
     """Write rows, table and figure of a sweep into its folder; returns the table."""
-    rows = rows_of(folder)
-    swept = list(rows[0])[: list(rows[0]).index("folder")]
+    swept, rows = sweep_rows(folder)
     groups = [key for key in swept if key != "seed"]
     write_csv(folder / ROWS, rows)
     found: dict[tuple[Any, ...], list[Row]] = {}
@@ -90,21 +93,19 @@ def report(folder: Path) -> str:
         found.setdefault((*(row[key] for key in groups), row["policy"]), []).append(row)
     succeeds = any(row["success_rate"] > 0 for row in rows)
     shown = [name for name in MEASURES if succeeds or name not in ("success_rate", "steps")]
-    means = {group: {name: mean_of(runs, name) for name in shown} for group, runs in found.items()}
+    means = {
+        group: {name: mean_over_seeds([run[name] for run in runs], name) for name in shown}
+        for group, runs in found.items()
+    }
     lines = [[*group, len(found[group]), *estimates.values()] for group, estimates in means.items()]
     note = (
         f"n: runs, one for each seed; [95 % interval over runs, none below {FEWEST}]; "
         "perceived: as far as the server knew"
     )
     table = markdown_table([*groups, "policy", "n", *shown], lines, left=len(groups) + 1) + f"\n\n{note}"
-    write_atomically(folder / TABLE, table + "\n")
+    write_atomically(folder / MARKDOWN, table + "\n")
     plot_means(_points(groups, means), "return", folder / FIGURE)
     return table
-
-
-def mean_of(runs: Sequence[Row], measure: str) -> Estimate:
-    """Mean of a measure over runs."""
-    return mean_over_seeds([run[measure] for run in runs], measure)
 
 
 def _points(
@@ -133,9 +134,9 @@ def run() -> None:
     if len(words) != 1:
         raise InputError("damian results FOLDER: give one folder, of a run, a sweep or a comparison")
     folder = Path(words[0])
-    if is_comparison(folder):
-        print((folder / TABLE).read_text() if (folder / TABLE).exists() else _listed(rows_of(folder)))
-    elif (folder / RESULTS).exists():
+    if is_comparison(folder) and (folder / MARKDOWN).exists():
+        print((folder / MARKDOWN).read_text())
+    elif is_comparison(folder) or (folder / RESULTS).exists():
         print(_listed(rows_of(folder)))
     else:
         print(f"{report(folder)}\n\nresults: {folder}")

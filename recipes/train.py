@@ -55,7 +55,7 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
     state = TrainingState(folder, learner.components(), collector, clock, buffer)
     begin(config, state)
     if config.compiles:
-        print("compiling: the first update takes up to a minute longer, all others about half as long")
+        print("compiling: the first update takes up to a minute longer")
     loggers, settings = make_loggers(config.logger.custom, folder), dict(leaves(config))
     log = MetricsLog(
         folder, config.logger.tensorboard, config.logger.csv, state.progress.frames, loggers, settings

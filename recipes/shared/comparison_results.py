@@ -24,6 +24,8 @@ from ..cli import reason
 from .many_runs import Run
 
 ROWS, CURVES = "results.csv", "curves.csv"
+MARKDOWN, FIGURE = "table.md", "figure.png"
+"""What follows from the rows, also of a sweep."""
 WORDS = ("task", "delay", "arm", "regime", "policy")
 """Columns that are not numbers."""
 POINTS = 50

@@ -218,12 +218,17 @@ def check_policy_fits(config: TrainConfig, stored: TrainConfig) -> None:
             raise InputError(f"{key}: the policy was trained with {trained}, so it cannot fly with {asked}")
 
 
+def any_number_of_uavs(config: TrainConfig) -> bool:
+    """Do the layers of a policy's networks have the same sizes for any number of UAVs?"""
+    # An actor with a learnt belief predicts the critic's observation, so that its layers depend on it too.
+    predicts = isinstance(config.learner, PredictiveMappoConfig)
+    return "agent_distances" not in (config.observation.critic if predicts else config.observation.actor)
+
+
 def _shape(config: TrainConfig) -> dict[str, Any]:
     """What the sizes of a policy's networks follow from, by setting."""
     observation, actions, model = config.observation, config.actions, config.model
     discrete, predicts = actions.kind == "discrete", isinstance(config.learner, PredictiveMappoConfig)
-    # An actor with a learnt belief predicts the critic's observation, so that its layers depend on it too.
-    used = observation.critic if predicts else observation.actor
     return {
         "learner=predictive_mappo": predicts,
         "observation.ctde": observation.ctde,
@@ -231,7 +236,7 @@ def _shape(config: TrainConfig) -> dict[str, Any]:
         "observation.global_features": [*observation.global_features] * (predicts or not observation.ctde),
         "observation.belief": [*observation.belief],
         # After the features, from which it follows: a policy with other features does not lack UAVs.
-        "agents": config.agents if "agent_distances" in used else "any number of UAVs",
+        "agents": "any number of UAVs" if any_number_of_uavs(config) else config.agents,
         "observation.age": observation.age,
         "delay.history": config.delay.history,
         "delay.messages": config.delay.messages,

@@ -1,4 +1,4 @@
-"""An exported policy chooses in a process without damian what it chooses with it."""
+"""An exported policy, run in a process without damian, chooses the same actions as the loaded one."""
 
 import json
 import subprocess
@@ -25,18 +25,13 @@ from safetensors.torch import load_file
 torch.save(load_file("policy.safetensors"), "weights.pt")
 """
 
+HISTORY, GRU = ["delay.history=2"], ["model=gru"]
+CONTINUOUS = ["learner=sac", "actions=continuous", "learner.warm_up=8", "learner.batch_size=8"]
+BELIEF = ["observation.belief=[belief_gain]", "model.skip=true"]
+BELIEF += ["observation.global_features=[agent_distances]"]  # for three UAVs alone
 every_policy = pytest.mark.parametrize(
     "words",
-    [
-        ["delay.history=2"],
-        ["model=gru"],
-        ["learner=sac", "actions=continuous", "learner.warm_up=8", "learner.batch_size=8"],
-        [
-            "observation.belief=[belief_gain]",
-            "model.skip=true",
-            "observation.global_features=[agent_distances]",
-        ],
-    ],
+    [HISTORY, *(pytest.param(words, marks=pytest.mark.slow) for words in (GRU, CONTINUOUS, BELIEF))],
     ids=["history", "gru", "continuous", "belief"],
 )
 

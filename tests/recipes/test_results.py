@@ -1,4 +1,4 @@
-"""What has been stored, from Python: trained policies, and tables of runs, sweeps and comparisons."""
+"""``damian.load`` reads trained policies, ``damian.results`` the results of runs, sweeps and comparisons."""
 
 import csv
 from pathlib import Path
