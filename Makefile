@@ -1,13 +1,13 @@
-# make train | test | test-order | test-deep | test-slow | test-browser | bench | bench-jaxmarl | bench-quick | bench-advise | benchmarl | pictures | docs | page-libraries | check | format
+# make train | test | test-order | test-deep | test-slow | test-browser | test-lowest | test-newest | package | bench | bench-jaxmarl | bench-quick | bench-advise | benchmarl | pictures | docs | page-libraries | check | format
 # (each sets up what it needs)
 
 PYTHON ?= python3
 VENV   ?= .venv
 TORCH  ?= torch==2.13.0
 PY     := $(VENV)/bin/python
-PIP    := $(PY) -m pip install --quiet --disable-pip-version-check
+PIP     = $(PY) -m pip install --quiet --disable-pip-version-check $(CONSTRAINTS)
 
-.PHONY: train test test-order test-deep test-slow test-browser bench bench-jaxmarl bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
+.PHONY: train test test-order test-deep test-slow test-browser test-lowest test-newest package bench bench-jaxmarl bench-quick bench-advise benchmarl pictures docs page-libraries check format clean
 
 train: $(VENV)/base
 	$(VENV)/bin/damian train scenario=delaybench/crowded delay.obs=4 aware=backupdate observation.own=true frames=400000 $(ARGS)
@@ -34,6 +34,26 @@ test-slow: $(VENV)/slow
 test-browser: $(VENV)/browser
 	command -v chromium && command -v chromedriver || (apt-get update && apt-get install -y chromium chromium-driver)
 	$(PY) -m pytest -m browser tests/show/test_replay_browser.py $(ARGS)
+
+# With the lowest versions that pyproject.toml admits, and with the newest.
+test-lowest: build/lowest.txt
+	$(MAKE) test VENV=build/lowest CONSTRAINTS="--constraint build/lowest.txt"
+
+build/lowest.txt: pyproject.toml
+	mkdir -p build
+	grep -oE '"[A-Za-z-]+>=[0-9.]+[,"]' $< | tr -d '",' | sed 's/>=/==/' > $@
+
+test-newest:
+	$(MAKE) test VENV=build/newest TORCH="torch<3"
+
+# A wheel and a source distribution in build/dist, checked, and the wheel tried in an environment of its own.
+package: $(VENV)/package
+	rm -rf build/dist build/wheel
+	$(PY) -m build --outdir build/dist
+	$(PY) -m twine check --strict build/dist/*
+	$(PYTHON) -m venv build/wheel
+	build/wheel/bin/python -m pip install --quiet --disable-pip-version-check "$(TORCH)" build/dist/*.whl
+	cd build && wheel/bin/damian train frames=2000 hydra.run.dir=wheel/run
 
 bench: $(VENV)/bench
 	$(PY) examples/benchmarks/bench.py $(ARGS)
@@ -118,6 +138,10 @@ $(VENV)/docs: $(VENV)/base
 
 $(VENV)/dev: $(VENV)/test
 	$(PIP) -e ".[dev]" "$(TORCH)"
+	touch $@
+
+$(VENV)/package: $(VENV)/base
+	$(PIP) build twine
 	touch $@
 
 $(VENV)/browser: $(VENV)/test

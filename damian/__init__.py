@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from damian.delays.laws import Burst, Constant, Distance, Geometric, Lag, Law, Trace, Uniform
+    from damian.delays.laws import Burst, Constant, Distance, Function, Geometric, Lag, Law, Trace, Uniform
     from damian.delays.samplers import ContextSampler, MessageContext
     from damian.envs.pipeline import make_env
     from damian.envs.uav_env import UavEnv
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         RewardDelay,
         SampleAndHold,
         delay_trajectories,
+        set_seed,
     )
     from damian.transforms.server_node import ServerNode
     from damian.world.sensors import sensor
@@ -38,7 +39,17 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL reads it when it
 __version__ = "0.18.0.dev0"
 
 _MODULES = {
-    "damian.delays.laws": ["Burst", "Constant", "Distance", "Geometric", "Lag", "Law", "Trace", "Uniform"],
+    "damian.delays.laws": [
+        "Burst",
+        "Constant",
+        "Distance",
+        "Function",
+        "Geometric",
+        "Lag",
+        "Law",
+        "Trace",
+        "Uniform",
+    ],
     "damian.delays.samplers": ["ContextSampler", "MessageContext"],
     "damian.envs.pipeline": ["make_env"],
     "damian.envs.uav_env": ["UavEnv"],
@@ -59,6 +70,7 @@ _MODULES = {
         "RewardDelay",
         "SampleAndHold",
         "delay_trajectories",
+        "set_seed",
     ],
     "damian.transforms.server_node": ["ServerNode"],
     "damian.world.sensors": ["sensor"],
@@ -77,6 +89,7 @@ __all__ = [
     "CumulativeReward",
     "DelayConfig",
     "Distance",
+    "Function",
     "Geometric",
     "Lag",
     "Law",
@@ -100,6 +113,7 @@ __all__ = [
     "results",
     "reward_term",
     "sensor",
+    "set_seed",
 ]
 
 

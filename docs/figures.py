@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torchrl.envs import GymEnv, TransformedEnv
 
-from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform
+from damian import Burst, Constant, Geometric, Lag, ObservationDelay, Uniform, set_seed
 
 IMAGES = Path(__file__).parent / "images"
 STEPS = 24
@@ -39,7 +39,7 @@ class Drawn(NamedTuple):
 def draw_messages(law: Any, n_steps: int, seed: int, loss: float = 0.0) -> Drawn:
     """Let a law delay the observations of an environment."""
     env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationDelay(law, loss=loss, delay_key="delay"))
-    env.set_seed(seed)
+    set_seed(env, seed)
     torch.manual_seed(seed)
     steps = env.rollout(n_steps)["next"]
     return Drawn(steps["delay"].flatten().numpy(), steps["age"].flatten().numpy())

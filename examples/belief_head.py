@@ -23,6 +23,7 @@ from damian import (
     ObservationDelay,
     Uniform,
     keys,
+    set_seed,
 )
 from damian.learners.networks import ModelConfig
 from damian.learners.predictive_mappo import PredictiveMappo, PredictiveMappoConfig
@@ -86,7 +87,7 @@ def make_learner(env: TransformedEnv, config: PredictiveMappoConfig, n_worlds: i
 
 
 env = late_navigation(WORLDS)
-env.set_seed(0)
+set_seed(env, 0)
 torch.manual_seed(0)
 learner = make_learner(
     env, PredictiveMappoConfig(steps=STEPS, prediction_steps=20, prediction_batch=64), WORLDS

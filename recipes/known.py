@@ -67,6 +67,7 @@ SYNONYMS = {
     "num_agents": "agents",
     "uavs": "agents",
     "algo": "learner",
+    "algorithm": "learner",
     "task": "scenario",
     "env": "scenario",
     "gpu": "device",

@@ -21,6 +21,7 @@ from damian.transforms import (
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
+    set_seed,
 )
 from damian.transforms.server_node import Belief, ServerNode
 
@@ -157,7 +158,7 @@ def onward(env: EnvBase, td: TensorDictBase, n_steps: int = 6, seed: int = 0) ->
 
 def begun(env: EnvBase, n_steps: int = 5, seed: int = 0) -> TensorDictBase:
     """Reset and step an environment; the TensorDict from which ``onward`` can continue."""
-    env.set_seed(seed)
+    set_seed(env, seed)
     torch.manual_seed(seed)
     td = env.reset()
     return onward(env, td, n_steps, seed)[-1] if n_steps else td

@@ -19,6 +19,7 @@ from damian.transforms import (
     RewardDelay,
     SampleAndHold,
     StatefulTransform,
+    set_seed,
 )
 
 LATE = Uniform(1, 3)
@@ -65,7 +66,7 @@ def played(env: EnvBase, kind: Kind, n_steps: int = 8, seed: int | None = 0) -> 
     """Outputs of every step and every reset, with actions drawn from torch's generator."""
     if seed is not None:
         torch.manual_seed(seed)
-        env.set_seed(seed)
+        set_seed(env, seed)
     td, outputs = env.reset(), []
     for _ in range(n_steps):
         after, td = env.step_and_maybe_reset(env.rand_action(td))

@@ -23,10 +23,8 @@ FILES += sorted((ROOT / "recipes").glob("*.py"))
 
 def test_the_readmes_python_runs(capsys):
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    exec(block.replace("num_worlds=1024", "num_worlds=4"), {})
-    reward, age = map(float, capsys.readouterr().out.replace("tensor(", "").replace(")", "").split())
-    assert 0 <= reward <= 1
-    assert 3 < age < 8
+    exec(block, {})
+    assert 3 < float(re.search(r"[\d.]+", capsys.readouterr().out)[0]) < 8  # type: ignore[index]
 
 
 def commands(file: Path) -> Iterator[tuple[str, list[str]]]:

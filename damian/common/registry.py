@@ -1,10 +1,12 @@
 """Components by name, or by the path of a class or function of a user's own: ``package.module:Name``."""
 
+import functools
 import importlib
 import inspect
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar, cast
 
 from damian.common import checks
@@ -19,7 +21,8 @@ class Registry(Generic[T]):
 
     With ``LAWS = Registry[type[Law]]("law")``, ``@LAWS.register("uniform")`` adds a class and
     ``LAWS.get("uniform", key)`` returns it. ``LAWS.get("my_lab.delays:Satellite", key)`` imports a class that
-    is not registered, also from the current folder, so that your own file needs no installation.
+    is not registered, also from the current folder, so that your own file needs no installation. An installed
+    package that declares its module as an entry point ``damian.plugins`` registers names in the same way.
 
     Args:
         kind: what a component is called in errors, such as ``law``.
@@ -49,6 +52,9 @@ class Registry(Generic[T]):
         if isinstance(name, str) and name in self._imported:
             return self._imported[name]
         if not isinstance(name, str) or ":" not in name:
+            load_plugins()
+            if name in self:
+                return self._components[name]
             known = f"one of {', '.join(self._components)}, nor " if self._components else ""
             raise InputError(f"{key}: {name} is not {known}a path such as package.module:Name")
         component = _import_path(name, key)
@@ -75,6 +81,13 @@ class Registry(Generic[T]):
     def items(self) -> Iterator[tuple[str, T]]:
         """Registered names and components."""
         yield from self._components.items()
+
+
+@functools.cache
+def load_plugins() -> None:
+    """Import the modules that installed packages declare as entry points ``damian.plugins``."""
+    for point in entry_points(group="damian.plugins"):
+        point.load()
 
 
 def name_of(parameters: dict[str, Any], default: str, key: str) -> str:

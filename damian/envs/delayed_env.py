@@ -39,6 +39,13 @@ class DelayedEnv(TransformedEnv):
         """The server node that environment, transforms, replay storage and evaluation share."""
         return self.uav_env.server
 
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Seed the worlds and the transforms, all from one seed."""
+        for module in self.transform.modules():
+            if isinstance(module, StatefulTransform):
+                module.set_seed(seed)
+        return super().set_seed(seed, static_seed)
+
     def seed_worlds(self, seeds: Tensor) -> None:
         """Give every world [B] its own random streams: it evolves the same alone as among others."""
         self.uav_env.seed_worlds(seeds)

@@ -6,14 +6,20 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 if TYPE_CHECKING:
+    from damian.interop.delay_wrapper import DelayWrapper
     from damian.interop.gym import UavGymEnv, UavVectorEnv
     from damian.interop.pettingzoo import UavParallelEnv
 
-__all__ = ["UavGymEnv", "UavParallelEnv", "UavVectorEnv"]
+__all__ = ["DelayWrapper", "UavGymEnv", "UavParallelEnv", "UavVectorEnv"]
 
 TASKS = ("spotting", "tracking", "coverage", "energy", "mixed")
 """Scenarios of conf/scenario that are registered, each as ``damian/NAME-v0``."""
-_MODULES = {"UavGymEnv": "gym", "UavParallelEnv": "pettingzoo", "UavVectorEnv": "gym"}
+_MODULES = {
+    "DelayWrapper": "delay_wrapper",
+    "UavGymEnv": "gym",
+    "UavParallelEnv": "pettingzoo",
+    "UavVectorEnv": "gym",
+}
 
 for _task in TASKS:
     gymnasium.register(

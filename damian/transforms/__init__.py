@@ -4,7 +4,7 @@ Transforms that need a ``UavEnv`` are in ``damian.transforms.server_node``, and 
 """
 
 from damian.transforms.action import ActionDelay
-from damian.transforms.base import StatefulTransform, check_order
+from damian.transforms.base import StatefulTransform, check_order, set_seed
 from damian.transforms.channel import Channel
 from damian.transforms.history import ActionHistory, MessageHistory
 from damian.transforms.hold import SampleAndHold
@@ -24,4 +24,5 @@ __all__ = [
     "StatefulTransform",
     "check_order",
     "delay_trajectories",
+    "set_seed",
 ]

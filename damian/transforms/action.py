@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
+from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
+from damian.common import checks
 from damian.common.errors import InputError
 from damian.delays.laws import law_of, sampler_of
 from damian.delays.line import DelayLine
@@ -85,8 +86,8 @@ def _default_action(space: tuple[Tensor, Tensor], default: Any) -> Tensor:
 class ActionTransform(StatefulTransform):
     """Base class of transforms that remember actions; ``keys`` are arguments of ``StatefulTransform``."""
 
-    def __init__(self, action_key: NestedKey, default: Any, **keys: Any) -> None:
-        super().__init__(in_keys_inv=[action_key], **keys)
+    def __init__(self, action_key: NestedKey | Sequence[NestedKey], default: Any, **keys: Any) -> None:
+        super().__init__(in_keys_inv=action_key, **keys)
         self.action_key: NestedKey = self.in_keys_inv[0]
         self.default = default
 
@@ -125,9 +126,11 @@ class ActionDelay(ActionTransform):
     begins at t = 3; the steps that begin at t = 0, 1 and 2 execute the default action.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``). A
-            delay is drawn for each world, each agent (under a nested key) and each step.
-        action_key: key of the action. A bare name for another key means an entry beside it.
+        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
+            (``Function``). A delay is drawn for each world, each agent (under a nested key) and each step.
+        in_keys_inv: key of the action that the environment executes. A bare name for another key means an
+            entry beside it.
+        out_keys_inv: key under which the policy writes what it chooses; if not given, ``in_keys_inv``.
         default: action that is executed until the first one arrives: a number, or values in the shape of an
             action; an index for discrete and one-hot actions. If not given, the legal value nearest to 0.
         loss: probability that an action never arrives.
@@ -148,7 +151,8 @@ class ActionDelay(ActionTransform):
     def __init__(
         self,
         delay: Any,
-        action_key: NestedKey = "action",
+        in_keys_inv: NestedKey | Sequence[NestedKey] = "action",
+        out_keys_inv: NestedKey | Sequence[NestedKey] | None = None,
         *,
         default: Any = None,
         loss: float = 0.0,
@@ -158,13 +162,18 @@ class ActionDelay(ActionTransform):
         context_keys: Mapping[str, NestedKey] | None = None,
         seed: int | None = None,
     ) -> None:
-        super().__init__(action_key, default, out_keys_inv=[action_key], seed=seed)
+        super().__init__(in_keys_inv, default, out_keys_inv=out_keys_inv or in_keys_inv, seed=seed)
+        should = "is not one key each: delay a second action by another transform"
+        checks.require(
+            len(self.in_keys_inv) == len(self.out_keys_inv) == 1, "in_keys_inv", in_keys_inv, should
+        )
+        self.chosen_key: NestedKey = self.out_keys_inv[0]
         law = law_of(delay)
         self.draw_from(sampler_of(law, dt, loss))
         self.line = DelayLine(self.sampler, "generation")
         self.sent_key, self.valid_key = (sibling_key(self.action_key, key) for key in (sent_key, valid_key))
         self.contexts = ContextReader(law, self.sampler, context_keys, dt, self.action_key, before_step=True)
-        self.action_keys = existing([self.action_key, self.sent_key, *self.contexts.keys.values()])
+        self.action_keys = existing([self.chosen_key, self.sent_key, *self.contexts.keys.values()])
 
     @property
     def required_keys(self) -> Sequence[NestedKey]:
@@ -185,7 +194,7 @@ class ActionDelay(ActionTransform):
         return memory, {}
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
-        chosen = as_rows(entries[self.action_key], self.rows)
+        chosen = as_rows(entries[self.chosen_key], self.rows)
         sent = self.sending_rows(entries)
         context = self.contexts.read(memory, entries, sent, self.rows)
         memory, delivery = self.line.step(memory, [chosen], sent, context)
@@ -194,3 +203,9 @@ class ActionDelay(ActionTransform):
             default = memory["generated_at"] == memory["reset_at"]
             executed[self.valid_key] = (delivery.fresh | default).view(self.rows)
         return memory, executed
+
+    def transform_action_spec(self, action_spec: Composite) -> Composite:  # type: ignore[override]
+        if self.chosen_key != self.action_key:
+            action_spec[self.chosen_key] = action_spec[self.action_key].clone()
+            del action_spec[self.action_key]
+        return action_spec

@@ -1,13 +1,8 @@
-"""The base class of transforms with memory, the order in which they must stand, and how seeds reach them.
-
-Importing this module extends ``TransformedEnv.set_seed`` for the whole process, in workers too: it then also
-seeds the transforms of damian that the environment contains.
-"""
+"""The base class of transforms with memory, the order in which they must stand, and how seeds reach them."""
 
 import itertools
 import multiprocessing
 from collections.abc import Callable, Collection, Iterable, Sequence
-from functools import wraps
 from typing import Any, NamedTuple, NoReturn, cast
 
 import torch
@@ -76,8 +71,8 @@ class StatefulTransform(Transform):
     Args:
         in_keys, out_keys, in_keys_inv, out_keys_inv: as in TorchRL's ``Transform``; the last two are of
             actions.
-        seed: of all draws, until ``set_seed`` of the environment seeds it; if not given, it is drawn from
-            torch's global generator at the first reset.
+        seed: of all draws, until ``damian.set_seed`` gives another; if not given, it is drawn from torch's
+            global generator at the first reset.
     """
 
     stage: str = "delay"
@@ -523,7 +518,7 @@ def all_transforms(env: EnvBase | None) -> list[Transform]:
     return [*all_transforms(env.base_env), *leaf_transforms(env.transform)]
 
 
-# Seeds, which TorchRL's ``TransformedEnv`` does not pass on to its transforms.
+# Seeds.
 
 
 def stream_name(transform: Transform) -> str:
@@ -544,18 +539,17 @@ def _unseeded() -> int:
     return drawn ^ counter_rng.number_of(multiprocessing.current_process().name)
 
 
-_set_seed_of_torchrl = TransformedEnv.set_seed
+def set_seed(env: EnvBase, seed: int) -> int | None:
+    """Seed an environment and the transforms of damian within it; returns the next seed, as TorchRL does.
 
-
-@wraps(_set_seed_of_torchrl)
-def _set_seed(self: TransformedEnv, seed: int | None = None, static_seed: bool = False) -> int | None:
-    for transform in leaf_transforms(self.transform):
+    TorchRL's ``env.set_seed`` does not reach transforms, nor does this function reach worker processes. The
+    seed holds from the next reset on, and right after a reset of all worlds at once. An environment of
+    ``make_env`` needs only its own ``env.set_seed``.
+    """
+    for transform in all_transforms(env):
         if isinstance(transform, StatefulTransform):
             transform.set_seed(seed)
-    return _set_seed_of_torchrl(self, seed, static_seed)
-
-
-TransformedEnv.set_seed = _set_seed  # type: ignore[method-assign]
+    return env.set_seed(seed)
 
 
 # Entries of TensorDicts, viewed as M rows: one for each world, or for each agent of each world.

@@ -45,10 +45,10 @@ class Channel(StatefulTransform):
     t = 0, of age 3.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``); or an
-            N x N nested list of them, ``delay[receiver][sender]``, whose diagonal is not used. A delay is
-            drawn for each receiver and message. With a ``position_key``, a law may read ``position`` and
-            ``receiver_position``.
+        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
+            (``Function``); or an N x N nested list of them, ``delay[receiver][sender]``, whose diagonal is
+            not used. A delay is drawn for each receiver and message. With a ``position_key``, a law may read
+            ``position`` and ``receiver_position``.
         in_keys: keys of the entries [*B, N, ...] of a group of agents that every agent sends together; if
             neither this nor ``action_key`` is given, ``("agents", "observation")``. A bare name for another
             key means an entry beside these.

@@ -39,8 +39,8 @@ class ObservationDelay(StatefulTransform):
     t = 4 shows observation 1, of age 3.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``). A
-            delay is drawn for each world, each agent (under a nested key) and each step.
+        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
+            (``Function``). A delay is drawn for each world, each agent (under a nested key) and each step.
         in_keys: keys of the entries that are sent together, or one key. A bare name for another key means an
             entry beside the first one.
         out_keys: keys under which the received entries are written; if not given, ``in_keys``.

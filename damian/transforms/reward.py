@@ -83,8 +83,9 @@ class RewardDelay(RewardTransform):
     place.
 
     Args:
-        delay: steps (``3``), a time (``"3s"``), or a law of ``damian.delays.laws`` (``Uniform(3, 7)``) that
-            loses nothing. A delay is drawn for each world, each agent (under a nested key) and each step.
+        delay: steps (``3``), a time (``"3s"``), a distribution (``Uniform(3, 7)``), or a function
+            (``Function``), that loses nothing. A delay is drawn for each world, each agent (under a nested
+            key) and each step.
         reward_key: key of the reward.
         dt: length of a step [s], for delays given as times.
         context_keys: keys of the entries that the law may read, by name (``ContextSampler``).

@@ -23,6 +23,7 @@ from torch import Tensor
 from uav_task import UavTask
 from vmas_delay import DelayedVmasTask
 
+from damian import set_seed
 from damian.baselines.random import random_policy
 from damian.common.errors import InputError
 from damian.common.tables import markdown_table
@@ -98,7 +99,7 @@ def returns(task: UavTask | DelayedVmasTask, experiment: Experiment) -> dict[str
     found: dict[str, list[float]] = {name: [] for name in policies}
     for seed in range(EVALUATIONS):
         for name, (policy, sample) in policies.items():
-            env.set_seed(2000 + seed)
+            set_seed(env, 2000 + seed)
             torch.manual_seed(seed)
             found[name].append(task.mean_return(env, policy, sample))
     return {name: torch.tensor(values) for name, values in found.items()}

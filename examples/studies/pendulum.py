@@ -44,7 +44,7 @@ from damian.learners.sac import Sac, SacConfig
 from damian.replay.backupdate import BackupdateStorage
 from damian.replay.time_storage import TimeStorage
 from damian.settings import BpqlConfig
-from damian.transforms import ActionHistory, ObservationDelay
+from damian.transforms import ActionHistory, ObservationDelay, set_seed
 
 ARMS = ("undelayed", "naive", "history", "bpql")
 DEPLOYED = {0: -145, 2: -153, 3: -324, 4: -757, 6: -777, 8: -977}
@@ -139,7 +139,7 @@ def draw(learner: Sac) -> TensorDictBase:
 def evaluate_under(delay: int, history: int, actor: nn.Module, episodes: int) -> float:
     """Mean return of the most likely actions, in episodes with the same initial conditions at every call."""
     env = make_env(delay, history, episodes)
-    env.set_seed(EVALUATION_SEED)
+    set_seed(env, EVALUATION_SEED)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rollout = env.rollout(HORIZON, actor, break_when_any_done=False)
     env.close()
@@ -153,7 +153,7 @@ def run_arm(arm: str, seed: int, args: Namespace) -> dict[str, float]:
     delay = 0 if arm == "undelayed" else args.delay
     history = args.delay if arm in ("history", "bpql") else 0
     env = make_env(delay, history)
-    env.set_seed(seed)
+    set_seed(env, seed)
     learner = make_learner(env, arm, args.steps, args.delay, args.hidden)
     with tqdm(total=args.steps, desc=f"seed {seed} {arm}") as bar:
         train(env, learner, args.steps, bar)

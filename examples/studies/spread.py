@@ -32,7 +32,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from damian import keys
+from damian import keys, set_seed
 from damian.common.tables import markdown_table
 from damian.delays.laws import Constant, Law, Uniform
 from damian.keys import next_key
@@ -116,7 +116,7 @@ def make_learner(env: EnvBase, arm: Arm, frames: int) -> Mappo:
 def train(arm: Arm, seed: int, frames: int, bar: tqdm) -> nn.Module:
     """Train for at least ``frames`` environment steps; returns the policy."""
     env = make_env(arm, WORLDS, arm.delay)
-    env.set_seed(seed)
+    set_seed(env, seed)
     learner, done = make_learner(env, arm, frames), 0
     collector = Collector(
         env,
@@ -147,7 +147,7 @@ def evaluate(arm: Arm, actor: nn.Module | None, delay: Law, episodes: int) -> di
     returns = {}
     for name, how in ACTING.items():
         env = make_env(arm, episodes, delay)
-        env.set_seed(EVALUATION_SEED)
+        set_seed(env, EVALUATION_SEED)
         with set_exploration_type(how):
             returns[name] = returns_in(env.rollout(HORIZON, actor, break_when_any_done=False))
     return returns

@@ -2,7 +2,7 @@
 
 from torchrl.envs import Compose, GymEnv, TransformedEnv
 
-from damian import ActionDelay, ActionHistory, ObservationDelay, RewardDelay, Uniform
+from damian import ActionDelay, ActionHistory, ObservationDelay, RewardDelay, Uniform, set_seed
 
 delays = Compose(
     ActionDelay(1),  # executed one step after it was chosen
@@ -11,6 +11,6 @@ delays = Compose(
     ActionHistory(5, append_to="observation"),  # with it the process is Markovian again
 )
 env = TransformedEnv(GymEnv("Pendulum-v1"), delays)
-env.set_seed(0)
+set_seed(env, 0)
 steps = env.rollout(200)
 print(f"mean age of an observation: {steps['age'].mean():.1f} steps")

@@ -3,7 +3,7 @@
 from torchrl.envs import TransformedEnv
 from torchrl.envs.libs.vmas import VmasEnv
 
-from damian import Channel, Uniform
+from damian import Channel, Uniform, set_seed
 
 radio = Channel(
     Uniform(1, 5),  # one draw for each receiver and message
@@ -12,7 +12,7 @@ radio = Channel(
     message_size=4,  # four numbers in [-1, 1]
 )
 env = TransformedEnv(VmasEnv("navigation", num_envs=32, n_agents=3), radio)
-env.set_seed(0)
+set_seed(env, 0)
 agents = env.rollout(50)["agents"]
 heard = agents["received"]  # [32 worlds, 50 steps, 3 receivers, 3 senders, 4]
 age = agents["received_age"]  # [32, 50, 3, 3], and agents["received_mask"]: has any arrived

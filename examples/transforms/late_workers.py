@@ -1,21 +1,22 @@
-"""Delays in worker processes: one seed for all, and a stream of delays for each worker."""
+"""Delays in worker processes, each with a seed of its own."""
 
 from collections.abc import Callable
+from functools import partial
 
 from torchrl.envs import EnvBase, GymEnv, ParallelEnv, TransformedEnv
 
 from damian import ObservationDelay, Uniform
 
 
-def late_cartpole() -> TransformedEnv:
+def late_cartpole(seed: int) -> TransformedEnv:
     """Runs in each worker."""
-    return TransformedEnv(GymEnv("CartPole-v1"), ObservationDelay(Uniform(0, 4), delay_key="delay"))
+    delay = ObservationDelay(Uniform(0, 4), delay_key="delay", seed=seed)
+    return TransformedEnv(GymEnv("CartPole-v1"), delay)
 
 
 def draw(workers: Callable[..., EnvBase]) -> list[list[int]]:
     """The first ten delays of each of two workers."""
-    env = workers(2, late_cartpole)
-    env.set_seed(0)
+    env = workers(2, [partial(late_cartpole, seed) for seed in (0, 1)])
     delays = env.rollout(10, break_when_any_done=False)["next", "delay"].squeeze(-1)
     env.close()
     return delays.tolist()

@@ -3,7 +3,8 @@
 import pytest
 
 from damian.common.errors import InputError
-from damian.common.registry import Registry, check_parameters
+from damian.common.registry import Registry, check_parameters, load_plugins
+from damian.delays.laws import LAWS, law_of
 
 
 def greetings() -> Registry:
@@ -34,6 +35,21 @@ def test_your_own_component_is_found_by_its_path_in_the_current_folder(tmp_path,
     monkeypatch.chdir(tmp_path)
     (tmp_path / "polite_words.py").write_text("def formal():\n    return 'good day'\n")
     assert greetings().get("polite_words:formal", "greeting")() == "good day"
+
+
+def test_an_installed_package_registers_names_by_its_entry_point(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "lab_components.py").write_text(
+        "from damian.delays.laws import LAWS, Constant\n"
+        "LAWS.register('lab_relay')(type('Relay', (Constant,), {}))\n"
+    )
+    info = tmp_path / "my_lab-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-lab\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[damian.plugins]\nmy_lab = lab_components\n")
+    load_plugins.cache_clear()
+    assert law_of({"law": "lab_relay", "delay": 2}).delay == 2
+    del LAWS._components["lab_relay"]
 
 
 REFUSED = {

@@ -20,6 +20,7 @@ from damian.transforms import (
     ObservationDelay,
     RewardDelay,
     SampleAndHold,
+    set_seed,
 )
 
 
@@ -181,7 +182,7 @@ def test_neither_messages_nor_rewards_that_arrive_later_are_used(group):
 def late_cartpole(*transforms: object) -> TransformedEnv:
     late = RewardDelay(Uniform(0, 4), delay_key="reward_delay", earned_key="earned", seed=0)
     env = TransformedEnv(GymEnv("CartPole-v1"), Compose(StepCounter(), late, *transforms))
-    env.set_seed(0)
+    set_seed(env, 0)
     return env
 
 

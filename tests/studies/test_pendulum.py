@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from tqdm import tqdm
 
-from damian import keys
+from damian import keys, set_seed
 from damian.learners.sac import Sac
 
 
@@ -15,7 +15,7 @@ def learn(delay: int, history: int, steps: int, arm: str = "history") -> nn.Modu
     """The policy that is trained with one seed."""
     torch.manual_seed(0)
     env = make_env(delay, history)
-    env.set_seed(0)
+    set_seed(env, 0)
     learner = make_learner(env, arm, steps, delay, 128)
     train(env, learner, steps, tqdm(disable=True))
     return learner.actor
@@ -30,7 +30,7 @@ def collected(arm: str, steps: int) -> Sac:
     """The learner of an arm after random actions."""
     torch.manual_seed(0)
     env = make_env(DELAY, DELAY)
-    env.set_seed(0)
+    set_seed(env, 0)
     learner = make_learner(env, arm, 1000, DELAY, 8)
     train(env, learner, steps, tqdm(disable=True))
     return learner

@@ -8,7 +8,7 @@ from spread import ARMS, LATE, make_env, make_learner
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from damian import keys
+from damian import keys, set_seed
 from damian.learners.networks import ModelConfig
 
 WORLDS = 3
@@ -19,7 +19,7 @@ def steps() -> TensorDictBase:
     """Two episodes of the arm ``learnt``, whose agents act at random, [T, B]."""
     torch.manual_seed(0)
     env = make_env(ARMS["learnt"], WORLDS, LATE)
-    env.set_seed(0)
+    set_seed(env, 0)
     return env.rollout(2 * HORIZON, break_when_any_done=False).transpose(0, 1)
 
 
@@ -66,7 +66,7 @@ def small(monkeypatch) -> None:
 @pytest.mark.parametrize("arm", ["backupdate", "learnt"])
 def test_critics_learn_from_what_agents_would_have_seen_without_delay(small, arm):
     env = make_env(ARMS[arm], 4, LATE)
-    env.set_seed(0)
+    set_seed(env, 0)
     learner = make_learner(env, ARMS[arm], 1)
     with torch.no_grad():
         batches = env.rollout(3 * HORIZON, learner.actor, break_when_any_done=False).split(HORIZON, 1)

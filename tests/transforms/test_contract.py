@@ -26,6 +26,7 @@ from damian.transforms import (
     RewardDelay,
     SampleAndHold,
     StatefulTransform,
+    set_seed,
 )
 
 IDENTITIES: dict[str, Callable[[Kind], StatefulTransform]] = {
@@ -92,7 +93,7 @@ def test_delay_0_changes_nothing_for_a_policy_that_draws_from_torchs_generator(k
 @every_case
 def test_what_is_written_shares_no_memory_with_the_buffers(kind, make):
     env = TransformedEnv(kind.make(), make(kind, LATE))
-    env.set_seed(0)
+    set_seed(env, 0)
     td = env.reset()
     for _ in range(5):
         owned = [*env.transform.memory.values()]

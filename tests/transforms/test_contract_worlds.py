@@ -1,6 +1,7 @@
 """Seeds that reach every transform, and worlds that skip steps."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import pytest
@@ -22,18 +23,19 @@ from damian.transforms import (
     ObservationDelay,
     RewardDelay,
     StatefulTransform,
+    set_seed,
 )
 
 # Seeds.
 
 
 @drawing
-def test_the_seed_of_a_plain_environment_reaches_its_transforms(kind, make):
+def test_set_seed_reaches_the_transforms_of_an_environment(kind, make):
     env = TransformedEnv(kind.make(), make(kind, Uniform(0, 20)))
     outputs, streams = [], []
     for number, seed in enumerate((3, 4, 3)):
         torch.manual_seed(number)  # the state of torch's generator does not matter
-        env.set_seed(seed)
+        set_seed(env, seed)
         outputs.append([env.reset()])
         streams.append(env.transform.memory["streams"].clone())
         torch.manual_seed(0)
@@ -63,15 +65,16 @@ def test_all_streams_of_an_environment_differ(wrap):
         for transform in transforms if wrap else [Compose(*transforms)]:
             env = TransformedEnv(env, transform, auto_unwrap=False)
         if seeded:
-            env.set_seed(7919)
+            set_seed(env, 7919)
         env.reset()
         streams = torch.cat([transform.memory["streams"] for transform in transforms])
         assert len(streams.unique()) == len(streams) == 4 * 4 + 2 * 2
         check_independent(streams)
 
 
-def pendulum() -> TransformedEnv:
-    return TransformedEnv(GymEnv("Pendulum-v1"), Compose(ObservationDelay(LATE), RewardDelay(LATE)))
+def pendulum(seed: int | None) -> TransformedEnv:
+    delays = Compose(ObservationDelay(LATE, seed=seed), RewardDelay(LATE, seed=seed))
+    return TransformedEnv(GymEnv("Pendulum-v1"), delays)
 
 
 def worker_streams(env: EnvBase) -> list[int]:
@@ -91,21 +94,16 @@ def worker_streams(env: EnvBase) -> list[int]:
 
 
 @pytest.mark.parametrize("vector", [SerialEnv, ParallelEnv])
-def test_workers_have_streams_of_their_own_that_follow_from_one_seed(vector):
+def test_workers_have_streams_of_their_own_that_follow_from_their_seeds(vector):
     options = {"mp_start_method": "fork"} if vector is ParallelEnv else {}
-    env = vector(3, pendulum, **options)
-    try:
-        unseeded = worker_streams(env)
-        seeded = []
-        for seed in (0, 1, 0):
-            env.set_seed(seed)
-            seeded.append(worker_streams(env))
-    finally:
+    found = []
+    for seeds in ((None, None, None), (0, 1, 2), (3, 4, 5), (0, 1, 2)):
+        env = vector(3, [partial(pendulum, seed) for seed in seeds], **options)
+        found.append(worker_streams(env))
         env.close()
-    assert len(set(unseeded)) == len(unseeded) == 6
-    assert len({*seeded[0], *seeded[1]}) == 12
-    check_independent(torch.tensor([*unseeded, *seeded[0], *seeded[1]]))
-    assert seeded[0] == seeded[2]
+    assert len({*found[0], *found[1], *found[2]}) == 18
+    check_independent(torch.tensor([*found[0], *found[1], *found[2]]))
+    assert found[1] == found[3]
 
 
 # Worlds that skip a step.
@@ -136,7 +134,7 @@ def test_a_world_that_skips_steps_goes_on_as_if_they_had_not_been(make):
     kind, law = KINDS["CartPole"], Burst(0.4, 0.4, good=Uniform(0, 2), bad=3, bad_loss=0.0)
     skipping, steady = (TransformedEnv(two_worlds(), make(kind, law)) for _ in range(2))
     for env in (skipping, steady):
-        env.set_seed(1)
+        set_seed(env, 1)
         env.transform.seed_worlds(torch.tensor([5, 6]))
     td, other = skipping.reset(), steady.reset()
     actions = torch.randint(2, (8, 2), generator=torch.Generator().manual_seed(0))

@@ -9,7 +9,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from damian import keys
 from damian.envs.uav_env import UavEnv
-from damian.transforms import MessageHistory, ObservationDelay
+from damian.transforms import MessageHistory, ObservationDelay, set_seed
 
 K, WORLDS, AGENTS = 3, 2, 3
 
@@ -22,7 +22,7 @@ def flown(law: object = LATE, loss: float = 0.2, **options) -> TensorDictBase:
     )
     history = MessageHistory(K, keys.MESSAGE, delay_key="delay", sent_key="message_sent", **options)
     env = TransformedEnv(uav_env, Compose(delay, history))
-    env.set_seed(5)
+    set_seed(env, 5)
     torch.manual_seed(5)
     return env.rollout(20, break_when_any_done=False)
 

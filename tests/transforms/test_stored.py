@@ -28,6 +28,7 @@ from damian.transforms import (
     RewardDelay,
     SampleAndHold,
     delay_trajectories,
+    set_seed,
 )
 
 LATE = Uniform(0, 3)
@@ -72,7 +73,7 @@ CHAINS: dict[str, Callable[[Any, Any, Any], Transform]] = {
 
 def collect(env: EnvBase, n_steps: int = 30) -> TensorDictBase:
     """Steps under random actions, the same at each call, with resets in between; [*, T]."""
-    env.set_seed(0)
+    set_seed(env, 0)
     torch.manual_seed(0)
     return env.rollout(n_steps, break_when_any_done=False)
 

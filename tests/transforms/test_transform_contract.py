@@ -22,7 +22,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 import damian.transforms
-from damian.transforms import StatefulTransform
+from damian.transforms import StatefulTransform, set_seed
 from damian.transforms.server_node import Belief, ServerNode
 
 every_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -196,8 +196,7 @@ def whole_step(transform):
 def test_a_collector_returns_the_same_data_as_a_rollout(case):
     env, twin = case.build(), case.build()
     for each in (env, twin):
-        each.set_seed(0)
-        each.transform.set_seed(0)
+        set_seed(each, 0)
     n_worlds = env.batch_size.numel()
     torch.manual_seed(5)
     policy = RandomPolicy(env.full_action_spec)

@@ -50,20 +50,6 @@ def test_a_replay_buffer_contains_late_steps():
     assert stored["age"][0] == stored["age"][1:][stored["next", "done"][:-1]].max() == 0
 
 
-@pytest.mark.slow
-def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew(capsys):
-    example = run("late_critic")
-    learnt, actor, loss = (example[name] for name in ("learnt", "actor", "loss"))
-    assert len(learnt) == 150 - 6
-    assert learnt["next", "state"].equal(learnt["next", "observation"])
-    assert learnt["known"][6:, :, :3].equal(learnt["state"][:-6])  # six steps old, then six actions
-    assert learnt["known"][6:, :, -1:].equal((learnt["action"][5:-1] + 2) / 4)
-    assert loss.qvalue_network.in_keys == ["state", "action"]
-    weights = loss.actor_network_params.values(True, True)
-    assert all(weight is other for weight, other in zip(actor.parameters(), weights, strict=True))
-    assert capsys.readouterr().out.endswith("critics learn from: 0.0\n")
-
-
 @pytest.mark.slow  # what each transform's own test shows, in the words of the document
 def test_compiled_steps_have_no_graph_break(capsys):
     run("late_compiled")["main"](num_worlds=4, backend="eager")

@@ -1,0 +1,51 @@
+"""The examples that a person copies run, and learn under delay (slow)."""
+
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def load(name: str) -> dict[str, Any]:
+    """The names that an example defines."""
+    return runpy.run_path(str(EXAMPLES / f"{name}.py"))
+
+
+def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew():
+    storage, _ = load("sac_backupdating")["train"](delay=6, frames=150, warm_up=120)
+    learnt = storage.steps[storage.latest()[:-6]]
+    assert len(learnt) == 150 - 6
+    assert learnt["next", "state"].equal(learnt["next", "observation"])
+    assert learnt["known"][6:, :, :3].equal(learnt["state"][:-6])  # six steps old, then six actions
+    assert learnt["known"][6:, :, -1:].equal((learnt["action"][5:-1] + 2) / 4)
+
+
+def test_ppo_behind_delays_takes_a_few_steps():
+    assert load("ppo_gymnasium")["train"](delay=2, frames=1000) > 5
+
+
+def test_multi_agent_ppo_behind_delays_takes_a_few_steps():
+    pytest.importorskip("vmas")
+    load("ppo_vmas")["train"](batches=1)
+
+
+@pytest.mark.slow
+def test_ppo_behind_delays_learns():
+    train = load("ppo_gymnasium")["train"]
+    assert train(delay=3, frames=60_000) > 100  # random actions last 22 steps
+
+
+@pytest.mark.slow
+def test_multi_agent_ppo_behind_delays_learns():
+    pytest.importorskip("vmas")
+    train = load("ppo_vmas")["train"]
+    assert train(batches=40) > train(batches=1) + 1
+
+
+@pytest.mark.slow
+def test_soft_actor_critic_with_back_updating_swings_the_pendulum_up():
+    _, returns = load("sac_backupdating")["train"](frames=12_000)
+    assert sum(returns[-10:]) / 10 > -400  # random actions return -1200
