@@ -14,8 +14,8 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 import damian
-from damian.recipes.command import PROGRAMS, SETTINGS
-from damian.recipes.known import Setting, default_options, groups, help_text, known_settings
+from damian.recipes.command import PROGRAMS, program_help
+from damian.recipes.known import Setting, default_options, groups, known_settings
 
 ROOT = Path(__file__).parents[1]
 TEXTS = {"README.md": "index.md", "RESULTS.md": "RESULTS.md", "CONTRIBUTING.md": "CONTRIBUTING.md"}
@@ -86,7 +86,7 @@ def commands() -> str:
     hint = "Settings are overrides of [Hydra](https://hydra.cc); `damian PROGRAM --help KEY` explains one."
     parts = ["# Commands", hint]
     for name, what in PROGRAMS.items():
-        text = help_text(name, SETTINGS[name])
+        text = program_help(name)
         parts += [f"## damian {name}", f"{what[0].upper()}{what[1:]}.", f"```text\n{text}\n```"]
     return "\n\n".join(parts)
 

@@ -32,8 +32,8 @@ def make_env(delay: int, history: bool) -> TransformedEnv:
     return TransformedEnv(GymEnv("CartPole-v1"), Compose(*delays, StepCounter(), RewardSum()))
 
 
-def train(delay: int = 3, history: bool = True, frames: int = 60_000, seed: int = 0) -> float:
-    """Train, and return the mean return of the last batch's episodes."""
+def train(delay: int = 3, history: bool = True, frames: int = 60_000, seed: int = 0) -> list[float]:
+    """Train; returns the mean return of the episodes that end in each batch."""
     torch.manual_seed(seed)
     env = make_env(delay, history)
     set_seed(env, seed)
@@ -55,8 +55,11 @@ def train(delay: int = 3, history: bool = True, frames: int = 60_000, seed: int 
     buffer = ReplayBuffer(
         storage=LazyTensorStorage(BATCH), sampler=SamplerWithoutReplacement(), batch_size=MINIBATCH
     )
-    mean = 0.0
-    for number, batch in enumerate(Collector(env, actor, frames_per_batch=BATCH, total_frames=frames)):
+    collector = Collector(
+        env, actor, frames_per_batch=BATCH, total_frames=frames, auto_register_policy_transforms=False
+    )
+    means = []
+    for number, batch in enumerate(collector):
         for _ in range(EPOCHS):
             advantage(batch)
             buffer.extend(batch.reshape(-1))
@@ -68,13 +71,11 @@ def train(delay: int = 3, history: bool = True, frames: int = 60_000, seed: int 
                 optimizer.zero_grad()
         done = batch["next", "done"]
         if done.any():
-            mean = batch["next", "episode_reward"][done].mean().item()
+            means.append(batch["next", "episode_reward"][done].mean().item())
         if number % 10 == 9:
             age = batch["age"].mean().item()
-            print(
-                f"{(number + 1) * BATCH:7} steps: return {mean:6.1f}, age of an observation {age:.2f} steps"
-            )
-    return mean
+            print(f"{(number + 1) * BATCH:7} steps: return {means[-1]:6.1f}, mean age {age:.2f} steps")
+    return means
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ ENDS = ("done", "terminated")
 
 def make_env(delay: int, history: bool) -> TransformedEnv:
     """Agents that find their goals, each with late observations; entries lie under "agents"."""
-    env = VmasEnv("navigation", WORLDS, n_agents=AGENTS, max_steps=STEPS, collisions=False)
+    env = VmasEnv("navigation", num_envs=WORLDS, n_agents=AGENTS, max_steps=STEPS, collisions=False)
     transforms = [
         ObservationDelay(delay, OBSERVATION),  # under a nested key: a delay for each agent
         *([ActionHistory(delay, ACTION, append_to=OBSERVATION)] if history and delay else []),
@@ -59,8 +59,8 @@ def make_networks(env: TransformedEnv) -> tuple[ProbabilisticActor, TensorDictMo
     return actor, TensorDictModule(network(1, True), [OBSERVATION], [("agents", "state_value")])
 
 
-def train(delay: int = 3, history: bool = True, batches: int = 40, seed: int = 0) -> float:
-    """Train, and return the mean return of the last batch's episodes."""
+def train(delay: int = 3, history: bool = True, batches: int = 40, seed: int = 0) -> list[float]:
+    """Train; returns the mean return of the episodes of each batch."""
     torch.manual_seed(seed)
     env = make_env(delay, history)
     set_seed(env, seed)
@@ -73,8 +73,14 @@ def train(delay: int = 3, history: bool = True, batches: int = 40, seed: int = 0
     optimizer, frames = torch.optim.Adam(loss.parameters(), 5e-4), WORLDS * STEPS
     sampler = SamplerWithoutReplacement()
     buffer = ReplayBuffer(storage=LazyTensorStorage(frames), sampler=sampler, batch_size=frames // 8)
-    mean = 0.0
-    collector = Collector(env, actor, frames_per_batch=frames, total_frames=batches * frames)
+    means = []
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=frames,
+        total_frames=batches * frames,
+        auto_register_policy_transforms=False,
+    )
     for number, batch in enumerate(collector):
         for end in ENDS:  # of a world; the loss wants them for each agent
             flag = batch["next", end].unsqueeze(-2).expand(batch["next", *REWARD].shape)
@@ -91,10 +97,10 @@ def train(delay: int = 3, history: bool = True, batches: int = 40, seed: int = 0
                 nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
                 optimizer.step()
                 optimizer.zero_grad()
-        mean = batch["next", *RETURN][batch["next", "agents", "done"]].mean().item()
+        means.append(batch["next", *RETURN][batch["next", "agents", "done"]].mean().item())
         if number % 10 == 9:
-            print(f"{(number + 1) * frames:7} steps: mean return {mean:.2f}")
-    return mean
+            print(f"{(number + 1) * frames:7} steps: mean return {means[-1]:.2f}")
+    return means
 
 
 if __name__ == "__main__":

@@ -55,16 +55,15 @@ def _run(name: str, words: Sequence[str]) -> None:
         raise InputError(f"{name}: no such program; the programs are {', '.join(PROGRAMS)}")
     sys.argv = [f"damian {name}", *words]
     if name not in SETTINGS:  # it takes a folder
-        module = import_module(f".{name}", __package__)
         if {"-h", "--help"} & {*words}:
-            _show(module.__doc__ or "")
+            _show(program_help(name))
         else:
-            module.run()
+            import_module(f".{name}", __package__).run()
         return
     program, given = SETTINGS[name], parsed(words)
     if given.help:
         keys = [word for word in given.overrides if "=" not in word]
-        _show(help_text(name, program, keys, given.config_dir))
+        _show(program_help(name, keys, given.config_dir))
         return
     check_words(program, given.overrides, given.config_dir)
     cli = import_module(".cli", __package__)  # with Hydra, which takes a while to import
@@ -89,6 +88,13 @@ def usage() -> str:
     width = max(map(len, PROGRAMS))
     programs = [f"  {name:{width}}  {what}" for name, what in PROGRAMS.items()]
     return "\n".join(["damian PROGRAM [GROUP=OPTION] [KEY=VALUE] ...", "", *programs, "", MORE])
+
+
+def program_help(name: str, keys: Sequence[str] = (), own_folder: str | None = None) -> str:
+    """What ``damian NAME --help`` prints."""
+    if name not in SETTINGS:
+        return import_module(f".{name}", __package__).__doc__ or ""
+    return help_text(name, SETTINGS[name], keys, own_folder)
 
 
 MORE = "damian PROGRAM --help explains a program's settings, damian --version prints the version."

@@ -24,25 +24,26 @@ def test_critics_learn_from_the_states_and_the_actor_from_what_it_knew():
 
 
 def test_ppo_behind_delays_takes_a_few_steps():
-    assert load("ppo_gymnasium")["train"](delay=2, frames=1000) > 5
+    (mean,) = load("ppo_gymnasium")["train"](delay=2, frames=1000)
+    assert 9 < mean < 60
 
 
 def test_multi_agent_ppo_behind_delays_takes_a_few_steps():
     pytest.importorskip("vmas")
-    load("ppo_vmas")["train"](batches=1)
+    assert len(load("ppo_vmas")["train"](batches=1)) == 1
 
 
 @pytest.mark.slow
 def test_ppo_behind_delays_learns():
-    train = load("ppo_gymnasium")["train"]
-    assert train(delay=3, frames=60_000) > 100  # random actions last 22 steps
+    means = load("ppo_gymnasium")["train"](delay=3, frames=30_000)
+    assert sum(means[-10:]) / 10 > 150  # random actions last 22 steps
 
 
 @pytest.mark.slow
 def test_multi_agent_ppo_behind_delays_learns():
     pytest.importorskip("vmas")
-    train = load("ppo_vmas")["train"]
-    assert train(batches=40) > train(batches=1) + 1
+    means = load("ppo_vmas")["train"](batches=40)
+    assert means[-1] > means[0] + 1
 
 
 @pytest.mark.slow

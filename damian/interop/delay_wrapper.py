@@ -1,5 +1,6 @@
 """A wrapper that delays observations and actions of any Gymnasium environment, whatever their spaces."""
 
+import copy
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -58,13 +59,14 @@ class DelayWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         observation, info = self.env.reset(seed=seed, options=options)
         self._actions.begin(self._default, seed)
         self._observations.begin(observation, seed)
-        return observation, info | {"age": 0}
+        return copy.deepcopy(observation), info | {"age": 0}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         executed, _ = self._actions.send(action)
         observation, reward, terminated, truncated, info = self.env.step(executed)
         held, age = self._observations.send(observation)
-        return held, reward, terminated, truncated, info | {"age": age}
+        # A copy, as users may keep and change what they get.
+        return copy.deepcopy(held), reward, terminated, truncated, info | {"age": age}
 
 
 class _Link:

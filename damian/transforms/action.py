@@ -194,7 +194,8 @@ class ActionDelay(ActionTransform):
         return memory, {}
 
     def on_action(self, memory: Memory, entries: Entries) -> Change:
-        chosen = as_rows(entries[self.chosen_key], self.rows)
+        # A distribution may draw one-hot actions as floats, where the specs have integers.
+        chosen = as_rows(entries[self.chosen_key], self.rows).to(memory["initial"].dtype)
         sent = self.sending_rows(entries)
         context = self.contexts.read(memory, entries, sent, self.rows)
         memory, delivery = self.line.step(memory, [chosen], sent, context)

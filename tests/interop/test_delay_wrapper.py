@@ -122,6 +122,7 @@ def test_a_space_without_zero_asks_for_a_default():
     DelayWrapper(Anything(space), default={"gas": np.zeros(1, np.float32)})
 
 
+@pytest.mark.filterwarnings("ignore:.*WARN")  # of the wrapped environments themselves
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
 def test_gymnasiums_checker_finds_nothing(name):
     check_env(DelayWrapper(gymnasium.make(name).unwrapped, Uniform(0, 3), 2), skip_render_check=True)

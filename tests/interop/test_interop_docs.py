@@ -12,7 +12,7 @@ BLOCKS = re.findall(r"## ([^\n]+)\n(?:(?!\n## ).)*?```python\n(.*?)```", "## fir
 
 
 def test_every_example_is_found():
-    assert len(BLOCKS) == TEXT.count("```python") == 5
+    assert len(BLOCKS) == TEXT.count("```python") == 6
 
 
 @pytest.mark.parametrize("code", [block for _, block in BLOCKS], ids=[title for title, _ in BLOCKS])
