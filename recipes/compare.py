@@ -59,15 +59,15 @@ def plan(config: CompareConfig, folder: Path) -> list[Run]:
     ]
     by_folder = {run.folder: run.config for run in runs}
     for run in runs:
-        if run.policy is not None:
+        if run.config.checkpoint is not None:
             try:
-                check_policy_fits(run.config, by_folder[run.policy])
+                check_policy_fits(run.config, by_folder[Path(run.config.checkpoint)])
             except InputError as error:
                 raise InputError(f"{run.task}/{run.delay}/{run.arm}: {error}") from None
     succeeds = any(run.config.episode.success_share is not None for run in runs)
     should = "is in none of the tasks anything that can be reached: choose return or perceived_return"
     checks.require(succeeds or "success" not in config.score, "score", config.score, should)
-    return sorted(runs, key=lambda run: (not run.trains, run.config.seed))
+    return sorted(runs, key=lambda run: (run.stage, run.config.seed))
 
 
 def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list[str]) -> Iterator[Run]:
@@ -75,7 +75,9 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     task, delay, name = folder.parts[-3:]
     arm, arms = config.experiment.arms[name], config.experiment.arms
     flies_alone = arm.oracle or arm.untrained
-    source = arm.policy_of or (name if task != trained_in and not flies_alone else None)
+    away = task != trained_in  # a held-out task, where nothing is trained
+    flown = arm.policy_of or (name if away and not flies_alone else None)
+    source = flown or arm.source
     overrides = ["logger=csv", *overrides, *arm.overrides, *config.overrides]
     try:
         unseeded = _composed(*overrides, own_folder=config.own_folder)
@@ -85,21 +87,24 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
         flies_script = arm.oracle and unseeded.seeks_source and has_message_delay(unseeded)
         if flies_script:
             oracle.check(unseeded)
-        elif source is None and not arm.oracle and not arm.untrained:
+        elif flown is None and not flies_alone:
             check_learning(unseeded)
     except InputError as error:
         raise InputError(f"{task}/{delay}/{name}: {error}") from None
     if arm.oracle and not flies_script:
         return  # nothing is won by finding the source, as the script does, or no message is late
     for seed in config.every_seed:
-        seed_folder = f"seed_{seed}"
+        policy, seed_folder = None, f"seed_{seed}"
         seeded = replace(unseeded, seed=seed, overrides=[*overrides, f"seed={seed}"])
         if source:
             source_delay = delay if arms[source].delayed else NOT_LATE
             policy = folder.parents[2] / trained_in / source_delay / source / seed_folder
-            seeded = replace(seeded, checkpoint=str(policy))
-        program = oracle.fly if arm.oracle else fly_untrained if arm.untrained else fly if source else train
-        yield Run(task, delay, name, seeded, folder / seed_folder, program, trains=program is train)
+            if flown or arm.starts_from:
+                seeded = replace(seeded, checkpoint=str(policy))
+            else:
+                seeded = replace(seeded, learner=replace(seeded.learner, teacher=str(policy)))
+        program = oracle.fly if arm.oracle else fly_untrained if arm.untrained else fly if flown else train
+        yield Run(task, delay, name, seeded, folder / seed_folder, program, program is train, policy)
 
 
 _composed = cache(cli.settings)  # several arms differ only in whose policy they fly; Hydra takes 0.2 s
@@ -171,7 +176,10 @@ def compare(config: CompareConfig, folder: Path) -> None:
 
 def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list[str], list[Run]]:
     """Carry out the runs, unless only a report is asked for."""
-    runs, failed = plan(config, folder), []
+    runs, failed, kept = plan(config, folder), [], Results([], [])
+    if config.keep and (folder / ROWS).exists():
+        kept = stored_results(folder, partial(includes, config))
+        runs = _not_kept(runs, kept)
     for run in runs:
         check_stored(run)
     try:
@@ -185,10 +193,19 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
     done = [run for run in runs if run.finished]
     if failed and not done:
         sys.exit(1)
-    results = results_of(done, config.chosen("arms"))
+    results = kept.with_those_of(results_of(done, config.chosen("arms")))
     if done:
         results.write(folder)
     return results, [run.name for run in runs if not run.finished], failed
+
+
+def _not_kept(runs: list[Run], kept: Results) -> list[Run]:
+    """The runs without kept results, or with a folder, and those whose policies they need."""
+    done = {(row["task"], row["delay"], row["arm"], row["seed"]) for row in kept.rows}
+    todo = [r for r in runs if (r.task, r.delay, r.arm, r.config.seed) not in done or r.folder.exists()]
+    needed = {run.needs for run in todo if not run.finished}
+    needed |= {run.needs for run in runs if run.folder in needed}
+    return [run for run in runs if run in todo or run.folder in needed]
 
 
 def run() -> None:

@@ -24,7 +24,7 @@ from damian.keys import next_key
 from damian.learners.base import Learner, divergence
 from damian.learners.schedule import SystemClock
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.recompute import server_recompute
+from damian.replay.recompute import CORRECTED, server_recompute
 from damian.replay.time_storage import TimeStorage
 from damian.runs.interrupt import Interrupt, end_interrupted
 from damian.runs.loggers import make_loggers
@@ -99,7 +99,7 @@ def make_learner(config: TrainConfig, env: DelayedEnv, buffer: ReplayBuffer | No
 
 def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     """The replay buffer of the learner, if it needs one; with ``backupdate``, late messages correct it."""
-    setup, actor = learning_setup(config), config.recompute_actor
+    setup = learning_setup(config)
     with own_code(config.learner.name):
         size = config.learner.buffer_size(setup)
     if size is None:
@@ -109,9 +109,9 @@ def replay_buffer(config: TrainConfig, env: DelayedEnv) -> ReplayBuffer | None:
     least = setup.least_buffer
     should = f"is too little for back-updating, which needs {least}: a period and twice the longest delay"
     checks.require(size >= least, f"{config.learner.name}: buffer_size", size, should)
-    recompute = server_recompute(env.server, actor=actor) if has_message_delay(config) else None
-    observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor] if recompute else []
-    corrections = corrections_of(env.transform, [keys.REWARD, *observed])
+    recompute = server_recompute(env.server, config.corrected) if has_message_delay(config) else None
+    corrected = config.corrected if recompute else ["reward"]
+    corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
     # With this order the server may hold an older message than it had before, and a UAV in flight sends none.
     # The storage then has to keep the newest one.
     hindsight = "hindsight" in config.learner.reads or (bool(recompute) and config.delay.order == "arrival")

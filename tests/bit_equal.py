@@ -53,7 +53,7 @@ TRAININGS = [
     ["scenario=tracking", "learner=sac", "actions=continuous"],
     ["scenario=tracking", "learner=bpql", "delay.obs=2", "aware=both"],
     ["scenario=tracking", "learner=predictive_mappo", "delay=paper", "delay.messages=4", "aware=backupdate"],
-    ["scenario=paper/usecase2", "delay=paper", "aware=both", "recompute_actor=true"],
+    ["scenario=paper/usecase2", "delay=paper", "aware=both", "corrected=[reward,critic,actor]"],
 ]
 TRAINED = ("loss", "kl", "entropy", "return", "success", "steps", "age")
 """Beginnings and endings of the columns of metrics.csv and result.csv that count."""

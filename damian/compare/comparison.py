@@ -88,15 +88,18 @@ the ``frames`` (environment steps in training) and ``seconds``. Unknown or meani
 
 
 def regime(arms: Mapping[str, Arm], name: str) -> str:
-    """The regime of an arm: its own, or R3 without delay, R2 with a policy trained without, or else R0."""
+    """The regime of an arm: its own, or R3 without delay, R2 with a policy trained without, or else R0.
+
+    A policy that it flies, starts from, or imitates counts alike.
+    """
     arm = arms[name]
     if arm.regime:
         return arm.regime
     if not arm.delayed:
         return "R3"
-    if arm.policy_of is None:
+    if arm.source is None:
         return "R0"
-    return "R2" if not arms[arm.policy_of].delayed else regime(arms, arm.policy_of)
+    return "R2" if not arms[arm.source].delayed else regime(arms, arm.source)
 
 
 def track(arms: Mapping[str, Arm], name: str) -> str:

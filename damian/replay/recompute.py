@@ -1,5 +1,7 @@
 """Recomputes stored steps of UAVs with the server node, for ``BackupdateStorage``."""
 
+from collections.abc import Collection
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -11,11 +13,17 @@ from damian.replay.hindsight import arrived_by_now
 from damian.server.belief import likelihood, predict, repeated, report_rows, weigh
 from damian.server.server import Server
 
+CORRECTED = {"reward": keys.REWARD, "critic": keys.GLOBAL_OBSERVATION, "actor": keys.OBSERVATION}
+"""What late messages can correct in stored steps, and where it lies; of the actors' observations not what
+``ActionHistory`` appends."""
 
-def server_recompute(server: Server, reward_terms: bool = False, actor: bool = False) -> Recompute:
+
+def server_recompute(
+    server: Server, corrected: Collection[str] = ("reward", "critic"), reward_terms: bool = False
+) -> Recompute:
     """A ``BackupdateStorage.recompute``: what the server would have output, had it held other messages.
 
-    ``actor``: also the actors' observations, without what ``ActionHistory`` appends to them.
+    ``corrected``: names in ``CORRECTED``; the ends of episodes always are.
     """
 
     def recompute(steps: TensorDictBase, messages: Tensor) -> dict[NestedKey, Tensor]:
@@ -30,7 +38,7 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
         }
         if belief is not None:
             entries[keys.BELIEF] = belief
-        if actor:
+        if "actor" in corrected:
             sent, own = steps[next_key(keys.MESSAGE)], server.observation.own
             entries[keys.OBSERVATION] = (
                 server.observe_with_timely_messages(
@@ -41,7 +49,8 @@ def server_recompute(server: Server, reward_terms: bool = False, actor: bool = F
             )
         if reward_terms:
             entries |= {(*keys.REWARD_TERMS, name): term for name, term in outputs.terms.items()}
-        return {next_key(key): value for key, value in entries.items()}
+        kept = {CORRECTED[name] for name in CORRECTED if name not in corrected}
+        return {next_key(key): value for key, value in entries.items() if key not in kept}
 
     return recompute
 

@@ -197,7 +197,7 @@ class MappoConfig(LearnerConfig):
         should = f"needs more than {longest} steps (longest delay) per update (learner.steps), not {shortest}"
         checks.require(not setup.settle or longest < shortest, "settle", True, should)
         should = "does not go with model.rnn: hidden states are not recomputed"
-        checks.require(not (recurrent and setup.recompute_actor), "recompute_actor", True, should)
+        checks.require(not (recurrent and setup.recompute_actor), "corrected", "actor", should)
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         return setup.least_buffer if setup.backupdate else None
@@ -233,7 +233,7 @@ class PredictiveMappoConfig(MappoConfig):
         checks.require(not model.recurrent, "model.rnn", model.rnn, should)
         checks.require(not model.skip, "model.skip", True, should)
         checks.require(bool(model.hidden), "model.hidden", [], should)
-        checks.require(not setup.recompute_actor, "recompute_actor", True, should)
+        checks.require(not setup.recompute_actor, "corrected", "actor", should)
 
     def buffer_size(self, setup: LearningSetup) -> int | None:
         least = super().buffer_size(setup)
@@ -277,7 +277,7 @@ class SacConfig(LearnerConfig):
         should = "is for learner=mappo only"
         checks.require(not setup.model.recurrent, "model.rnn", setup.model.rnn, should)
         checks.require(not setup.model.shared_value, "model.shared_value", True, should)
-        checks.require(not setup.recompute_actor, "recompute_actor", True, should)
+        checks.require(not setup.recompute_actor, "corrected", "actor", should)
         checks.in_range("learner.buffer_steps", self.buffer_steps, setup.least_buffer, unit="steps")
         checks.in_range("learner.warm_up", self.warm_up, 0, self.buffer_size(setup), unit="steps")
 

@@ -213,6 +213,8 @@ class Arm(Settings):
     delayed: bool = setting(True, "Whether it has delays; exactly one arm, the reference, has none.")
     naive: bool = setting(False, "Whether it ignores the delay; the best such arm has recovery 0.")
     policy_of: str | None = setting(None, "Arm whose policies it flies, without any training of its own.")
+    starts_from: str | None = setting(None, "Arm from whose policies, of the same seed, its training starts.")
+    teacher: str | None = setting(None, "Arm whose policies its learner imitates: its ``learner.teacher``.")
     untrained: bool = setting(False, "Whether the networks fly as they are before the first update.")
     oracle: bool = setting(False, "Whether the script flies with ever more known on time (damian oracle).")
     tasks: list[str] | None = setting(None, "Tasks that the arm does; all of them if not given.")
@@ -221,6 +223,11 @@ class Arm(Settings):
         "Information in training: R0 messages, R1 truth for the critic, R2 no delay; R3: never any delay.",
         choices=("", "R0", "R1", "R2", "R3"),
     )
+
+    @property
+    def source(self) -> str | None:
+        """Arm whose policies it flies, starts from, or imitates."""
+        return self.policy_of or self.starts_from or self.teacher
 
 
 @dataclass
@@ -278,7 +285,7 @@ class Experiment(Settings):
             checks.require((arm.delayed and not flies_others) or not arm.oracle, key, "oracle", should)
             good = (arm.delayed and not flies_others and not arm.oracle) or not arm.untrained
             checks.require(good, key, "untrained", f"{should} nor oracle")
-            source = self.arms.get(arm.policy_of or "", arm)
+            source = self.arms.get(arm.source or "", arm)
             for task in self.tasks if arm.tasks is None else arm.tasks:
                 options = self.tasks if source.tasks is None else source.tasks
                 checks.one_of(f"{key}.tasks", task, options)
@@ -308,6 +315,9 @@ class CompareConfig(Settings):
     score: str = setting("return", SCORE_MEANS, choices=SCORES)
     policy: str = setting("sampled", POLICY_MEANS, choices=STORED)
     report_only: bool = setting(False, "Run nothing; write tables and figures from stored results.")
+    keep: bool = setting(
+        False, "Keep the stored results of runs whose folders are gone, and run only the others."
+    )
     own_folder: str | None = constant(None, "The folder after --config-dir; the program fills it in.")
 
     def __post_init__(self) -> None:
@@ -328,8 +338,9 @@ class CompareConfig(Settings):
         arms = self.chosen("arms")
         trained = [n for n, a in arms.items() if not (a.policy_of or a.oracle or a.untrained)]
         for name, arm in arms.items():
-            if arm.policy_of is not None:
-                checks.one_of(f"experiment.arms.{name}.policy_of", arm.policy_of, trained)
+            for kind in ("policy_of", "starts_from", "teacher"):
+                if getattr(arm, kind) is not None:
+                    checks.one_of(f"experiment.arms.{name}.{kind}", getattr(arm, kind), trained)
 
     def chosen(self, kind: str) -> dict[str, Any]:
         """The experiment's tasks, delays or arms (``kind``) that are asked for, by name."""

@@ -53,8 +53,9 @@ class TrainConfig(ScenarioConfig):
     settle: bool = setting(
         False, "With ``backupdate``: learn from a step only when nothing of it can be in transit any more."
     )
-    recompute_actor: bool = setting(
-        False, "With ``backupdate``: correct the actor's observations and log-probabilities too."
+    corrected: list[str] = setting(
+        ["reward", "critic"],
+        "With ``backupdate``: what late messages correct: reward, critic (its observation), actor (its own).",
     )
     checkpoint: str | None = setting(
         None, "Run folder, or the best.pt in it, of the policy to begin with or to fly; its overrides apply."
@@ -77,6 +78,8 @@ class TrainConfig(ScenarioConfig):
         matches = type(self.learner) is LEARNERS.get(self.learner.name, "learner")
         problem = f"is not the learner of these settings: choose one with learner={'|'.join(LEARNERS)}"
         checks.require(matches, "learner.name", self.learner.name, problem)
+        checks.names("corrected", self.corrected, ("reward", "critic", "actor"))
+        self.refuse(not self.corrected, "corrected", "is empty: choose reward, critic or actor")
         if not self.seeks_source:  # aware=belief suits any task: observe no belief by which nothing is won
             self.observation = replace(self.observation, belief=[])
             self.model = replace(self.model, skip=False)

@@ -50,6 +50,16 @@ class Results:
             seeds.setdefault(point["seed"], []).append(point)
         return {name: list(seeds.values()) for name, seeds in found.items()}
 
+    def with_those_of(self, new: "Results") -> "Results":
+        """Both results; where both have a run, the new ones."""
+
+        def run(row: Row) -> tuple[str, ...]:
+            return tuple(str(row[name]) for name in ("task", "delay", "arm", "seed"))
+
+        again = {*map(run, new.rows)}
+        pairs = ((self.rows, new.rows), (self.points, new.points))
+        return Results(*([*(row for row in old if run(row) not in again), *added] for old, added in pairs))
+
     def write(self, folder: Path) -> None:
         """Write both files."""
         write_csv(folder / ROWS, self.rows)

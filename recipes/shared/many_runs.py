@@ -58,24 +58,26 @@ class Run:
     """The work to do, importable by name."""
     trains: bool = True
     """Does the program train, so that it writes checkpoints and can be resumed?"""
+    needs: Path | None = None
+    """Folder of the run whose policy this one flies, starts from, or imitates, if it does so."""
 
     @property
     def name(self) -> str:
         return "/".join(self.folder.parts[-4:])
 
     @property
-    def policy(self) -> Path | None:
-        """Folder of the run whose policy this one flies, if it flies another one's."""
-        return None if self.config.checkpoint is None else Path(self.config.checkpoint)
+    def stage(self) -> int:
+        """Runs of stage 0 need no others, those of stage 1 learn from them, and those of stage 2 fly them."""
+        return 2 if not self.trains else int(self.needs is not None)
 
     @property
     def finished(self) -> bool:
         """Has the run results, and if it flies another's policy, are they of that policy as it is now?"""
         has_results = (self.folder / RESULTS).exists()
-        if self.policy is None or not has_results:
+        if self.needs is None or not has_results or self.config.checkpoint is None:
             return has_results
-        same = read_record(self.folder).get(POLICY) == digest(self.policy / CHECKPOINT)
-        return same and (self.policy / RESULTS).exists()
+        same = read_record(self.folder).get(POLICY) == digest(self.needs / CHECKPOINT)
+        return same and (self.needs / RESULTS).exists()
 
     def score(self, policy: str, measure: str) -> float:
         """A measure of one policy in the results of a finished run, or of its first one."""
@@ -105,7 +107,7 @@ def check_stored(run: Run) -> None:
     except InputError as error:
         raise InputError(f"{error}; delete the folder") from error
     old, new = dict(leaves(stored)), dict(leaves(run.config))
-    for key in (new | old).keys() - {"resume", "overrides", "checkpoint"}:
+    for key in (new | old).keys() - {"resume", "overrides", "checkpoint", "learner.teacher"}:
         if old.get(key) != new.get(key):
             raise InputError(
                 f"{run.folder}: {key} is {old.get(key)} in this stored run, and {new.get(key)} is asked "
@@ -143,8 +145,8 @@ def perform_all(
     """Carry out the runs that are not finished; returns those that failed. The bar shows ``told``."""
     todo, failed = [run for run in runs if not run.finished], []
     with tqdm(total=len(runs), initial=len(runs) - len(todo), unit=" runs", disable=not todo) as bar:
-        for trains in (True, False):
-            for run, error in perform_each([r for r in todo if r.trains == trains], processes, slurm):
+        for stage in range(3):
+            for run, error in perform_each([r for r in todo if r.stage == stage], processes, slurm):
                 bar.update()
                 if error:
                     failed.append(run)
@@ -230,8 +232,8 @@ def perform_run(run: Run) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / LOG).open("a", buffering=1) as log, redirect_stdout(log), redirect_stderr(log):
         try:
-            if run.policy is not None and not (run.policy / RESULTS).exists():
-                raise InputError(f"checkpoint: {run.policy} has no finished policy to fly")
+            if run.needs is not None and not (run.needs / RESULTS).exists():
+                raise InputError(f"checkpoint: {run.needs} has no finished policy")
             with locked(run.folder):
                 resumes = run.trains and (run.folder / CHECKPOINT).exists()
                 config = replace(run.config, resume=str(run.folder)) if resumes else run.config

@@ -52,7 +52,7 @@ def learning_setup(config: TrainConfig) -> LearningSetup:
         longest_delay=longest_wait(config),
         backupdate=backupdates(config),
         settle=config.settle,
-        recompute_actor=config.recompute_actor,
+        recompute_actor="actor" in config.corrected,
         critic_key=keys.PRIVILEGED_OBSERVATION if privileged else keys.GLOBAL_OBSERVATION,
         compile=config.compiles,
         frames=config.frames,
@@ -102,11 +102,11 @@ def _check_backupdate(config: TrainConfig) -> None:
     problem = "reads hindsight, which needs aware=backupdate and a message delay (delay.obs)"
     unable = "hindsight" in config.learner.reads and no_messages
     checks.require(not unable, "learner", config.learner.name, problem)
-    onboard = config.recompute_actor and config.links.kind != "server"
+    onboard = "actor" in config.corrected and config.links.kind != "server"
     problem = (
         f"does not go with links={config.links.kind}: an actor sees what the links bring, not the server"
     )
-    checks.require(not onboard, "recompute_actor", True, problem)
-    for key in ("settle", "recompute_actor"):
-        alone = getattr(config, key) and not config.backupdate
-        checks.require(not alone, key, True, "means nothing without backupdate=true")
+    checks.require(not onboard, "corrected", config.corrected, problem)
+    for key, default in (("settle", False), ("corrected", ["reward", "critic"])):
+        alone = getattr(config, key) != default and not config.backupdate
+        checks.require(not alone, key, getattr(config, key), "means nothing without backupdate=true")

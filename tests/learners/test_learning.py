@@ -106,7 +106,7 @@ def collect_delayed(kind: str, recompute_actor: bool) -> tuple[Mappo, TensorDict
     scenario = everything(kind=kind, delay=delay, episode=EpisodeConfig(max_steps=9))
     env = make_env(scenario, 4, seed=1, extras=["message"])
     env.append_transform(StepCounter())
-    recompute = server_recompute(env.server, actor=recompute_actor)
+    recompute = server_recompute(env.server, ["reward", "critic", *["actor"] * recompute_actor])
     observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * recompute_actor]
     corrections = corrections_of(env.transform, observed)
     storage = BackupdateStorage(40 * 4, recompute, longest=5, corrections=corrections)

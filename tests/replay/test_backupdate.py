@@ -9,13 +9,13 @@ from tensordict import TensorDictBase
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import StepCounter
 
-from damian import keys
 from damian.delays.config import DelayConfig
 from damian.envs.pipeline import make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.envs.uav_env import EXTRAS
+from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.recompute import server_recompute
+from damian.replay.recompute import CORRECTED, server_recompute
 from damian.server.termination import EpisodeConfig
 
 LONGEST = 5
@@ -41,9 +41,9 @@ def buffer(
     scenario: ScenarioConfig, capacity: int, n_worlds: int = 4, actor: bool = False, **options
 ) -> TensorDictReplayBuffer:
     env = make_env(scenario, n_worlds, extras=EXTRAS)
-    recompute = server_recompute(env.server, reward_terms=True, actor=actor)
-    observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor]
-    corrections = corrections_of(env.transform, [keys.REWARD, *observed])
+    corrected = ["reward", "critic", *["actor"] * actor]
+    recompute = server_recompute(env.server, corrected, reward_terms=True)
+    corrections = corrections_of(env.transform, [CORRECTED[name] for name in corrected])
     storage = BackupdateStorage(capacity * n_worlds, recompute, LONGEST, corrections=corrections)
     return TensorDictReplayBuffer(storage=storage, batch_size=8, **options)
 
@@ -55,7 +55,7 @@ def in_order(replay: TensorDictReplayBuffer, n_steps: int) -> TensorDictBase:
 
 
 PERSISTENT = EpisodeConfig(max_steps=None)
-CORRECTED = [
+CORRECTED_KEYS = [
     ("next", "agents", "global_observation"),
     ("next", "agents", "reward"),
     ("next", "agents", "reward_terms"),
@@ -65,7 +65,7 @@ CORRECTED = [
 
 
 def check_corrected(corrected: TensorDictBase, expected: TensorDictBase) -> None:
-    for key in CORRECTED:
+    for key in CORRECTED_KEYS:
         entry, right = corrected[key], expected[key]
         for name, value in right.items() if isinstance(right, TensorDictBase) else [("", right)]:
             assert (entry[name] if name else entry).equal(value), (key, name)
@@ -110,6 +110,20 @@ def test_an_actors_observation_can_be_back_updated_but_its_action_history_stays(
     assert history.any()
     assert in_order(replay, 39)["agents", "observation"][..., -2 * 2 :].equal(history)
     assert corrected["agents", "observation"].shape[-1] >= n_features + 2 * 2
+
+
+@pytest.mark.parametrize("corrected", [["reward"], ["critic"], ["reward", "critic"]], ids="+".join)
+def test_only_what_is_named_is_corrected(corrected):
+    scenario = square()
+    late = rollout(replace(scenario, delay=DelayConfig(obs=3)), 30)
+    env = make_env(scenario, 4, extras=EXTRAS)
+    storage = BackupdateStorage(60 * 4, server_recompute(env.server, corrected), LONGEST)
+    TensorDictReplayBuffer(storage=storage, batch_size=8).extend(late)
+    found = storage[storage.latest()[:25]]
+    for name in ("reward", "critic"):
+        key = next_key(CORRECTED[name])
+        unchanged = found[key].equal(late[key].transpose(0, 1)[:25])
+        assert unchanged == (name not in corrected)
 
 
 def test_a_success_that_the_server_hears_of_late_ends_the_episode_where_it_happened():

@@ -17,7 +17,7 @@ from damian.envs.pipeline import has_message_delay, make_env
 from damian.envs.scenario import ScenarioConfig
 from damian.keys import next_key
 from damian.replay.backupdate import BackupdateStorage, corrections_of
-from damian.replay.recompute import server_recompute
+from damian.replay.recompute import CORRECTED, server_recompute
 from damian.server.termination import EpisodeConfig
 from damian.settings import ClockConfig
 
@@ -46,9 +46,10 @@ def fly(env: DelayedEnv) -> TensorDictBase:
 def backupdated(scenario: ScenarioConfig, actor: bool) -> tuple[TensorDictBase, TensorDictBase]:
     """Such steps as collected, and as corrected by all that has arrived after the last one, [T, B]."""
     env = training_env(scenario)
-    recompute = server_recompute(env.server, actor=actor) if has_message_delay(scenario) else None
-    observed = [keys.GLOBAL_OBSERVATION, *[keys.OBSERVATION] * actor] if recompute else []
-    corrections = corrections_of(env.transform, [keys.REWARD, *observed])
+    corrected = ["reward", "critic", *["actor"] * actor]
+    recompute = server_recompute(env.server, corrected) if has_message_delay(scenario) else None
+    names = corrected if recompute else ["reward"]
+    corrections = corrections_of(env.transform, [CORRECTED[name] for name in names])
     storage = BackupdateStorage(2 * STEPS * WORLDS, recompute, LONGEST, corrections=corrections, device="cpu")
     buffer, late = ReplayBuffer(storage=storage), fly(env)
     for steps in late.split(8):
