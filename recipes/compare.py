@@ -82,6 +82,8 @@ def _seeds(config: CompareConfig, folder: Path, trained_in: str, overrides: list
     try:
         unseeded = _composed(*overrides, own_folder=config.own_folder)
         late_by = [] if arm.delayed else late(unseeded)
+        if late_by and away:
+            return  # a held-out delay, under which the undelayed arm is not flown
         should = "delays this arm, with which others are compared: put delays under experiment.delays"
         checks.require(not late_by, ", ".join(late_by), "its value", should)
         flies_script = arm.oracle and unseeded.seeks_source and has_message_delay(unseeded)

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -15,9 +16,14 @@ from damian.compare.comparison import KNOWN_ON_TIME, TRAINED, Arm
 from damian.recipes.compare import plan
 from damian.recipes.compare import run as main
 from damian.recipes.known import CONF
+from damian.recipes.shared.comparison_results import write_csv
+from damian.recipes.shared.runs import POLICY
+from damian.runs.checkpoint import digest
 from damian.runs.run_lock import locked
+from damian.runs.run_record import read_record
 from damian.settings.programs import CompareConfig, Experiment
 
+ROOT = Path(__file__).parents[2]
 SMALL = [
     "frames=16",
     "worlds=2",
@@ -111,6 +117,46 @@ def test_each_arm_and_seed_is_run_once_and_an_interrupted_run_is_resumed(compare
     assert f"{runs[2]}: delay.loss is 0.0 in this stored run, and 0.5 is asked for" in error
     assert error.count("\n") == 1
     assert stamps(folder) == after
+
+
+LEARNING_FROM_OTHERS = """\
+tasks: {tracking: [scenario=tracking]}
+delays: {paper: [delay=paper]}
+arms:
+  undelayed: {delayed: false}
+  unaware: {naive: true}
+  finetuned: {starts_from: undelayed}
+  student: {teacher: undelayed, overrides: [learner=distillation:DistillationConfig]}
+"""
+
+
+def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(compare, tmp_path):
+    (tmp_path / "conf" / "experiment").mkdir(parents=True)
+    (tmp_path / "conf" / "experiment" / "others.yaml").write_text(LEARNING_FROM_OTHERS)
+    shutil.copy(ROOT / "examples" / "extending" / "distillation.py", tmp_path)
+    small = listed(*(word for word in SMALL if "learner" not in word))
+    words = ["--config-dir", "conf", "experiment=others", "seeds=1", "experiment.first_seed=3", small]
+    compare(*words)
+    folder = tmp_path / "runs" / "others"
+    place = folder / "tracking"
+    policy = digest(place / "none" / "undelayed" / "seed_3" / "checkpoint.pt")
+    assert read_record(place / "paper" / "finetuned" / "seed_3")[POLICY] == policy
+    rows = measured(folder)
+    regimes = {row["arm"]: row["regime"] for row in rows}
+    assert regimes == {"undelayed": "R3", "unaware": "R0", "finetuned": "R2", "student": "R2"}
+
+    shutil.rmtree(place)
+    compare(*words, "keep=true")
+    assert not place.exists()
+    assert measured(folder) == rows
+
+    write_csv(
+        folder / "results.csv", [row for row in table(folder / "results.csv") if row["arm"] != "student"]
+    )
+    compare(*words, "keep=true")
+    assert {path.parent.name for path in place.rglob("seed_3")} == {"undelayed", "student"}
+    found = measured(folder)
+    assert sorted(map(str, found)) == sorted(map(str, rows))
 
 
 @pytest.mark.slow
