@@ -31,6 +31,8 @@ PACKAGES = (
     "learners",
     "server",
     "world",
+    "settings",
+    "baselines",
     "runs",
     "compare",
     "show",
@@ -38,6 +40,12 @@ PACKAGES = (
     "advice",
 )
 """Packages with a page of the API, the most used first."""
+PROGRAM_FUNCTIONS = {
+    "load": "recipes.evaluate.load",
+    "results": "recipes.results.results",
+    "compose_scenario": "recipes.shared.environments.compose_scenario",
+}
+"""Public functions of the programs, and where they lie in a clone."""
 NOTEBOOKS = sorted(ROOT.glob("docs/notebooks/*.ipynb"))
 
 
@@ -139,17 +147,20 @@ def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 def public_names() -> str:
     """The names that ``import damian`` offers."""
     parts = ["# damian", "`import damian` offers these names, and loads each when it is first used.", ""]
-    for module, names in damian._MODULES.items():
-        package_name = module.split(".")[1]
-        page = f" ([{module}]({package_name}.md))" if package_name in PACKAGES else ""
-        parts += [f"- `{name}`{page}" for name in names]
+    for name in sorted(damian._MODULE_OF):
+        path = PROGRAM_FUNCTIONS.get(name, f"{getattr(damian, name).__module__}.{name}")
+        parts.append(f"- [`{name}`][{path}]")
+    parts += ["", *(f"::: {path}" for path in PROGRAM_FUNCTIONS.values()), "", "::: damian.keys"]
     return "\n".join(parts)
 
 
 def package(name: str) -> str:
     """The API of a package, module by module."""
     folder = ROOT / "damian" / name
-    modules = [f"::: damian.{name}.{path.stem}" for path in sorted(folder.glob("[!_]*.py"))]
+    paths = sorted(folder.rglob("[!_]*.py"))
+    modules = [
+        f"::: damian.{'.'.join(path.relative_to(ROOT / 'damian').with_suffix('').parts)}" for path in paths
+    ]
     return "\n\n".join([f"# damian.{name}", docstring(folder / "__init__.py"), *modules])
 
 
