@@ -37,11 +37,12 @@ test-browser: $(VENV)/browser
 
 # With the lowest versions that pyproject.toml admits, and with the newest.
 test-lowest: build/lowest.txt
-	$(MAKE) test VENV=build/lowest CONSTRAINTS="--constraint build/lowest.txt"
+	$(MAKE) test VENV=build/lowest CONSTRAINTS="--constraint build/lowest.txt" ARGS="-W ignore $(ARGS)"
 
 build/lowest.txt: pyproject.toml
 	mkdir -p build
-	grep -oE '"[A-Za-z-]+>=[0-9.]+[,"]' $< | tr -d '",' | sed 's/>=/==/' > $@
+	sed -n '/^dependencies/,/^]/p; /^advise\|^tune\|^interop\|^export/p' $< | \
+	  grep -oE '"[A-Za-z-]+>=[0-9.]+' | tr -d '"' | sed 's/>=/==/' > $@
 
 test-newest:
 	$(MAKE) test VENV=build/newest TORCH="torch<3"
