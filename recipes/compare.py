@@ -180,7 +180,7 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
     """Carry out the runs, unless only a report is asked for."""
     runs, failed, kept = plan(config, folder), [], Results([], [])
     if config.keep and (folder / ROWS).exists():
-        kept = stored_results(folder, partial(includes, config))
+        kept = stored_results(folder, lambda row: True)
         runs = _not_kept(runs, kept)
     for run in runs:
         check_stored(run)
@@ -198,6 +198,7 @@ def _results_of_runs(config: CompareConfig, folder: Path) -> tuple[Results, list
     results = kept.with_those_of(results_of(done, config.chosen("arms")))
     if done:
         results.write(folder)
+    results = results.only(partial(includes, config))
     return results, [run.name for run in runs if not run.finished], failed
 
 

@@ -60,6 +60,10 @@ class Results:
         pairs = ((self.rows, new.rows), (self.points, new.points))
         return Results(*([*(row for row in old if run(row) not in again), *added] for old, added in pairs))
 
+    def only(self, included: Callable[[Row], bool]) -> "Results":
+        """Those of the rows that are included."""
+        return Results(*([*filter(included, rows)] for rows in (self.rows, self.points)))
+
     def write(self, folder: Path) -> None:
         """Write both files."""
         write_csv(folder / ROWS, self.rows)
@@ -94,7 +98,7 @@ def results_of(runs: Sequence[Run], arms: Mapping[str, Arm]) -> Results:
 
 def stored_results(folder: Path, included: Callable[[Row], bool]) -> Results:
     """Read the results that a folder stores; ``included`` says which rows."""
-    return Results(*([*filter(included, _read(folder / name))] for name in (ROWS, CURVES)))
+    return Results(*(_read(folder / name) for name in (ROWS, CURVES))).only(included)
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:

@@ -158,6 +158,10 @@ def test_an_arm_starts_from_another_or_imitates_it_and_stored_rows_are_kept(comp
     found = measured(folder)
     assert sorted(map(str, found)) == sorted(map(str, rows))
 
+    compare(*words[:3], "arms=[undelayed]", "seeds=1", "experiment.first_seed=4", small, "keep=true")
+    assert {row["seed"] for row in measured(folder)} == {"3", "4"}
+    assert "1 seeds (4 to 4)" in (folder / "table.md").read_text()
+
 
 @pytest.mark.slow
 def test_a_report_from_stored_results_is_that_from_the_runs(compare, capsys, tmp_path):
