@@ -25,7 +25,7 @@ def markdown(comparison: Comparison, notes: Sequence[str]) -> str:
                 parts += _pairs(comparison, task, delay)
     overall = [(arm, seeds, str(norm)) for arm, (seeds, norm) in comparison.overall().items()]
     if overall:
-        table = markdown_table(("arm", "n", "interquartile mean of J_norm"), overall)
+        table = markdown_table(("method", "n", "interquartile mean of J_norm"), overall)
         parts += ["## All tasks and delays", table]
     return "\n\n".join([*parts, "## Compute", _compute(comparison)]) + "\n"
 
@@ -42,7 +42,7 @@ def _length(comparison: Comparison, task: str) -> str:
 
 
 def _table(lines: Sequence[Line]) -> str:
-    left, heads = ["arm", "regime", "policy"], [column.head for column in MEASURED]
+    left, heads = ["method", "regime", "policy"], [column.head for column in MEASURED]
     rows = []
     for line in lines:
         name = f"{line.arm} (undelayed)" if line.delay == NOT_LATE and line.arm in SCRIPTED else line.arm
@@ -59,8 +59,8 @@ def _pairs(comparison: Comparison, task: str, delay: str) -> list[str]:
     pairs = comparison.pairs(task, delay)
     arms = list(dict.fromkeys(one for one, _ in pairs))
     rows = [[one, *(str(pairs.get((one, other), "")) for other in arms)] for one in arms]
-    title = "Probability that a run of the row's arm beats one of the column's [95 % score interval]:"
-    return [title, markdown_table(("arm", *arms), rows)] if arms else []
+    title = "Probability that a run of the method in the row beats one of that in the column [95 % score interval]:"
+    return [title, markdown_table(("method", *arms), rows)] if arms else []
 
 
 def _compute(comparison: Comparison) -> str:
@@ -72,4 +72,4 @@ def _compute(comparison: Comparison) -> str:
         for arm, times in (by_arm | {"all": [run["seconds"] for run in runs]}).items()
         if times
     ]
-    return markdown_table(("arm", "runs", "seconds a run", "hours of all runs"), rows)
+    return markdown_table(("method", "runs", "seconds a run", "hours of all runs"), rows)
