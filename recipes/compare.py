@@ -144,11 +144,11 @@ def _notes(config: CompareConfig, results: Results, missing: Sequence[str]) -> l
         "Mean over seeds [95 % interval: stratified bootstrap over seeds, widened for few seeds; none below "
         f"{FEWEST}]; J: {config.score} of the {config.policy} policy; perceived: as far as the server knew, "
         "else as it truly was; age in steps; back-updated: share of the messages in training; n: seeds",
-        "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (R0, or R1 and "
-        "R2), 1 undelayed, not shown where "
+        "J_norm: 0 random, 1 undelayed; recovery: 0 the strongest naive method of the same track (R0, or R1 "
+        "and R2), 1 undelayed, not shown where "
         "the delay costs less than a tenth of undelayed - random; P > naive: probability that a run beats "
-        "one of the strongest naive method, with its score interval; n compared: seeds that all of these have; "
-        "of oracle: J over that of the script which knows all messages on time",
+        "one of the strongest naive method, with its score interval; n compared: seeds that all of these "
+        "have; of oracle: J over that of the script which knows all messages on time",
     ]
     if min(map(len, by_arm.values())) < SEEDS or episodes[0] < EPISODES:
         notes.insert(0, f"**developing**: fewer than {SEEDS} seeds or {EPISODES} episodes")

@@ -59,7 +59,7 @@ def _pairs(comparison: Comparison, task: str, delay: str) -> list[str]:
     pairs = comparison.pairs(task, delay)
     arms = list(dict.fromkeys(one for one, _ in pairs))
     rows = [[one, *(str(pairs.get((one, other), "")) for other in arms)] for one in arms]
-    title = "Probability that a run of the method in the row beats one of that in the column [95 % score interval]:"
+    title = "Probability that a run of the row's method beats one of the column's [95 % score interval]:"
     return [title, markdown_table(("method", *arms), rows)] if arms else []
 
 
