@@ -56,7 +56,7 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
     begin(config, state)
     if config.compiles:
         print("compiling: the first update takes up to a minute longer")
-    loggers, settings = make_loggers(config.logger.custom, folder), dict(leaves(config))
+    loggers, settings = make_loggers(config.logger, folder), dict(leaves(config))
     log = MetricsLog(
         folder, config.logger.tensorboard, config.logger.csv, state.progress.frames, loggers, settings
     )

@@ -10,6 +10,7 @@ from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError, naming_errors
 from damian.common.registry import Registry, check_parameters
+from damian.settings import LoggerConfig
 
 
 class Logger(Protocol):
@@ -39,10 +40,12 @@ LOGGERS = Registry[Callable[..., Logger]]("logger", _not_a_logger)
 """Loggers of the user's own as ``package.module:Name``: functions or classes that get the run folder."""
 
 
-def make_loggers(written: Sequence[Any], folder: Path) -> list[Logger]:
-    """Make loggers for a run folder; the arguments are as for ``check_loggers``."""
+def make_loggers(config: LoggerConfig, folder: Path) -> list[Logger]:
+    """Make the loggers of ``config.custom``, which are as for ``check_loggers``, for a run folder."""
     loggers = []
-    for path, make, parameters in map(_read, written):
+    told = {"project": config.wandb.project, "offline": config.wandb.offline}
+    for path, make, written in map(_read, config.custom):
+        parameters = told | written if make is wandb else written
         with naming_errors(f"logger.custom: {path}"):
             logger = make(folder, **parameters)
             should = "is no logger: it has no method log_scalar(name, value, step)"
@@ -65,10 +68,7 @@ def _read(written: Any) -> tuple[str, Callable[..., Logger], dict[str, Any]]:
 
 
 def wandb(folder: Path, *, project: str = "damian", offline: bool = False) -> Logger:
-    """A run of Weights & Biases, named as the run folder; a resumed training continues it.
-
-    With ``offline``, or WANDB_MODE=offline, the folder keeps everything for ``wandb sync``.
-    """
+    """A run of Weights & Biases, named as the run folder; a resumed training continues it."""
     try:
         library = import_module("wandb")
     except ImportError:
