@@ -26,7 +26,7 @@ from damian.settings import TrainConfig
 from . import cli
 from .shared.runs import save_config, with_policy_of
 
-MEANING = """untrained: the same network before its first update; its results are not learnt. script: a rule
+MEANING = """untrained: the same network before any training; its results are not learnt. script: a rule
 of thumb on the same observations. Actions are drawn from the policy's distribution; deterministic: the most
 likely one is taken. A policy without memory often needs chance to search."""
 """Lines under the table of an evaluation."""

@@ -23,10 +23,11 @@ from torchrl.modules import ProbabilisticActor
 
 import damian
 from damian import keys
+from damian.common import checks
 from damian.common.atomic_files import write_atomically
 from damian.common.errors import InputError
 from damian.envs.delayed_env import DelayedEnv
-from damian.runs.run_folder import RESULTS
+from damian.runs.run_folder import CONFIG, RESULTS
 from damian.server.features import feature_of
 from damian.settings import ActionConfig, ScenarioConfig
 from damian.world.landing import action_table
@@ -194,12 +195,13 @@ def actions(config: ActionConfig) -> dict[str, Any]:
 
 def run() -> None:
     """Export the policy of the run folder that the command line names."""
-    words = [word for word in sys.argv[1:] if word != "trust=true"]
+    words = [word.removeprefix("checkpoint=") for word in sys.argv[1:] if word != "trust=true"]
     if len(words) != 1:
         raise InputError(
             "damian export RUN: give the run folder, and trust=true if it names code of your own"
         )
     folder = Path(words[0])
+    checks.require((run_folder(folder) / CONFIG).is_file(), "RUN", folder, f"holds no {CONFIG}")
     if not (folder / RESULTS).exists() and not folder.is_file():
         print(f"{folder}: the training has not finished; its latest checkpoint is exported")
     print(f"results: {export(folder, trust=len(words) < len(sys.argv[1:]))}")

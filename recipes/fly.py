@@ -121,7 +121,7 @@ def summary(name: str, episode: Episode) -> str:
     n_sent = max(int(episode.sent.sum()), 1)
     age = episode.age[min(episode.n_steps, 1) :]  # of the steps, without the reset
     return (
-        f"{name}: {episode.n_steps} steps, return {episode.perceived_return:.2f}"
+        f"{name}: {episode.n_steps} steps, perceived return {episode.perceived_return:.2f}"
         f"{', success' if episode.success else ''}; mean age {age.mean():.2f} s, "
         f"messages late {episode.late.sum() / n_sent:.1%}, lost {episode.lost.sum() / n_sent:.1%}"
     )

@@ -241,7 +241,8 @@ HINTS = """\
 Often used: agents=3 seed=0 frames=300000 worlds=64 device=cuda compile=true learner.lr=3e-4
   delay.obs=3 (steps) | 3s | "delay.obs={{law: uniform, low: 3s, high: 7s}}"   delay.act=   delay.loss=
   resume=FOLDER   checkpoint=FOLDER   hydra.run.dir=FOLDER   -m seed=0,1,2 (a sweep)   --config-dir FOLDER
-Meaning, type, default and unit: damian {name} --help KEY | GROUP ...   All settings: docs/settings.md"""
+Meaning, type, default and unit: damian {name} --help KEY | GROUP ...
+All settings with your words, and the defaults of your learner and scenario: damian {name} ... --cfg job"""
 
 
 def _options(program: str, group: str, own_folder: str | None) -> list[str]:

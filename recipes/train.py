@@ -38,7 +38,7 @@ from damian.settings.fields import leaves
 from . import cli
 from .evaluate import make_eval_env, own_code, report
 from .shared.collectors import learning_env, make_collector, ticks
-from .shared.runs import run_folder, save_config, stored_config
+from .shared.runs import names_own_code, run_folder, save_config, stored_config
 from .shared.settings import backupdates, check_learning, learning_setup, longest_wait
 
 Watch = Callable[[int, dict[str, float]], None]
@@ -75,7 +75,7 @@ def train(config: TrainConfig, folder: Path, watch: Watch | None = None) -> None
     title = f"{config.agents} UAVs, {name or module.upper()}"
     plot_learning_curve(log.rows, evaluations, folder / FIGURE, title)
     print(f"learning curve: {folder / FIGURE}")
-    print(f"fly the best policy: {best_flight(evaluations, folder)}")
+    print(f"fly this policy: {best_flight(evaluations, folder)}{' trust=true' * names_own_code(config)}")
 
 
 def best_flight(evaluations: dict[str, Evaluation], folder: Path) -> str:
@@ -131,6 +131,11 @@ def begin(config: TrainConfig, state: TrainingState) -> None:
     """Load what the run continues or starts from, and write the first checkpoint and then the settings."""
     if config.resume:
         state.load()
+        made = state.progress
+        should = f"is fewer than the {made.frames} that the run has made"
+        checks.require(
+            made.frames - made.frames / max(made.updates, 1) < config.frames, "frames", config.frames, should
+        )
     elif config.checkpoint:
         trained = stored_config(run_folder(Path(config.checkpoint)), "checkpoint", trust=True).learner.name
         names = ["actor", "critic"] if trained == config.learner.name else ["actor"]

@@ -134,6 +134,10 @@ class BackupdateStorage(TimeStorage):
             delays.append(("message", self._delay, writer))
         for name, key, writer in [*needed, *(("delay_key", *delay[1:]) for delay in delays)]:
             checks.require(key in present, name, key, f"is not in the steps: {writer} writes it")
+        if self._n_worlds is None and min(data.shape) > 1:
+            along = [(data[self._count].squeeze(-1).diff(dim=dim) == 1).double().mean() for dim in (0, 1)]
+            should = "grows from world to world instead of step to step: give ReplayBuffer.extend [B, T]"
+            checks.require(bool(along[0] >= along[1]), "step_count", self._count, should)
         n_worlds = self._n_worlds = data.shape[1] if self._n_worlds is None else self._n_worlds
         if data.shape[1] != n_worlds:
             raise InputError(

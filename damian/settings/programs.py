@@ -105,7 +105,11 @@ class FlyConfig(FlownPolicyConfig):
     policy: str | None = setting(
         None, "sampled (default with a checkpoint), deterministic, script (default without), or random."
     )
-    keep: str = setting("all", "Episodes to keep: all, or best, median, worst.", choices=("all", "extremes"))
+    keep: str = setting(
+        "all",
+        "Episodes to keep: all, or the best, the median and the worst (extremes).",
+        choices=("all", "extremes"),
+    )
     formats: list[str] = setting(
         ["gif", "png"],
         "What to make of each: films (gif, mp4), a figure (png), a page (html), or geojson for map tools.",

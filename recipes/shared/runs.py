@@ -174,11 +174,17 @@ def _components(node: Any) -> Iterator[str]:
             yield from _components(each)
 
 
+def names_own_code(config: TrainConfig) -> bool:
+    """Do the settings name components of your own, which a program imports only with ``trust=true``?"""
+    return any(True for _ in _components(OmegaConf.create(dict(leaves(config)))))
+
+
 def resumed(folder: Path, given: DictConfig, words: Sequence[str]) -> TrainConfig:
     """The settings of a run to resume; only ``frames`` and ``episodes`` may change."""
     allowed = ("resume", "frames", "episodes", "trust")
     if refused := [word for word in words if key_of(word) not in allowed]:
-        problem = "a resumed run keeps its configuration; only frames= and episodes= may change"
+        problem = "a resumed run keeps its configuration; only frames= and episodes= may change; checkpoint="
+        problem += f"{folder} {refused[0]} begins a new run with its policy"
         raise InputError(f"{refused[0]}: {problem}")
     config = stored_config(folder, "resume", given.trust, words)
     checkpoint_file(folder, "resume")

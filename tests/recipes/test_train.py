@@ -86,7 +86,9 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     assert (trained / "metrics.csv").read_text() == before
     assert (other / "metrics.csv").read_text() != before
     check_refused(lambda: run(*TINY, "seed=2", folder="same"), "same holds a run already", capsys)
-    run(f"resume={same}", "frames=100", folder="second")
+    fewer, made = (f"resume={same}", "frames=100"), "frames: 100 is fewer than the 256 that the run has made"
+    check_refused(lambda: run(*fewer, folder="second"), made, capsys)
+    run(f"resume={same}", "frames=250", folder="second")
     assert (same / "metrics.csv").read_text() == before, "nothing was left to train"
     run(f"resume={same}", "frames=512", folder="second")
     assert (same / "metrics.csv").read_text().startswith(before)
@@ -95,7 +97,7 @@ def test_a_run_is_the_same_again_goes_on_and_is_not_overwritten(run, trained, ca
     resumed = json.loads((same / "run.json").read_text())
     assert record["command"] == resumed["command"]
     assert shlex.split(record["command"])[:3] == ["damian", "train", "frames=256"]
-    assert resumed["resumed"][0]["command"] == f"damian train resume={same} frames=100 hydra.run.dir=second"
+    assert resumed["resumed"][0]["command"] == f"damian train resume={same} frames=250 hydra.run.dir=second"
 
 
 @pytest.mark.parametrize(
