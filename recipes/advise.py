@@ -28,11 +28,12 @@ from damian.common.errors import InputError
 from damian.common.text_files import named
 from damian.runs.run_lock import locked
 from damian.settings.programs import AdviseConfig, check_token
+from damian.world.vehicles import MOTION_MODELS
 
 from . import cli
 from .evaluate import stored_actor
 from .known import key_of
-from .shared.runs import save_config
+from .shared.runs import run_folder, save_config, stored_config
 
 FLEET = "main"
 """Name of the only fleet of a table or a folder."""
@@ -53,13 +54,25 @@ def make_session(config: AdviseConfig, folder: Path | None) -> AdviceSession:
         node = Node(for_uavs(config.eval_scenario, n_uavs), config.seed)
         return node, stored_actor(config, node.env) if config.learnt else greedy_policy(node.env)
 
-    def make_fleet(uavs: list[str]) -> Fleet:
+    def make_fleet(uavs: list[str], mark: str) -> Fleet:
         node, policy = parts(len(uavs))
-        return Fleet(node, uavs, policy, drawn=config.flown == "sampled", seed=config.seed)
+        drawn = config.flown == "sampled"
+        return Fleet(node, uavs, policy, drawn, config.seed, config, parts, mark)
 
     overrides = without_token(config).overrides
     about = {"policy": config.flown, "checkpoint": config.checkpoint, "overrides": overrides}
     return AdviceSession(make_fleet, folder, about)
+
+
+def check_motion(config: AdviseConfig) -> None:
+    """Refuse a policy whose UAVs flew in no time in its training, unless it is asked for."""
+    if not config.learnt or config.instant:
+        return
+    trained = stored_config(run_folder(Path(str(config.checkpoint))), "checkpoint", trust=True).motion.kind
+    for kind in (trained, config.motion.kind):
+        if MOTION_MODELS.get(kind, "motion.kind").instant:
+            problem = "the policy's UAVs were at their targets at once: train one with motion=polynomial"
+            raise InputError(f"motion: {kind}: {problem}, or give instant=true to have it served")
 
 
 def answer_table(config: AdviseConfig, folder: Path) -> None:
@@ -95,6 +108,7 @@ def advise(config: AdviseConfig, folder: Path) -> None:
         fit_delays(config, folder)
         return
     scenario_of_service(config.eval_scenario)
+    check_motion(config)
     if config.observation.own and config.learnt:
         print("note: the policy knew a UAV's own messages at once; the service knows them when they arrive")
     if config.reports is not None:

@@ -5,6 +5,7 @@ is lost if the process is killed at any time. The first line says which fleet it
 """
 
 import os
+import secrets
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
-from damian.advice.rows import Advice, Number, Report, Time, UavId, parsed_json, validated
+from damian.advice.rows import Acknowledgement, Advice, Number, Report, Time, UavId, parsed_json, validated
 from damian.common.atomic_files import writing
 from damian.common.errors import InputError
 from damian.common.text_files import named
@@ -32,12 +33,16 @@ class Head(BaseModel):
     """The first line of a journal."""
 
     journal: Literal["damian-advice"] = "damian-advice"
-    version: Literal[2] = 2
+    version: Literal[3] = 3
     fleet: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
     uavs: Annotated[list[UavId], Field(min_length=1, max_length=100)]
     about: About
     ground: str = ""
     """Stands for the landing points."""
+    rules: dict[str, bool | float] = {}
+    """Settings of ``FieldRules``."""
+    mark: str = Field(default_factory=lambda: secrets.token_hex(3))
+    """Begins the IDs of the answers, so that those of an earlier fleet of this name are told apart."""
 
     @model_validator(mode="after")
     def _distinct(self) -> "Head":
@@ -63,13 +68,44 @@ class Advised(BaseModel):
     """A line about UAVs that have chosen and were told so."""
 
     asked: Time
-    told: dict[str, int | tuple[Number, Number]]
-    """Their actions, by ID."""
+    told: dict[str, int | tuple[Number, Number] | tuple[Literal["hold", "return"], str]]
+    """Their actions, by ID; for those that could not be left to the policy, what they do instead, and why."""
     advice: list[Advice] = []
     """What they were told."""
 
 
-Line = Received | Advised
+class Acknowledged(BaseModel):
+    """A line about what UAVs do with their answers."""
+
+    received: Time
+    acknowledged: list[Acknowledgement]
+
+
+class Commanded(BaseModel):
+    """A line about what a person tells UAVs to do."""
+
+    received: Time
+    command: Literal["hold", "resume", "return"]
+    uavs: list[UavId]
+
+
+class Members(BaseModel):
+    """A line about UAVs that join a fleet and leave it."""
+
+    received: Time
+    join: list[UavId] = []
+    leave: list[UavId] = []
+
+
+Line = Received | Advised | Acknowledged | Commanded | Members
+KINDS: dict[str, type[Line]] = {
+    "reports": Received,
+    "told": Advised,
+    "acknowledged": Acknowledged,
+    "command": Commanded,
+    "join": Members,
+}
+"""Kinds of lines by the entry that only they have."""
 
 
 class Journal:
@@ -110,7 +146,8 @@ def read_lines(path: Path) -> Iterator[tuple[int, Line]]:
     for number, text in enumerate(texts[1:], 2):
         with named(f"{path}: line {number}"):
             found = parsed_json(text)
-            line = validated(Received if "reports" in found else Advised, found)
+            kind = next((kind for name, kind in KINDS.items() if name in found), Members)
+            line = validated(kind, found)
         yield number, line
 
 

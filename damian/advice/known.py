@@ -99,6 +99,8 @@ class FilledReport:
     """Heading of its latest flight [rad]."""
     battery: float = 100.0
     """Battery level [%]."""
+    battery_known: bool = False
+    """Whether the UAV has ever reported one."""
     spotted: bool = False
     """Whether it spots the source; a UAV in flight does not."""
     detected: int | None = None
@@ -180,6 +182,7 @@ class UavLog:
             track, battery, readings = before.track, before.battery, before.readings
         filled.track = track if report.track is None else math.radians(report.track) % (2 * math.pi)
         filled.battery = battery if report.battery is None else report.battery
+        filled.battery_known = report.battery is not None or (before is not None and before.battery_known)
         filled.readings = readings if report.readings is None else report.readings
         filled.spotted = report.source_spotted and not report.flies
         place = report.place("source_")

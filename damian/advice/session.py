@@ -5,6 +5,7 @@ the journal does not say, and a request that fails changes nothing.
 """
 
 import json
+from dataclasses import fields
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -14,16 +15,42 @@ import torch
 
 from damian import keys
 from damian.advice.fleet import Fleet, Waiting
-from damian.advice.journal import SUFFIX, About, Advised, Head, Journal, Line, Received, read_head, read_lines
-from damian.advice.rows import Advice, Report, Rows, as_csv, as_rows, read_file, validated
+from damian.advice.journal import (
+    SUFFIX,
+    About,
+    Acknowledged,
+    Advised,
+    Commanded,
+    Head,
+    Journal,
+    Line,
+    Members,
+    Received,
+    read_head,
+    read_lines,
+)
+from damian.advice.rows import (
+    Acknowledgement,
+    Advice,
+    Report,
+    Rows,
+    acknowledgements_of,
+    as_csv,
+    as_rows,
+    reports_of,
+    rows_of_file,
+    validated,
+)
 from damian.common.atomic_files import write_atomically, writing
 from damian.common.errors import InputError
 from damian.common.text_files import named, show
 from damian.runs.run_lock import locked
+from damian.settings.programs import FieldRules
 
 MAY_DIFFER = {
     *("reports", "folder", "port", "host", "token", "uavs", "journal"),
     *("policy", "checkpoint", "agents", "device", "frames", "episodes", "eval_episodes", "hydra"),
+    *("reserve", "oldest_report", "clearance", "instant"),
 }
 """Settings that a journal and a service need not share: those that say how reports come in and where journals
 lie, those that are compared apart, and those on which no advice depends."""
@@ -37,12 +64,13 @@ class AdviceSession:
     """The fleets of a service.
 
     The ``folder`` of journals is locked until ``close``, and the fleets in it are restored if they are of the
-    policy and settings ``about``; with None nothing is kept.
+    policy and settings ``about``; with None nothing is kept. ``make_fleet`` makes a fleet of UAVs and the
+    mark of its answers.
     """
 
     def __init__(
         self,
-        make_fleet: Callable[[list[str]], Fleet],
+        make_fleet: Callable[[list[str], str], Fleet],
         folder: Path | None = None,
         about: Mapping[str, Any] | None = None,
     ) -> None:
@@ -76,10 +104,10 @@ class AdviceSession:
             if self.fleets[name].uavs != head.uavs:
                 raise InputError(f"fleet: {name} has other UAVs; end it first, or take another name")
             return False
-        made = self.make(head.uavs)
+        made = self.make(head.uavs, head.mark)
         if self._folder is not None:
             journal = Journal(self._folder / f"{name}{SUFFIX}")
-            journal.append(head.model_copy(update={"ground": made.ground.mark}))
+            journal.append(head.model_copy(update={"ground": made.ground.mark, "rules": rules_of(made)}))
             self._journals[name] = journal
         self.fleets[name] = made
         return True
@@ -101,6 +129,7 @@ class AdviceSession:
         for where, report in rows:
             with named(where):
                 report.stamp(now, file)
+                (report.model_extra or {}).clear()  # what is not understood need not be kept
                 if not file:  # by the clock of the fleet, which never goes back
                     report.received = clock
                 fleet.check(report, None if file else clock)
@@ -115,11 +144,45 @@ class AdviceSession:
         fleet = self.fleet(name)
         choice = fleet.choose(now, asking)
         if choice is not None:
-            told = {fleet.uavs[uav]: decision.action for uav, decision in choice.decisions.items()}
-            advice = [fleet.advice_of(*each) for each in choice.decisions.items()]
+            told = {
+                fleet.uavs[uav]: (each.kind, each.reason) if each.action is None else each.action
+                for uav, each in choice.decisions.items()
+            }
+            advice = [fleet.advice_of(uav, each, each.kind) for uav, each in choice.decisions.items()]
             self._write(name, Advised.model_construct(asked=fleet.clock, told=told, advice=advice))
             fleet.tell(choice)
         return fleet.advice(fleet.numbers_of(asking) if only else None)
+
+    def acknowledge(self, name: str, rows: list[Acknowledgement], now: float) -> list[str]:
+        """Take acknowledgements, all or none; returns how far the answers have come, or ``unknown``."""
+        fleet = self.fleet(name)
+        for row in rows:
+            fleet.number_of(row.id)
+            (row.model_extra or {}).clear()
+        clock = max(now, fleet.clock)
+        self._write(name, Acknowledged.model_construct(received=clock, acknowledged=rows))
+        return [fleet.acknowledge(row, clock) for row in rows]
+
+    def command(self, name: str, command: Any, uavs: Any, now: float) -> list[str]:
+        """Let UAVs hold, return or resume, all of them if ``uavs`` is None; returns which."""
+        fleet = self.fleet(name)
+        chosen = fleet.uavs if uavs is None else uavs
+        told = {"received": max(now, fleet.clock), "command": command, "uavs": chosen}
+        line = validated(Commanded, told)
+        for uav in line.uavs:
+            fleet.number_of(uav)
+        self._write(name, line)
+        replay(fleet, line)
+        return line.uavs
+
+    def change_members(self, name: str, join: Any, leave: Any, now: float) -> list[str]:
+        """Let UAVs join with their first reports, and leave now; returns the members from now on."""
+        fleet = self.fleet(name)
+        line = validated(Members, {"received": max(now, fleet.clock), "join": join, "leave": leave})
+        fleet.check_change(line.join, line.leave)
+        self._write(name, line)
+        replay(fleet, line)
+        return fleet.uavs
 
     def advance(self, now: float) -> None:
         """Let all fleets take their steps, so that no answer has to wait for many of them."""
@@ -150,7 +213,7 @@ class AdviceSession:
             if head.fleet != path.stem:
                 raise InputError(f"it is the journal of the fleet {head.fleet}: name it {head.fleet}{SUFFIX}")
             check_same(head.about, self.about)
-            fleet = self.make(head.uavs)
+            fleet = self.make(head.uavs, head.mark)
             if head.ground != fleet.ground.mark:
                 raise InputError("it is of other landing points: give the region and the lattice that it had")
         for number, line in read_lines(path):
@@ -159,26 +222,49 @@ class AdviceSession:
         self.fleets[head.fleet] = fleet
 
 
+def rules_of(fleet: Fleet) -> dict[str, bool | float]:
+    """The settings that a fleet holds to."""
+    return {each.name: getattr(fleet.rules, each.name) for each in fields(FieldRules)}
+
+
 def replay(fleet: Fleet, line: Line) -> None:
-    """Repeat in a fleet the reports or the advice that a line of its journal records."""
+    """Repeat in a fleet what a line of its journal records."""
     if isinstance(line, Received):
         for report in line.reports:
             fleet.check(report)
         _taken(fleet, line.reports)
-        return
-    if fleet.start is None:
+    elif isinstance(line, Acknowledged):
+        for row in line.acknowledged:
+            fleet.acknowledge(row, line.received)
+    elif isinstance(line, Commanded):
+        fleet.command(line.command, line.uavs, line.received)
+    elif isinstance(line, Members):
+        fleet.change_members(line.join, line.leave, line.received)
+    elif fleet.start is None:
         raise InputError("advice before every UAV has reported")
+    else:
+        _advised(fleet, line)
+
+
+def _advised(fleet: Fleet, line: Advised) -> None:
+    """Let UAVs be told again what they were told."""
     fleet.advance(line.asked)
-    numbers, hidden = fleet.numbers_of(list(line.told)) or [], None
-    if fleet.hidden is not None:
-        _, hidden = fleet.ask_policy(numbers)
+    chosen: dict[int, Any] = {}
+    instead: dict[int, tuple[str, str]] = {}
+    for uav, told in line.told.items():
+        number = fleet.number_of(uav)
+        if isinstance(told, tuple) and isinstance(told[0], str):
+            instead[number] = (told[0], str(told[1]))
+        else:
+            chosen[number] = told
+    hidden = None if fleet.hidden is None else fleet.ask_policy([*chosen])[1]
     spec = fleet.node.env.full_action_spec[keys.ACTION]
     action = spec.zero()
-    for uav, chosen in line.told.items():
-        action[0, fleet.number[uav]] = torch.tensor(chosen)
+    for number, one in chosen.items():
+        action[0, number] = torch.tensor(one)
     if not spec.is_in(action):
         raise InputError(f"told: {show(line.told)} are not all actions of these settings")
-    fleet.tell(fleet.choice(numbers, action, hidden))
+    fleet.tell(fleet.choice([*chosen], action, hidden, instead))
 
 
 def _taken(fleet: Fleet, reports: Sequence[Report]) -> list[str]:
@@ -224,7 +310,11 @@ def read_inbox(session: AdviceSession, name: str, folder: Path, now: float) -> b
     for path in tables:
         end = DONE
         try:
-            session.report(name, read_file(path), now)
+            rows = rows_of_file(path)
+            if {"answer", "Answer"} & {*(rows[0][1] if rows and isinstance(rows[0][1], dict) else ())}:
+                session.acknowledge(name, acknowledgements_of(rows), now)
+            else:
+                session.report(name, reports_of(rows), now)
         except InputError as error:
             end = REFUSED
             write_atomically(path.with_name(path.name + REASON), f"{error}\n")

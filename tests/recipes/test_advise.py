@@ -21,7 +21,7 @@ B,NA,52.8133,-4.1264,0,NA,NA,NA,0.5,0
 C,NA,52.8154,-4.1311,1,180,NA,70,NA,NA
 """
 TOKEN = "a-token-of-the-service"
-SCRIPT = ["policy=script", "actions.distances=[0,30,60]", "region.initial_conditions=1"]
+SCRIPT = ["policy=script", "actions.distances=[0,30,60]", "region.initial_conditions=1", "reserve=0"]
 
 
 @pytest.fixture
@@ -66,7 +66,11 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
     train()
     rows = TABLE.splitlines()
     Path("two.csv").write_text("\n".join(rows[:3]))
-    answer = json.loads((run("checkpoint=trained", "reports=two.csv") / "advice.json").read_text())
+    for word in ("motion=instant", "motion=polynomial"):  # what is given now does not change the training
+        check_refused(
+            lambda word=word: run("checkpoint=trained", "reports=two.csv", word), "motion: instant: ", capsys
+        )
+    answer = json.loads((run("checkpoint=trained", "reports=two.csv", "instant=true", "reserve=0") / "advice.json").read_text())
     assert [each["ID"] for each in answer] == ["A", "B"]
     assert all(each["state"] in ("fly", "hold") for each in answer)
 
@@ -102,7 +106,7 @@ def test_no_file_keeps_the_token_however_it_is_written(run, monkeypatch, word):
 
 def session_of(folder: Path) -> AdviceSession:
     region = RegionConfig(kind="fir", path="damian:fir.csv", id="LlanbedrTest", initial_conditions=1)
-    return make_session(AdviseConfig(policy="script", region=region), folder)
+    return make_session(AdviseConfig(policy="script", region=region, reserve=0.0), folder)
 
 
 @pytest.fixture
