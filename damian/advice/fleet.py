@@ -16,8 +16,8 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from damian import keys
-from damian.advice.known import FilledReport, Ground, UavLog, messages_of
-from damian.advice.node import LateMessage, Memories, Node, Reported
+from damian.advice.known import FilledReport, UavLog, messages_of
+from damian.advice.node import REMEMBERED_STEPS, LateMessage, Memories, Node, Reported
 from damian.advice.orders import (
     ABORTED,
     ACCEPTED,
@@ -51,6 +51,9 @@ MOST_UAVS = 100
 """Most UAVs of a fleet."""
 NEVER_DECIDED = 2**31
 """Steps since the latest decision of a UAV that is ready to choose."""
+_SIMPLE = ("uavs", "levels", "homes", "commands", "n_answers", "start", "step", "clock", "first_step", "begun")
+_SIMPLE += ("last_arrival", "before", "hidden", "action", "chosen", "previous")
+"""What of a fleet is stored as it is."""
 _ROUNDING = 1e-3
 """Share of a step by which times may be rounded."""
 
@@ -91,10 +94,8 @@ class Fleet:
         self.node, self.uavs, self.policy, self.drawn, self.seed = node, list(uavs), policy, drawn, seed
         self.rules, self.parts, self.mark = rules or FieldRules(), parts, mark
         self.number = {uav: i for i, uav in enumerate(self.uavs)}
-        airspace = node.simulation.airspace
-        check_levels(self.rules.levels[: len(uavs)], airspace)
-        self.ground = Ground(airspace, 2 * node.scenario.region.lattice_step + 50.0)
-        self.points = airspace.points[0]
+        self.ground, self.points = node.ground, node.simulation.airspace.points[0]
+        check_levels(self.rules.levels[: len(uavs)], node.simulation.airspace)
         self.logs = [self._new_log() for _ in self.uavs]
         self.joining: dict[str, UavLog] = {}
         """UAVs that join with their first report."""
@@ -127,12 +128,14 @@ class Fleet:
         self.outputs: TensorDictBase | None = None
         """Outputs of this step, and the messages ``sent`` that are held in it; None until they are needed."""
         self.sent: Messages | None = None
-        self.first_step = self.last_arrival = 0
+        self.first_step = self.begun = self.last_arrival = 0
+        """The first step; that in which the present members began; that of the latest report or decision."""
         self._forget_history()
 
     def _new_log(self) -> UavLog:
-        sensors = self.node.simulation.sensors.values()
-        return UavLog(self.ground, self.node.server.observation.window, sum(each.width for each in sensors))
+        n_readings = sum(each.width for each in self.node.simulation.sensors.values())
+        kept = 2 * max(self.node.law_longest, REMEMBERED_STEPS)
+        return UavLog(self.ground, self.node.server.observation.window, n_readings, kept)
 
     def _forget_history(self) -> None:
         """Begin the hidden states and the choices anew."""
@@ -190,7 +193,7 @@ class Fleet:
             if not self._missing():
                 self._begin()
             return found
-        if report.time < self.start:
+        if report.time < max(self.start, log.known_from):
             return "old"
         now = self.step_of(self.clock)
         step = min(self.step_of(report.time), now)
@@ -227,7 +230,7 @@ class Fleet:
         """Begin with the newest report of each UAV."""
         newest = [log.reports[-1].report for log in self.logs]
         self.start = min(report.time for report in newest)
-        self.step = self.first_step = self.last_arrival = max(self.step_of(self.clock), 0)
+        self.step = self.first_step = self.begun = self.last_arrival = max(self.step_of(self.clock), 0)
         for log, report in zip(self.logs, newest, strict=True):
             log.reports.clear()
             log.add(report, min(self.step_of(report.time), self.step), self._detected(report))
@@ -258,8 +261,10 @@ class Fleet:
         if self.start is None:
             return
         last = self.step_of(now)
+        changes = self.node.diffuses or self.hidden is not None
+        settles = SILENT_STEPS if changes else self.node.settles
         while self.step < last:
-            quiet = self.step >= self.last_arrival + SILENT_STEPS
+            quiet = self.step >= self.last_arrival + settles
             if self.before is not None and quiet and not self.chosen.any() and not self.previous[1].any():
                 following = min([last, *(due for due, _, _ in self.pending)])
                 self.before = self.node.skip(self.before, following - self.step)
@@ -285,7 +290,7 @@ class Fleet:
 
     def _reported(self) -> Reported:
         arrived = {(uav, filled.step): filled for uav, filled in self.arrived}
-        late = {key: filled for key, filled in arrived.items() if self.first_step < key[1] < self.step}
+        late = {key: filled for key, filled in arrived.items() if self.begun < key[1] < self.step}
         self.sent = self._messages(self.held)
         rows = self._messages([*late.values()]).pack() if late else ()
         on_time = [
@@ -558,6 +563,7 @@ class Fleet:
         known = [*self.told[uav], decision]
         self.told[uav] = deque(sorted(known, key=lambda each: each.time), maxlen=TOLD)
         if decision.action is not None:
+            self.last_arrival = max(self.last_arrival, self.step)
             self.chosen = self.chosen | self._mask([uav])
             self.action = self.action.clone()
             self.action[0, uav] = torch.tensor(decision.action)
@@ -636,7 +642,7 @@ class Fleet:
         if self.start is not None:
             self.held = moved(self.held, lambda: filled)
             self.homes = moved(self.homes, lambda: filled.point)
-            self.first_step = self.step
+            self.begun = self.step
         elif not self._missing():
             self._begin()
         self.arrived, self.before, self.after, self.outputs, self.sent = [], None, [], None, None
@@ -656,6 +662,77 @@ class Fleet:
     def _forget_choices(self) -> None:
         self.action = self.node.env.full_action_spec[keys.ACTION].zero()
         self.chosen = self._mask([])
+
+    # What is stored of a fleet.
+
+    def state(self) -> dict[str, Any]:
+        """All that the fleet knows, as plain values and tensors; ``restore`` takes it back, bit for bit."""
+        filled: dict[int, tuple] = {}
+
+        def plain(one: FilledReport) -> tuple:
+            if id(one) not in filled:
+                said = one.report.model_dump_json(by_alias=True, exclude_none=True)
+                filled[id(one)] = (said, one.report.received, *list(vars(one).values())[1:])
+            return filled[id(one)]
+
+        decisions: dict[int, tuple] = {}
+
+        def rows(each: Sequence[deque[Decision]]) -> list[list[tuple]]:
+            return [[decisions.setdefault(id(one), tuple(vars(one).values())) for one in own] for own in each]
+
+        logs = [
+            ([plain(one) for one in log.reports], log.known_from, log.received, log.late, log.duplicates)
+            for log in [*self.logs, *self.joining.values()]
+        ]
+        return {
+            "simple": {name: getattr(self, name) for name in _SIMPLE},
+            "joining": [*self.joining],
+            "logs": logs,
+            "held": [plain(one) for one in self.held],
+            "offered": rows(self.offered),
+            "told": rows(self.told),
+            "pending": [(due, uav, plain(one)) for due, uav, one in self.pending],
+            "arrived": [(uav, plain(one)) for uav, one in self.arrived],
+            "hidden_after": None if self.hidden_after is self.hidden else self.hidden_after,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take back a ``state`` in a new fleet of these settings."""
+        filled: dict[int, FilledReport] = {}
+
+        def full(one: tuple) -> FilledReport:
+            if id(one) not in filled:
+                said, received, *others = one
+                report = Report.model_validate_json(said)
+                report.received = received
+                filled[id(one)] = FilledReport(report, *others)
+            return filled[id(one)]
+
+        made: dict[int, Decision] = {}
+
+        def rows(each: list[list[tuple]]) -> list[deque[Decision]]:
+            return [
+                deque((made.setdefault(id(one), Decision(*one)) for one in own), maxlen=TOLD) for own in each
+            ]
+
+        uavs = state["simple"]["uavs"]
+        if uavs != self.uavs and self.parts is not None:
+            self.node, self.policy = self.parts(len(uavs))
+        for name, value in state["simple"].items():
+            setattr(self, name, value)
+        self.number = {uav: i for i, uav in enumerate(uavs)}
+        logs = [self._new_log() for _ in state["logs"]]
+        for log, (reports, *counts) in zip(logs, state["logs"], strict=True):
+            log.reports = [full(one) for one in reports]
+            log.known_from, log.received, log.late, log.duplicates = counts
+        self.logs = logs[: len(uavs)]
+        self.joining = dict(zip(state["joining"], logs[len(uavs) :], strict=True))
+        self.held = [full(one) for one in state["held"]]
+        self.offered, self.told = rows(state["offered"]), rows(state["told"])
+        self.pending = [(due, uav, full(one)) for due, uav, one in state["pending"]]
+        self.arrived = [(uav, full(one)) for uav, one in state["arrived"]]
+        self.hidden_after = self.hidden if state["hidden_after"] is None else state["hidden_after"]
+        self.after, self.outputs, self.sent = [], None, None
 
     # Answers.
 

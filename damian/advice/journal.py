@@ -5,11 +5,12 @@ is lost if the process is killed at any time. The first line says which fleet it
 """
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, BinaryIO, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
@@ -109,28 +110,54 @@ KINDS: dict[str, type[Line]] = {
 
 
 class Journal:
-    """A journal to append to; an unfinished last line, which a killed process leaves, is removed."""
+    """A journal to append to; an unfinished last line, which a killed process leaves, is removed.
+
+    Its file is open only while a line is written, so that thousands of fleets need no file handles.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
-            self._end = path.read_bytes().rfind(b"\n") + 1
-            os.ftruncate(self._file, self._end)
+            self.end = path.stat().st_size if path.exists() else 0
+            """Where the whole lines end [bytes]."""
+            if self.end:
+                with path.open("rb") as file:
+                    while self.end and b"\n" not in (part := _before(file, self.end)):
+                        self.end -= len(part)
+                    self.end -= len(part) - 1 - part.rfind(b"\n") if self.end else 0
+                os.truncate(path, self.end)
 
     def append(self, line: Head | Line) -> None:
-        """Write a line, or nothing of it if that fails."""
+        """Write a line, or nothing of it if that fails (``RunError``)."""
         text = line.model_dump_json(by_alias=True, exclude_none=True).encode() + b"\n"
         with writing(self.path):
-            os.ftruncate(self._file, self._end)  # what is left of a line that could not be written
-            if os.write(self._file, text) != len(text):
-                raise OSError(None, "the disk is full")
-            self._end += len(text)
+            file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+            try:
+                os.ftruncate(file, self.end)  # what is left of a line that could not be written
+                if os.write(file, text) != len(text):
+                    raise OSError(None, "the disk is full")
+            finally:
+                os.close(file)
+            self.end += len(text)
 
-    def close(self) -> None:
-        """Close the file."""
-        os.close(self._file)
+    def last_time(self) -> float:
+        """When the last line was written [s since 1970]; 0 if only the first one is there."""
+        with writing(self.path), self.path.open("rb") as file:
+            *_, text, _ = [b"", *_before(file, self.end, 2 * MAX_LINE).split(b"\n")]
+        found = re.match(rb'\{"(?:received|asked)":([0-9.e+]+)', text)
+        return float(found[1]) if found else 0.0
+
+
+MAX_LINE = 1_000_000
+"""Bytes of a line, about as many as a request has."""
+
+
+def _before(file: BinaryIO, end: int, most: int = 1 << 16) -> bytes:
+    """What stands in a file before a place, up to ``most`` bytes."""
+    first = max(end - most, 0)
+    file.seek(first)
+    return file.read(end - first)
 
 
 def read_head(path: Path) -> Head:
@@ -139,11 +166,14 @@ def read_head(path: Path) -> Head:
         return validated(Head, parsed_json(_texts(path, 1)[0]), "line 1")
 
 
-def read_lines(path: Path) -> Iterator[tuple[int, Line]]:
-    """The lines after the first one, with their numbers; an unfinished one at the end is left out."""
+def read_lines(path: Path, start: int = 0) -> Iterator[tuple[int, Line]]:
+    """The lines after the first one, with their numbers; an unfinished one at the end is left out.
+
+    With ``start`` [bytes], only those from there on; their numbers count from there.
+    """
     with named(path):
-        texts = _texts(path)
-    for number, text in enumerate(texts[1:], 2):
+        texts = _texts(path, start=start)
+    for number, text in enumerate(texts if start else texts[1:], 1 if start else 2):
         with named(f"{path}: line {number}"):
             found = parsed_json(text)
             kind = next((kind for name, kind in KINDS.items() if name in found), Members)
@@ -151,13 +181,14 @@ def read_lines(path: Path) -> Iterator[tuple[int, Line]]:
         yield number, line
 
 
-def _texts(path: Path, most: int = -1) -> list[bytes]:
-    """The whole lines of a file, or the first ``most`` ones."""
+def _texts(path: Path, most: int = -1, start: int = 0) -> list[bytes]:
+    """The whole lines of a file from a place on, or the first ``most`` ones."""
     try:
         with path.open("rb") as file:
+            file.seek(start)
             *lines, _ = (file.read() if most < 0 else b"".join(islice(file, most))).split(b"\n")
     except OSError as error:
         raise InputError(f"it cannot be read: {error.strerror}") from None
-    if not lines:
+    if not lines and not start:
         raise InputError("it is empty")
     return lines

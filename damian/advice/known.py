@@ -7,7 +7,7 @@ import bisect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import shapely
@@ -23,8 +23,8 @@ from damian.world.battery import observed
 from damian.world.messages import Messages
 from damian.world.regions.geodesy import to_latlon, to_local
 
-KEPT = 512
-"""Reports of a UAV that are kept: a late one changes what newer ones left open."""
+KEPT, KEPT_ANYWAY = 512, 16
+"""Most and fewest reports of a UAV that are kept: a late one changes what newer ones left open."""
 DIGITS = {DEGREES: 8, METRES: 3}
 """Decimals of a place in answers: a millimetre."""
 
@@ -45,7 +45,7 @@ class Ground:
         self.way = lru_cache(10_000)(self._way)
         """Distance between two landing points [m] and heading, clockwise from north [deg]; two decimals."""
 
-    @property
+    @cached_property
     def mark(self) -> str:
         """A text that stands for the landing points."""
         return str(number_of(str(self.points.round(2).tolist())))
@@ -118,9 +118,11 @@ class FilledReport:
 class UavLog:
     """The reports of one UAV."""
 
-    def __init__(self, ground: Ground, window: int, n_readings: int) -> None:
-        self.ground, self.window, self.n_readings = ground, window, n_readings
+    def __init__(self, ground: Ground, window: int, n_readings: int, kept_steps: int) -> None:
+        self.ground, self.window, self.n_readings, self.kept_steps = ground, window, n_readings, kept_steps
         self.reports: list[FilledReport] = []
+        self.known_from = -math.inf
+        """Time since which all reports are kept [s]."""
         self.received = self.late = self.duplicates = 0
 
     @property
@@ -162,7 +164,10 @@ class UavLog:
         self.reports.insert(at, filled)
         for i in range(at, len(self.reports)):
             self._fill(self.reports[i], self.reports[i - 1] if i else None)
-        del self.reports[: max(len(self.reports) - KEPT, 0)]
+        too_old = self.reports[-1].step - self.kept_steps
+        while len(self.reports) > KEPT or (len(self.reports) > KEPT_ANYWAY and self.reports[0].step < too_old):
+            del self.reports[0]
+            self.known_from = self.reports[0].report.time
         return filled
 
     def _fill(self, filled: FilledReport, before: FilledReport | None) -> None:

@@ -4,15 +4,18 @@ Each request checks, writes the line of the journal, and then changes the fleet:
 the journal does not say, and a request that fails changes nothing.
 """
 
+import io
 import json
-from dataclasses import fields
-from collections.abc import Callable, Mapping, Sequence
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import torch
 
+import damian
 from damian import keys
 from damian.advice.fleet import Fleet, Waiting
 from damian.advice.journal import (
@@ -41,8 +44,8 @@ from damian.advice.rows import (
     rows_of_file,
     validated,
 )
-from damian.common.atomic_files import write_atomically, writing
-from damian.common.errors import InputError
+from damian.common.atomic_files import UNFINISHED, write_atomically, writing
+from damian.common.errors import InputError, RunError, described
 from damian.common.text_files import named, show
 from damian.runs.run_lock import locked
 from damian.settings.programs import FieldRules
@@ -54,6 +57,13 @@ MAY_DIFFER = {
 }
 """Settings that a journal and a service need not share: those that say how reports come in and where journals
 lie, those that are compared apart, and those on which no advice depends."""
+
+
+SNAPSHOT = ".snapshot"
+"""End of the name of the file with what a fleet knows, beside its journal."""
+SNAPSHOT_LINES, SNAPSHOT_TIME = 50, 0.1
+"""Lines of a journal after which a fleet is stored anew; time for this in each round [s]."""
+_LOG = logging.getLogger("damian.advice")
 
 
 class NoFleet(InputError):
@@ -77,7 +87,12 @@ class AdviceSession:
         self.make, self._folder = make_fleet, folder
         self.about = About.model_validate(about or {})
         self.fleets: dict[str, Fleet] = {}
+        """Those that are at hand; another one of ``names`` is restored when it is needed."""
+        self.problem: str | None = None
+        """Why a journal could not be written at last; None if it could."""
         self._journals: dict[str, Journal] = {}
+        self._unsaved: dict[str, int] = {}
+        """Lines of journals since the latest snapshots."""
         self._at_close = ExitStack()
         if folder is None:
             return
@@ -86,22 +101,37 @@ class AdviceSession:
         self._at_close.enter_context(locked(folder, "journal"))
         try:
             for path in sorted(folder.glob(f"*{SUFFIX}")):
-                self._restore(path)
+                self._find(path)
         except BaseException:
             self.close()
             raise
 
+    @property
+    def names(self) -> list[str]:
+        """The names of all fleets."""
+        return sorted({*self.fleets, *self._journals})
+
+    @property
+    def latest(self) -> float:
+        """The latest time that a journal names [s]."""
+        return max((journal.last_time() for journal in self._journals.values()), default=0.0)
+
     def fleet(self, name: str) -> Fleet:
         """The fleet of a name."""
         if name not in self.fleets:
-            raise NoFleet(f"fleet: there is no fleet {show(name)}")
+            if name not in self._journals:
+                raise NoFleet(f"fleet: there is no fleet {show(name)}")
+            try:
+                self.fleets[name] = self._restored(self._journals[name])
+            except InputError as error:  # its journal is damaged: the request is not wrong
+                raise RunError(str(error)) from None
         return self.fleets[name]
 
     def create(self, name: str, uavs: Any) -> bool:
         """Create a fleet of UAVs with these IDs; returns whether it is new."""
         head = validated(Head, {"fleet": name, "uavs": uavs, "about": self.about})
-        if name in self.fleets:
-            if self.fleets[name].uavs != head.uavs:
+        if name in self.names:
+            if self.fleet(name).uavs != head.uavs:
                 raise InputError(f"fleet: {name} has other UAVs; end it first, or take another name")
             return False
         made = self.make(head.uavs, head.mark)
@@ -118,7 +148,7 @@ class AdviceSession:
         if journal := self._journals.get(name):
             with writing(journal.path):
                 journal.path.rename(journal.path.with_suffix(f".{now:.3f}.ended"))
-            journal.close()
+                journal.path.with_suffix(SNAPSHOT).unlink(missing_ok=True)
             del self._journals[name]
         del self.fleets[name]
 
@@ -152,6 +182,11 @@ class AdviceSession:
             self._write(name, Advised.model_construct(asked=fleet.clock, told=told, advice=advice))
             fleet.tell(choice)
         return fleet.advice(fleet.numbers_of(asking) if only else None)
+
+    def told(self, name: str, uavs: Sequence[str] | None) -> list[Advice]:
+        """What UAVs, or all, were told last; the fleet has begun."""
+        fleet = self.fleet(name)
+        return fleet.advice(fleet.numbers_of(uavs))
 
     def acknowledge(self, name: str, rows: list[Acknowledgement], now: float) -> list[str]:
         """Take acknowledgements, all or none; returns how far the answers have come, or ``unknown``."""
@@ -189,37 +224,85 @@ class AdviceSession:
         for fleet in self.fleets.values():
             fleet.advance(now)
 
+    def upkeep(self, clock: Callable[[], float]) -> Iterator[None]:
+        """Bring fleets up to date, one after the other; snapshots take a part of the time only."""
+        spent = 0.0
+        for name in self.names:
+            if name in self.fleets or name in self._journals:
+                with suppress(RunError):  # a request says so; the other fleets go on
+                    self.fleet(name).advance(clock())
+                    if self._unsaved.get(name, 0) >= SNAPSHOT_LINES and spent < SNAPSHOT_TIME:
+                        began = clock()
+                        self._save(name)
+                        spent += clock() - began
+                yield
+
     def close(self) -> None:
-        """Close all journals, and leave their folder to others."""
-        for journal in self._journals.values():
-            journal.close()
+        """Store all fleets, and leave their folder to others."""
+        with suppress(RunError):  # the journals have it all
+            for name in [name for name, lines in self._unsaved.items() if lines and name in self.fleets]:
+                self._save(name)
         self._journals.clear()
         self._at_close.close()
 
     def _write(self, name: str, line: Line) -> None:
         if self._folder is not None:
-            self._journals[name].append(line)
+            try:
+                self._journals[name].append(line)
+            except RunError as error:
+                self.problem = str(error)
+                raise
+            self.problem = None
+            self._unsaved[name] = self._unsaved.get(name, 0) + 1
 
-    def _restore(self, path: Path) -> None:
-        """Restore a fleet from its journal."""
+    def _save(self, name: str) -> None:
+        """Store what a fleet knows, so that a restart reads only the lines of its journal after that."""
+        journal, content = self._journals[name], io.BytesIO()
+        fleet = self.fleets[name]
+        mark = damian.__version__, fleet.mark
+        torch.save({"mark": mark, "end": journal.end, "state": fleet.state()}, content)
+        path = journal.path.with_suffix(SNAPSHOT)
+        part = path.with_suffix(UNFINISHED)
+        with writing(path):
+            part.write_bytes(content.getvalue())
+            part.replace(path)
+        self._unsaved[name] = 0
+
+    def _find(self, path: Path) -> None:
+        """Find the journal of a fleet, and check that it is of these settings."""
         journal = Journal(path)  # removes what is unfinished
-        self._journals[path.stem] = journal
-        if not path.stat().st_size:  # the service was killed before the fleet was there
+        if not journal.end:  # the service was killed before the fleet was there
             path.unlink()
-            self._journals.pop(path.stem).close()
             return
         head = read_head(path)
         with named(path):
             if head.fleet != path.stem:
                 raise InputError(f"it is the journal of the fleet {head.fleet}: name it {head.fleet}{SUFFIX}")
             check_same(head.about, self.about)
-            fleet = self.make(head.uavs, head.mark)
-            if head.ground != fleet.ground.mark:
+            if head.ground != self.make(head.uavs, head.mark).ground.mark:
                 raise InputError("it is of other landing points: give the region and the lattice that it had")
-        for number, line in read_lines(path):
-            with named(f"{path}: line {number}"):
+        self._journals[path.stem] = journal
+
+    def _restored(self, journal: Journal) -> Fleet:
+        """A fleet as its journal tells, from its snapshot on, if there is one that can be read."""
+        head, path = read_head(journal.path), journal.path.with_suffix(SNAPSHOT)
+        fleet, end = self.make(head.uavs, head.mark), 0
+        if path.exists():
+            try:
+                stored = torch.load(path, weights_only=True)
+                if stored["mark"] == (damian.__version__, head.mark) and stored["end"] <= journal.end:
+                    fleet.restore(stored["state"])
+                    end = stored["end"]
+            except Exception as error:  # of a machine that stopped while it was written: the journal has it all
+                _LOG.warning("%s: it is not read: %s", path, described(error))
+                fleet = self.make(head.uavs, head.mark)
+        n_lines = 0
+        for number, line in read_lines(journal.path, end):
+            with named(f"{journal.path}: line {number}{' of those after the snapshot' if end else ''}"):
                 replay(fleet, line)
-        self.fleets[head.fleet] = fleet
+            n_lines += 1
+        self._unsaved[journal.path.stem] = n_lines
+        return fleet
 
 
 def rules_of(fleet: Fleet) -> dict[str, bool | float]:

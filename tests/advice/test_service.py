@@ -136,7 +136,7 @@ def test_after_any_nonsense_the_service_goes_on(client, fleet, session, content)
         answer = client.post(f"{fleet}/reports", content=body, headers={"Content-Type": content})
         assert answer.status_code == 422, (body, answer.text)
         assert answer.json()["error"].isprintable()
-    assert not any(log.reports for log in session.fleets["north"].logs)
+    assert not any(log.reports for log in session.fleet("north").logs)
     assert client.post(f"{fleet}/reports", json=rows(session)).status_code == 200
     assert client.get(f"{fleet}/advice").status_code == 200
 
@@ -172,7 +172,7 @@ def test_a_journal_brings_everything_back(task, tmp_path):
                 session.advance(clock.now)
             if generator.random() < 0.5:
                 client.get(f"/fleets/north/advice?uav={generator.choice(UAVS)}")
-    one, other = session.fleets["north"], make_session().fleets["north"]
+    one, other = session.fleet("north"), make_session().fleet("north")
     assert (one.start, list(map(list, one.told))) == (other.start, list(map(list, other.told)))
     assert [log.reports for log in one.logs] == [log.reports for log in other.logs]
     for fleet in (one, other):

@@ -81,7 +81,6 @@ def test_what_is_appended_is_there_at_once_and_an_unfinished_line_is_removed(tmp
     for line in (HEAD, LINE):
         written.append(line)
     assert lines_of(path) == [HEAD, LINE]
-    written.close()
     assert path.stat().st_mode & 0o077 == 0, "others need not read where UAVs are"
     with path.open("a") as file:
         file.write('{"received": 1.5, "repo')
@@ -128,7 +127,7 @@ def test_journals_are_of_one_session_until_it_is_closed(make_session):
     with pytest.raises(InputError, match=r"journal: .*journals is in use by another run"):
         make_session()
     session.close()
-    assert [*make_session().fleets] == ["north"]
+    assert make_session().names == ["north"]
 
 
 # Other settings.
@@ -142,7 +141,7 @@ def test_a_journal_of_other_settings_is_refused_with_both_values(make_session):
     assert f"north.jsonl: it is of other settings: {message}" in str(error.value)
     now = ["port=8000", "host=0.0.0.0", "journal=x", "device=cuda", "agents=7"]
     session = make_session(overrides=["+region=llanbedr", *now, *WORDS[1:]])
-    assert [*session.fleets] == ["north"], "these may differ"
+    assert session.names == ["north"], "these may differ"
 
 
 # A journal that cannot be written.
