@@ -5,7 +5,6 @@ to the step in which it was generated, and counts from the step in which it came
 """
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -51,9 +50,8 @@ MOST_UAVS = 100
 """Most UAVs of a fleet."""
 NEVER_DECIDED = 2**31
 """Steps since the latest decision of a UAV that is ready to choose."""
-_SIMPLE = ("uavs", "levels", "homes", "commands", "n_answers", "start", "step", "clock", "first_step", "begun")
-_SIMPLE += ("last_arrival", "before", "hidden", "action", "chosen", "previous")
-"""What of a fleet is stored as it is."""
+_NOT_STORED = {"node", "policy", "rules", "parts", "ground", "points", "after", "outputs", "sent"}
+"""What of a fleet is given to it, or computed again."""
 _ROUNDING = 1e-3
 """Share of a step by which times may be rounded."""
 
@@ -114,9 +112,9 @@ class Fleet:
         self.step, self.clock = 0, 0.0
         self.held: list[FilledReport] = []
         """The message of each UAV that the server holds."""
-        self.offered: list[deque[Decision]] = [deque(maxlen=TOLD) for _ in self.uavs]
+        self.offered: list[list[Decision]] = [[] for _ in self.uavs]
         """The latest answers to each UAV, oldest first."""
-        self.told: list[deque[Decision]] = [deque(maxlen=TOLD) for _ in self.uavs]
+        self.told: list[list[Decision]] = [[] for _ in self.uavs]
         """Those that it has followed, oldest first."""
         self.pending: list[tuple[int, int, FilledReport]] = []
         """Reports that count later: the step from which they do, the number of the UAV, the report."""
@@ -255,19 +253,25 @@ class Fleet:
 
     # Steps.
 
+    @property
+    def changes_by_itself(self) -> bool:
+        """Whether steps must be taken one by one, even if nothing is reported."""
+        return self.node.diffuses or self.hidden is not None
+
     def advance(self, now: float) -> None:
         """Take all steps up to an instant [s]."""
         self.clock = now = max(self.clock, now)
         if self.start is None:
             return
         last = self.step_of(now)
-        changes = self.node.diffuses or self.hidden is not None
-        settles = SILENT_STEPS if changes else self.node.settles
+        settles = SILENT_STEPS if self.changes_by_itself else self.node.settles
+        skipped = last - self.node.held_back
         while self.step < last:
             quiet = self.step >= self.last_arrival + settles
-            if self.before is not None and quiet and not self.chosen.any() and not self.previous[1].any():
-                following = min([last, *(due for due, _, _ in self.pending)])
-                self.before = self.node.skip(self.before, following - self.step)
+            quiet = quiet and self.step < skipped and self.before is not None
+            if quiet and not self.chosen.any() and not self.previous[1].any():
+                following = min([skipped, *(due for due, _, _ in self.pending)])
+                self.before = self.node.skip(cast(Memories, self.before), following - self.step)
             else:
                 if self.hidden is not None and self.hidden_after is self.hidden:
                     _, self.hidden_after = self.ask_policy([])  # hidden states change in every step
@@ -370,7 +374,9 @@ class Fleet:
         if self.rules.acknowledge and order is not None and order.is_open(self.clock):
             return True
         chosen = offer is not None and (offer.action is not None or offer.reason in ("conflict", "battery"))
-        return chosen and (cast(Decision, offer).is_live(self.clock) or cast(Decision, offer).step == self.step)
+        return chosen and (
+            cast(Decision, offer).is_live(self.clock) or cast(Decision, offer).step == self.step
+        )
 
     def _is_told(self, uav: int, reason: str) -> bool:
         """Whether a UAV in danger has been told so, and the answer still holds."""
@@ -476,9 +482,9 @@ class Fleet:
                 for other, each in flights.items()
                 if other != uav and abs(self.levels[other] - self.levels[uav]) < self.rules.level_step / 2
             ]
-            if any(decision.goal in booked[other] for other in self._others(uav)):
-                reason = "conflict"
-            elif too_close(self._path(decision), at_level, self.rules.clearance):
+            if any(decision.goal in booked[other] for other in self._others(uav)) or too_close(
+                self._path(decision), at_level, self.rules.clearance
+            ):
                 reason = "conflict"
             elif decision.action is not None and self.node.scenario.battery.enabled:
                 left = cast(FilledReport, self.logs[uav].newest).battery
@@ -534,7 +540,9 @@ class Fleet:
             before = self._state(choosing)
             state = self.node.simulation.decide(before, action, self._mask(choosing))
             columns = [each[0].tolist() for each in (action, before.goal, state.goal)]
-            decisions |= {uav: self._decision(uav, *(each[uav] for each in columns), None) for uav in choosing}
+            decisions |= {
+                uav: self._decision(uav, *(each[uav] for each in columns), None) for uav in choosing
+            }
         decisions = dict(sorted(decisions.items()))
         for number, decision in enumerate(decisions.values(), self.n_answers + 1):
             decision.answer, decision.since = f"{self.mark}-{number}".lstrip("-"), self.step
@@ -544,7 +552,7 @@ class Fleet:
         """Note what UAVs have been told; without acknowledgements, they follow it from now on."""
         for uav, decision in choice.decisions.items():
             self._lapse(uav)
-            self.offered[uav].append(decision)
+            self.offered[uav] = [*self.offered[uav][1 - TOLD :], decision]
             if not self.rules.acknowledge and decision.acknowledge(ACCEPTED, self.clock, self.step):
                 self._follow(uav, decision)
         self.n_answers += len(choice.decisions)
@@ -560,8 +568,7 @@ class Fleet:
         """Take a UAV to follow a decision from now on."""
         if decision.action is None and not decision.moves:
             return
-        known = [*self.told[uav], decision]
-        self.told[uav] = deque(sorted(known, key=lambda each: each.time), maxlen=TOLD)
+        self.told[uav] = sorted([*self.told[uav], decision], key=lambda each: each.time)[-TOLD:]
         if decision.action is not None:
             self.last_arrival = max(self.last_arrival, self.step)
             self.chosen = self.chosen | self._mask([uav])
@@ -626,8 +633,8 @@ class Fleet:
             return [new() if then is None else old[then] for _, then in stay]
 
         self.logs = moved(self.logs, self._new_log)
-        self.offered = moved(self.offered, lambda: deque(maxlen=TOLD))
-        self.told = moved(self.told, lambda: deque(maxlen=TOLD))
+        self.offered = moved(self.offered, list)
+        self.told = moved(self.told, list)
         self.commands = moved(self.commands, str)
         used = [self.levels[then] for _, then in stay if then is not None]
         self.levels = moved(self.levels, lambda: level_for_another(self.rules.levels, used))
@@ -666,73 +673,16 @@ class Fleet:
     # What is stored of a fleet.
 
     def state(self) -> dict[str, Any]:
-        """All that the fleet knows, as plain values and tensors; ``restore`` takes it back, bit for bit."""
-        filled: dict[int, tuple] = {}
-
-        def plain(one: FilledReport) -> tuple:
-            if id(one) not in filled:
-                said = one.report.model_dump_json(by_alias=True, exclude_none=True)
-                filled[id(one)] = (said, one.report.received, *list(vars(one).values())[1:])
-            return filled[id(one)]
-
-        decisions: dict[int, tuple] = {}
-
-        def rows(each: Sequence[deque[Decision]]) -> list[list[tuple]]:
-            return [[decisions.setdefault(id(one), tuple(vars(one).values())) for one in own] for own in each]
-
-        logs = [
-            ([plain(one) for one in log.reports], log.known_from, log.received, log.late, log.duplicates)
-            for log in [*self.logs, *self.joining.values()]
-        ]
-        return {
-            "simple": {name: getattr(self, name) for name in _SIMPLE},
-            "joining": [*self.joining],
-            "logs": logs,
-            "held": [plain(one) for one in self.held],
-            "offered": rows(self.offered),
-            "told": rows(self.told),
-            "pending": [(due, uav, plain(one)) for due, uav, one in self.pending],
-            "arrived": [(uav, plain(one)) for uav, one in self.arrived],
-            "hidden_after": None if self.hidden_after is self.hidden else self.hidden_after,
-        }
+        """All that the fleet knows; ``restore`` takes it back, bit for bit."""
+        return {name: value for name, value in vars(self).items() if name not in _NOT_STORED}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take back a ``state`` in a new fleet of these settings."""
-        filled: dict[int, FilledReport] = {}
-
-        def full(one: tuple) -> FilledReport:
-            if id(one) not in filled:
-                said, received, *others = one
-                report = Report.model_validate_json(said)
-                report.received = received
-                filled[id(one)] = FilledReport(report, *others)
-            return filled[id(one)]
-
-        made: dict[int, Decision] = {}
-
-        def rows(each: list[list[tuple]]) -> list[deque[Decision]]:
-            return [
-                deque((made.setdefault(id(one), Decision(*one)) for one in own), maxlen=TOLD) for own in each
-            ]
-
-        uavs = state["simple"]["uavs"]
-        if uavs != self.uavs and self.parts is not None:
-            self.node, self.policy = self.parts(len(uavs))
-        for name, value in state["simple"].items():
-            setattr(self, name, value)
-        self.number = {uav: i for i, uav in enumerate(uavs)}
-        logs = [self._new_log() for _ in state["logs"]]
-        for log, (reports, *counts) in zip(logs, state["logs"], strict=True):
-            log.reports = [full(one) for one in reports]
-            log.known_from, log.received, log.late, log.duplicates = counts
-        self.logs = logs[: len(uavs)]
-        self.joining = dict(zip(state["joining"], logs[len(uavs) :], strict=True))
-        self.held = [full(one) for one in state["held"]]
-        self.offered, self.told = rows(state["offered"]), rows(state["told"])
-        self.pending = [(due, uav, full(one)) for due, uav, one in state["pending"]]
-        self.arrived = [(uav, full(one)) for uav, one in state["arrived"]]
-        self.hidden_after = self.hidden if state["hidden_after"] is None else state["hidden_after"]
-        self.after, self.outputs, self.sent = [], None, None
+        if len(state["uavs"]) != len(self.uavs) and self.parts is not None:
+            self.node, self.policy = self.parts(len(state["uavs"]))
+        vars(self).update(state)
+        for log in [*self.logs, *self.joining.values()]:
+            log.ground = self.ground
 
     # Answers.
 
@@ -789,8 +739,9 @@ class Fleet:
             place: Any = newest and newest.report.place()
             where = dict(zip(self.ground.columns, place, strict=True)) if place else {}
             number, offer = self.number[uav], self.offer(self.number[uav])
-            counts |= {"command": self.commands[number], "order": offer and offer.status}
-            rows.append(UavStatus(ID=uav, age=self._age(newest), **where, reports=log.received, **counts))
+            told: dict[str, Any] = {"command": self.commands[number], "order": offer and offer.status}
+            how = {"age": self._age(newest), "reports": log.received, **counts}
+            rows.append(UavStatus(ID=uav, **how, **where, **told))
         start = None if self.start is None else written(self.start)
         return FleetStatus(fleet=name, start=start, step=self.step, dt=self.node.dt, uavs=rows)
 

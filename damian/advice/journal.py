@@ -20,6 +20,8 @@ from damian.common.errors import InputError
 from damian.common.text_files import named
 
 SUFFIX = ".jsonl"
+BLOCK, MAX_LINE = 1 << 16, 1_000_000
+"""Bytes that are read at a time from the end of a journal; of a line, about as many as a request has."""
 
 
 class About(BaseModel):
@@ -123,9 +125,9 @@ class Journal:
             """Where the whole lines end [bytes]."""
             if self.end:
                 with path.open("rb") as file:
-                    while self.end and b"\n" not in (part := _before(file, self.end)):
-                        self.end -= len(part)
-                    self.end -= len(part) - 1 - part.rfind(b"\n") if self.end else 0
+                    while self.end and not (whole := _before(file, self.end).rfind(b"\n") + 1):
+                        self.end = max(self.end - BLOCK, 0)
+                    self.end = max(self.end - BLOCK, 0) + whole if self.end else 0
                 os.truncate(path, self.end)
 
     def append(self, line: Head | Line) -> None:
@@ -149,11 +151,7 @@ class Journal:
         return float(found[1]) if found else 0.0
 
 
-MAX_LINE = 1_000_000
-"""Bytes of a line, about as many as a request has."""
-
-
-def _before(file: BinaryIO, end: int, most: int = 1 << 16) -> bytes:
+def _before(file: BinaryIO, end: int, most: int = BLOCK) -> bytes:
     """What stands in a file before a place, up to ``most`` bytes."""
     first = max(end - most, 0)
     file.seek(first)

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 import shapely
@@ -125,6 +126,10 @@ class UavLog:
         """Time since which all reports are kept [s]."""
         self.received = self.late = self.duplicates = 0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What is stored: all but the landing points."""
+        return self.__dict__ | {"ground": None}
+
     @property
     def newest(self) -> FilledReport | None:
         """The report that was generated last."""
@@ -165,7 +170,9 @@ class UavLog:
         for i in range(at, len(self.reports)):
             self._fill(self.reports[i], self.reports[i - 1] if i else None)
         too_old = self.reports[-1].step - self.kept_steps
-        while len(self.reports) > KEPT or (len(self.reports) > KEPT_ANYWAY and self.reports[0].step < too_old):
+        while len(self.reports) > KEPT or (
+            len(self.reports) > KEPT_ANYWAY and self.reports[0].step < too_old
+        ):
             del self.reports[0]
             self.known_from = self.reports[0].report.time
         return filled

@@ -107,8 +107,11 @@ class Node:
         """The environment for which the policy is built; nobody steps it."""
         self.env.reset()
         self.ground = Ground(self.simulation.airspace, 2 * scenario.region.lattice_step + 50.0)
-        self.settles = 2 + max(scenario.clock.steps(name) for name in ("agents", "server"))
+        periods = [scenario.clock.steps(name) for name in ("agents", "server")]
+        self.settles = 2 + sum(periods)
         """Steps after which all that has arrived is known to all, if nothing else arrives."""
+        self.held_back = 0 if periods == [1, 1] else self.settles
+        """Steps for which an observation may be held, which must be taken even if nothing arrives."""
         self.diffuses = any(isinstance(each, Belief) for each in transforms)
         """Whether something changes in every step, even if nothing arrives."""
         self.transforms = cast(list[StatefulTransform], transforms)

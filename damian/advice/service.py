@@ -51,7 +51,9 @@ ALIVE = 15.0
 MOST_LOGGED = 10
 """Lines that a log gets within a minute."""
 _CSV = "text/csv"
-_BUSY = b"HTTP/1.1 503 Service Unavailable\r\ncontent-length: 0\r\nretry-after: 1\r\nconnection: close\r\n\r\n"
+_BUSY = (
+    b"HTTP/1.1 503 Service Unavailable\r\ncontent-length: 0\r\nretry-after: 1\r\nconnection: close\r\n\r\n"
+)
 
 
 def make_app(

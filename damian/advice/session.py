@@ -32,6 +32,8 @@ from damian.advice.journal import (
     read_head,
     read_lines,
 )
+from damian.advice.known import FilledReport, UavLog
+from damian.advice.orders import Decision
 from damian.advice.rows import (
     Acknowledgement,
     Advice,
@@ -63,6 +65,8 @@ SNAPSHOT = ".snapshot"
 """End of the name of the file with what a fleet knows, beside its journal."""
 SNAPSHOT_LINES, SNAPSHOT_TIME = 50, 0.1
 """Lines of a journal after which a fleet is stored anew; time for this in each round [s]."""
+STORED = [Decision, FilledReport, Report, UavLog]
+"""Classes of which snapshots are made, beside tensors and plain values; nothing else is read from them."""
 _LOG = logging.getLogger("damian.advice")
 
 
@@ -230,7 +234,8 @@ class AdviceSession:
         for name in self.names:
             if name in self.fleets or name in self._journals:
                 with suppress(RunError):  # a request says so; the other fleets go on
-                    self.fleet(name).advance(clock())
+                    if self.fleet(name).changes_by_itself:  # another one skips quiet steps when it is asked
+                        self.fleet(name).advance(clock())
                     if self._unsaved.get(name, 0) >= SNAPSHOT_LINES and spent < SNAPSHOT_TIME:
                         began = clock()
                         self._save(name)
@@ -289,11 +294,14 @@ class AdviceSession:
         fleet, end = self.make(head.uavs, head.mark), 0
         if path.exists():
             try:
-                stored = torch.load(path, weights_only=True)
+                with torch.serialization.safe_globals(STORED):
+                    stored = torch.load(path, weights_only=True)
                 if stored["mark"] == (damian.__version__, head.mark) and stored["end"] <= journal.end:
                     fleet.restore(stored["state"])
                     end = stored["end"]
-            except Exception as error:  # of a machine that stopped while it was written: the journal has it all
+            except (
+                Exception
+            ) as error:  # of a machine that stopped while it was written: the journal has it all
                 _LOG.warning("%s: it is not read: %s", path, described(error))
                 fleet = self.make(head.uavs, head.mark)
         n_lines = 0

@@ -48,7 +48,9 @@ SCENARIOS = {name: replace(SCENARIO, motion=motion) for name, motion in MOTIONS.
 
 
 def fleet_of(uavs: list[str], scenario: ScenarioConfig = SCENARIO) -> Fleet:
-    return Fleet(Node(scenario, 3, reward_terms=True), uavs, policy=lambda _: pytest.fail("it was asked"), rules=FREE)
+    return Fleet(
+        Node(scenario, 3, reward_terms=True), uavs, policy=lambda _: pytest.fail("it was asked"), rules=FREE
+    )
 
 
 @pytest.fixture(scope="module", params=[pytest.param("instant", marks=pytest.mark.slow), "flights"])

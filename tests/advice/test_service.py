@@ -29,7 +29,11 @@ def parts():
 @pytest.fixture
 def session(parts, tmp_path):
     node, policy = parts
-    return AdviceSession(lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark), tmp_path / "journals", {"policy": "greedy"})
+    return AdviceSession(
+        lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
+        tmp_path / "journals",
+        {"policy": "greedy"},
+    )
 
 
 class Clock:
@@ -91,7 +95,10 @@ def test_reports_go_in_and_landing_points_come_out(client, fleet, session, clock
     ]
     assert found == [["new"], ["duplicate"]]
     head, *table = client.get(f"{fleet}/advice?format=csv").text.splitlines()
-    assert head == "answer,ID,state,reason,lat,lon,altitude,speed,heading,distance,duration,arrival,until,step,age"
+    assert (
+        head
+        == "answer,ID,state,reason,lat,lon,altitude,speed,heading,distance,duration,arrival,until,step,age"
+    )
     assert [(line.split(",")[1], line.split(",")[-1]) for line in table] == [
         ("A", "1.0"),
         ("B", "5.0"),
@@ -149,7 +156,11 @@ def test_a_journal_brings_everything_back(task, tmp_path):
     policy, clock = greedy_policy(node.env), Clock()
 
     def make_session() -> AdviceSession:
-        return AdviceSession(lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark), tmp_path, {"policy": "greedy"})
+        return AdviceSession(
+            lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
+            tmp_path,
+            {"policy": "greedy"},
+        )
 
     session, generator = make_session(), random.Random(5)
     headers = {"Authorization": f"Bearer {TOKEN}"}

@@ -40,7 +40,13 @@ def make_session(node, tmp_path):
     def make(node: Node = node, policy=None, **about) -> AdviceSession:
         policy = policy or greedy_policy(node.env)
         folder = tmp_path / "journals"
-        made.append(AdviceSession(lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark), folder, {**ABOUT, **about}))
+        made.append(
+            AdviceSession(
+                lambda uavs, mark: Fleet(node, uavs, policy, rules=FREE, mark=mark),
+                folder,
+                {**ABOUT, **about},
+            )
+        )
         return made[-1]
 
     yield make

@@ -70,7 +70,11 @@ def test_a_trained_policy_answers_as_it_was_trained(run, monkeypatch, capsys):
         check_refused(
             lambda word=word: run("checkpoint=trained", "reports=two.csv", word), "motion: instant: ", capsys
         )
-    answer = json.loads((run("checkpoint=trained", "reports=two.csv", "instant=true", "reserve=0") / "advice.json").read_text())
+    answer = json.loads(
+        (
+            run("checkpoint=trained", "reports=two.csv", "instant=true", "reserve=0") / "advice.json"
+        ).read_text()
+    )
     assert [each["ID"] for each in answer] == ["A", "B"]
     assert all(each["state"] in ("fly", "hold") for each in answer)
 
